@@ -1,4 +1,4 @@
-"""The page's server: whom it lets in, and what it hears from them. All on this machine; no tunnel is ever opened."""
+"""Access control of the page's server: requests, tokens and messages, on this machine only."""
 
 import http.client
 import math
@@ -73,14 +73,14 @@ def visitor(page):
 
 
 def still_heard(page, visitor):
-    """Whether a visitor's messages arrive, and none before did: they come in order, so all others were dealt with."""
+    """True if a visitor's next message arrives and none before it did; messages are handled in order."""
     value = 0.1 if page.inputs["force [N]"].value != 0.1 else 0.2
     visitor.set(page.inputs["force [N]"], value)
     return wait_for(lambda: value in page.heard) and page.heard == [value]
 
 
 def ask(page, path="/", method="GET", **headers):
-    """Status and headers of an answer."""
+    """Status and headers of an HTTP response."""
     wire = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
     wire.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
     answer = wire.getresponse()
@@ -90,7 +90,7 @@ def ask(page, path="/", method="GET", **headers):
 
 
 def knock(page, path="", **settings):
-    """Status of a handshake: 101 where it is let in."""
+    """Status of a web-socket handshake; 101 if it is accepted."""
     try:
         connect(f"ws://127.0.0.1:{page.port}{path}", subprotocols=PROTOCOL, **settings).close()
     except InvalidStatus as error:
@@ -99,7 +99,7 @@ def knock(page, path="", **settings):
 
 
 class TestSharing:
-    def test_a_visitor_cannot_open_a_tunnel(self, page, visitor, monkeypatch, capfd):
+    def test_visitor_cannot_open_a_share_tunnel(self, page, visitor, monkeypatch, capfd):
         opened = []
         monkeypatch.setattr("viser._viser.ViserTunnel", lambda *words: opened.append(words))
         monkeypatch.setattr(page.server, "request_share_url", lambda *words: opened.append(words))
@@ -110,7 +110,7 @@ class TestSharing:
         assert not opened
         assert "Traceback" not in capfd.readouterr().err
 
-    def test_nothing_in_the_server_answers_such_a_request(self, page):
+    def test_server_has_no_handler_for_share_requests(self, page):
         kinds = {kind.__name__ for kind in page.server._websock_server._incoming_handlers}
         assert "GuiUpdateMessage" in kinds and not [kind for kind in kinds if "Share" in kind]
 
@@ -127,7 +127,7 @@ class TestDoor:
             "http://127.0.0.1:{port}.evil.example",
         ],
     )
-    def test_another_page_is_refused(self, page, origin):
+    def test_foreign_origin_is_rejected_with_403(self, page, origin):
         assert knock(page, origin=origin.format(port=page.port)) == 403
         assert ask(page, Origin=origin.format(port=page.port))[0] == 403
 
@@ -135,7 +135,7 @@ class TestDoor:
         "host",
         ["evil.example:{port}", "127.0.0.1:1", "127.0.0.1", "localhost.evil.example:{port}", "localhost:{port}0"],
     )
-    def test_a_foreign_name_for_this_machine_is_refused(self, page, host):
+    def test_foreign_host_header_is_rejected_with_403(self, page, host):
         host = host.format(port=page.port)
         assert ask(page, Host=host)[0] == 403
         with socket.create_connection(("127.0.0.1", page.port), timeout=10) as wire:
@@ -144,29 +144,29 @@ class TestDoor:
             wire.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\n{shake}{keys}\r\n".encode())
             assert b" 403 " in wire.recv(4096).split(b"\r\n")[0]
 
-    def test_a_second_origin_is_no_help(self, page):
+    def test_second_origin_header_is_rejected_with_403(self, page):
         with socket.create_connection(("127.0.0.1", page.port), timeout=10) as wire:
             own = f"Host: localhost:{page.port}\r\nOrigin: http://localhost:{page.port}\r\n"
             wire.sendall(f"GET / HTTP/1.1\r\n{own}Origin: http://evil.example\r\n\r\n".encode())
             assert b" 403 " in wire.recv(4096).split(b"\r\n")[0]
 
     @pytest.mark.parametrize("name", ["127.0.0.1", "localhost", "LOCALHOST", "[::1]"])
-    def test_the_page_itself_is_let_in(self, page, name):
+    def test_requests_from_the_page_origin_are_accepted(self, page, name):
         place = f"{name}:{page.port}"
         assert ask(page, Host=place)[0] == 200
         assert knock(page, origin=f"http://{place}") == 101
 
-    def test_the_page_cannot_be_framed(self, page):
+    def test_page_forbids_embedding_in_foreign_frames(self, page):
         assert "frame-ancestors 'self'" in ask(page)[1]["Content-Security-Policy"]
 
-    def test_a_crowd_waits_outside(self):
+    def test_connection_above_visitor_limit_is_rejected_with_503(self):
         with (
             closing(Page(visitors=1)) as page,
             connect(f"ws://127.0.0.1:{page.port}", subprotocols=PROTOCOL, max_size=None),
         ):
             assert knock(page) == 503
 
-    def test_scanners_and_health_checks_leave_no_trace(self, page, capfd):
+    def test_malformed_http_requests_print_no_output(self, page, capfd):
         assert ask(page, method="HEAD")[0] == 405
         for text in (
             b"\x16\x03\x01\x02\x00",
@@ -185,7 +185,7 @@ class TestDoor:
         assert ask(page)[0] == 200
         assert capfd.readouterr() == ("", "")
 
-    def test_a_viser_that_cannot_be_guarded_does_not_serve(self, monkeypatch):
+    def test_unsupported_viser_version_raises_unguarded_error(self, monkeypatch):
         before = set(threading.enumerate())
         with monkeypatch.context() as patch:
             patch.setattr(viser, "__version__", "2.0.0")
@@ -199,26 +199,26 @@ class TestDoor:
 
 @pytest.fixture(scope="module")
 def far():
-    """A page that others than this machine reach; the test comes to it from here."""
+    """Page on a network address, requested here from this machine."""
     page = Page("0.0.0.0")
     yield page
     page.close()
 
 
 class TestToken:
-    def test_a_page_on_this_machine_asks_for_none(self, page):
+    def test_loopback_page_has_no_token(self, page):
         assert (
             page.token is None
             and access_guard.AccessPolicy.create("localhost").token is None
             and access_guard.AccessPolicy.create("127.0.0.2").token is None
         )
 
-    def test_a_host_that_others_reach_too_asks_for_one(self, monkeypatch):
+    def test_host_with_network_address_has_a_token(self, monkeypatch):
         found = [(0, 0, 0, "", (address, 0)) for address in ("127.0.0.1", "192.0.2.1")]
         monkeypatch.setattr(socket, "getaddrinfo", lambda *words: found)
         assert access_guard.AccessPolicy.create("both.example").token is not None
 
-    def test_the_address_carries_the_token_and_nothing_else_gets_in(self, far):
+    def test_requests_without_valid_token_are_rejected_with_403(self, far):
         token = far.token
         assert len(token) >= 32 and far.address == f"http://localhost:{far.port}/?token={token}"
         assert access_guard.AccessPolicy.create("0.0.0.0").token != token
@@ -228,7 +228,7 @@ class TestToken:
         assert ask(far, Cookie=f"page-{far.port}=wrong")[0] == 403
         assert ask(far, f"/?token={token}", Host="evil.example")[0] == 403
 
-    def test_page_needs_token_and_socket_needs_cookie(self, far):
+    def test_page_requires_token_and_web_socket_requires_cookie(self, far):
         status, headers = ask(far, urlsplit(far.address).path + "?" + urlsplit(far.address).query)
         assert status == 200 and "HttpOnly" in headers["Set-Cookie"] and "SameSite=Strict" in headers["Set-Cookie"]
         cookie = headers["Set-Cookie"].split(";")[0]
@@ -248,7 +248,7 @@ BAD = {
 
 class TestMessages:
     @pytest.mark.parametrize("label", BAD)
-    def test_a_value_out_of_range_is_not_heard(self, page, visitor, label, capfd):
+    def test_value_out_of_range_does_not_change_the_control(self, page, visitor, label, capfd):
         control = page.frame if label == "frame" else page.inputs[label]
         before = control.value
         for value in BAD[label]:
@@ -258,7 +258,7 @@ class TestMessages:
         said = capfd.readouterr().err
         assert "Traceback" not in said and len(said.splitlines()) <= 2
 
-    def test_values_at_the_ends_of_the_range_are_heard(self, page, visitor):
+    def test_values_at_range_limits_are_accepted(self, page, visitor):
         for value in (0, 0.4, 0.4 + 1e-12):
             visitor.set(page.inputs["force [N]"], value)
         visitor.set(page.frame, 99)
@@ -271,7 +271,7 @@ class TestMessages:
         visitor.set(page.inputs["gravity"], True)
         assert wait_for(lambda: len(page.heard) == 8)
 
-    def test_only_the_value_of_a_control_can_be_changed(self, page, visitor):
+    def test_update_of_other_control_attributes_is_ignored(self, page, visitor):
         control = page.inputs["force [N]"]
         uuid = control._impl.uuid
         for name, value in {"removed": True, "update_cb": [], "sync_cb": None, "nothing": 1, "is_button": True}.items():
@@ -283,12 +283,12 @@ class TestMessages:
         say(visitor, type="GuiUpdateMessage", uuid=[uuid], updates={"value": 0.3})
         assert still_heard(page, visitor)
 
-    def test_a_control_that_is_not_there_is_refused(self):
+    def test_update_of_unknown_control_raises_message_error(self):
         said = msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "none such", "updates": {"value": 1.0}})
         with pytest.raises(MessageError, match="a control that is not there"):
             check_message(said, lambda identifier: None)
 
-    def test_messages_of_other_kinds_are_not_heard(self, page, visitor, capfd):
+    def test_messages_of_unsupported_type_are_ignored(self, page, visitor, capfd):
         kinds = ("FileTransferStartUpload", "GuiFormDirtyMessage", "GuiCloseModalMessage", "Message", "no such", 3)
         for kind in kinds:
             say(visitor, type=kind, uuid="x")
@@ -308,7 +308,7 @@ class TestMessages:
             {"wxyz": [1.0]},
         ],
     )
-    def test_a_camera_that_cannot_be_is_not_heard(self, page, visitor, bad, capfd):
+    def test_message_with_invalid_camera_is_ignored(self, page, visitor, bad, capfd):
         axes = {"wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "look_at": [0, 0, 0], "up_direction": [0, 1, 0]}
         good = axes | {"fov": 1.0, "near": 0.01, "far": 10.0, "image_height": 600, "image_width": 777}
         say(visitor, type="ViewerCameraMessage", **(good | bad))
@@ -321,7 +321,7 @@ class TestMessages:
     @pytest.mark.parametrize(
         "bytes_", [b"", b"\xc1", b"\x81\xa1a" * 10000 + b"\x01", "text", b"\x81\xa4type\xa3\xff\xff\xff", b"a" * 70000]
     )
-    def test_what_is_no_message_ends_that_visit_alone(self, page, visitor, bytes_, capfd):
+    def test_malformed_message_closes_only_its_connection(self, page, visitor, bytes_, capfd):
         hostile = connect(f"ws://127.0.0.1:{page.port}", subprotocols=PROTOCOL, max_size=None)
         hostile.send(bytes_)
         with pytest.raises(ConnectionClosed) as closed:
@@ -333,7 +333,7 @@ class TestMessages:
         assert "Traceback" not in said and len(said.splitlines()) <= 1
 
     @pytest.mark.parametrize("shared", [{"burst": 50.0, "per_second": 20.0}], indirect=True)
-    def test_a_flood_ends_that_visit_alone(self, page):
+    def test_message_flood_closes_only_its_connection(self, page):
         hostile, begun = Visitor(page, 1200), time.monotonic()
         assert wait_for(lambda: page.visitors == 1)
         visitor = Visitor(page, 1200)

@@ -1,4 +1,4 @@
-"""The page: served, shared by several visitors, whose actions it hears. A visitor here is a bare web socket."""
+"""Page server with several visitors and their inputs; a visitor is a plain web socket."""
 
 import re
 import time
@@ -52,13 +52,13 @@ def page(heard):
     page.close()
 
 
-def test_the_page_is_served(page):
+def test_page_is_served_as_html(page):
     with urllib.request.urlopen(page.address) as answer:
         assert answer.status == 200 and b"<html" in answer.read().lower()
 
 
-def test_the_address_names_the_host_that_serves(heard):
-    """A page on one interface is not to be found at localhost."""
+def test_address_contains_the_given_host(heard):
+    """A page bound to one interface is not available at localhost."""
     page = open_page(heard, free_port(), host="127.0.0.2")
     assert page.address.startswith("http://127.0.0.2:")
     with urllib.request.urlopen(page.address) as answer:
@@ -66,7 +66,7 @@ def test_the_address_names_the_host_that_serves(heard):
     page.close()
 
 
-def test_a_port_that_is_taken_is_left_to_its_owner(page, heard):
+def test_occupied_port_selects_another_port(page, heard):
     second = open_page(heard, int(page.address.rsplit(":", 1)[1]))
     assert second.address != page.address
     with urllib.request.urlopen(second.address) as answer:
@@ -74,7 +74,7 @@ def test_a_port_that_is_taken_is_left_to_its_owner(page, heard):
     second.close()
 
 
-def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, heard):
+def test_page_sends_latest_frame_and_updates_slider(page, heard):
     for number in range(50):
         page.show(number, np.full((48, 64, 3), number, np.uint8), f"frame {number}")
     assert wait_for(lambda: int(page.frame.value) == 49)
@@ -82,8 +82,8 @@ def test_only_the_newest_picture_is_sent_and_the_slider_follows(page, heard):
     assert heard["frame"] == []
 
 
-def test_picture_and_words_travel_as_one(page):
-    """A slow browser shows the two of one frame, or neither; words alone bring the picture that they are beside."""
+def test_image_and_text_are_sent_in_one_update(page):
+    """A slow browser shows image and text of the same frame; new text is sent with its image."""
     visitor = Visitor(page, 1600)
     assert wait_for(lambda: page.visitors == 1)
     pictures = [np.full((48, 64, 3), number, np.uint8) for number in range(40)]
@@ -107,8 +107,8 @@ def test_picture_and_words_travel_as_one(page):
     assert not any("said" in str(each) for each in visitor.updates if "sulcus-next" not in str(each))
 
 
-def test_what_is_shown_already_is_not_sent_again(page):
-    """A paused page says the same thirty times a second; the slider is left to the visitor who may be moving it."""
+def test_unchanged_frame_is_not_sent_again(page):
+    """A paused page repeats its frame thirty times a second; the slider stays free for the visitor."""
     visitor, picture = Visitor(page, 1600), np.full((48, 64, 3), 7, np.uint8)
     page.show(7, picture, "said")
     assert wait_for(lambda: page.visitors == 1 and int(page.frame.value) == 7)
@@ -122,7 +122,7 @@ def test_what_is_shown_already_is_not_sent_again(page):
     visitor.wire.close()
 
 
-def test_bodies_move_and_reports_change(page):
+def test_page_updates_vertices_report_and_input_value(page):
     page.move("tumour", TRIANGLE + 0.01)
     page.report("render <b>12 ms</b>")
     page.put("force [N]", 0.35)
@@ -130,12 +130,12 @@ def test_bodies_move_and_reports_change(page):
     assert np.allclose(page.meshes["tumour"].vertices, TRIANGLE + 0.01)
 
 
-def test_an_unknown_body_is_an_error_at_once(page):
+def test_move_of_unknown_body_raises_key_error(page):
     with pytest.raises(KeyError):
         page.move("liver", TRIANGLE)
 
 
-def test_several_visitors_see_the_page_and_are_heard(page, heard):
+def test_several_visitors_receive_frames_and_send_inputs(page, heard):
     wide, narrow = Visitor(page, 1600), Visitor(page, 420)
     assert wait_for(lambda: page.visitors == 2)
     assert wait_for(lambda: wide.received > 0 and narrow.received > 0)
@@ -153,8 +153,8 @@ def test_several_visitors_see_the_page_and_are_heard(page, heard):
     narrow.wire.close()
 
 
-def test_who_came_first_leads_and_what_others_set_is_put_back(page, heard):
-    """They may ask; who leads lets them, and the lead passes on when its owner leaves."""
+def test_only_the_first_visitor_controls_the_page(page, heard):
+    """Others may request control; the leader grants it, and it passes on when the leader leaves."""
     first, second = Visitor(page, 1600), Visitor(page, 420)
     page.show_line(lambda visitor: f"number {visitor}")
     assert wait_for(lambda: set(page.crowd.rows) == {0, 1} and page.crowd.rows[1].ask.visible)
@@ -185,7 +185,7 @@ def test_who_came_first_leads_and_what_others_set_is_put_back(page, heard):
     first.wire.close()
 
 
-def test_keys_play_step_and_choose(heard):
+def test_hotkeys_play_step_and_select_deformer(heard):
     page = open_page(heard, free_port())
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
@@ -204,8 +204,8 @@ def test_keys_play_step_and_choose(heard):
     page.close()
 
 
-def test_a_recording_is_one_whole_film_as_long_as_it_took(page, monkeypatch):
-    """Its owner gets it; nobody gets one whose owner has left."""
+def test_recording_is_downloaded_as_one_video(page, monkeypatch):
+    """Only the visitor who started it receives it, and none does if that visitor has left."""
     sent: list[tuple] = []
     monkeypatch.setattr("viser.ClientHandle.send_file_download", lambda client, *file, **how: sent.append(file))
     visitor, button = Visitor(page, 1200), page.recorder.button
@@ -227,7 +227,7 @@ def test_a_recording_is_one_whole_film_as_long_as_it_took(page, monkeypatch):
     assert wait_for(lambda: page.recorder.recording is None and button.label == RECORD_LABEL) and len(sent) == 1
 
 
-def test_slices_and_history_arrive_together_at_limited_rate(page):
+def test_slices_and_history_are_sent_together_at_limited_rate(page):
     drawn: list[int] = []
 
     def draw(number: int) -> tuple[np.ndarray, str]:
@@ -248,7 +248,7 @@ def test_slices_and_history_arrive_together_at_limited_rate(page):
     visitor.wire.close()
 
 
-def test_user_input_wins_over_concurrent_page_update(heard):
+def test_user_input_has_priority_over_page_updates(heard):
     page = open_page(heard, free_port(), limits=ConnectionLimits(sendings=2000.0))
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
@@ -263,7 +263,7 @@ def test_user_input_wins_over_concurrent_page_update(heard):
     page.close()
 
 
-def test_the_button_pauses_and_plays(page, heard):
+def test_play_button_toggles_playback(page, heard):
     visitor = Visitor(page, 900)
     assert wait_for(lambda: page.visitors == 1)
     for wanted in ([False], [False, True]):
@@ -272,15 +272,15 @@ def test_the_button_pauses_and_plays(page, heard):
     visitor.wire.close()
 
 
-def test_scripts_do_not_take_over_from_themselves(page, heard):
+def test_value_set_by_program_triggers_no_callback(page, heard):
     page.put("force [N]", 0.5)
     assert wait_for(lambda: page.inputs["force [N]"].value == 0.5)
     time.sleep(0.2)
     assert heard["force"] == []
 
 
-def test_the_page_is_filled_anew(page, heard):
-    """Another scene: other bodies and controls, nothing of the old ones, and what was on its way to them is dropped."""
+def test_fill_replaces_bodies_and_controls(page, heard):
+    """A new scene replaces bodies and controls, and pending updates of the old ones are dropped."""
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
     old = page.inputs["force [N]"]
@@ -304,7 +304,7 @@ def test_the_page_is_filled_anew(page, heard):
     visitor.wire.close()
 
 
-def test_a_visitor_saves_the_picture_as_it_is_shown(page, monkeypatch):
+def test_save_button_downloads_the_displayed_image(page, monkeypatch):
     sent: list[tuple] = []
     monkeypatch.setattr("viser.ClientHandle.send_file_download", lambda client, *file, **how: sent.append(file))
     shown = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
@@ -320,13 +320,13 @@ def test_a_visitor_saves_the_picture_as_it_is_shown(page, monkeypatch):
     visitor.wire.close()
 
 
-def test_low_window_keeps_save_button_before_controls(page):
+def test_save_button_precedes_the_controls(page):
     after = [handle.order for handle in page.inputs.values()]
     assert page.frame.order < page.saver.order < min(after)
 
 
 def test_phone_layout_puts_distance_and_playback_first(page):
-    """There all stands in one column: the report, which scrolls by itself on a low one, then controls, then words."""
+    """One column: the report (scrolls in a low window), then controls, then descriptions."""
     assert page.folder is not None
     assert page.text.order < page.folder.order < page.words.order
     # The distance, and eight lines more: whom to trust, what acts, and the verdict even on an earlier load.
@@ -338,33 +338,32 @@ def test_phone_layout_puts_distance_and_playback_first(page):
     assert page.folder.order < page.words.order
 
 
-def test_no_new_line_parts_a_number_from_its_unit():
+def test_number_and_unit_are_joined_by_nonbreaking_space():
     kept = keep_together('<p style="top: 3 px">in 4.72 mm (95 %)')
     assert kept == '<p style="top: 3 px">in&nbsp;4.72&nbsp;mm (95&nbsp;%)'
 
 
-def test_a_wide_window_has_its_controls_in_two_columns(page):
-    """All of them in sight in 1280 x 720, and the words over them as wide as both."""
+def test_wide_window_shows_controls_in_two_columns(page):
+    """All controls are visible at 1280 x 720, and the text above them spans both columns."""
     wide = build_style(4 / 3).split("@media (min-width: 75em) and (min-aspect-ratio: 13/10) {")[1].split("@media")[0]
     holder = f"div:has(> div > #{SAID})"
     assert 75 * 16 <= 1280 and f"{holder} {{ display: grid; grid-template-columns: 1fr 1fr;" in wide
     assert wide.index(f"{holder} > * {{ grid-column: 1 / -1 }}") < wide.index(f"{holder} > div:has(> button)")
 
 
-def test_the_line_over_the_picture_comes_and_goes(page):
+def test_status_line_is_shown_and_cleared(page):
     page.show_status("solving ... 3 s")
     assert wait_for(lambda: "<span>solving ... 3 s</span>" in page.line.content)
     page.show_status("")
     assert wait_for(lambda: page.line.content == "")
 
 
-def test_status_line_leaves_header_visible():
-    """They stand at the left."""
+def test_status_line_does_not_cover_the_header():
     (rule,) = re.findall(rf"#{STATUS} {{ position: fixed; (.*?) }}", build_style(4 / 3))
     assert "right: calc(100vw - var(--w)" in rule and "left:" not in rule
 
 
-def test_a_note_is_there_while_it_has_words(page):
+def test_note_is_visible_only_with_text(page):
     page.fill([], Playback(30, print, print), [Note("how"), Note("why", "<p>known</p>")])
     folder, text = page.controls.notes["how"]
     assert (
@@ -379,19 +378,19 @@ def test_a_note_is_there_while_it_has_words(page):
     assert wait_for(lambda: not folder.visible)
 
 
-def test_the_button_says_whether_it_plays(page):
+def test_play_button_label_follows_playback_state(page):
     page.show_playback(False)
     assert wait_for(lambda: page.button.label == "Play")
     page.show_playback(True)
     assert wait_for(lambda: page.button.label == "Pause")
 
 
-def test_a_body_changes_its_colour(page):
+def test_tint_changes_the_colour_of_a_body(page):
     page.tint("tumour", (0.5, 0.0, 1.0))
     assert wait_for(lambda: tuple(page.meshes["tumour"].color) == (128, 0, 255))
 
 
-def test_style_rules_use_image_shape_and_page_elements(page):
+def test_style_sheet_uses_image_shape_and_page_elements(page):
     sheet = build_style(4 / 3)
     assert "--aspect: 1.3333" in sheet and sheet.startswith("<style>") and sheet.count("{") == sheet.count("}")
     assert f".{NOTE}" in sheet

@@ -1,4 +1,4 @@
-"""Calibrations as text: what OpenCV and ROS write is read, and what is wrong is refused by name."""
+"""Calibration files of OpenCV and ROS: reading, writing and messages for invalid files."""
 
 import re
 
@@ -61,11 +61,11 @@ LENS = "distortion_coefficients:\n  rows: 1\n  cols: 5\n  data: [0.1, -0.2, 0.0,
 
 @pytest.mark.parametrize("calibration", [SOME, RATIONAL])
 @pytest.mark.parametrize("form", [to_opencv_text, to_ros_text])
-def test_what_is_written_is_read_again(calibration, form):
+def test_written_calibration_is_read_unchanged(calibration, form):
     assert parse_calibration(form(calibration)) == calibration
 
 
-def test_opencv_reads_what_we_write():
+def test_opencv_reads_the_written_calibration():
     storage = cv2.FileStorage(to_opencv_text(SOME), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     assert np.array_equal(storage.getNode("camera_matrix").mat(), SOME.K)
     assert storage.getNode("distortion_coefficients").mat().ravel().tolist() == [-0.31, 0.12, 1e-3, -2e-3, -0.02]
@@ -73,7 +73,7 @@ def test_opencv_reads_what_we_write():
 
 
 @pytest.mark.parametrize("calibration", [SOME, RATIONAL])
-def test_any_yaml_reader_reads_what_we_write_for_ros(calibration):
+def test_yaml_reader_reads_the_calibration_written_for_ros(calibration):
     found = yaml.safe_load(to_ros_text(calibration))
     assert found["camera_name"] == calibration.name and found["image_height"] == 480
     assert (
@@ -86,7 +86,7 @@ def test_any_yaml_reader_reads_what_we_write_for_ros(calibration):
     assert np.array_equal(np.reshape(found["rectification_matrix"]["data"], (3, 3)), np.eye(3))
 
 
-def test_image_scaling_requires_request_and_same_shape():
+def test_image_scaling_requires_option_and_same_aspect_ratio():
     with pytest.raises(ValueError, match=r"640 x 480, not 320 x 240: calibrate with that size, or ask"):
         SOME.resize_calibration(320, 240)
     with pytest.raises(ValueError, match=r"not 640 x 360, which have another shape"):
@@ -97,14 +97,14 @@ def test_image_scaling_requires_request_and_same_shape():
     assert np.allclose(2.0 * pixels[0], pixels[1]) and half.lens == SOME.lens and half.name == SOME.name
 
 
-def test_the_camera_of_a_calibration_is_opencvs():
+def test_camera_of_calibration_projects_as_opencv():
     camera, points = SOME.build_camera(np.eye(4)), np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0]])
     wanted = cv2.projectPoints(points, np.zeros(3), np.zeros(3), SOME.K, SOME.lens.coefficients[:5])[0]
     assert np.allclose(camera.project(points)[0], wanted.reshape(-1, 2), atol=1e-9)
     assert repr(SOME) == repr(parse_calibration(to_ros_text(SOME)))
 
 
-def test_what_others_write_is_read():
+def test_calibrations_of_ros_and_opencv_are_read():
     ros, opencv = parse_calibration(ROS), parse_calibration(OPENCV)
     assert ros == Calibration(
         (520, 521.5), (320.5, 240), 640, 480, Lens(-0.25, 0.05, 1e-3, -2e-4), "narrow_stereo/left"
@@ -171,14 +171,14 @@ def changed(old, new, text=ROS):
         "list": ("- 1\n- 2\n", "missing"),
     }.values(),
 )
-def test_what_is_wrong_is_refused_by_name_with_a_remedy(text, reason):
+def test_invalid_calibration_is_rejected_with_remedy(text, reason):
     with pytest.raises(ValueError, match=reason) as refused:
         parse_calibration(text)
     assert re.search(r"[.:;] .+", str(refused.value)) and len(str(refused.value)) < 400
 
 
-def test_damage_never_raises_anything_else():
-    """Cut off anywhere, or with other characters in it: a sentence of ours, or a calibration."""
+def test_damaged_calibration_raises_only_value_error():
+    """Truncated text or replaced characters give a ValueError or a finite calibration."""
     random, signs = np.random.default_rng(0), list("\n\t :-[]{}\"'#&*!|>%@0.9eé\\")
     for text in (ROS, OPENCV, to_opencv_text(RATIONAL)):
         damaged = [text[:cut] for cut in range(0, len(text), 7)]
@@ -196,14 +196,14 @@ def test_damage_never_raises_anything_else():
 
 @pytest.mark.parametrize("inset", ["  ", "    "])
 @pytest.mark.parametrize("name", ["720p", "4k_cam", "2024-01-02", "left: 1", "12", '"quoted"'])
-def test_calibration_of_ros_with_plain_names_and_lists_is_read(name, inset):
+def test_ros_calibration_with_unquoted_names_is_read(name, inset):
     lists = MATRIX.format("".join(f"{inset}- {number}\n" for number in NUMBERS))
     for start in ("", "\ufeff", "%YAML:1.0\n---\n", "stamp: 12:30:01\nnote: 3rd\n"):
         found = parse_calibration(start + PLAIN.format(name, lists, LENS))
         assert found.name == name.strip('"') and found.focal == (500.0, 500.0) and found.lens.k1 == 0.1
 
 
-def test_calibration_of_zeros_is_not_calibrated():
+def test_calibration_with_zero_matrix_is_rejected():
     lists = MATRIX.format("  - 0.0\n" * 9)
     with pytest.raises(ValueError, match="a camera that is not calibrated: calibrate it first"):
         parse_calibration(PLAIN.format("cam", lists, LENS))

@@ -1,4 +1,4 @@
-"""The pinhole model: against OpenCV, and against what a picture must do."""
+"""Pinhole camera model compared with OpenCV, and rolling-shutter images."""
 
 from dataclasses import dataclass, replace
 
@@ -46,7 +46,7 @@ def points_in_front(count: int = 200) -> np.ndarray:
     return TARGET + 0.05 * np.random.default_rng(0).standard_normal((count, 3))
 
 
-def test_projection_is_opencvs():
+def test_projection_equals_opencv_projection():
     camera = some_camera()
     skewed = Camera(camera.K + [[0, 3.0, 7.5], [0, 12.0, -4.0], [0, 0, 0]], camera.T_camera_world, 320, 200)
     for one in (camera, camera.perturb(3.0, (1.0, 2.0, -1.0))):
@@ -56,7 +56,7 @@ def test_projection_is_opencvs():
     assert np.abs(skewed.project(points_in_front())[0] - project_cv2(skewed, points_in_front())).max() > 0.1
 
 
-def test_target_is_in_the_middle_right_is_right_and_up_is_up():
+def test_look_at_centres_target_with_right_and_up_axes():
     camera = some_camera()
     pixel, depth = camera.project(TARGET)
     assert pixel == pytest.approx([159.5, 99.5])
@@ -73,12 +73,12 @@ def test_unproject_inverts_project():
     assert np.allclose(camera.unproject(*camera.project(points)), points, atol=1e-12)
 
 
-def test_points_behind_have_no_pixel():
+def test_points_behind_the_camera_project_to_nan():
     pixels, depth = some_camera().project(np.array([EYE - (TARGET - EYE), TARGET]))
     assert np.isnan(pixels[0]).all() and depth[0] < 0.0 and np.isfinite(pixels[1]).all()
 
 
-def test_half_a_degree_moves_the_picture_by_half_a_degree():
+def test_perturbation_of_half_a_degree_shifts_the_target():
     camera = some_camera()
     moved, _ = camera.perturb(0.5).project(TARGET)
     assert moved - [159.5, 99.5] == pytest.approx([camera.K[0, 0] * np.tan(np.radians(0.5)), 0.0], abs=1e-9)
@@ -86,7 +86,7 @@ def test_half_a_degree_moves_the_picture_by_half_a_degree():
 
 
 @pytest.mark.parametrize("aspect", [2.5, 1.6, 1.0, 0.45])
-def test_padding_centres_the_picture_on_a_canvas_of_any_shape(aspect):
+def test_padding_centres_the_image_at_any_aspect_ratio(aspect):
     camera = some_camera()
     canvas = camera.pad(aspect)
     assert canvas.width / canvas.height == pytest.approx(aspect, rel=0.01)
@@ -95,14 +95,14 @@ def test_padding_centres_the_picture_on_a_canvas_of_any_shape(aspect):
     assert np.allclose(shift, [(canvas.width - camera.width) // 2, (canvas.height - camera.height) // 2])
 
 
-def test_twice_the_pixels_see_the_same_view():
+def test_scaled_camera_has_the_same_view():
     camera = some_camera()
     double = camera.scale(2.0)
     assert (double.width, double.height) == (640, 400)
     assert np.allclose(double.project(points_in_front())[0] + 0.5, 2.0 * (camera.project(points_in_front())[0] + 0.5))
 
 
-def test_the_camera_of_a_part_of_the_picture_sees_that_part():
+def test_cropped_camera_shifts_pixels_by_the_crop_origin():
     camera = some_camera()
     part = camera.crop_to(slice(20, 150), slice(30, 290))
     assert (part.width, part.height) == (260, 130)
@@ -119,13 +119,13 @@ def test_the_camera_of_a_part_of_the_picture_sees_that_part():
         ({"width": 0}, "empty"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(change, reason):
+def test_invalid_camera_parameters_are_rejected(change, reason):
     good = {"K": np.diag([100.0, 100.0, 1.0]), "T_camera_world": np.eye(4), "width": 4, "height": 3}
     with pytest.raises(ValueError, match=reason):
         Camera(**(good | change))
 
 
-def test_a_view_without_direction_is_refused():
+def test_look_at_rejects_undefined_view_direction():
     with pytest.raises(ValueError, match="undefined"):
         look_at(EYE, EYE, UP)
     with pytest.raises(ValueError, match="undefined"):
@@ -137,14 +137,14 @@ def near_points() -> np.ndarray:
     return 0.3 * points_in_front()
 
 
-def test_a_camera_is_moved_along_its_own_axes():
+def test_camera_moves_along_its_own_axes():
     camera, shift = some_camera(), np.array([0.01, -0.02, 0.03])
     moved = camera.move(shift)
     assert np.allclose(moved.to_camera_frame(points_in_front()), camera.to_camera_frame(points_in_front()) - shift)
     assert moved.centre == pytest.approx(EYE + shift @ camera.T_camera_world[:3, :3])
 
 
-def test_a_zoom_draws_larger_about_the_principal_point():
+def test_zoom_magnifies_about_the_principal_point():
     for camera in (some_camera(), seen_by()):
         middle = camera.K[:2, 2]
         near = camera.zoom(2.0)
@@ -156,8 +156,8 @@ def test_a_zoom_draws_larger_about_the_principal_point():
             some_camera().zoom(factor)
 
 
-def test_focus_changes_the_size_as_a_thin_lens_does():
-    """1 / f = 1 / d + 1 / b, and what is drawn is as large as b."""
+def test_refocus_scales_focal_length_by_thin_lens_equation():
+    """1 / f = 1 / d + 1 / b; the size of the image is proportional to b."""
     camera = some_camera()
     for d in (0.2, 0.3, 1e9):
         b = 1.0 / (1.0 / 50e-3 - 1.0 / d)
@@ -168,7 +168,7 @@ def test_focus_changes_the_size_as_a_thin_lens_does():
             camera.refocus(*wrong)
 
 
-def test_parallel_eyes_see_the_same_rows_and_depth_by_disparity():
+def test_parallel_stereo_pair_has_rows_equal_and_disparity():
     camera = some_camera()
     left, right = build_stereo_pair(camera)
     assert np.linalg.norm(left.centre - right.centre) == pytest.approx(BASELINE) == pytest.approx(24e-3)
@@ -177,7 +177,7 @@ def test_parallel_eyes_see_the_same_rows_and_depth_by_disparity():
     assert np.allclose(u[:, 0] - v[:, 0], camera.K[0, 0] * BASELINE / depth)
 
 
-def test_converging_eyes_meet_at_the_working_distance():
+def test_converging_stereo_axes_meet_at_working_distance():
     camera = some_camera()
     distance = float(np.linalg.norm(TARGET - EYE))
     left, right = build_stereo_pair(camera, 30e-3, distance)
@@ -191,8 +191,8 @@ def test_converging_eyes_meet_at_the_working_distance():
     )
 
 
-def test_points_are_refound_in_both_distorted_images():
-    """By OpenCV: undistorted and triangulated."""
+def test_points_are_triangulated_from_distorted_stereo_images():
+    """Undistorted and triangulated with OpenCV."""
     for pair in (build_stereo_pair(seen_by(SOME)), build_stereo_pair(seen_by(SOME), working_distance=0.14)):
         seen = []
         for one in pair:
@@ -204,7 +204,7 @@ def test_points_are_refound_in_both_distorted_images():
     assert (pictures[0] != pictures[1]).mean() > 0.1
 
 
-def test_a_pair_that_cannot_be_is_refused():
+def test_invalid_stereo_baseline_or_distance_is_rejected():
     for wrong in ((0.0, None), (np.nan, None), (24e-3, 0.0), (24e-3, -1.0)):
         with pytest.raises(ValueError, match="above 0"):
             build_stereo_pair(some_camera(), *wrong)
@@ -237,7 +237,7 @@ def discs(radius=3e-3, corners=48):
     return [Layer(str(n), n + 1, place + np.vstack([np.zeros(3), rim]), triangles) for n, place in enumerate(GRID)]
 
 
-def test_each_row_is_drawn_where_the_camera_is_when_it_is_taken():
+def test_image_rows_use_camera_pose_at_their_readout_time():
     layers = discs()
     renderer = Renderer(layers, Lamp(np.array([0.0, 0.0, -0.4]), np.zeros(3), 0.2))
     bands = split_row_bands(camera_at, READOUT, GRID)
@@ -268,7 +268,7 @@ def test_fixed_camera_has_one_row_band():
     assert find_row_time(camera_at, READOUT, np.array([0.0, 0.0, -1.0])) == 0.0  # behind it
 
 
-def test_files_have_the_readout_and_others_stay_as_they_were():
+def test_calibration_files_store_the_readout_time():
     for text in (to_opencv_text, to_ros_text):
         assert parse_calibration(text(replace(USUAL_CALIBRATION, readout=0.0125))).readout == 0.0125
         assert "readout" not in text(USUAL_CALIBRATION) and parse_calibration(text(USUAL_CALIBRATION)).readout == 0.0
@@ -289,7 +289,7 @@ def player():
     )
 
 
-def test_rolling_shutter_error_is_drawn_on_video(player):
+def test_rolling_shutter_increases_tracking_error_on_video(player):
     mounts = mount_targets(player)
     shots = list(render_shots(player, mounts, Taking(noise=0.0)))
     calibration = player.scene.viewpoint.calibration

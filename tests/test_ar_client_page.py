@@ -1,4 +1,4 @@
-"""The document of the page: title and icon from the start, and a script for browsers without WebGL."""
+"""HTML document of the page: title, icon and a script for browsers without WebGL."""
 
 import gzip
 import http.client
@@ -15,7 +15,7 @@ from ar.page.style import build_style
 
 
 @pytest.mark.parametrize("encoding", ["gzip", "identity"])
-def test_page_has_own_title_icon_and_script(encoding):
+def test_page_document_contains_title_icon_and_script(encoding):
     with closing(Page()) as page, closing(http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)) as wire:
         wire.request("GET", "/", headers={"Accept-Encoding": encoding})
         answer = wire.getresponse()
@@ -28,7 +28,7 @@ def test_page_has_own_title_icon_and_script(encoding):
     assert head.index(SCRIPT[:60]) < head.index("<title>")  # before any of viser's own
 
 
-def test_unknown_document_is_left_as_it_is():
+def test_unknown_html_document_is_unchanged():
     assert build_document(b"<p>none</p>", False) == b"<p>none</p>"
     assert f":root.{NO_WEBGL_CLASS} canvas" in build_style(1.3)
 
@@ -62,7 +62,7 @@ console.log(JSON.stringify(drawn));
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
 @pytest.mark.parametrize("name", ["ANGLE (Google, Vulkan 1.3 (SwiftShader Device))", "NVIDIA H200"])
-def test_software_draws_the_view_now_and_then(name):
+def test_software_rendered_view_is_drawn_at_reduced_rate(name):
     code = COUNTING.replace("NAME", json.dumps(name)).replace(
         "eval(SCRIPT)", SCRIPT.replace("PERIOD", str(SOFTWARE_PERIOD))
     )

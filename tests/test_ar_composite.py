@@ -1,4 +1,4 @@
-"""Kernels of pictures are loaded ahead: all of them, and by one thread at a time."""
+"""Loading of all rendering kernels in advance, by one thread at a time."""
 
 import ast
 import threading
@@ -35,7 +35,7 @@ def of_kernels(path):
     return any(ast.unparse(decorator) == "forward_kernel" for f in functions for decorator in f.decorator_list)
 
 
-def test_every_kernel_of_a_picture_is_loaded_ahead(loading):
+def test_load_kernels_loads_every_rendering_kernel(loading):
     load_kernels()
     house = Path(ar.__file__).parents[1]
     paths = (path.relative_to(house) for path in Path(ar.__file__).parent.rglob("*.py") if of_kernels(path))
@@ -45,7 +45,7 @@ def test_every_kernel_of_a_picture_is_loaded_ahead(loading):
     assert len(names) > 5 and sorted(loading[0]) == sorted(names - later)
 
 
-def test_whoever_needs_them_meanwhile_waits(loading):
+def test_kernel_load_waits_for_running_load(loading):
     loaded, most = loading
     ahead = threading.Thread(target=load_kernels)
     ahead.start()

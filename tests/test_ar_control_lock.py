@@ -1,10 +1,10 @@
-"""Who leads a page."""
+"""Control of a page by one visitor at a time."""
 
 from ar.page.control_lock import MAX_IDLE_TIME, ControlLock
 
 
 class TestLead:
-    def test_control_passes_to_first_request_then_oldest(self):
+    def test_control_passes_to_first_request_then_oldest_visitor(self):
         lead = ControlLock()
         lead.see({2, 3, 4}, 0.0)
         assert lead.leader == 2 and lead.record_change(2, 1.0) and not lead.record_change(3, 1.0)
@@ -22,7 +22,7 @@ class TestLead:
         lead.see({4, 5}, 5.0)
         assert lead.leader == 4 and not lead.describe_control(4, {4})
 
-    def test_who_does_nothing_for_long_hands_over_on_being_asked(self):
+    def test_idle_leader_loses_control_on_request(self):
         lead = ControlLock()
         lead.see({1, 2}, 0.0)
         lead.record_change(1, 10.0)

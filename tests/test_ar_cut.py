@@ -1,4 +1,4 @@
-"""Cuts through camera, tip and tumour."""
+"""Sections through camera, tip and tumour."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from ar.overlay.outlines import compute_ink, find_ink, to_key
 from ar.overlay.window import CLOSED_GROUND, Roles
 
 
-def test_a_cut_holds_camera_tip_and_middle():
+def test_cut_plane_contains_camera_tip_and_centre():
     middle, tip = np.array([0.0, 0.0, -0.02]), np.array([0.01, 0.004, 0.0])
     plane = build_plane(CAMERA, middle, tip)
     normal = np.cross(plane.across, plane.along)
@@ -23,7 +23,7 @@ def test_a_cut_holds_camera_tip_and_middle():
     np.testing.assert_allclose(plane.to_plane(plane.to_world(places)), places, atol=1e-15)
 
 
-def test_cut_shows_surface_section_and_no_air():
+def test_section_shows_cortex_profile_and_tumour_area():
     picture, at = seen(0.0), tumour()
     plane: CutPlane = build_plane(CAMERA, at.vertices.mean(axis=0), None)
     roles = Roles((), (CORTEX,)).read_roles(picture.segmentation)
@@ -40,7 +40,7 @@ def test_cut_shows_surface_section_and_no_air():
 
 
 @pytest.mark.parametrize("error", [2e-3, 6e-3])
-def test_cut_draws_its_broken_line_at_the_error(error):
+def test_section_draws_dashed_line_at_error_distance(error):
     at, ink = tumour(), to_key(compute_ink(GREEN))
     plane = build_plane(CAMERA, at.vertices.mean(axis=0), None)
     places = plane.to_plane(np.array([[-0.03, 0.0, 0.0], [0.03, 0.0, 0.0]])), np.zeros(2, int)

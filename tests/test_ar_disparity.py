@@ -1,4 +1,4 @@
-"""Depth from two eyes, and points that are followed: against the places that were drawn."""
+"""Stereo depth and point tracking compared with the rendered positions."""
 
 from dataclasses import replace
 
@@ -91,7 +91,7 @@ def view(geometry, pictures):
     return compute_stereo_view(geometry, *(taken(picture, seed) for seed, picture in enumerate(pictures)))
 
 
-def test_windows_show_what_cameras_with_lenses_see(pair, geometry):
+def test_rectified_windows_match_distorted_projection(pair, geometry):
     columns, rows = np.meshgrid(np.arange(320, dtype=np.float32), np.arange(240, dtype=np.float32))
     points = TARGET + 5e-3 * np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
     pixels, disparity = geometry.place(points)
@@ -118,7 +118,7 @@ def test_depth_errors_match_their_standard_deviation(pair, geometry, pictures, d
     assert 0.4 < np.sqrt(((error / found.sigma) ** 2).mean()) < 1.6
 
 
-def test_noise_increases_the_reported_deviation(geometry, pictures):
+def test_image_noise_increases_depth_standard_deviation(geometry, pictures):
     pixels, random = grid(geometry.size), np.random.default_rng(0)
     sigma = []
     for noise in (0.0, 10.0):
@@ -130,7 +130,7 @@ def test_noise_increases_the_reported_deviation(geometry, pictures):
     assert sigma[1] > 1.25 * sigma[0]
 
 
-def test_glare_is_left_out(pair, geometry, pictures):
+def test_saturated_pixels_are_excluded_from_the_cloud(pair, geometry, pictures):
     lit, random = [taken(picture, seed) for seed, picture in enumerate(pictures)], np.random.default_rng(3)
     for picture in lit:
         for column, row in random.integers((100, 60), (220, 180), (20, 2)).tolist():
@@ -144,7 +144,7 @@ def test_glare_is_left_out(pair, geometry, pictures):
     assert np.sqrt((error**2).mean()) < 0.6e-3 and np.median(np.abs(error)) < 0.25e-3
 
 
-def test_what_a_tool_hides_in_either_eye_is_no_point(geometry, pictures, view):
+def test_pixels_hidden_in_either_image_give_no_point(geometry, pictures, view):
     pixels, none = grid(geometry.size), np.zeros((240, 320), bool)
     left, right = none.copy(), none.copy()
     left[:, :140], right[:, 180:] = True, True
@@ -158,7 +158,7 @@ def test_what_a_tool_hides_in_either_eye_is_no_point(geometry, pictures, view):
         assert mask.any() and not mask[row, column].any()
 
 
-def test_light_alone_tells_no_depth(pair, geometry):
+def test_textureless_surface_gives_no_points(pair, geometry):
     plain = Renderer([bulge(texture=0.0)], LAMP, "cpu")
     view = compute_stereo_view(
         geometry, *(taken(picture, seed) for seed, picture in enumerate(shot(pair, renderer=plain)))
@@ -166,7 +166,7 @@ def test_light_alone_tells_no_depth(pair, geometry):
     assert not len(triangulate_cloud(view, grid(geometry.size)).which)
 
 
-def test_other_cameras_and_blind_eyes_are_refused(pair, geometry, pictures):
+def test_invalid_stereo_inputs_are_rejected(pair, geometry, pictures):
     left, right = (taken(picture, seed) for seed, picture in enumerate(pictures))
     with pytest.raises(ValueError, match="the right eye sees nothing"):
         compute_stereo_view(geometry, left, np.zeros_like(right))
@@ -179,8 +179,8 @@ def test_other_cameras_and_blind_eyes_are_refused(pair, geometry, pictures):
         triangulate_cloud(compute_stereo_view(window_of(turned), left, right), grid(geometry.size))
 
 
-def test_points_are_followed_over_many_pixels(pair, geometry, view):
-    """By 5 mm, 30 pixels, in each direction in turn: where they come to is found in three dimensions."""
+def test_points_are_tracked_over_30_pixels(pair, geometry, view):
+    """Displacements of 5 mm (30 pixels) in two directions are measured in three dimensions."""
     pixels = grid(geometry.size)
     known = triangulate_cloud(view, pixels)
     for seed, motion in enumerate(np.array([[5e-3, 0.0, 0.0], [-2e-3, 4e-3, -2e-3]]), start=5):
@@ -194,15 +194,15 @@ def test_points_are_followed_over_many_pixels(pair, geometry, view):
         assert np.median(error) < 0.25e-3 and np.quantile(error, 0.95) < 0.8e-3
 
 
-def test_nothing_is_followed_into_another_picture(geometry, view):
+def test_points_are_not_tracked_into_unrelated_image(geometry, view):
     random = np.random.default_rng(0)
     other = replace(view, left=random.integers(0, 255, view.left.shape, dtype=np.uint8))
     which, there = follow_pixels(view, other, grid(geometry.size))
     assert len(which) == len(there) < 3
 
 
-def test_point_that_leads_back_elsewhere_is_dropped(geometry, view, monkeypatch):
-    """As where a texture repeats: each point is found, and every other one leads back 5 pixels from its start."""
+def test_point_with_inconsistent_backward_flow_is_dropped(geometry, view, monkeypatch):
+    """Simulates a repeating texture: the backward flow of every second point ends 5 pixels from its start."""
     pixels = grid(geometry.size)
     ends = []
 
@@ -219,7 +219,7 @@ def test_point_that_leads_back_elsewhere_is_dropped(geometry, view, monkeypatch)
     assert len(ends) == 2 and len(which) == len(ends[0]) // 2
 
 
-def test_a_motion_unlike_its_neighbours_has_no_support():
+def test_motion_unlike_its_neighbours_is_unsupported():
     random = np.random.default_rng(0)
     places, motions = random.uniform(0.0, 0.02, (60, 3)), 1e-4 * random.standard_normal((60, 3)) + 3e-3
     motions[[4, 30]] += [2e-3, 0.0, 0.0]

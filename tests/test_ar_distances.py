@@ -1,4 +1,4 @@
-"""Rings of distance: their lines and their numbers."""
+"""Distance rings and their labels."""
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from ar.overlay.hud import FONT, TEXT_SCALE
 from ar.overlay.window import BORDER_COLOUR
 
 
-def test_rings_lie_where_the_distance_is_what_they_say():
+def test_distance_rings_lie_at_their_distances():
     picture, at = seen(), tumour((0.0, 0.0, -0.014))
     whole, free = np.s_[0:480, 0:640], np.ones((480, 640), bool)
     far = compute_seen_distance(
@@ -42,7 +42,7 @@ def written(sheet, number):
     return int((cv2.matchTemplate(sheet[..., :3].copy(), stamp, cv2.TM_CCOEFF_NORMED) > 0.9).sum())
 
 
-def test_long_ring_pieces_are_labelled():
+def test_each_long_ring_segment_is_labelled():
     rows, columns = np.mgrid[:480, :640]
     far = (0.1e-3 * np.hypot(rows - 240.0, columns - 320.0)).astype(np.float32)
     far[:, 300:340] = np.nan  # halves of rings of 50, 100 and 150 pixels
@@ -52,7 +52,7 @@ def test_long_ring_pieces_are_labelled():
         assert [written(sheet, number) >= least for number in ("5", "10", "15")] == [True] * 3
 
 
-def test_rings_may_be_covered_and_their_numbers_may_not():
+def test_ring_mask_excludes_the_pixels_of_ring_labels():
     drawn = np.zeros((80, 120, 4), np.uint8)
     distance = np.repeat(np.linspace(0.0, 8e-3, 120, dtype=np.float32)[None], 80, axis=0)
     assert draw_rings(drawn, distance, np.ones((80, 120), bool), [5e-3]) == ["5"]

@@ -1,4 +1,4 @@
-"""A fine surface embedded in a coarse one follows it, and stays inside its facets."""
+"""Fine surface embedded in a coarse one: it follows the motion and stays inside the facets."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def test_linear_field_is_interpolated_exactly(fine):
     assert np.allclose(fine.interpolate(POINTS @ A + 1.0), fine.interpolate(POINTS) @ A + 1.0, atol=1e-12)
 
 
-def test_fine_vertices_are_never_outside_the_facets(fine):
+def test_fine_vertices_stay_inside_the_coarse_facets(fine):
     random = np.random.default_rng(2)
     for at in (POINTS, POINTS + 0.05 * random.standard_normal(POINTS.shape)):
         normals = fine.interpolate(at) - fine.place(at)
@@ -54,7 +54,7 @@ def test_fine_vertices_are_never_outside_the_facets(fine):
         assert (side * np.einsum("mi,mi->m", outward, normals) >= -1e-12)[inside].all()
 
 
-def test_rounding_makes_a_coarse_sphere_rounder(fine):
+def test_rounding_reduces_radius_error_of_coarse_sphere(fine):
     free = replace(fine, depth=np.zeros(len(fine.depth)), highest=np.inf, rounding=0.5)
     flat, found = (np.linalg.norm(at, axis=1) for at in (fine.interpolate(POINTS), free.place(POINTS)))
     assert np.abs(found - 1.0).max() < 0.25 * np.abs(flat - 1.0).max()

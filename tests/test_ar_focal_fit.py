@@ -1,4 +1,4 @@
-"""The focal length that a target's relief tells."""
+"""Focal length estimated from a target with depth."""
 
 from dataclasses import replace
 
@@ -26,8 +26,8 @@ def corners_of(camera, noise, seed, faces=(0, 1)):
     return DetectedCorners(points, pixels + noise * np.random.default_rng(seed).standard_normal(pixels.shape), face)
 
 
-def test_a_focal_length_is_found_by_the_relief_of_a_target():
-    """Of a camera that is stated a tenth too long, and of the true one; of few corners nothing is known."""
+def test_focal_length_is_estimated_from_cube_corners():
+    """Cases: a focal length that is 10 % too long, a correct one, and too few corners."""
     camera = read_calibration(FILM / "camera.yaml").build_camera(np.eye(4))
     seen = [(CUBE, corners_of(camera, 0.1, seed)) for seed in range(12)]
     for factor in (1.0, 1.1):

@@ -1,4 +1,4 @@
-"""The gauge: the number beside the tip."""
+"""Distance label at the tip."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from ar.overlay.outlines import find_text, has_text
 
 
 @pytest.mark.parametrize("tip", [(0.0, 0.0), (0.052, 0.03), (-0.07, 0.0), (0.0, -0.09), (0.3, 0.3)])
-def test_the_number_stands_beside_the_tip_inside_the_frame(tip):
+def test_distance_label_is_near_the_tip_inside_the_image(tip):
     picture = seen()
     gauge = Gauge(np.array([*tip, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
     shown = composite(picture, CAMERA, tumour(), marks=Marks(gauge=gauge)).colour
@@ -23,7 +23,7 @@ def test_the_number_stands_beside_the_tip_inside_the_frame(tip):
     assert np.linalg.norm(pixel - np.clip(pixel, found[:2], found[2:])) < 110
 
 
-def test_a_tip_inside_is_said_to_be():
+def test_tip_inside_tumour_is_labelled_inside():
     assert format_gauge(2.1e-3, None, True) == "inside, 2.1 mm from its edge"
     assert format_gauge(2.1e-3, 1e-3, False) == "2.1 +- 1.0 mm"
     gauge = Gauge(np.array([0.0, 0.0, -0.02]), np.array([0.0, 0.0, -0.008]), inside=True)

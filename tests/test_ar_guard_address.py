@@ -1,4 +1,4 @@
-"""A page behind a proxy or another port: addresses that are allowed, each with the token."""
+"""Page behind a proxy or a forwarded port: allowed addresses and the token."""
 
 import pytest
 from test_ar_access_guard import Page, ask, knock
@@ -24,7 +24,7 @@ def proxied():
         ("localhost:{port}", "https://page.example", False),  # a proxy that names the host itself
     ],
 )
-def test_allowed_address_needs_the_token(proxied, host, origin, secure):
+def test_allowed_address_requires_the_token(proxied, host, origin, secure):
     host, origin = (text.format(port=proxied.port) for text in (host, origin))
     assert ask(proxied, Host=host, Origin=origin)[0] == 403
     status, headers = ask(proxied, f"/?token={proxied.token}", Host=host, Origin=origin)
@@ -47,7 +47,7 @@ def test_allowed_address_needs_the_token(proxied, host, origin, secure):
         ("localhost:9000", "null"),
     ],
 )
-def test_other_address_is_rejected_with_the_token(proxied, host, origin):
+def test_unlisted_address_with_token_is_rejected(proxied, host, origin):
     assert ask(proxied, f"/?token={proxied.token}", Host=host, Origin=origin)[0] == 403
 
 
@@ -64,7 +64,7 @@ def test_addresses_are_printed_with_the_token(proxied):
         ("https://[::1]:8443", "https://[::1]:8443"),
     ],
 )
-def test_address_is_written_as_browsers_do(text, origin):
+def test_origin_is_normalised_as_in_browsers(text, origin):
     assert access_guard.format_origin(text) == origin
 
 
@@ -73,6 +73,6 @@ def test_address_is_written_as_browsers_do(text, origin):
     ["", "page.example", "ftp://a", "https://", "https://a/b", "https://u@a", "https://a?b", "https://a:0"]
     + ["https://a:99999", "https://*.example", "https://a b", "https://[::1", "https://a\r\nb", "https://pagé.example"],
 )
-def test_bad_address_is_rejected(text):
+def test_malformed_address_is_rejected(text):
     with pytest.raises(ValueError, match="must be https://NAME"):
         access_guard.format_origin(text)

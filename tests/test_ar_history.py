@@ -1,4 +1,4 @@
-"""The chart of the last seconds."""
+"""Chart of the last seconds."""
 
 import re
 
@@ -22,11 +22,11 @@ class TestHistory:
         assert chart.count("<polyline") == 2 and chart.count("stroke-dasharray") == 1
         assert "force: not known" in chart and "distance [mm]" in chart and 'role="img"' in chart
 
-    def test_before_anything_is_read_it_is_an_empty_chart(self):
+    def test_chart_without_samples_is_empty(self):
         chart = History((Line("a<b", "mm", "#fff"),)).draw_chart()
         assert "<polyline" not in chart and "nothing yet" in chart
 
-    def test_single_sample_is_a_dot_and_gaps_stay_empty(self):
+    def test_chart_draws_single_samples_and_keeps_gaps(self):
         history = History((Line("distance", "mm", "#fff"),))
         for time, value in ((0.0, 3.0), (5.0, 4.0), (6.0, 4.0), (7.0, None), (8.0, 5.0)):
             history.add(Sample(time, (value,), (None,)))
@@ -40,5 +40,5 @@ class TestHistory:
         history.add(Sample(9.0, (None,), (None,)))
         assert ">not known<" in history.draw_chart()
 
-    def test_scales_end_at_round_numbers(self):
+    def test_chart_scales_end_at_round_numbers(self):
         assert [round_up_scale(value) for value in (0.0, 0.3, 1.0, 1.2, 9.0, 13.9)] == [1.0, 0.5, 1.0, 2.0, 10.0, 20.0]

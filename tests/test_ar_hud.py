@@ -1,4 +1,4 @@
-"""Words on a picture: the patient's sides at its edges, lines where there is room, lengths as they are read."""
+"""Text on an image: orientation labels, panels and lengths."""
 
 import cv2
 import numpy as np
@@ -36,12 +36,12 @@ from ar.overlay.text_placement import BORDER_DISTANCE
         ((-0.8, 0.6, 0.1), "LA"),
     ],
 )
-def test_a_direction_has_the_letters_of_its_greatest_parts(direction, letters):
+def test_direction_is_named_by_its_largest_components(direction, letters):
     assert name_direction(np.array(direction)) == letters
 
 
-def test_what_lies_at_the_edges_follows_from_the_camera():
-    """From the patient's right side, crown upwards: the face is on the right."""
+def test_edge_labels_follow_the_camera_orientation():
+    """Seen from the patient's right with the crown up, the face is on the right."""
     aside = look_at(np.array([0.3, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     assert name_bearings(aside.T_camera_world[:3, :3]) == {"left": "P", "right": "A", "top": "S", "bottom": "I"}
     # From above, face upwards in the picture: the patient's right is on the right; from below it is on the left.
@@ -51,7 +51,7 @@ def test_what_lies_at_the_edges_follows_from_the_camera():
     assert name_bearings(below.T_camera_world[:3, :3]) == {"left": "R", "right": "L", "top": "A", "bottom": "P"}
 
 
-def test_letters_stand_at_the_edges():
+def test_orientation_labels_are_drawn_at_image_edges():
     plain = np.full((240, 320, 3), 90, np.uint8)
     turn = np.eye(3)
     letters = draw_orientation_labels(plain, turn, np.zeros(plain.shape[:2], np.uint8))
@@ -61,7 +61,7 @@ def test_letters_stand_at_the_edges():
     assert not changed[40:200, 40:280].any() and (plain == 90).all()
 
 
-def test_panel_drops_lines_that_do_not_fit():
+def test_text_panel_drops_lines_that_do_not_fit():
     plain = np.full((100, 320, 3), 90, np.uint8)
     lines = ["first", "second", "third", "fourth", "fifth"]
     few = draw_text_panel(plain, lines, below=30)
@@ -84,8 +84,8 @@ def test_length_is_printed_in_millimetres_with_error(length, error, text):
     assert format_millimetres(length, error) == text
 
 
-def test_letters_at_an_edge_give_way_along_it():
-    """A line that leaves the picture where the upper letter stands moves that letter aside, and no other."""
+def test_orientation_label_shifts_along_its_edge():
+    """A line through the top label shifts this label sideways, and no other."""
     plain = np.full((240, 320, 3), 90, np.uint8)
     taken = np.zeros(plain.shape[:2], np.uint8)
     free = draw_orientation_labels(plain, np.eye(3), taken)
@@ -100,7 +100,7 @@ def test_letters_at_an_edge_give_way_along_it():
     assert np.array_equal(letters[:40], plain[:40]) and np.array_equal(letters[60:], free[60:])
 
 
-def test_labels_take_place_and_optional_ones_drop():
+def test_optional_labels_without_room_are_dropped():
     colour, taken = np.zeros((100, 200, 3), np.uint8), np.zeros((100, 200), np.uint8)
     lay(colour, taken, ["first"], (0, 100))
     (low,) = np.nonzero(taken.any(axis=1))[0][[-1]]
@@ -117,7 +117,7 @@ def test_labels_take_place_and_optional_ones_drop():
 
 
 @pytest.mark.parametrize("room", [1.0, 60.0, 130.0, 150.0, 1000.0])
-def test_a_folded_line_keeps_its_words_and_its_room(room):
+def test_wrapped_line_keeps_its_words_and_width_limit(room):
     text = "the bone's edge stops the tool 17.5 mm short"
     lines = wrap_line(text, room)
     wide = [cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines]
@@ -126,7 +126,7 @@ def test_a_folded_line_keeps_its_words_and_its_room(room):
     assert (len(lines) == 1) is (room == 1000.0) and (room != 150.0 or max(wide) < 1.4 * min(wide))
 
 
-def test_a_panel_folds_lines_that_are_wider_than_the_picture():
+def test_panel_wraps_lines_wider_than_the_image():
     colour = np.full((150, 200, 3), 90, np.uint8)
     shown = draw_text_panel(colour, ["a line that is much wider than so narrow a picture", "short"])
     changed = (shown != colour).any(axis=2)
@@ -144,13 +144,13 @@ def test_a_panel_folds_lines_that_are_wider_than_the_picture():
         ("blue 95 % of its middle", ["blue 95 %"]),
     ],
 )
-def test_a_number_stays_beside_its_name_and_its_unit(text, held):
+def test_wrapping_keeps_number_with_name_and_unit(text, held):
     for room in (1.0, 60.0, 100.0):
         lines = wrap_line(text, room)
         assert " ".join(lines) == text and all(any(each in line for line in lines) for each in held)
 
 
-def test_panel_drops_last_lines_before_required_marks():
+def test_text_panel_drops_lines_instead_of_covering_marks():
     colour, hidden = np.full((300, 400, 3), 90, np.uint8), np.ones((300, 400), np.uint8)
     hidden[40:120, 200:] = 0
     lines = ["the first line", "the second", "the third", "the fourth", "the fifth", "the sixth"]
@@ -160,8 +160,8 @@ def test_panel_drops_last_lines_before_required_marks():
     assert (draw_text_panel(colour, lines[:2], sights=[hidden]) != colour).any(axis=2).sum() < changed.sum()
 
 
-def test_labels_may_cover_thin_lines():
-    """As a number does rings: without that it went far below the line that it belongs to."""
+def test_text_labels_may_cover_thin_lines():
+    """Example: a number over rings; otherwise it would be placed far below its line."""
     rows = {}
     for name, thin in (("far", None), ("near", True)):
         colour, taken = np.zeros((300, 400, 3), np.uint8), np.zeros((300, 400), np.uint8)

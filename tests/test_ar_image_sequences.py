@@ -1,4 +1,4 @@
-"""Pictures of folders: their order, and their pixels as stored."""
+"""Order and pixels of images in folders."""
 
 import struct
 
@@ -22,7 +22,7 @@ from ar.tracking.image_sequences import read_images, read_video
         ["7 end.png", "010 end.png", "0100 end.png"],
     ],
 )
-def test_folder_pictures_come_in_natural_order(tmp_path, names):
+def test_images_of_folder_are_read_in_natural_order(tmp_path, names):
     for grey, name in enumerate(names):
         cv2.imwrite(str(tmp_path / name), np.full((8, 8), 20 * grey, np.uint8))
     with pytest.warns(UserWarning, match="order of the numbers in its names, not alphabetically"):
@@ -31,14 +31,14 @@ def test_folder_pictures_come_in_natural_order(tmp_path, names):
     assert [each.name for each in read_images(tmp_path)] == names
 
 
-def test_folder_in_alphabetical_order_has_no_notice(tmp_path):
+def test_folder_in_alphabetical_order_gives_no_warning(tmp_path):
     for name in ("a09.png", "a10.png", "b1.png"):
         cv2.imwrite(str(tmp_path / name), np.zeros((8, 8), np.uint8))
     assert [each.name for each in read_video(tmp_path, 10.0)] == ["a09.png", "a10.png", "b1.png"]
 
 
-def test_pixels_are_as_stored_whatever_metadata_says(tmp_path):
-    """A quarter turn in a video's track header and in EXIF moves no pixel."""
+def test_rotation_metadata_does_not_rotate_pixels(tmp_path):
+    """A rotation by 90 degrees in a video's track header or in EXIF is ignored."""
     still = np.zeros((64, 96, 3), np.uint8)
     still[:32, :48] = 200
     film, turned = tmp_path / "film.mp4", tmp_path / "turned.mp4"

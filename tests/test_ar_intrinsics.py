@@ -1,4 +1,4 @@
-"""A camera from views of the board: found as it was, as surely as repeated calibrations say, or refused."""
+"""Camera intrinsics from views of the board: values, covariance and rejected input."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ BOARD = Detector([build_calibration_board()])
 TRUTH = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *CAMERA.lens.coefficients[:5]])
 
 
-def test_a_camera_is_found_from_pictures():
+def test_intrinsics_are_recovered_from_board_images():
     places = poses(12)
     found = [find_board(BOARD, str(number), picture(T)) for number, T in enumerate(places)]
     assert all(found) and min(len(view.pixels) for view in found) > 20
@@ -46,7 +46,7 @@ def repeated():
     return [calibrate_intrinsics(views(places, 0.2, seed), WIDTH, HEIGHT) for seed in range(20)]
 
 
-def test_the_covariance_is_that_of_repeated_calibrations(repeated):
+def test_covariance_matches_repeated_calibrations(repeated):
     values = np.array([each.values for each in repeated])
     stated = np.mean([each.covariance for each in repeated], axis=0)
     ratio = values.std(axis=0, ddof=1) / np.sqrt(np.diag(stated))
@@ -59,7 +59,7 @@ def test_the_covariance_is_that_of_repeated_calibrations(repeated):
     assert all(each.rms == pytest.approx(np.sqrt(2) * 0.2, rel=0.1) for each in repeated)
 
 
-def test_deviations_are_those_of_opencv(repeated):
+def test_standard_deviations_equal_opencv_values(repeated):
     some = views(poses(14), 0.2, 0)
     points, pixels = ([np.float32(getattr(view, what)) for view in some] for what in ("points", "pixels"))
     rms, *_, deviations, _, _ = cv2.calibrateCameraExtended(points, pixels, (WIDTH, HEIGHT), None, None)
@@ -67,7 +67,7 @@ def test_deviations_are_those_of_opencv(repeated):
     assert repeated[0].rms == pytest.approx(rms, rel=1e-3)
 
 
-def test_a_view_that_does_not_fit_is_left_out_and_said():
+def test_calibration_excludes_and_names_distorted_view():
     some = views(poses(14), 0.1)
     bent = replace(some[5], pixels=some[5].pixels + 3.0 * np.sin(some[5].pixels[:, ::-1] / 20.0))
     camera = calibrate_intrinsics([*some[:5], bent, *some[6:]], WIDTH, HEIGHT)
@@ -76,7 +76,7 @@ def test_a_view_that_does_not_fit_is_left_out_and_said():
     np.testing.assert_allclose(camera.values, alone.values, rtol=1e-6)
 
 
-def test_what_determines_no_camera_is_refused():
+def test_calibration_rejects_insufficient_views():
     with pytest.raises(ValueError, match=r"7 sharp views show the board, but 8 are needed: take 20 images"):
         calibrate_intrinsics(views(poses(7), 0.1), WIDTH, HEIGHT)
     with pytest.raises(ValueError, match=r"one direction in all 14 views, to \d+ degrees\. Tilt the board"):
@@ -90,8 +90,8 @@ def test_what_determines_no_camera_is_refused():
         calibrate_intrinsics([*some[:5], bent, *some[6:]], WIDTH, HEIGHT)
 
 
-def test_calibration_error_is_what_the_pose_leaves_of_it():
-    """A focal length that is 0.2 % off: the pose is fitted again, and a place beside the target is seen elsewhere."""
+def test_calibration_error_accounts_for_pose_compensation():
+    """Focal length wrong by 0.2 %: the pose is fitted again, and a point next to the target moves in the image."""
     T, corners, place = turned("x", 25.0), build_patient_reference().faces[0].corners, np.array([0.1, 0.05, 0.03])
     T[:3, 3], own = (0.0, 0.02, 0.4), np.zeros((9, 9))
     own[:2, :2] = 4.0
@@ -105,7 +105,7 @@ def test_calibration_error_is_what_the_pose_leaves_of_it():
     assert np.sqrt(np.trace(found)) == pytest.approx(expected, rel=0.1)
 
 
-def test_directions_are_angles_between_planes():
+def test_tilt_range_is_angle_between_board_planes():
     focal = max(WIDTH, HEIGHT)  # as it is assumed
     one, other = views(poses(2, tilt=20.0), 0.0)
     (R, _), (S, _) = ((T[:3, :3], T) for T in poses(2, tilt=20.0))
@@ -115,7 +115,7 @@ def test_directions_are_angles_between_planes():
     )
 
 
-def test_sharp_views_that_differ_are_chosen():
+def test_sharp_and_distinct_views_are_selected():
     places = poses(12)
     some = [replace(view, name=str(number)) for number, view in enumerate(views(places, 0.0))]
     again = [replace(view, name=f"{view.name} again") for view in some for _ in range(4)]
@@ -126,7 +126,7 @@ def test_sharp_views_that_differ_are_chosen():
     assert choose_views([], FACE, 12) == []
 
 
-def test_blur_is_seen_in_whichever_direction():
+def test_blur_in_any_direction_reduces_sharpness():
     plain = picture(poses(1, tilt=0.0)[0])
     sharp = find_board(BOARD, "sharp", plain).sharpness
     for size in ((5, 1), (1, 5)):
@@ -135,7 +135,7 @@ def test_blur_is_seen_in_whichever_direction():
     assert dark == pytest.approx(sharp, rel=0.1)
 
 
-def test_the_board_is_not_seen_where_there_is_too_little_of_it():
+def test_board_with_too_few_visible_rows_is_not_detected():
     plain = picture(poses(12)[3])
     assert find_board(BOARD, "grey", np.full_like(plain, 120)) is None
     assert find_board(BOARD, "noise", np.random.default_rng(0).integers(0, 256, plain.shape, np.uint8)) is None
@@ -149,7 +149,7 @@ def test_the_board_is_not_seen_where_there_is_too_little_of_it():
         assert view is None if rows == 2 else len(view.pixels) == 3 * (FACE.columns - 1)
 
 
-def test_covered_is_what_lies_between_corners():
+def test_covered_share_is_area_spanned_by_corners():
     (one,) = views(poses(1, tilt=0.0), 0.0)
     box = replace(one, pixels=np.array([[0.0, 0.0], [319.0, 0.0], [319.0, 239.0], [0.0, 239.0], [100.0, 50.0]]))
     other = replace(box, pixels=box.pixels + [320.0, 0.0])

@@ -1,4 +1,4 @@
-"""Layers of a picture: textures, and normals of vertices."""
+"""Layers of an image: textures and vertex normals."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from ar.rendering.layer import Layer, Solid, compute_vertex_normals
 from ar.rendering.renderer import Lamp, render
 
 
-def test_a_solid_texture_sticks_to_the_material():
-    """Colour is read at the rest point: moving the vertices moves the stripe with them."""
+def test_solid_texture_moves_with_the_material():
+    """Colour is evaluated at the rest position, and a stripe moves with the vertices."""
     values = np.zeros((19, 2, 2))
     values[9] = 1.0
     scale = np.diag([100.0, 1.0, 1.0, 1.0])

@@ -1,4 +1,4 @@
-"""The legend: it names lines and leaves the cortex in sight."""
+"""Legend: it names lines and leaves the cortex visible."""
 
 import numpy as np
 from test_ar_styles import CAMERA, DRAPE, GREEN, OPENING, seen, tumour
@@ -10,7 +10,7 @@ from ar.overlay.marks import Cover, Marks, Words
 from ar.overlay.outlines import compute_ink, find_ink
 
 
-def test_legend_names_lines_and_keeps_cortex_clear():
+def test_legend_names_lines_and_does_not_cover_the_cortex():
     picture, at = seen(0.0), tumour()
     names = LegendNames("it", "its error", "before")
     plain, named = (
@@ -29,7 +29,7 @@ def test_legend_names_lines_and_keeps_cortex_clear():
     assert np.array_equal(crowded, without)  # there is cortex everywhere: no room
 
 
-def test_a_cut_leaves_the_foot_to_its_words():
+def test_section_inset_leaves_bottom_rows_for_text():
     covered = np.zeros((480, 640), bool)
     covered[:270, 400:] = True  # the inset stands low
     over = composite(

@@ -1,4 +1,4 @@
-"""Cameras with a lens: against OpenCV's own distortion, and against what a picture must do."""
+"""Cameras with lens distortion compared with OpenCV and with undistorted images."""
 
 from dataclasses import replace
 
@@ -50,15 +50,15 @@ def points_in_view() -> np.ndarray:
 
 
 @each_lens
-def test_a_lens_bends_as_opencvs_and_is_inverted_to_its_reach(lens):
+def test_distortion_equals_opencv_and_is_inverted(lens):
     where = places(lens)
     assert len(where) > 1000 and np.abs(lens.distort(where) - by_opencv(lens, where)).max() < 1e-9
     assert np.abs(lens.undistort(lens.distort(where)) - where).max() < 1e-9
     assert lens.undistort(np.zeros((3, 4, 2))).shape == (3, 4, 2) and not lens.undistort(np.zeros(2)).any()
 
 
-def test_a_lens_that_folds_back_sees_nothing_beyond():
-    """By calculus r - r^3 / 2 turns back at r = sqrt(2 / 3), where it is 2 / 3 of that."""
+def test_points_beyond_the_distortion_fold_are_nan():
+    """Radial polynomial r - r^3 / 2 has its maximum at r = sqrt(2 / 3); its value there is 2 / 3 of that."""
     lens, turn = LENSES["folding"], np.sqrt(2.0 / 3.0)
     assert lens.reach == pytest.approx(turn, rel=2e-3) and lens.reach < turn
     beyond = np.array([[1.2, 0.0], [0.0, -1.5], [4.0, 3.0], [np.nan, 0.0]])
@@ -71,15 +71,15 @@ def test_a_lens_that_folds_back_sees_nothing_beyond():
 
 
 @each_lens
-def test_no_two_places_come_to_one(lens):
-    """Along rays of all directions, with the tangential part: places are kept in their order."""
+def test_distortion_is_monotonic_along_rays(lens):
+    """Rays in all directions, with tangential distortion: radii keep their order."""
     angles = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
     ways = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     radii = np.linspace(0.0, min(0.999 * lens.reach, 5.0), 500)[:, None, None]
     assert ((np.diff(lens.distort(radii * ways), axis=0) * ways).sum(axis=-1) > 0.0).all()
 
 
-def test_a_lens_that_cannot_be_is_refused():
+def test_invalid_lens_coefficients_are_rejected():
     with pytest.raises(ValueError, match="finite"):
         Lens(np.nan)
     with pytest.raises(ValueError, match="folds"):
@@ -87,7 +87,7 @@ def test_a_lens_that_cannot_be_is_refused():
 
 
 @each_lens
-def test_a_camera_projects_as_opencv_and_back(lens):
+def test_distorted_projection_equals_opencv_and_is_inverted(lens):
     camera = seen_by(lens)
     for one in (camera, camera.perturb(3.0, (1.0, 2.0, -1.0))):
         pixels, depth = one.project(points_in_view())
@@ -98,7 +98,7 @@ def test_a_camera_projects_as_opencv_and_back(lens):
     assert np.abs(pixels - replace(one, lens=None).project(points_in_view())[0])[there].max() > 1.0
 
 
-def test_scaled_cropped_and_padded_cameras_see_the_same():
+def test_scaled_cropped_and_padded_cameras_project_equally():
     camera, points = seen_by(), points_in_view()
     pixels, _ = camera.project(points)
     assert np.allclose(camera.scale(2.0).project(points)[0] + 0.5, 2.0 * (pixels + 0.5))
@@ -108,7 +108,7 @@ def test_scaled_cropped_and_padded_cameras_see_the_same():
 
 
 @each_lens
-def test_straight_pixels_are_bent_back_to_their_own(lens):
+def test_undistorted_pixels_project_to_their_own_pixel(lens):
     camera = seen_by(lens)
     rows, columns = np.mgrid[:240, :320]
     points = replace(camera, lens=None).unproject(camera.straight, np.ones((240, 320)))
@@ -119,7 +119,7 @@ def test_straight_pixels_are_bent_back_to_their_own(lens):
     assert np.allclose(part.straight, again.straight, atol=1e-6, equal_nan=True)
 
 
-def test_small_balls_are_drawn_where_opencv_has_them():
+def test_small_spheres_are_drawn_at_opencv_projection():
     camera = seen_by(SOME, 640, 480, 75.0)
     spread = np.linspace(-0.105, 0.11, 4)
     for x in spread:
@@ -159,7 +159,7 @@ def test_static_and_batched_images_agree_through_lens():
             assert np.array_equal(getattr(together, name).numpy()[row], getattr(other, name))
 
 
-def test_identity_lens_is_none_and_draws_the_same():
+def test_identity_lens_renders_the_same_as_no_lens():
     assert seen_by(Lens()).lens is None
     one, other = (render(seen_by(lens), scene(), LAMP) for lens in (None, Lens(k3=1e-15)))
     assert (one.segmentation == other.segmentation).mean() > 0.9999
@@ -167,7 +167,7 @@ def test_identity_lens_is_none_and_draws_the_same():
 
 
 @each_lens
-def test_the_overlay_is_in_register_through_a_lens(lens):
+def test_overlay_outline_is_registered_through_lens(lens):
     camera, ground = seen_by(lens, 640, 480), [floor()]
     hidden = replace(ball((0.04, 0.02, -0.03)), colour=(0.3, 0.95, 0.55))
     picture = render(camera, ground, LAMP)
@@ -182,8 +182,8 @@ def test_the_overlay_is_in_register_through_a_lens(lens):
     assert measure_outline_gap(shown, ink, off, clear) > 2.0
 
 
-def test_what_lies_beyond_the_lens_is_not_drawn():
-    """OpenCV's polynomial has it in the picture."""
+def test_objects_beyond_the_distortion_limit_are_not_drawn():
+    """OpenCV's polynomial would project them into the image."""
     camera = replace(look_at(np.zeros(3), np.array([0.0, 0, 1]), np.array([0.0, 1, 0])), lens=LENSES["folding"])
     vertices, triangles = build_sphere(20, 30, 0.05)
     aside = Layer("ball", BALL, vertices + [1.2, 0.0, 1.0], triangles)

@@ -1,4 +1,4 @@
-"""The rasteriser for cameras with a lens."""
+"""Rasteriser for cameras with lens distortion."""
 
 import numpy as np
 from test_ar_lens import each_lens, seen_by
@@ -10,8 +10,8 @@ from ar.rendering.raycast import raycast
 
 
 @each_lens
-def test_the_rasteriser_sees_what_rays_see(lens):
-    """Of triangles as large as the picture, which reach behind the camera and beyond the lens, and of small ones."""
+def test_lens_rasteriser_matches_ray_casting(lens):
+    """Small triangles, and one as large as the image that reaches behind the camera and beyond the lens limit."""
     camera, (vertices, triangles) = seen_by(lens), build_sphere(20, 30, 0.02)
     vertices = np.concatenate([vertices + [0.01, 0.0, 0.03], [[-9.0, -9, -0.3], [9, -8, -0.3], [0, 9, 0.3]]])
     triangles = np.concatenate([triangles, [[600, 601, 602]] + np.array(len(vertices) - 603)])
@@ -25,7 +25,7 @@ def test_the_rasteriser_sees_what_rays_see(lens):
 
 @each_lens
 def test_pixel_box_contains_a_distorted_triangle(lens):
-    """The triangle is as large as the image: the lens bends its edges."""
+    """The triangle is as large as the image, and distortion bends its edges."""
     camera = seen_by(lens)
     points = np.array([[-0.08, -0.05, 0.0], [0.08, -0.05, 0.0], [0.0, 0.08, 0.0]])
     mask = compute_silhouette(camera, points, np.array([[0, 1, 2]]))

@@ -1,4 +1,4 @@
-"""Cameras that are unplugged or silent."""
+"""Live cameras that are unplugged or send no image."""
 
 import time
 from itertools import islice
@@ -9,7 +9,7 @@ from films import Plugged
 from ar.tracking.live_camera import read_camera_images, read_newest
 
 
-def test_a_camera_that_is_unplugged_is_opened_until_it_is_back():
+def test_unplugged_camera_is_reopened_until_it_returns():
     cameras, moments, late = [Plugged(2), Plugged(0), Plugged(1)], iter(range(9)), []
     first = cameras.pop(0)
 
@@ -26,7 +26,7 @@ def test_a_camera_that_is_unplugged_is_opened_until_it_is_back():
     assert late[1].released
 
 
-def test_the_newest_picture_is_had_and_a_silence_is_said():
+def test_latest_image_is_returned_and_timeout_yields_none():
     def slow():
         yield from "abc"
         time.sleep(0.15)

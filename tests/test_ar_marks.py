@@ -1,4 +1,4 @@
-"""What is drawn beside a hidden surface: outlines of others with their dots, and points that are seen."""
+"""Marks next to a hidden surface: traces with dots, and visible points."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def tumour(centre=(0.0, 0.0, -0.02)) -> Layer:
     return Layer("tumour", 3, ball.vertices + np.array(centre), ball.faces, (0.2, 0.9, 0.3))
 
 
-def test_traces_lie_under_outline_with_given_motion():
+def test_displacement_trace_is_drawn_below_the_outline():
     here, at = camera(640, 480), tumour()
     picture = ground(here)
     blue = replace(tumour((0.004, 0.0, -0.02)), colour=np.array((0.2, 0.4, 1.0)))
@@ -53,7 +53,7 @@ def test_traces_lie_under_outline_with_given_motion():
     assert has_text(shown, "moved 2.0 +- 1.3 mm", TEXT_SCALE) and has_text(plain, "moved 0.0 mm", TEXT_SCALE)
 
 
-def test_fewer_pixels_than_are_asked_for_are_no_outline():
+def test_outline_gap_ignores_outlines_below_minimum_pixels():
     picture, mask = np.zeros((60, 60, 3), np.uint8), np.zeros((60, 60), bool)
     mask[20:40, 20:40] = True
     covered = np.ones((60, 60), bool)
@@ -62,7 +62,7 @@ def test_fewer_pixels_than_are_asked_for_are_no_outline():
     assert measure_outline_gap(picture, (9, 9, 9), mask, np.zeros_like(mask), 32) == np.inf
 
 
-def test_points_are_drawn_where_they_are_in_sight_and_on_no_line():
+def test_points_are_drawn_only_on_visible_free_pixels():
     here = camera(640, 480)
     over = composite(ground(here), here, tumour(), style="contour")
     points = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 9.0], [9.0, 0.0, 0.0]])

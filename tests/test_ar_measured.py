@@ -1,4 +1,4 @@
-"""Rings and their numbers."""
+"""Distance rings and their labels next to the line from the tip."""
 
 import cv2
 import numpy as np
@@ -8,7 +8,7 @@ from ar.overlay.measured import Measure
 from ar.overlay.window import BORDER_COLOUR, Roles
 
 
-def test_a_ring_s_number_keeps_off_the_line_from_the_tip():
+def test_ring_numbers_avoid_the_line_from_the_tip():
     at = tumour((0.0, 0.0, -0.014))
     roles = Roles((TOOL,), None, None)
     plain, crossed = (np.zeros((480, 640, 4), np.uint8) for _ in range(2))

@@ -1,4 +1,4 @@
-"""The lit view and what is drawn into it: order, register, occlusion."""
+"""Rendered image and its overlay: order, registration, occlusion."""
 
 from dataclasses import replace
 
@@ -54,7 +54,7 @@ def tumour(centre=(0.0, 0.0, -0.02), radius: float = 0.012) -> Layer:
 LAMP = build_lamp(camera(), np.zeros(3))
 
 
-def test_a_picture_has_colour_depth_and_segmentation():
+def test_rendered_image_has_colour_depth_and_segmentation():
     here = camera()
     picture = render(here, [cortex(), tool()], LAMP)
     assert picture.colour.shape == (150, 200, 3) and picture.colour.dtype == np.uint8
@@ -66,7 +66,7 @@ def test_a_picture_has_colour_depth_and_segmentation():
     assert (picture.depth[empty] == 0.0).all() and (picture.depth[~empty] > 0.0).all()
 
 
-def test_the_nearer_layer_is_seen_in_any_order():
+def test_nearer_layer_is_visible_in_any_layer_order():
     one = render(camera(), [cortex(), tool()], LAMP)
     other = render(camera(), [tool(), cortex()], LAMP)
     assert np.array_equal(one.segmentation, other.segmentation)
@@ -74,14 +74,14 @@ def test_the_nearer_layer_is_seen_in_any_order():
     assert np.array_equal(one.colour, other.colour)
 
 
-def test_normals_face_camera_for_any_orientation():
+def test_shading_is_independent_of_triangle_orientation():
     there = cortex()
     turned = replace(there, triangles=there.triangles[:, ::-1])
     one, other = (render(camera(), [layer], LAMP) for layer in (there, turned))
     assert np.abs(one.colour.astype(int) - other.colour).max() <= 1
 
 
-def test_the_tool_throws_a_shadow_on_the_cortex():
+def test_tool_casts_a_shadow_on_the_cortex():
     shadowless = replace(tool(), casts_shadow=False)
     with_shadow, without = (render(camera(), [cortex(), layer], LAMP) for layer in (tool(), shadowless))
     darker = without.colour.astype(int).sum(-1) - with_shadow.colour.astype(int).sum(-1)
@@ -94,14 +94,14 @@ def test_the_tool_throws_a_shadow_on_the_cortex():
     assert columns.mean() > tool_columns.mean() and rows.mean() > tool_rows.mean()
 
 
-def test_a_surface_without_casters_is_evenly_lit():
-    """No surface shades itself: under a lamp far away, a flat sheet that casts shadows looks as one that does not."""
+def test_flat_surface_casts_no_shadow_on_itself():
+    """Under a distant lamp a flat sheet looks the same with and without casting shadows."""
     lamp = Lamp(np.array([-0.2, 0.1, 0.3]), np.zeros(3), 0.1)
     one, other = (render(camera(), [cortex(casts_shadow=casts)], lamp).colour.astype(int) for casts in (True, False))
     assert np.abs(one - other).max() <= 1
 
 
-def test_iou_falls_when_the_tumour_is_moved():
+def test_iou_decreases_with_tumour_displacement():
     here = camera()
     truth = compute_silhouette(here, tumour().vertices, tumour().triangles)
     overlaps = []
@@ -115,7 +115,7 @@ def test_iou_falls_when_the_tumour_is_moved():
     assert compute_iou(truth, compute_silhouette(here.perturb(0.5), tumour().vertices, tumour().triangles)) < 0.9
 
 
-def test_nothing_seen_is_no_agreement():
+def test_iou_of_empty_masks_is_zero():
     assert compute_iou(np.zeros((4, 4), bool), np.zeros((4, 4), bool)) == 0.0
 
 
@@ -124,7 +124,7 @@ def contour_mask(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("style", ["window", "contour", "fill"])
-def test_the_overlay_stands_where_the_tumour_is(style):
+def test_overlay_is_drawn_at_the_tumour_position(style):
     here = camera()
     picture = render(here, [cortex()], LAMP)
     drawn = composite(picture, here, tumour(), style=style)
@@ -140,7 +140,7 @@ def test_the_overlay_stands_where_the_tumour_is(style):
 
 
 @pytest.mark.parametrize("style", ["window", "contour", "fill"])
-def test_the_tool_is_in_front_of_the_overlay(style):
+def test_tool_occludes_the_overlay(style):
     here = camera()
     picture = render(here, [cortex(), tool((0.0, 0.0, 0.012))], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
@@ -155,7 +155,7 @@ def test_the_tool_is_in_front_of_the_overlay(style):
     assert contour_mask(picture.colour, shown.colour)[~covered].any()
 
 
-def test_the_margin_runs_outside_the_contour():
+def test_margin_line_is_outside_the_contour_by_its_width():
     here = camera()
     picture = render(here, [cortex()], LAMP)
     plain = composite(picture, here, tumour(), style="contour")
@@ -167,8 +167,7 @@ def test_the_margin_runs_outside_the_contour():
 
 
 @pytest.mark.parametrize("side", [(0.06, 0.0), (-0.06, 0.0), (0.0, 0.04), (0.0, -0.04)])
-def test_no_line_runs_along_the_edge_that_cuts_a_margin_off(side):
-    """Strokes end near the edge."""
+def test_clipped_margin_is_not_drawn_along_the_image_edge(side):
     here, centre = camera(), (*side, -0.02)
     picture = render(here, [cortex()], LAMP)
     plain, wide = (composite(picture, here, tumour(centre), style="contour", marks=Marks(each)) for each in (0.0, 0.02))
@@ -178,7 +177,7 @@ def test_no_line_runs_along_the_edge_that_cuts_a_margin_off(side):
     assert changed.sum() > 40 and not (changed & edge).any()
 
 
-def test_lines_at_the_head_stand_there_whatever_the_style():
+def test_header_lines_are_drawn_at_the_top_in_every_style():
     here = camera(320, 240)
     picture = render(here, [cortex()], LAMP)
     for style in ("window", "none"):
@@ -195,7 +194,7 @@ def test_lines_at_the_head_stand_there_whatever_the_style():
         assert said.taken[HEAD_ROW + LINE_SPACING, 8:20].all()
 
 
-def test_a_deeper_tumour_shines_less():
+def test_deeper_tumour_is_drawn_darker():
     here = camera()
     picture = render(here, [cortex()], LAMP)
     green = [
@@ -204,12 +203,12 @@ def test_a_deeper_tumour_shines_less():
     assert green[0] > green[1] > green[2]
 
 
-def test_the_gauge_is_the_distance():
+def test_gauge_distance_is_euclidean_distance():
     assert Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.003, 0.004, 0.0])).distance == pytest.approx(0.005)
 
 
-def test_the_picture_says_how_far_the_tumour_moved():
-    """The mean motion of the surface. Its margin is no error of the motion, but of the place."""
+def test_image_label_shows_mean_tumour_displacement():
+    """Mean displacement of the surface; the margin is an error of the position, not of the displacement."""
     here, now = camera(400, 300), tumour()
     picture = render(here, [cortex()], LAMP)
     far = np.linspace(0.002, 0.004, len(now.vertices))[:, None] * [1.0, 0.0, 0.0]
@@ -221,7 +220,7 @@ def test_the_picture_says_how_far_the_tumour_moved():
     assert has_text(composite(picture, here, now, marks=Marks(before=before)).colour, "moved 3.0 mm", TEXT_SCALE)
 
 
-def test_the_arrow_points_to_where_the_tumour_is_now():
+def test_motion_arrow_points_to_the_current_tumour_position():
     here, before, now = camera(400, 300), tumour((-0.012, 0.0, -0.02), 0.006), tumour((0.012, 0.0, -0.02), 0.006)
     picture = render(here, [cortex()], LAMP)
     shown = composite(picture, here, now, style="contour", marks=Marks(before=before)).colour
@@ -233,8 +232,8 @@ def test_the_arrow_points_to_where_the_tumour_is_now():
     assert near[1] > 1.5 * near[0] > 0
 
 
-def test_motion_and_doubt_stand_on_lines_of_their_own():
-    """A margin that nobody knows is not drawn."""
+def test_motion_and_warning_are_on_separate_lines():
+    """An unknown margin is not drawn."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     before, now = tumour((0.0, 0.0, -0.02)), tumour((0.003, 0.0, -0.02))
@@ -247,8 +246,8 @@ def test_motion_and_doubt_stand_on_lines_of_their_own():
     )
 
 
-def test_of_what_may_not_be_relied_on_nothing_is_promised():
-    """The reason stands in the picture, the outline is amber, and there is neither margin nor +-."""
+def test_unreliable_overlay_is_amber_without_error_margin():
+    """The image shows the reason and an amber outline, with neither margin nor +-."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
@@ -271,14 +270,14 @@ def test_of_what_may_not_be_relied_on_nothing_is_promised():
     assert amber > 20 and green == 0
 
 
-def test_a_tumour_out_of_the_picture_leaves_it_alone():
+def test_tumour_outside_the_image_changes_no_pixel():
     here = camera()
     picture = render(here, [cortex()], LAMP)
     for centre in ((1.0, 0.0, 0.0), (0.0, -0.1, 0.6)):
         assert np.array_equal(composite(picture, here, tumour(centre)).colour, picture.colour)
 
 
-def test_without_overlay_a_doubt_is_all_that_is_drawn():
+def test_without_overlay_only_the_warning_is_drawn():
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
@@ -295,8 +294,8 @@ def test_without_overlay_a_doubt_is_all_that_is_drawn():
     assert rows.min() > 270 and columns.max() < 120
 
 
-def test_what_lines_and_words_cover_is_reported():
-    """Every pixel of outline, arrow and number, and no other but a margin round letters."""
+def test_taken_mask_covers_lines_and_text():
+    """All pixels of outline, arrow and number, and no others except a margin around letters."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
@@ -311,14 +310,14 @@ def test_what_lines_and_words_cover_is_reported():
     assert taken[(ring - cv2.erode(ring, np.ones((3, 3), np.uint8))) > 0].all()
 
 
-def test_words_stay_inside_the_picture():
+def test_text_is_drawn_inside_the_image():
     for at in ((-50, -50), (1000, 1000), (100, 60)):
         colour = np.full((80, 200, 3), 90, np.uint8)
         write(colour, "12.3 mm", at)
         assert np.count_nonzero(colour[2:-2, 2:-2].max(axis=-1) > 200) > 20
 
 
-def test_the_panel_is_a_copy_in_its_corner():
+def test_text_panel_is_drawn_on_a_copy_of_the_image():
     colour = np.full((150, 200, 3), 90, np.uint8)
     shown = draw_text_panel(colour, ["render 12 ms", "error 0.1 mm"], "bottom right")
     rows, columns = np.nonzero((shown != colour).any(axis=-1))
@@ -339,13 +338,13 @@ def test_the_panel_is_a_copy_in_its_corner():
         (lambda: draw_text_panel(np.zeros((9, 9, 3), np.uint8), ["a"], "middle"), "corner"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(attempt, reason):
+def test_invalid_overlay_inputs_are_rejected(attempt, reason):
     with pytest.raises(ValueError, match=reason):
         attempt()
 
 
 def test_outline_error_counts_misplaced_and_missing_pixels():
-    """One that stands 12 pixels off beside the true one, and one of which the right half is not drawn."""
+    """Cases: an outline shifted by 12 pixels, and one without its right half."""
     here, ink = camera(400, 300), (20.0, 240.0, 60.0)
     true = compute_silhouette(here, tumour().vertices, tumour().triangles)
     nothing = np.zeros(true.shape, bool)
@@ -364,7 +363,7 @@ def test_outline_error_counts_misplaced_and_missing_pixels():
     assert gap(nothing) == np.inf
 
 
-def test_a_line_of_text_is_found_whole():
+def test_text_search_matches_only_whole_lines():
     colour = np.full((80, 200, 3), 90, np.uint8)
     write(colour, "11.5 mm", (60, 40))
     found = {text for text in ("11.5 mm", "1.5 mm", "11.6 mm", "5 mm") if has_text(colour, text, 0.5)}

@@ -1,4 +1,4 @@
-"""Pages of markers: exact on paper, found by OpenCV where they say, and a net that folds into the cube's corner."""
+"""Pages of markers: printed size, corner positions and the net of the cube."""
 
 import io
 import re
@@ -35,7 +35,7 @@ def drawn_in_pdf(content):
         yield np.asarray(Image.open(io.BytesIO(tiff)).convert("L")), np.array(size, float) / 72.0 * 25.4
 
 
-def test_pdf_and_png_hold_the_same_pages_at_their_size(pages):
+def test_pdf_and_png_pages_have_equal_pixels_and_size(pages):
     content = to_pdf(pages)
     found = list(drawn_in_pdf(content))
     assert [page.name for page in pages] == ["tool", "patient", "board"] and len(found) == 3
@@ -54,8 +54,8 @@ def edges(line):
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_squares_and_markers_measure_on_paper_what_they_should(pages, number):
-    """From the PNG's own dots per inch; along the first row and column of squares, and through a marker."""
+def test_squares_and_markers_have_nominal_printed_size(pages, number):
+    """Size from the PNG's dots per inch, along the first row and column of squares and through a marker."""
     page = pages[number]
     with Image.open(io.BytesIO(to_png(page))) as picture:
         pixels, per_mm = np.asarray(picture.convert("L")), picture.info["dpi"][0] / 25.4
@@ -72,7 +72,7 @@ def test_squares_and_markers_measure_on_paper_what_they_should(pages, number):
         assert np.diff(across) / per_mm == pytest.approx(750.0 * face.square)
 
 
-def test_rulers_are_100_mm(pages):
+def test_printed_rulers_are_100_mm_long(pages):
     for page in pages:
         black = page.pixels == 0
         right, down = ([edges(line) for line in side] for side in (black, black.T))
@@ -84,7 +84,7 @@ def test_rulers_are_100_mm(pages):
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_opencv_finds_every_corner_where_the_page_says(pages, number):
+def test_opencv_detects_corners_at_their_page_positions(pages, number):
     page = pages[number]
     small = cv2.resize(page.pixels, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
     for each in page.placed:
@@ -105,8 +105,8 @@ def on_paper(each, places):
     return around + 0.5 * size + [each.left, each.top]
 
 
-def test_sides_that_touch_on_paper_touch_on_the_cube(pages):
-    """Corners of the faces' borders: what is one place on the net is one place in space; the tab joins the rest."""
+def test_adjacent_faces_on_paper_are_adjacent_on_the_cube(pages):
+    """Border corners at one place of the net coincide in space; a tab joins the remaining edge."""
     spots = []
     for each in pages[0].placed:
         T, size, border = each.face.T_target_face, each.face.size, BORDER_WIDTH
@@ -128,8 +128,8 @@ def test_sides_that_touch_on_paper_touch_on_the_cube(pages):
     assert (names["+y"].left - 48.0, names["+y"].top) == (names["+x"].left, names["+x"].top)
 
 
-def test_cut_lines_go_round_the_borders(pages):
-    """Most of each outer side of the net and of the plate is drawn, and nothing of the white between."""
+def test_cut_lines_surround_the_face_borders(pages):
+    """Most of each outer side of net and plate is drawn, and nothing in the white area between."""
     for page, names in ((pages[0], "+z"), (pages[1], "-z")):
         (each,) = [each for each in page.placed if to_face_name(each.face) == names]
         left, top = (round(20.0 * (at - 1e3 * BORDER_WIDTH)) for at in (each.left, each.top))
@@ -139,7 +139,7 @@ def test_cut_lines_go_round_the_borders(pages):
         assert (page.pixels[top + 200 : top + wide - 5, left + 5 : left + 75] == 255).all()
 
 
-def test_the_list_holds_what_was_printed():
+def test_target_list_describes_the_printed_targets():
     listed = describe_targets()
     assert listed["dictionary"] == "DICT_4X4_250" and listed["nominal_tip_mm"] == {"tool": [0.0, 0.0, -150.0]}
     targets = (build_tool_cube(), build_patient_reference(), build_calibration_board())
@@ -155,5 +155,5 @@ def test_the_list_holds_what_was_printed():
     assert every == list(range(79))
 
 
-def test_a_page_is_black_or_white(pages):
+def test_page_pixels_are_black_or_white(pages):
     assert all(isinstance(page, Page) and set(np.unique(page.pixels)) == {0, 255} for page in pages)

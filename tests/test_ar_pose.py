@@ -1,4 +1,4 @@
-"""Printed targets: drawn as a camera sees them, found again, and where they are, with what is not known."""
+"""Poses of printed targets: detection, covariance, ambiguity and tracking."""
 
 from dataclasses import replace
 
@@ -90,7 +90,7 @@ def scene():
     return taken((CUBE, poses["tool"]), (PLATE, poses["patient"])), poses
 
 
-def test_corners_are_found_where_the_lens_puts_them(scene):
+def test_corners_are_detected_at_distorted_positions(scene):
     picture, poses = scene
     found = Detector((CUBE, PLATE)).detect(picture)
     assert len(found["patient"].points) >= 14 and len(np.unique(found["tool"].face)) == 3
@@ -113,8 +113,8 @@ def test_tip_error_lies_within_its_covariance(scene):
     assert angle(tracked.poses["patient"].T_camera_target, poses["patient"]) < 1.0
 
 
-def test_a_covariance_is_what_noise_does():
-    """Corners of known noise, many times: squared errors in units of the covariance have their mean at 6."""
+def test_pose_covariance_matches_repeated_noise():
+    """Repeated corners with known noise: the mean squared Mahalanobis error is 6."""
     rng, T = np.random.default_rng(1), looking((10.0, 5.0, -20.0), (0.0, 0.02, 0.3))
     found = []
     for _ in range(150):
@@ -127,8 +127,8 @@ def test_a_covariance_is_what_noise_does():
     assert np.mean(np.array(found) < 12.6) == pytest.approx(0.95, abs=0.05)
 
 
-def test_a_pose_beside_another_target_has_the_errors_of_both():
-    """The tip in the patient's frame, many times: what noise does to both poses is what the covariance says."""
+def test_relative_pose_covariance_includes_both_poses():
+    """Tip in the patient's frame: noise of both poses gives the reported covariance."""
     rng, T = np.random.default_rng(6), looking((10.0, 5.0, -20.0), (0.0, 0.02, 0.3))
     plate = flat((30.0, 20.0, 0.0), (-0.1, 0.0, 0.3))
     true = (np.linalg.inv(plate) @ T @ [0.0, 0.0, -TIP_DISTANCE, 1.0])[:3]
@@ -142,8 +142,8 @@ def test_a_pose_beside_another_target_has_the_errors_of_both():
     assert np.mean(found) == pytest.approx(3.0, rel=0.25)
 
 
-def test_a_mirrored_pose_is_never_called_good():
-    """A plate far away and nearly square to the view has two poses that fit: whichever is given is the right one."""
+def test_mirrored_pose_is_never_rated_good():
+    """A distant plate that faces the camera has two fitting poses; a returned pose is the true one."""
     rng, verdicts = np.random.default_rng(2), []
     for _ in range(300):
         T = flat(tuple(rng.uniform(-25.0, 25.0, 3)), (0.05 * rng.normal(), 0.05 * rng.normal(), rng.uniform(0.4, 1.5)))
@@ -157,7 +157,7 @@ def test_a_mirrored_pose_is_never_called_good():
     assert verdicts.count(Verdict.GOOD) > 40 and verdicts.count(Verdict.AMBIGUOUS) > 60
 
 
-def test_the_last_pose_tells_two_apart_and_a_far_one_does_not():
+def test_previous_pose_resolves_the_mirror_ambiguity():
     rng, T = np.random.default_rng(3), flat((12.0, -10.0, 0.0), (0.0, 0.0, 1.0))
     corners = is_seen_from_front(T, 0.1, rng)
     assert find_pose(CAMERA, PLATE, corners)[0] is Verdict.AMBIGUOUS
@@ -170,7 +170,7 @@ def test_the_last_pose_tells_two_apart_and_a_far_one_does_not():
     assert find_pose(CAMERA, PLATE, corners, far) == (Verdict.AMBIGUOUS, None)
 
 
-def test_what_fits_nothing_is_lost():
+def test_inconsistent_corners_give_no_pose():
     corners = is_seen_from_front(flat((20.0, 15.0, 5.0), (-0.05, 0.0, 0.3)), 0.1, np.random.default_rng(4))
     few = DetectedCorners(corners.points[:5], corners.pixels[:5], corners.face[:5])
     assert find_pose(CAMERA, PLATE, few) == find_pose(CAMERA, PLATE, None) == (Verdict.LOST, None)
@@ -180,7 +180,7 @@ def test_what_fits_nothing_is_lost():
     assert find_pose(CAMERA, PLATE, mirrored)[1] is None
 
 
-def test_a_target_is_followed_lost_and_found(scene):
+def test_target_is_tracked_lost_and_detected_again(scene):
     picture, poses = scene
     tracker = Tracker(CAMERA, (CUBE,))
     first = tracker.track(picture)
@@ -201,7 +201,7 @@ def test_a_target_is_followed_lost_and_found(scene):
     assert angle(state.poses["tool"].T_camera_target, poses["tool"]) < 1.0
 
 
-def test_a_picture_of_another_size_or_kind_is_refused():
+def test_tracker_rejects_image_of_other_size_or_type():
     tracker = Tracker(CAMERA, (CUBE,))
     with pytest.raises(ValueError, match="calibrate it at this size"):
         tracker.track(np.zeros((240, 320), np.uint8))

@@ -1,4 +1,4 @@
-"""Streams of poses: errors of clocks, and covariances between samples."""
+"""Streams of poses: clock errors, and covariances between samples."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from scenes.tracked.external_tracker import ExternalTracker
 
 
 @pytest.mark.parametrize(("error", "expected"), [(0.0, 0.0), (0.01, 2e-3)])
-def test_tracker_clock_error_is_in_the_covariance(error, expected):
-    """A tool at 0.2 m/s, and a clock that is known to 10 ms."""
+def test_tracker_clock_error_increases_the_covariance(error, expected):
+    """Tool at 0.2 m/s; clock error of 10 ms (standard deviation)."""
     times = np.arange(0.0, 1.0, 0.02)
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     still, none = build_pose_stream(times, poses.copy(), np.zeros((len(times), 6, 6))), np.zeros((len(times), 6, 6))
@@ -19,7 +19,7 @@ def test_tracker_clock_error_is_in_the_covariance(error, expected):
     assert np.abs(found.covariance[1:, 1:]).max() < 1e-12
 
 
-def test_pose_between_samples_weighs_their_covariances():
+def test_interpolated_pose_weights_sample_covariances():
     stream = build_pose_stream(
         np.array([0.0, 0.04]), np.tile(np.eye(4), (2, 1, 1)), np.stack([np.eye(6), 4.0 * np.eye(6)])
     )

@@ -1,4 +1,4 @@
-"""The rasteriser: against the ray cast, against analytic planes, and on the meshes that break rasterisers."""
+"""Rasteriser compared with ray casting and analytic planes, with degenerate meshes."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def build_sphere(rings: int = 40, segments: int = 60, radius: float = 0.06) -> t
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_it_sees_what_rays_see(seed):
+def test_rasteriser_matches_ray_casting(seed):
     random = np.random.default_rng(seed)
     vertices = random.uniform(-0.08, 0.08, (400, 3))
     vertices[:200] = vertices[200:] + 0.015 * random.standard_normal((200, 3))
@@ -48,8 +48,8 @@ def test_it_sees_what_rays_see(seed):
 
 
 @pytest.mark.parametrize("depth", [5e-4, 0.0, -5e-4, -0.2])
-def test_a_triangle_that_reaches_the_camera_may_cover_every_row(depth):
-    """Where a corner is nearer than the near plane, its own row says nothing: it may lie on the other side."""
+def test_triangle_crossing_near_plane_reaches_all_rows(depth):
+    """The projected row of a corner nearer than the near plane is no bound."""
     here = camera(height=41)
     corners = np.array([[-0.1, 0.02, 0.3], [0.1, 0.02, 0.3], [0.0, 0.02, depth]])
     assert find_rows_reached(corners @ here.K.T, 1e-3, here.height) == (0, here.height)
@@ -58,7 +58,7 @@ def test_a_triangle_that_reaches_the_camera_may_cover_every_row(depth):
     assert drawn.mask[-1].any() and not drawn.mask[: here.height // 2].any()
 
 
-def test_closed_surface_without_cracks_matches_ray_depth():
+def test_closed_surface_has_no_cracks_and_ray_cast_depth():
     smooth, triangles = build_sphere()
     here = camera(640, 480)
     # A crack would show the far wall, behind the sphere's middle.
@@ -71,7 +71,7 @@ def test_closed_surface_without_cracks_matches_ray_depth():
 
 
 def test_pixel_centres_on_shared_edges_and_vertices_are_covered():
-    """A grid whose every edge and vertex lies exactly on pixel centres."""
+    """Grid whose edges and vertices lie exactly on pixel centres."""
     K = np.array([[8.0, 0.0, 16.0], [0.0, 8.0, 16.0], [0.0, 0.0, 1.0]])
     here = Camera(K, np.eye(4), 33, 33)
     x, y = np.meshgrid(np.linspace(-2.0, 2.0, 9), np.linspace(-2.0, 2.0, 9), indexing="ij")
@@ -84,7 +84,7 @@ def test_pixel_centres_on_shared_edges_and_vertices_are_covered():
     assert (fragments.depth == 1.0).all()
 
 
-def test_the_nearer_surface_wins_whatever_the_order():
+def test_nearer_surface_is_visible_in_any_order():
     front = np.array([[-0.05, -0.05, -0.02], [0.05, -0.05, -0.02], [0.0, 0.05, -0.02]])
     back = front * [3.0, 3.0, -1.0]
     here = camera()
@@ -94,8 +94,8 @@ def test_the_nearer_surface_wins_whatever_the_order():
         assert fragments.depth[60, 80] == pytest.approx(0.28, abs=1e-7)
 
 
-def test_values_are_interpolated_in_space_and_not_on_the_screen():
-    """A tilted plane: the value at a pixel is the linear function of the world point that the pixel's ray meets."""
+def test_interpolation_is_perspective_correct():
+    """Tilted plane: the value at a pixel is the linear function at the point hit by its ray."""
     vertices = np.array([[-0.2, -0.2, -0.1], [0.2, -0.2, -0.1], [0.2, 0.25, 0.4], [-0.2, 0.25, 0.4]])
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     here = camera()
@@ -111,8 +111,8 @@ def test_values_are_interpolated_in_space_and_not_on_the_screen():
     assert fragments.interpolate(triangles, values)[~fragments.mask].max(initial=0.0) == 0.0
 
 
-def test_triangles_through_the_near_plane_and_behind_the_camera():
-    """A floor that starts far behind the eye: only its part beyond the near plane shows, and every ray agrees."""
+def test_triangles_are_clipped_at_the_near_plane():
+    """Floor that starts far behind the camera: only its part beyond the near plane is drawn, as by ray casting."""
     vertices = np.array([[-1.0, 0.05, -2.0], [1.0, 0.05, -2.0], [0.0, 0.05, 3.0], [0.0, 0.0, -0.4], [0.1, 0.1, -0.5]])
     triangles = np.array([[0, 1, 2], [3, 4, 0]])
     here = camera()
@@ -123,20 +123,20 @@ def test_triangles_through_the_near_plane_and_behind_the_camera():
     assert np.abs(1.0 / drawn.depth[drawn.mask] - 1.0 / cast.depth[drawn.mask]).max() < 1e-4
 
 
-def test_one_triangle_larger_than_the_picture_covers_it():
+def test_triangle_larger_than_the_image_covers_all_pixels():
     vertices = np.array([[-50.0, -50.0, 1.0], [50.0, -50.0, 1.0], [0.0, 80.0, 1.0]])
     assert rasterise(camera(), vertices, np.array([[0, 1, 2]])).mask.all()
     assert not rasterise(camera(), vertices + [200.0, 0.0, 0.0], np.array([[0, 1, 2]])).mask.any()
 
 
-def test_what_has_no_area_leaves_no_trace():
+def test_triangles_without_area_cover_no_pixel():
     line = np.array([[-0.05, 0.0, 0.0], [0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.03, 0.0]])
     assert not rasterise(camera(), line, np.array([[0, 1, 2], [0, 0, 3], [1, 1, 1]])).mask.any()
     edge_on = np.array([[0.0, 0.0, -0.1], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
     assert not rasterise(camera(), edge_on, np.array([[0, 1, 2]])).mask.any()
 
 
-def test_nothing_gives_an_empty_picture():
+def test_empty_mesh_gives_an_empty_image():
     fragments = rasterise(camera(), np.zeros((0, 3)), NO_TRIANGLES)
     assert not fragments.mask.any() and (fragments.depth == 0.0).all() and (fragments.face == -1).all()
     assert not raycast(camera(), np.zeros((0, 3)), NO_TRIANGLES).mask.any()
@@ -151,18 +151,18 @@ def test_nothing_gives_an_empty_picture():
         (np.full((3, 3), np.nan), [[0, 1, 2]], "finite"),
     ],
 )
-def test_what_is_no_mesh_is_refused(vertices, triangles, reason):
+def test_invalid_mesh_arrays_are_rejected(vertices, triangles, reason):
     with pytest.raises(ValueError, match=reason):
         rasterise(camera(), vertices, np.array(triangles))
 
 
-def test_a_near_plane_behind_the_eye_is_refused():
+def test_near_plane_at_zero_distance_is_rejected():
     with pytest.raises(ValueError, match="near"):
         rasterise(camera(), *build_sphere(), near=0.0)
 
 
 @pytest.mark.gpu
-def test_the_graphics_card_draws_the_same():
+def test_gpu_rasteriser_matches_cpu_rasteriser():
     import warp as wp
 
     if not wp.is_cuda_available():

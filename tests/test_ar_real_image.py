@@ -1,4 +1,4 @@
-"""The round field of a microscope, and enlarged images."""
+"""Circular field of a microscope, and enlarged images."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from scenes.script.viewpoint import Viewpoint
 from sim.errors import InputError
 
 
-def test_round_field_darkens_only_beyond_its_edge():
+def test_vignette_darkens_only_pixels_beyond_its_edge():
     grey = template_theatre().intensity.values
     whole, field = seen(grey), add_vignette(seen(grey), 1.0)
     row, column = np.mgrid[:240, :320]

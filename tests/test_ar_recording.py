@@ -1,4 +1,4 @@
-"""A recording of the page."""
+"""Video recording of the page."""
 
 import cv2
 import numpy as np
@@ -9,12 +9,12 @@ from ar.page.recording import FRAME_RATE, MAX_DURATION, PageRecording, replay_im
 
 
 class TestRecording:
-    def test_a_film_shows_each_picture_as_long_as_the_page_did(self):
+    def test_video_shows_each_image_for_its_page_duration(self):
         codes = [to_data_url(np.full((48, 64, 3), grey, np.uint8)) for grey in (0, 100, 200)]
         shown = list(replay_images([(5.0, codes[0]), (6.0, codes[1]), (6.2, codes[2])], 7.0, 10.0))
         assert [round(float(picture.mean()), -2) for picture in shown] == [0.0] * 10 + [100.0] * 2 + [200.0] * 8
 
-    def test_it_is_an_mp4_that_can_be_read_and_of_bounded_length(self, tmp_path):
+    def test_recording_is_readable_mp4_of_bounded_length(self, tmp_path):
         recording = PageRecording(0.0)
         for number in range(20):
             recording.take(to_data_url(np.full((48, 64, 3), 10 * number, np.uint8)), 0.1 * number)
@@ -25,6 +25,6 @@ class TestRecording:
         assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 * FRAME_RATE
         assert film.read()[1].shape == (48, 64, 3)
 
-    def test_of_nothing_there_is_no_film(self):
+    def test_empty_recording_is_rejected(self):
         with pytest.raises(ValueError, match="at least one image"):
             PageRecording(0.0).encode_video(1.0)

@@ -1,4 +1,4 @@
-"""Registration of a scan to the patient's reference: exact without noise, as sure as it says, and refused by name."""
+"""Registration of a scan to the patient's reference: accuracy, coverage and rejected input."""
 
 import numpy as np
 import pytest
@@ -34,20 +34,20 @@ def held(found):
     return away @ np.linalg.solve(covariance, away) <= chi2.ppf(0.95, 3)
 
 
-def test_a_registration_is_exact_without_noise():
+def test_registration_is_exact_without_noise():
     found = register_points(SCAN, moved(SCAN))
     np.testing.assert_allclose(found.T_patient_scan, TRUE, atol=1e-12)
     assert found.rms < 1e-12 and found.pairs == 7
 
 
 @pytest.mark.parametrize("count", [3, 4, 7])
-def test_its_ellipsoid_holds_the_tumour_as_often_as_it_says(count):
+def test_registration_ellipsoid_has_nominal_coverage(count):
     rng = np.random.default_rng(count)
     some = [register_points(SCAN[:count], moved(SCAN[:count]) + 7e-4 * rng.normal(size=(count, 3))) for _ in range(400)]
     assert 0.925 < np.mean([held(each) for each in some]) < 0.98
 
 
-def test_a_traced_surface_makes_it_surer_and_it_still_holds():
+def test_traced_surface_improves_registration_accuracy():
     rng, alone, both = np.random.default_rng(1), [], []
     towards = rng.normal(size=(60, 3)) * [0.4, 0.4, 0.2] + [0.3, 0.2, 0.8]
     surface = moved(on_ellipsoid(towards)[0])
@@ -61,7 +61,7 @@ def test_a_traced_surface_makes_it_surer_and_it_still_holds():
     assert np.mean([held(each) for each in both]) > 0.88
 
 
-def test_what_determines_no_registration_is_refused():
+def test_underdetermined_registration_is_rejected():
     patient, line = moved(SCAN), SCAN[:1] + np.linspace(0.0, 1.0, 5)[:, None] * [0.1, 0.02, 0.0]
     with pytest.raises(ValueError, match="2 pairs are too few"):
         register_points(SCAN[:2], patient[:2])
@@ -91,7 +91,7 @@ def test_what_determines_no_registration_is_refused():
         )
 
 
-def test_pair_residual_uses_registration_without_pair():
+def test_held_out_residual_uses_registration_of_other_pairs():
     patient = moved(SCAN) + 5e-4 * np.random.default_rng(3).normal(size=SCAN.shape)
     fits = compute_pair_residuals(SCAN, patient)
     for row in range(len(SCAN)):
@@ -104,7 +104,7 @@ def test_pair_residual_uses_registration_without_pair():
     )
 
 
-def test_wrong_pair_suspicion_rate_matches_docs():
+def test_wrong_pair_detection_rate_matches_docs():
     rng, sound, wrong = np.random.default_rng(0), [], []
     for number in range(300):
         patient = moved(SCAN[:6]) + 5e-4 * rng.normal(size=(6, 3))

@@ -1,4 +1,4 @@
-"""Pictures of many cameras and frames: as rays and formulas have them, alone and together, on any device."""
+"""Images of many cameras and frames compared with ray casting, formulas and single images, on any device."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def agree(one: np.ndarray, other: np.ndarray) -> float:
     return float((np.abs(one.astype(int) - other).max(axis=-1) <= 1).mean())
 
 
-def test_depth_and_segmentation_are_what_rays_see():
+def test_depth_and_segmentation_match_ray_casting():
     layers = scene()
     picture, here = render(camera(), layers, LAMP), camera()
     vertices = np.concatenate([layer.vertices for layer in layers])
@@ -69,7 +69,7 @@ def test_depth_and_segmentation_are_what_rays_see():
 
 
 def test_colours_follow_the_shading_formulas():
-    """Without texture and shadow, in NumPy: base (ambient + wrapped Lambert) + Fresnel x lobe, under the lamp's rim."""
+    """NumPy formula without texture and shadow: base (ambient + wrapped Lambert) + Fresnel x lobe."""
     here, layer, light = camera(0.0, 320, 240), ball(gloss=0.4, shininess=30.0), as_light(LAMP)
     picture, cast = render(here, [layer], LAMP), raycast(here, layer.vertices, layer.triangles)
     normals, on = compute_vertex_normals(layer.vertices, layer.triangles), cast.mask
@@ -99,8 +99,8 @@ def test_colours_follow_the_shading_formulas():
     assert inside.sum() > 1000 and agree(picture.colour[on][inside], wanted[inside]) > 0.999
 
 
-def test_what_stands_still_is_drawn_once_and_looks_the_same():
-    """Also where the shadow of what moves falls on it, and from another camera."""
+def test_cached_static_layers_render_identically():
+    """Cases: a moving layer's shadow falls on the static one, and the camera changes."""
     renderer, backdrops = Renderer(scene(still=True), LAMP), []
     here, there = camera(), camera(0.4)
     aside, middle = (0.02, 0.01, 0.02), (0.0, 0.0, 0.03)
@@ -117,15 +117,15 @@ def test_what_stands_still_is_drawn_once_and_looks_the_same():
     assert none is None and again is first is moving and first.camera is here and last.camera is there
 
 
-def test_static_scene_without_shadows_looks_the_same():
+def test_static_scene_without_shadows_renders_identically():
     for layers, moved in (([striped(), ball()], [ball().vertices]), ([striped()], [])):
         still = [replace(layers[0], still=True), *layers[1:]]
         one, other = Renderer(still, LAMP).render(camera(), moved), render(camera(), layers, LAMP)
         assert np.array_equal(one.colour, other.colour) and np.array_equal(one.depth, other.depth)
 
 
-def test_pictures_together_are_those_alone():
-    """Of several cameras and frames, or of one camera; a layer that stands still is seen by all."""
+def test_batched_images_equal_single_images():
+    """Several cameras or one, several frames, and a static layer."""
     renderer = Renderer(scene(still=True), LAMP)
     centres = [(0.0, 0.0, 0.03), (0.03, 0.0, 0.02), (-0.02, 0.02, 0.04)]
     moved = np.stack([ball(centre).vertices for centre in centres])
@@ -141,8 +141,8 @@ def test_pictures_together_are_those_alone():
     assert not np.array_equal(together.colour.numpy()[0], together.colour.numpy()[1])
 
 
-def test_rows_shared_by_threads_give_the_same_depths():
-    """As on a card, where several threads draw each triangle."""
+def test_triangles_split_over_threads_render_equal_depth():
+    """Same partition as on a GPU, with several threads per triangle."""
     here, layer = camera(), scene()[0]
     whole = rasterise_surface(here, layer.vertices, layer.triangles)
     for parts, begin, end in ((3, 0, 120), (8, 0, 120), (7, 31, 90)):
@@ -166,7 +166,7 @@ def test_rows_shared_by_threads_give_the_same_depths():
         (lambda it: it.render_batch(np.stack([ball().vertices] * 2), [camera(width=40000, height=40000)]), "too many"),
     ],
 )
-def test_what_cannot_be_drawn_together_is_refused(attempt, reason):
+def test_invalid_batch_inputs_are_rejected(attempt, reason):
     with pytest.raises(ValueError, match=reason):
         attempt(Renderer(scene(still=True), LAMP))
 
@@ -182,7 +182,7 @@ def drawn_on(device: str) -> tuple[Pictures, Picture, np.ndarray]:
 
 
 @pytest.mark.gpu
-def test_the_graphics_card_draws_the_same_pictures():
+def test_gpu_images_match_cpu_images():
     if not wp.is_cuda_available():
         pytest.skip("no CUDA device")
     (many, one, shown), (many_there, one_there, shown_there) = drawn_on("cpu"), drawn_on("cuda:0")

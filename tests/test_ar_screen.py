@@ -1,4 +1,4 @@
-"""Screens: what goes in is what lies in the folder, and nothing half-written stays."""
+"""Image and video output: complete files with the given frames, and no partial files."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ def picture(number: int = 0) -> np.ndarray:
     return colour
 
 
-def test_a_folder_holds_the_frames_as_shown(tmp_path):
+def test_frames_are_written_to_the_folder_unchanged(tmp_path):
     screen = Film(tmp_path / "deep" / "frames")
     for number in (0, 1, 12):
         screen.show(number, picture(number))
@@ -25,7 +25,7 @@ def test_a_folder_holds_the_frames_as_shown(tmp_path):
     assert np.array_equal(read_png(tmp_path / "deep" / "frames" / "frame_0012.png"), picture(12))
 
 
-def test_a_video_has_every_picture_in_its_colours(tmp_path):
+def test_video_contains_every_frame_with_its_colours(tmp_path):
     write_film(tmp_path / "film.mp4", (picture(number) for number in range(7)), 20.0)
     video = cv2.VideoCapture(str(tmp_path / "film.mp4"))
     frames = [frame for good, frame in iter(video.read, (False, None)) if good]
@@ -35,7 +35,7 @@ def test_a_video_has_every_picture_in_its_colours(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
-def test_an_animation_loops_over_every_picture(tmp_path, suffix):
+def test_animation_contains_every_frame_and_loops(tmp_path, suffix):
     write_film(tmp_path / f"film{suffix}", (picture(number) for number in range(5)), 10.0)
     good, animation = cv2.imreadanimation(str(tmp_path / f"film{suffix}"))
     assert good and len(animation.frames) == 5 and animation.loop_count == 0
@@ -44,7 +44,7 @@ def test_an_animation_loops_over_every_picture(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".gif", ".webp"])
-def test_a_film_that_fails_leaves_nothing(tmp_path, suffix):
+def test_failed_video_leaves_no_file(tmp_path, suffix):
     def broken():
         yield picture()
         raise RuntimeError("the camera is gone")
@@ -76,7 +76,7 @@ def test_invalid_output_paths_are_rejected(tmp_path):
         read_png(tmp_path / "file")
 
 
-def test_bytes_of_pictures_are_read_as_they_say_and_no_others():
+def test_image_decoders_reject_mismatched_or_damaged_bytes():
     colour, grey = np.full((6, 8, 3), [250, 10, 90], np.uint8), np.full((6, 8), 7, np.uint8)
     jpeg, png = packed("colour", colour).tobytes(), packed("labels", grey).tobytes()
     assert read_image_size(jpeg) == read_image_size(png) == (8, 6)

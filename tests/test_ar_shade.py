@@ -1,4 +1,4 @@
-"""What the lamp's light is on the way to a point."""
+"""Shadow of a lamp at a point."""
 
 import numpy as np
 import pytest
@@ -17,8 +17,8 @@ def square(half: float, height: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("more", "dark"), [(-5e-4, False), (1e-4, False), (4e-4, True), (2e-3, True)])
-def test_what_casts_a_shadow_is_nearer_to_the_lamp_by_the_bias(more, dark):
-    """Seen from the side, under a small lid that lies so much higher than the shadow map is asked."""
+def test_shadow_requires_distance_above_the_bias(more, dark):
+    """Side view below a small lid whose height above the floor is near the bias of the shadow map."""
     camera = look_at(np.array([0.3, 0.0, 0.03]), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.radians(8.0), 320, 200)
     lamp = Lamp(np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.06)
     floor = Layer("floor", PLAIN, *square(0.05, 0.0), colour=(0.8, 0.8, 0.8))

@@ -1,4 +1,4 @@
-"""What stands beside the 3-D view: slices of a scan."""
+"""Slices of a scan next to the 3-D view."""
 
 import numpy as np
 import pytest
@@ -26,8 +26,8 @@ def ball(radius: float, middle=(0.0, 0.0, 0.0), colour=(0.3, 0.95, 0.55)) -> Lay
 
 
 class TestSection:
-    def test_a_ball_is_cut_in_a_circle(self):
-        """Closed, on the plane, and of the radius that Pythagoras says."""
+    def test_plane_section_of_sphere_is_a_circle(self):
+        """Closed, in the plane, with the radius of Pythagoras' theorem."""
         layer, normal = ball(12e-3), np.array([0.6, 0.0, 0.8])
         (line,) = cut_surface(layer.vertices, layer.triangles, 5e-3 * normal, normal)
         assert np.array_equal(line[0], line[-1]) and len(line) > 30
@@ -35,14 +35,14 @@ class TestSection:
         away = np.linalg.norm(line - 5e-3 * normal, axis=1)
         assert np.allclose(away, np.sqrt(12e-3**2 - 5e-3**2), rtol=0.02)
 
-    def test_each_part_is_a_line_and_what_is_not_cut_is_none(self):
+    def test_section_has_one_line_per_intersected_part(self):
         two = [ball(5e-3), ball(5e-3, (20e-3, 0.0, 0.0))]
         vertices = np.concatenate([layer.vertices for layer in two])
         triangles = np.concatenate([two[0].triangles, two[1].triangles + len(two[0].vertices)])
         assert len(cut_surface(vertices, triangles, np.zeros(3), np.array([0.0, 0.0, 1.0]))) == 2
         assert cut_surface(vertices, triangles, np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])) == []
 
-    def test_an_open_surface_is_cut_in_an_open_line(self):
+    def test_section_of_open_surface_is_an_open_line(self):
         corners = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 0.0, -1.0]])
         (line,) = cut_surface(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
         assert sorted(line[[0, -1], 0]) == [0.0, 1.0] and len(line) == 3
@@ -50,8 +50,8 @@ class TestSection:
 
 class TestViews:
     @pytest.mark.parametrize("plane", PLANES, ids=lambda plane: plane.name)
-    def test_the_scan_is_where_its_affine_says(self, plane):
-        """A volume whose grey grows along R, A or S grows that way in the view, by as much."""
+    def test_slice_is_resampled_with_the_affine_matrix_of_the_scan(self, plane):
+        """A volume whose grey value increases along R, A or S increases by the same amount in the view."""
         for axis in range(3):
             index = np.indices((51, 51, 51))[axis] / 50.0
             scan = Solid(index.astype(np.float32), np.linalg.inv(np.array(np.diag([2e-3, 2e-3, 2e-3, 1.0]) - OFF)))
@@ -61,20 +61,20 @@ class TestViews:
             assert across == pytest.approx(wanted * plane.right[axis], abs=1.5)
             assert down == pytest.approx(wanted * plane.down[axis], abs=1.5)
 
-    def test_the_band_is_as_wide_as_the_error(self):
+    def test_error_band_has_the_width_of_the_error(self):
         inside = find_pixels_within(PLANES[0], np.zeros(3), ball(15e-3), 5e-3)
         row = np.flatnonzero(inside[VIEW_SIDE // 2])
         widths = [len(part) * PITCH for part in np.split(row, np.flatnonzero(np.diff(row) > 1) + 1)]
         assert widths == pytest.approx([10e-3, 10e-3], abs=1e-3)
 
-    def test_unknown_error_or_unreliable_place_has_no_band(self):
+    def test_unknown_error_or_unreliable_position_has_no_band(self):
         known = Cut(ball(12e-3), ball(12e-3, (2e-3, 0.0, 0.0)), 4e-3)
         green = [np.count_nonzero(tinted(view(PLANES[0], None, np.zeros(3), cut))) for cut in (
             known, Cut(known.now, known.before), Cut(known.now, known.before, 4e-3, True)
         )]  # fmt: skip
         assert green[0] > 2 * green[1] > 0 and green[2] == 0
 
-    def test_three_views_stand_side_by_side_also_of_nothing(self):
+    def test_slices_have_three_views_for_empty_surface_too(self):
         none = Layer("tumour", 4, np.zeros((0, 3)), np.zeros((0, 3), int))
         for cut in (
             Cut(ball(12e-3), ball(12e-3), 1e-3, tip=np.zeros(3), others=[ball(3e-3)]),

@@ -1,4 +1,4 @@
-"""The page in a real browser: where things are at four sizes, in register with the server's picture, and its keys."""
+"""Page in a real browser: layout at four sizes, registration with the server's image, and keys."""
 
 import threading
 
@@ -51,8 +51,8 @@ def window(demo):
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-def test_the_page_fits_and_is_in_register(demo, window, size):
-    """Nothing is cut off or complained of, and both errors are in sight; the picture is the server's to a pixel."""
+def test_page_fits_the_window_and_matches_server_image(demo, window, size):
+    """No element is cut off, both errors are visible, and the image equals the server's to one pixel."""
     window.size(*size)
     said = f"document.getElementById('{SAID}')"
     assert window.wait(f"innerWidth == {size[0]} && {said}.innerText.includes('tumour position error')")
@@ -68,7 +68,7 @@ def test_the_page_fits_and_is_in_register(demo, window, size):
 
 
 def test_physics_switches_are_visible_in_a_low_window(demo, window):
-    """The folded section is above the 3-D view, with room for five lines of a comparison."""
+    """The folded section is above the 3-D view, with room for five lines."""
     window.size(1280, 720)
     fold = (
         "[...document.querySelectorAll('legend, span, div')].findLast(e => e.innerText?.startsWith('physics effects'))"
@@ -79,8 +79,8 @@ def test_physics_switches_are_visible_in_a_low_window(demo, window):
     assert box_of(window, fold)[3] + 5 * 16 <= view[1]
 
 
-def test_keys_and_names(demo, window):
-    """Keys step, choose and open their list; a slider keeps its own; whatever can be set has a name."""
+def test_keyboard_controls_and_accessible_names_work(demo, window):
+    """Keys step, select and open their list; a slider keeps its own keys; every control has a name."""
     window.size(1280, 720)
     demo.wish.set(plays=False, number=40)
     assert wait_for(lambda: demo.browser.shown[0] == 40)

@@ -1,4 +1,4 @@
-"""Each style shows what it says: in register, under tools, broken where it is not seen through the opening."""
+"""Overlay styles: registration, occlusion by tools, and dashed lines outside the opening."""
 
 from dataclasses import replace
 
@@ -48,7 +48,7 @@ def seen(edge=0.09, *more):
 
 
 @pytest.mark.parametrize("style", DRAWN)
-def test_every_style_has_the_outline_in_register_and_a_band(style):
+def test_every_style_draws_registered_outline_and_error_band(style):
     picture, at = seen(), tumour()
     shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
     mask = compute_silhouette(CAMERA, at.vertices, at.triangles)
@@ -66,7 +66,7 @@ def test_every_style_has_the_outline_in_register_and_a_band(style):
 
 
 @pytest.mark.parametrize("style", DRAWN)
-def test_outlines_alone_cross_tools_and_nothing_a_mask(style):
+def test_only_outlines_are_drawn_over_tools(style):
     probe = ball("tool", TOOL, (0.0, 0.0, 0.012), 0.01, (0.7, 0.7, 0.7))
     picture = seen(0.09, probe)
     gauge = Gauge(np.array([0.0, 0.0, 0.001]), np.array([0.0, 0.0, -0.008]))
@@ -86,7 +86,7 @@ def test_outlines_alone_cross_tools_and_nothing_a_mask(style):
 
 
 @pytest.mark.parametrize("style", DRAWN)
-def test_outline_under_drape_is_broken(style):
+def test_outline_under_drape_is_dashed(style):
     picture, at = seen(0.0), tumour()
     shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
     mask, shut = compute_silhouette(CAMERA, at.vertices, at.triangles), picture.segmentation == DRAPE
@@ -103,14 +103,14 @@ def test_outline_under_drape_is_broken(style):
     assert (find_ink(open_to_all, compute_ink(GREEN)) & (outline > 0))[(outline > 0) & shut].mean() > 0.95
 
 
-def test_what_is_said_of_the_ground():
+def test_opening_describes_tissue_above_the_tumour():
     assert OPENING.describe({CORTEX: 95, DRAPE: 5}) == OPENING.describe({}) == ""
     assert OPENING.describe({CORTEX: 50, DRAPE: 30, 7: 20}) == "partly under the drape"
     assert OPENING.describe({CORTEX: 50, DRAPE: 20, 7: 30}) == "partly seen through bone"
     assert OPENING.describe({DRAPE: 95, CORTEX: 5}) == "under the drape"
 
 
-def test_depth_is_the_stronger_the_nearer_and_has_a_scale():
+def test_depth_style_is_stronger_when_nearer_and_has_a_scale():
     picture = seen(0.0)
     row, column = CAMERA.project(np.array([[-0.004, 0.0, -0.02]]))[0][0, ::-1].round().astype(int)
     red = []
@@ -134,7 +134,7 @@ def test_depth_is_the_stronger_the_nearer_and_has_a_scale():
     assert changed[:, 480:].sum() > 1000  # the scale, on the drape
 
 
-def test_distances_are_signed_and_end():
+def test_signed_distance_is_nan_beyond_its_limit():
     surface = tumour((0.0, 0.0, 0.0), 0.01)
     turned = replace(surface, triangles=surface.triangles[:, ::-1])
     points = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.0, 0.005, 0.0], [0.5, 0.0, 0.0]])
@@ -143,7 +143,7 @@ def test_distances_are_signed_and_end():
         assert found[:3] == pytest.approx([-0.01, 0.01, -0.005], abs=2e-4) and np.isnan(found[3])
 
 
-def test_a_panel_moves_out_of_sight_of_what_it_would_hide():
+def test_text_panel_is_placed_outside_hidden_regions():
     colour, hidden = np.full((360, 640, 3), 90, np.uint8), np.zeros((360, 640), np.uint8)
     hidden[:, :400] = 1
     lines = ["a line that is as wide as more than half of the picture, or wider", "another"]
@@ -153,12 +153,12 @@ def test_a_panel_moves_out_of_sight_of_what_it_would_hide():
     assert np.array_equal(draw_text_panel(colour, lines, sights=[np.ones_like(hidden)]), draw_text_panel(colour, lines))
 
 
-def test_a_mask_of_another_size_is_refused():
+def test_occlusion_mask_of_other_size_is_rejected():
     with pytest.raises(ValueError, match="covered"):
         composite(seen(), CAMERA, tumour(), cover=Cover(covered=np.zeros((4, 4), bool)))
 
 
-def test_cut_has_letters_at_both_ends_despite_tool():
+def test_section_has_letters_at_both_ends_next_to_a_tool():
     at = tumour((0.0, 0.0, -0.014))
     for tool in (False, True):
         picture = seen()
@@ -177,7 +177,7 @@ def test_cut_has_letters_at_both_ends_despite_tool():
         assert (letters[1][-1] > middle[0] + reach) is not tool and (letters[1][-1] < 360 or not tool)
 
 
-def test_words_at_the_head_are_broken_beside_a_tool():
+def test_header_lines_wrap_next_to_a_tool():
     tool = np.zeros((480, 640), bool)
     texts = ["FEM reference (no surrogate)", "tumour position error <= 5.7 mm (95 %), above all registration"]
     assert format_head_lines(texts, tool) == texts
@@ -189,8 +189,8 @@ def test_words_at_the_head_are_broken_beside_a_tool():
     assert format_head_lines(texts, tool) == texts  # there is no room beside it
 
 
-def test_ring_caption_keeps_clear_of_tip_number():
-    """Right under the number, it would read as its explanation."""
+def test_ring_caption_is_separated_from_the_tip_distance():
+    """Directly below the number the caption would look like its explanation."""
     at, said = tumour((0.0, 0.0, -0.014)), "rings: mm to the surface; error not known"
     tip = CAMERA.unproject(np.array([[440.0, 20.0]]), np.array([0.2]))[0]
     shown = composite(
@@ -214,8 +214,8 @@ def test_ring_caption_keeps_clear_of_tip_number():
 
 
 @pytest.mark.parametrize(("covered", "middle"), [(460, -0.014), (640, -0.014), (0, 0.3)])
-def test_a_cut_is_drawn_where_nothing_is_seen_along_it(covered, middle):
-    """A hand covers all that is seen of it, or the whole picture; or all of it lies behind the camera."""
+def test_section_inset_is_drawn_unless_the_image_is_covered(covered, middle):
+    """Cases: a hand covers all visible parts or the whole image, or all parts are behind the camera."""
     hand = np.zeros((480, 640), bool)
     hand[:, :covered] = True
     at = tumour((0.0, 0.0, middle))

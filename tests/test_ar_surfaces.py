@@ -9,7 +9,7 @@ from ar.rendering.layer import Solid
 from ar.rendering.renderer import render
 
 
-def test_two_solid_textures_are_kept_apart():
+def test_two_solid_textures_render_independently():
     other = replace(ball(), solid=Solid(np.eye(4)[:, None].repeat(3, 1), 50.0 * np.eye(4)), rest=ball().vertices)
     both = render(camera(), [striped(), other], LAMP)
     for layer in (striped(), other):

@@ -1,4 +1,4 @@
-"""Targets with faces of markers, and their corners in a picture."""
+"""Targets with marker faces, and their corners in an image."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from test_ar_pose import CUBE, PLATE
 from ar.tracking.targets import BORDER_WIDTH, build_calibration_board
 
 
-def test_faces_look_outwards_and_no_two_markers_are_alike():
+def test_faces_point_outwards_and_marker_ids_are_unique():
     for number, face in enumerate(CUBE.faces):
         into = face.T_target_face[:3, 2]
         np.testing.assert_allclose(into, -np.eye(3)[number])

@@ -1,4 +1,4 @@
-"""Free places in a picture."""
+"""Free places in an image."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from ar.overlay.text_placement import BORDER_DISTANCE, GRID_SPACING, SIDEWAYS_WE
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_free_place_is_the_nearest(seed):
-    """Held against every place on the same grid, tried one by one."""
+def test_free_place_is_nearest_to_the_requested_position(seed):
+    """Compared with a search of all places on the same grid."""
     rng = np.random.default_rng(seed)
     taken = np.zeros((120, 160), np.uint8)
     for row, column in rng.integers(0, (120, 160), (14, 2)):
@@ -38,7 +38,7 @@ def test_the_free_place_is_the_nearest(seed):
     assert far(*found) == (0 if free(*there) else min(far(*place) for place in places))
 
 
-def test_without_room_there_is_no_place():
+def test_full_image_has_no_free_place_for_text():
     taken = np.zeros((100, 200), np.uint8)
     assert find_free_place(taken, (184, 84), (0, 0)) == (BORDER_DISTANCE, BORDER_DISTANCE)
     assert find_free_place(taken, (185, 84), (0, 0)) is None and find_free_place(taken, (20, 85), (0, 0)) is None

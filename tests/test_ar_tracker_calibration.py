@@ -1,4 +1,4 @@
-"""Hand-eye: exact without noise, as sure as they say with it, and refused where motion is lacking."""
+"""Hand-eye and pivot calibration: accuracy, deviation and rejected motions."""
 
 import numpy as np
 import pytest
@@ -42,8 +42,8 @@ def test_hand_eye_is_exact_without_noise(turn, shift):
     assert found.turn < 1e-6 and found.shift < 1e-12 and found.motions > 300
 
 
-def test_hand_eye_with_a_trackers_noise_is_as_good_as_published():
-    """0.3 degrees and 0.5 mm of noise: 0.2 degrees and 0.5 mm."""
+def test_hand_eye_error_with_noise_matches_published_error():
+    """Noise of 0.3 degrees and 0.5 mm gives errors of 0.2 degrees and 0.5 mm."""
     X = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12])
     turns, shifts = [], []
     for seed in range(8):
@@ -56,7 +56,7 @@ def test_hand_eye_with_a_trackers_noise_is_as_good_as_published():
     assert np.mean(turns) < 0.25 and np.mean(shifts) < 0.6
 
 
-def test_motions_that_determine_nothing_are_refused():
+def test_underdetermined_hand_eye_motions_are_rejected():
     X = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12])
     first, second = bodies(X)
     with pytest.raises(ValueError, match=r"30 and 29 poses: give both"):
@@ -73,8 +73,8 @@ def test_motions_that_determine_nothing_are_refused():
 
 
 @pytest.mark.parametrize(("tilt", "is_parallel"), [(1.9, True), (2.2, False)])
-def test_hand_eye_axes_within_8_degrees_are_rejected(tilt, is_parallel):
-    """Turns about the z axis, tilted to both sides: the axes of motions scatter just below and just above 8 degrees."""
+def test_hand_eye_rotation_axes_within_8_degrees_are_rejected(tilt, is_parallel):
+    """Rotations about axes tilted to both sides of z scatter just below and just above 8 degrees."""
     X, rng = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12]), np.random.default_rng(1)
     axes = [Rotation.from_euler("x", side * tilt, degrees=True).apply([0.0, 0.0, 1.0]) for side in (-1.0, 1.0)]
     turns = [0.0 * axes[0], *(angle * axis for angle in np.linspace(0.5, 2.0, 8) for axis in axes)]
@@ -87,7 +87,7 @@ def test_hand_eye_axes_within_8_degrees_are_rejected(tilt, is_parallel):
         solve_hand_eye(first, second)
 
 
-def test_many_poses_are_thinned():
+def test_hand_eye_limits_the_number_of_motions():
     X = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12])
     found = solve_hand_eye(*bodies(X, count=1000))
     assert found.motions == 2000
@@ -121,7 +121,7 @@ def test_tip_deviation_matches_repeated_pivoting():
     assert np.mean([each.rms for each in found]) == pytest.approx(5e-4, rel=0.1)
 
 
-def test_too_little_pivoting_is_refused():
+def test_insufficient_pivot_motion_is_rejected():
     with pytest.raises(ValueError, match=r"9 poses are too few"):
         calibrate_pivot(pivoting(9))
     with pytest.raises(ValueError, match=r"turns by 3\.\d degrees only .*tilt the tool by 30 degrees"):

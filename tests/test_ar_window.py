@@ -1,4 +1,4 @@
-"""The window of a picture in which outlines are drawn."""
+"""Window of an image in which outlines are drawn."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from ar.rendering.raycast import raycast
 from ar.rendering.renderer import render
 
 
-def test_the_rim_is_as_wide_by_kernels_as_by_opencv():
+def test_chamfer_distance_equals_opencv_near_the_edge():
     random = np.random.default_rng(3)
     mask = np.zeros((90, 110), np.uint8)
     for row, column, radius in random.integers((20, 20, 2), (70, 90, 14), (4, 3)):
@@ -28,8 +28,8 @@ def test_the_rim_is_as_wide_by_kernels_as_by_opencv():
     assert found[~near].min() > float(SOFT_EDGE_WIDTH) - 1e-3
 
 
-def test_the_window_is_what_its_formula_says():
-    """In NumPy, pixel by pixel: dimmed round the silhouette, and darker the deeper the hidden surface lies."""
+def test_window_overlay_matches_its_numpy_formula():
+    """NumPy reference, pixel by pixel: dimmed around the silhouette, and darker for deeper surfaces."""
     here = camera()
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG, colour=(0.2, 0.9, 0.3))
     picture = render(here, [floor()], LAMP)
@@ -53,8 +53,8 @@ def test_the_window_is_what_its_formula_says():
     assert agree(shown, picture.colour) < 0.95 and not taken.any()
 
 
-def test_the_outline_runs_along_the_edge():
-    """Its ink is where the silhouette ends, a dark rim on both sides; nothing else changes, nor what stays as it is."""
+def test_overlay_outline_follows_the_silhouette_edge():
+    """The line is at the silhouette's edge with a dark rim on both sides; no other pixel changes."""
     here, ink = camera(), (40.0, 220.0, 90.0)
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG)
     picture = render(here, [floor()], LAMP)

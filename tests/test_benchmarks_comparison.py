@@ -1,4 +1,4 @@
-"""sulcus beside other packages: one routine judges all, and who is not there is said to be missing."""
+"""sulcus compared with other packages by one evaluation, with missing packages reported."""
 
 import json
 from dataclasses import replace
@@ -62,20 +62,20 @@ def engine(folder, name, code):
     return Engine(name, "spoilt", (), (str(script),))
 
 
-def test_every_peer_can_be_named():
+def test_peer_list_matches_the_command_choices():
     assert tuple(peer.name for peer in PEERS) == NAMES
     assert all(peer.words[0].endswith(".py") and Path(peer.words[0]).exists() for peer in PEERS)
 
 
-def test_a_case_holds_what_slides_and_carries_the_whole_push(box, case):
+def test_comparison_case_fixes_sliding_nodes_and_keeps_force(box, case):
     assert case.held.sum() == (box.fixed.any(axis=1) | box.slide_normal.any(axis=1)).sum() > 0
     assert not case.held.all()
     total = np.linalg.norm(case.force.sum(axis=1), axis=1)
     assert ((total > 0.04) & (total < 0.41)).all()
 
 
-def test_every_answer_is_judged_by_one_routine(case, judge, tmp_path):
-    """An engine that is wrong, one that fails and one that dies count for nothing, and do not stop the others."""
+def test_invalid_and_failed_engines_get_no_good_result(case, judge, tmp_path):
+    """An engine with wrong results, one that fails and one that crashes do not stop the others."""
     engines = (
         OWN,
         engine(tmp_path, "wrong", WRONG),
@@ -98,7 +98,7 @@ def test_every_answer_is_judged_by_one_routine(case, judge, tmp_path):
     assert "pip install -e" in absent.missing and not absent.answers
 
 
-def test_the_command_says_it_in_json(box, tmp_path, capsys):
+def test_solver_command_prints_json_rows(box, tmp_path, capsys):
     write_anatomy(tmp_path / "box.vtu", box)
     words = ["solver", "--mesh", str(tmp_path / "box.vtu"), "--loads", "2", "--starts", "1", "--json"]
     assert main(words) == 0
@@ -114,7 +114,7 @@ def test_the_command_says_it_in_json(box, tmp_path, capsys):
     assert "2 of 2" in said.err
 
 
-def test_each_row_names_the_tolerance_that_it_was_asked_for(box, tmp_path, capsys):
+def test_each_row_states_its_requested_tolerance(box, tmp_path, capsys):
     write_anatomy(tmp_path / "box.vtu", box)
     words = ["--mesh", str(tmp_path / "box.vtu"), "--loads", "2", "--starts", "1", "--peers", "tled"]
     assert main(["solver", *words, "--tolerance", "1e-3", "1e-10"]) == 0
@@ -127,8 +127,8 @@ def test_each_row_names_the_tolerance_that_it_was_asked_for(box, tmp_path, capsy
 
 @pytest.mark.parametrize("name", ["tled", "modified-newton", "scikit-fem"])
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-10])
-def test_a_peer_finds_the_same_field(case, judge, name, tolerance):
-    """Each engine stops at the tolerance that is asked for, near the reference by so much."""
+def test_peer_engine_finds_the_same_displacement(case, judge, name, tolerance):
+    """Each engine stops at the requested tolerance, near the reference solution."""
     peer = next(peer for peer in PEERS if peer.name == name)
     if peer.missing:
         pytest.skip(peer.missing)
@@ -144,7 +144,7 @@ def test_a_peer_finds_the_same_field(case, judge, name, tolerance):
     )
 
 
-def test_ours_and_tled_alone_go_to_the_graphics_card():
+def test_only_sulcus_and_tled_run_on_the_gpu():
     moved = {engine.name for engine in (OWN, *PEERS) if engine.on("cuda").words == (*engine.words, "cuda")}
     assert moved == {"sulcus", "tled"}
     assert all(engine.on("cpu") == engine for engine in (OWN, *PEERS))
@@ -153,14 +153,14 @@ def test_ours_and_tled_alone_go_to_the_graphics_card():
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
-def test_tled_finds_the_same_field_on_a_graphics_card(case, judge):
+def test_tled_on_gpu_finds_the_same_displacement(case, judge):
     tled = next(peer for peer in PEERS if peer.name == "tled")
     for row in compared(case, judge, OWN.on("cuda"), tled.on("cuda")):
         assert [answer.reason for answer in row.answers] == [""] * len(case.force)
         assert all(answer.good and answer.apart < 1e-4 for answer in row.answers)
 
 
-def test_tled_of_other_law_or_early_end_is_detected(case, judge, tmp_path):
+def test_tled_with_other_law_or_few_steps_is_detected(case, judge, tmp_path):
     other = engine(tmp_path, "other", EXPLICIT + "serve(lambda case: set_up(replace(case, lam=1.001 * case.lam)))")
     hasty = engine(tmp_path, "hasty", EXPLICIT + "peer_tled.STEPS = 50; serve(set_up)")
     bold = engine(tmp_path, "bold", EXPLICIT + "peer_tled.SAFETY = 1.9; serve(set_up)")
@@ -182,10 +182,10 @@ def test_tled_of_other_law_or_early_end_is_detected(case, judge, tmp_path):
         ("--tolerance", "nan"),
     ],
 )
-def test_bad_input_is_a_sentence(words, capsys):
+def test_solver_bench_rejects_invalid_input(words, capsys):
     assert main(["solver", *words]) == 2
     assert words[1] in capsys.readouterr().err
 
 
-def test_ours_and_the_judge_solve_the_peers_linear_tetrahedra(case):
+def test_comparison_case_uses_linear_tetrahedra(case):
     assert fem_of(case).space.element == "p1"

@@ -1,4 +1,4 @@
-"""The benches: what they measure is what they say, and an interrupted trial goes on."""
+"""Element benchmarks: their statistics, and resuming of an interrupted trial."""
 
 import json
 import re
@@ -27,8 +27,8 @@ def anatomy():
     return coarse_brain()
 
 
-def test_medians_leave_the_warm_up_aside(monkeypatch):
-    """By a clock of its own: calls take 100 s while they warm up, and 1, 2, ... 20 s afterwards."""
+def test_timing_statistics_exclude_warm_up(monkeypatch):
+    """Simulated clock: 100 s for each warm-up call, then 1, 2, ... 20 s."""
     now, calls = [0.0], []
     monkeypatch.setattr(measurement.time, "perf_counter", lambda: now[0])
 
@@ -41,8 +41,8 @@ def test_medians_leave_the_warm_up_aside(monkeypatch):
     assert (row.median, row.p95, row.runs) == (pytest.approx(10.5e3), pytest.approx(19.05e3), 20)
 
 
-def test_soft_tissue_locks_linear_elements_alone():
-    """Nearly incompressible: the linear element loses half of the motion, the others little."""
+def test_nearly_incompressible_tissue_locks_only_p1_elements():
+    """Nearly incompressible tissue: P1 elements lose half of the motion, the others little."""
     anatomy = make_box(cells=(6, 6, 4), spacing=12e-3, tumour=12e-3, opening=45e-3)
     press = Press(law="linear", force=0.02, footprint=12e-3)
     found = list(rows([anatomy], ["p1", "smoothed"], [0.495], press, "cpu"))
@@ -65,7 +65,7 @@ def test_p2_contact_force_depends_less_on_mesh_than_p1():
     assert known.share == pytest.approx(0.2) and known.scatter == pytest.approx(0.2 / 1.2)
 
 
-def test_the_limit_is_that_of_a_second_order_error():
+def test_limit_is_extrapolated_with_second_order_error():
     row = Row(
         poisson=0.45, element="p2", vertices=1000, nodes=7000, motion=0.0, set_up=1.0, solve=1.0, outer=4, good=True
     )
@@ -76,14 +76,14 @@ def test_the_limit_is_that_of_a_second_order_error():
     assert limits([series[0], replace(series[1], good=False)]) == {}
 
 
-def test_half_of_the_loads_are_brutal_and_none_is_lost():
+def test_load_shares_are_half_brutal_and_sum_to_count():
     for count in (2, 7, 60, 10_000):
         assert sum(shares(count).values()) == count
         assert shares(count)["brutal"] == count // 2
     assert list(shares(100)) == list(SETS)
 
 
-def test_the_tally_counts_what_happened():
+def test_tally_counts_recorded_outcomes():
     one = Record(
         preset="brutal",
         number=0,
@@ -110,7 +110,7 @@ def test_the_tally_counts_what_happened():
     assert all(Outcome[record.outcome] for record in found)
 
 
-def test_an_interrupted_trial_goes_on(tmp_path, capsys):
+def test_interrupted_robustness_trial_resumes(tmp_path, capsys):
     write_anatomy(tmp_path / "brain.vtu", make_box((7, 7, 4), 8e-3, depth=18e-3))
     words = ["robust", "--anatomy", str(tmp_path / "brain.vtu"), "--count", "12", "--batch", "4"]
     out = tmp_path / "loads.csv"
@@ -144,15 +144,15 @@ def test_an_interrupted_trial_goes_on(tmp_path, capsys):
         ),
     ],
 )
-def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+def test_element_benches_reject_invalid_input(words, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main([*words]) == 2
     assert reason in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_random_loads_converge(anatomy):
-    """Half of them far beyond surgery; on the template, to 1e-4 in single precision."""
+def test_random_surgical_and_brutal_loads_converge(anatomy):
+    """Half of the loads are far above surgical ones; template to 1e-4 in single precision."""
     effects = (Elasticity(), Held(), Slide(), ToolForce())
     found = [record for some in records(Trial(anatomy, effects, "p1", "cpu", 30), 60, 1, ()) for record in some]
     assert len(found) == 60
@@ -164,7 +164,7 @@ def test_random_loads_converge(anatomy):
     assert max(checked) <= 1.1e-4
 
 
-def test_bench_contact_prints_what_its_columns_are(tmp_path, capsys):
+def test_contact_bench_prints_its_column_descriptions(tmp_path, capsys):
     path = tmp_path / "box.vtu"
     write_anatomy(path, make_box(cells=(5, 5, 3), spacing=8e-3, tumour=12e-3, opening=34e-3))
     words = ["contact", "--anatomy", str(path), "--device", "cpu", "--elements", "p1", "--ball", "8"]

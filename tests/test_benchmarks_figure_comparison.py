@@ -1,4 +1,4 @@
-"""`python -m benchmarks all`: what a record lacks compared with another one."""
+"""`python -m benchmarks all`: figures missing from a record, and former command names."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ from test_benchmarks_figure_record import entry, put
 from benchmarks.__main__ import main
 
 
-def test_what_the_new_record_lacks_is_said(tmp_path, capsys):
+def test_missing_figures_of_new_record_are_reported(tmp_path, capsys):
     gone = replace(entry(a=1.0), name="a-figure-of-last-year")
     old = put(tmp_path / "old.json", entry(a=1.0, b=1.0), entry("stages-cpu", a=2.0), gone)
     words = ["all", "--against", old, "--from"]
@@ -22,7 +22,7 @@ def test_what_the_new_record_lacks_is_said(tmp_path, capsys):
     assert "no longer measured as before: live-cpu: it has no number for b\n" in capsys.readouterr().out
 
 
-def test_record_of_the_former_command_is_compared(tmp_path, capsys):
+def test_record_of_former_command_name_is_compared(tmp_path, capsys):
     new, old = put(tmp_path / "new.json", entry(a=1.0)), tmp_path / "old.json"
     old.write_text(
         Path(new).read_text().replace("python -m benchmarks live", "sulcus bench live").replace("1.0", "1.2")

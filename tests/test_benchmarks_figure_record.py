@@ -1,4 +1,4 @@
-"""`python -m benchmarks all`: figures in processes of their own, records, tables of pages, and what got slower."""
+"""`python -m benchmarks all`: processes of figures, records, tables on pages, and slower numbers."""
 
 import json
 import re
@@ -45,7 +45,7 @@ def brain(tmp_path_factory):
     return path
 
 
-def test_failed_and_skipped_figures_resume(brain, tmp_path, capsys, monkeypatch):
+def test_failed_and_skipped_figures_are_measured_on_resume(brain, tmp_path, capsys, monkeypatch):
     out = tmp_path / "new.json"
     names = ("elements-limit-cpu", "live-cuda", "throughput-cpu")
     for name in names:  # small counts, as nobody waits for more
@@ -107,7 +107,7 @@ def terminable():
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_what_is_measured_is_kept_when_a_run_is_stopped(number, tmp_path, capsys, monkeypatch, terminable):
+def test_stopped_run_keeps_its_measurements(number, tmp_path, capsys, monkeypatch, terminable):
     asked = []
 
     def run(command, folder, heard):
@@ -131,8 +131,7 @@ def test_what_is_measured_is_kept_when_a_run_is_stopped(number, tmp_path, capsys
     assert out.read_bytes() == before and list(tmp_path.iterdir()) == [out] and set(asked) == {"live"}
 
 
-def test_a_run_that_is_stopped_ends_what_it_started(tmp_path):
-    """No bench goes on that nobody waits for."""
+def test_interrupted_run_ends_its_child_process(tmp_path):
     said = []
 
     def heard(line):
@@ -178,13 +177,13 @@ def said_by(script, figure=NAMED["live-cpu"], before=None, **more):
         ("print(SAID)\nsys.exit(1)", "missed", "not all that it measures came out as it asks"),
     ],
 )
-def test_however_a_process_ends_its_entry_says_it(script, state, reason):
+def test_record_entry_states_outcome_and_reason(script, state, reason):
     found = said_by(f"SAID = {spoken(NAMED['live-cpu'])!r}\n{script}")
     assert found.state == state and reason in found.reason and bool(found.reason) == bool(reason)
     assert bool(found.values) == (state in ("measured", "missed"))
 
 
-def test_a_bench_works_in_a_folder_of_its_own(tmp_path, monkeypatch):
+def test_benchmark_process_runs_in_a_temporary_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     script = "open('growth.png', 'w'); print(*sys.argv[1:], file=sys.stderr)\nsys.exit(2)"
     found = said_by(script, anatomy=Path("box.vtu"), quick=True)
@@ -193,7 +192,7 @@ def test_a_bench_works_in_a_folder_of_its_own(tmp_path, monkeypatch):
     assert "box.vtu" not in found.command  # of another folder tomorrow
 
 
-def test_what_a_process_started_ends_with_it(tmp_path):
+def test_background_children_end_with_their_process(tmp_path):
     script = (
         "import subprocess, sys; print(subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(99)']).pid)"
     )
@@ -202,7 +201,7 @@ def test_what_a_process_started_ends_with_it(tmp_path):
     assert gone(int(ended.output))
 
 
-def test_recorded_numbers_stay_without_a_new_measurement():
+def test_recorded_entry_is_kept_when_modules_are_missing():
     gone = Figure("live-cpu", "live", "cpu", LIVE, modules=("no_such_module",))
     before = entry(median=3.0, origin=replace(HERE, machine="another"))
     assert said_by("sys.exit(2)", gone, before) is before
@@ -210,7 +209,7 @@ def test_recorded_numbers_stay_without_a_new_measurement():
     assert said_by("sys.exit(2)", before=before).state == "failed"  # of another machine, so measured anew
 
 
-def test_number_is_found_by_the_names_of_its_row():
+def test_figure_number_is_selected_by_the_names_of_its_row():
     said = {"rows": [{"engine": "tled", "x": 1.0}, {"engine": "felupe 11.3", "x": True}, {"engine": "b", "x": -1.0}]}
     assert number_at(said, ("rows", {"engine": "tled"}, "x")) == 1.0
     assert number_at({"rows": [{"engine": "felupe 11.3", "x": 2}]}, ("rows", {"engine": "felupe"}, "x")) == 2.0
@@ -220,7 +219,7 @@ def test_number_is_found_by_the_names_of_its_row():
     assert number_at({"rows": 2 * said["rows"]}, ("rows", {"engine": "tled"}, "x")) is None
 
 
-def test_slower_numbers_are_named_and_fail(tmp_path, capsys):
+def test_slower_numbers_are_reported_with_exit_code_1(tmp_path, capsys):
     old = put(tmp_path / "old.json", entry(a=1.0, b=1.0), entry("stages-cpu", a=2.0))
     new = put(tmp_path / "new.json", entry(a=1.2, b=1.05), entry("stages-cpu", a=1.0))
     assert main(["all", "--from", new, "--against", old]) == 1
@@ -249,13 +248,13 @@ def test_slower_numbers_are_named_and_fail(tmp_path, capsys):
         ("same", 10.0, 10.9, False),
     ],
 )
-def test_worse_is_worse_by_more_than_a_tenth(better, old, new, worse):
+def test_change_above_ten_percent_counts_as_worse(better, old, new, worse):
     before, after = (replace(entry(), values=(Value("x", number, "", better),)) for number in (old, new))
     found = compared(record_of(HERE, [before]), record_of(HERE, [after]))
     assert bool(found.worse) is worse and len(found.changes) == 1
 
 
-def test_what_differs_besides_is_said(tmp_path, capsys):
+def test_differing_machine_version_and_command_are_reported(tmp_path, capsys):
     elsewhere = replace(HERE, machine="another machine", version="0.0.9")
     other = replace(entry("stages-cpu", a=9.0), command="python -m benchmarks stages slide")
     old = put(tmp_path / "old.json", entry(a=1.0, origin=elsewhere), other, entry("robust-cuda", a=1.0))
@@ -294,7 +293,7 @@ def damaged(whole):
 
 
 @pytest.mark.parametrize("kind", damaged(""))
-def test_a_damaged_record_is_one_sentence(kind, tmp_path, capsys):
+def test_damaged_record_is_rejected_with_one_line(kind, tmp_path, capsys):
     good = put(tmp_path / "good.json", entry(a=1.25))
     bad = tmp_path / "bad.json"
     bad.write_text(damaged(Path(good).read_text())[kind])
@@ -309,7 +308,7 @@ def test_a_damaged_record_is_one_sentence(kind, tmp_path, capsys):
 PAGE = "# Page\n\n<!-- bench: live-cpu stages-cpu -->\nold\n<!-- end -->\n\nBy hand: | 1 |\n"
 
 
-def test_tables_are_rewritten_only_between_marks(tmp_path, capsys):
+def test_tables_are_rewritten_only_between_markers(tmp_path, capsys):
     page, record = tmp_path / "page.md", put(tmp_path / "new.json", entry(a=0.01234, b=19183.0))
     page.write_text(PAGE)
     words = ["all", "--tables", str(page), "--from", record]
@@ -342,7 +341,7 @@ def test_tables_are_rewritten_only_between_marks(tmp_path, capsys):
         (PAGE.replace("live-cpu", "lively"), "'lively', which is no figure: choose from throughput-cpu"),
     ],
 )
-def test_a_page_that_is_marked_wrongly_is_left_alone(text, reason, tmp_path, capsys):
+def test_page_with_invalid_markers_is_unchanged(text, reason, tmp_path, capsys):
     page = tmp_path / "page.md"
     page.write_text(text)
     record = put(tmp_path / "new.json", entry(a=1.0))
@@ -362,7 +361,7 @@ def test_a_page_that_is_marked_wrongly_is_left_alone(text, reason, tmp_path, cap
         (["--against", "none.json"], "no such file"),
     ],
 )
-def test_bad_input_is_a_sentence(words, reason, tmp_path, monkeypatch, capsys):
+def test_figure_command_rejects_invalid_input(words, reason, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(figure_runs, "run_to_end", lambda *asked: pytest.fail("it measures"))
     put(tmp_path / "new.json", entry(a=1.0))
@@ -371,14 +370,14 @@ def test_bad_input_is_a_sentence(words, reason, tmp_path, monkeypatch, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["new.json"]
 
 
-def test_only_figures_that_there_are(capsys):
+def test_unknown_figure_name_is_rejected(capsys):
     with pytest.raises(SystemExit) as end:
         main(["all", "--only", "lively-cpu"])
     said = capsys.readouterr().err
     assert end.value.code == 2 and "'lively-cpu'" in said and "live-cpu" in said
 
 
-def test_the_tables_of_the_page_are_marked_as_they_are_written(tmp_path):
+def test_figures_page_changes_only_between_its_markers(tmp_path):
     page = shutil.copy(HOUSE / "docs/notes/figures.md", tmp_path)
     words = ["--from", put(tmp_path / "new.json", entry(a=1.0))]
     assert main(["all", "--tables", page, *words]) == 0
@@ -389,7 +388,7 @@ def test_the_tables_of_the_page_are_marked_as_they_are_written(tmp_path):
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
 @pytest.mark.parametrize("words", [["OLD=a.json", "NEW=b.json"], ["a.json", "b.json"]])
-def test_make_calls_it(words, tmp_path):
+def test_make_target_runs_the_figure_comparison(words, tmp_path):
     for name in ("a.json", "b.json"):
         (tmp_path / name).touch()
     make = ["make", "-n", "-f", str(HOUSE / "Makefile"), "-o", ".venv/.installed", "bench-check", *words]

@@ -1,4 +1,4 @@
-"""The list of figures: every command parses, its numbers are what its bench gives, no bench of a page is missing."""
+"""List of figures: commands parse, numbers exist in the results, and pages name no other benchmark."""
 
 import re
 from dataclasses import fields
@@ -32,7 +32,7 @@ ROWS = {
 
 
 @pytest.mark.parametrize("name", NAMED)
-def test_every_command_parses(name):
+def test_every_figure_command_parses(name):
     figure = NAMED[name]
     parser = make_parser(figure.command.split()[0])
     for quick in (False, True):
@@ -44,8 +44,8 @@ def test_every_command_parses(name):
             assert bool(given) == taken and (not taken or "brain.vtu" in str(given))
 
 
-def test_every_number_is_a_field_of_its_bench():
-    """The commands parse; here, what is read of their answers is what they answer."""
+def test_every_figure_number_is_a_field_of_its_bench():
+    """Numbers read from results are fields of these results."""
     for figure in FIGURES:
         row = ROWS[figure.command.split()[0]]
         known = {field.name for field in fields(row)} | {
@@ -67,7 +67,7 @@ def test_every_number_is_a_field_of_its_bench():
     assert len(stated) == 2 * len(SHORTCUTS) + 2 and not [pair for pair in stated if pair not in done]
 
 
-def test_every_bench_that_the_pages_state_is_a_figure():
+def test_every_bench_on_the_pages_has_a_figure():
     measured = {figure.command.split()[0] for figure in FIGURES}
     stated = set()
     for name in ("figures.md", "solver_speed.md"):

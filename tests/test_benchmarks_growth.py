@@ -1,4 +1,4 @@
-"""`python -m benchmarks growth`: rows, the plot, and a run that goes on where it was stopped."""
+"""`python -m benchmarks growth`: rows, the plot, and resuming of a stopped run."""
 
 import json
 from dataclasses import replace
@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_a_row_is_what_was_solved(folder):
+def test_growth_row_describes_the_solved_case(folder):
     row = measured(Trial("p1", "cpu", folder), 2000, 2)
     assert (row.preconditioner, row.batch, row.loads, row.converged) == ("sparse factor", 2, LOADS, LOADS)
     assert 1900 < row.nodes < 2100 and row.tets > 4 * row.nodes
@@ -46,8 +46,8 @@ def test_a_row_is_what_was_solved(folder):
     assert 0.05 < row.memory < 20.0 and row.card == row.foreseen == 0.0
 
 
-def test_what_is_measured_is_not_measured_again(folder, tmp_path, monkeypatch, capsys):
-    """The first row is taken from the record; the other is measured in a process of its own."""
+def test_recorded_rows_are_not_measured_again(folder, tmp_path, monkeypatch, capsys):
+    """The first row comes from the record; the other is measured in a separate process."""
     words = ["growth", "--sizes", "2000", "--batch", "1", "2", "--device", "cpu"]
     out = folder / "growth.png"
     asked = []
@@ -76,15 +76,15 @@ def test_what_is_measured_is_not_measured_again(folder, tmp_path, monkeypatch, c
     assert "growth.png: exists. Give --force" in capsys.readouterr().err
 
 
-def test_each_row_has_a_process_of_its_own(folder):
-    """What it refuses comes back as it is."""
+def test_child_process_error_is_raised_in_the_parent(folder):
+    """An error in the process is raised unchanged in the parent."""
     said = []
     with pytest.raises(InputError, match="no element"):
         list(rows(Trial("abacus", "cpu", folder), [2000], [1], [], said.append))
     assert said == ["2000 nodes, the mesh", "2000 nodes, batch of 1"]
 
 
-def test_the_switch_is_marked_between_the_sizes_beside_it():
+def test_plot_marks_the_change_of_preconditioner():
     large = replace(ROW, size=8000, nodes=8000, preconditioner="algebraic multigrid, 3 levels")
     larger = replace(large, nodes=32000, preconditioner="algebraic multigrid, 4 levels")
     seconds, memory = panels([ROW, large, larger])
@@ -103,7 +103,7 @@ def test_the_switch_is_marked_between_the_sizes_beside_it():
         (["--out", "growth.txt"], ".png"),
     ],
 )
-def test_bad_input_is_a_sentence(words, reason, capsys, tmp_path, monkeypatch):
+def test_growth_bench_rejects_invalid_input(words, reason, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["growth", *words]) == 2
     assert reason in capsys.readouterr().err

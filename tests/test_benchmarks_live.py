@@ -1,4 +1,4 @@
-"""The bench of live frames: the tool moves as it says, each frame starts from the last, errors are seen."""
+"""Benchmark of live frames: tool motion, warm start and measured errors."""
 
 import json
 from dataclasses import replace
@@ -27,7 +27,7 @@ def site():
     return build_craniotomy_frame(make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3))
 
 
-def test_wandering_path_has_one_speed_within_circle():
+def test_tool_path_has_constant_speed_within_circle():
     times = np.arange(0.0, 60.0, 0.01)
     path = stroke_cortex(0.25, 10e-3, 20e-3)
     places = np.array([(touch.x, touch.y) for touch in map(path, times.tolist())])
@@ -42,7 +42,7 @@ def test_wandering_path_has_one_speed_within_circle():
     assert len(sector) == 16
 
 
-def test_the_tool_presses_where_it_moves(site):
+def test_tool_presses_at_each_path_position(site):
     found = loads_of(RIDES[0], SCENE, site, 20)
     assert len(found) == WARM_UP + 20
     pushed = [load.get(Pushed) for load in found]
@@ -51,7 +51,7 @@ def test_the_tool_presses_where_it_moves(site):
     assert np.median(steps) == pytest.approx(20e-3 / 30.0, rel=0.01)
 
 
-def test_frames_start_from_last_and_first_do_not_count(site, pretender):
+def test_frames_start_from_last_result_and_skip_warm_up(site, pretender):
     starts = []
 
     class Watched:
@@ -67,7 +67,7 @@ def test_frames_start_from_last_and_first_do_not_count(site, pretender):
     assert all(frame.seconds > 0.0 for frame in frames)
 
 
-def test_an_error_is_seen(site):
+def test_errors_measure_a_known_displacement_error(site):
     fem = live.live_fem(SCENE, site, "cpu", "p1")
     load = loads_of(Ride("weak", 0.1, 10e-3), SCENE, site, 1)[-1]
     answer = fem.deform(load)
@@ -78,7 +78,7 @@ def test_an_error_is_seen(site):
     assert off[1] == pytest.approx(5e-4, abs=off[0])
 
 
-def test_the_tally_counts_what_happened(site, pretender):
+def test_tally_summarises_frame_times_and_outcomes(site, pretender):
     load = loads_of(RIDES[0], SCENE, build_craniotomy_frame(pretender.anatomy), 1)[-1]
     answer = pretender.deform(load)
     frames = [Frame(load, answer, 1e-3 * number) for number in range(1, 101)]
@@ -91,7 +91,7 @@ def test_the_tally_counts_what_happened(site, pretender):
     assert not tally(RIDES[0], [*frames, Frame(load, lost, 1.0)], np.zeros(1)).good
 
 
-def test_the_command_tells_every_tool(site, tmp_path, capsys, monkeypatch):
+def test_live_command_reports_every_tool(site, tmp_path, capsys, monkeypatch):
     write_anatomy(tmp_path / "box.vtu", site.anatomy)
     words = ["live", "--anatomy", str(tmp_path / "box.vtu"), "--frames", "3", "--checked", "2"]
     assert main([*words, "--device", "cpu", "--json"]) == 0
@@ -107,7 +107,7 @@ def test_the_command_tells_every_tool(site, tmp_path, capsys, monkeypatch):
     assert "| palpation | 3 |" in capsys.readouterr().out
 
 
-def test_bad_input_is_a_sentence(tmp_path, capsys):
+def test_live_bench_rejects_invalid_input(tmp_path, capsys):
     assert main(["live", "--frames", "3", "--checked", "4"]) == 2
     assert "--checked 4" in capsys.readouterr().err
     assert main(["live", "--frames", "0"]) == 2

@@ -1,4 +1,4 @@
-"""The script that reads another group's liver, held against a folder of that form with a box in it."""
+"""Script for a published liver data set, tested with a box in a folder of that form."""
 
 import importlib.util
 import sys
@@ -83,7 +83,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_forces_and_positions_are_found_from_clouds_alone(script, folder, capsys):
+def test_forces_and_positions_are_estimated_from_point_clouds(script, folder, capsys):
     assert script.sequences_of(folder) == ["linear/s1"] and script.main([str(folder)]) == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("| linear"))
     cells = line.split("|")
@@ -92,7 +92,7 @@ def test_forces_and_positions_are_found_from_clouds_alone(script, folder, capsys
     assert "0.8 - 1.2 s" in cells[6]
 
 
-def test_a_folder_that_is_none_is_named(script, tmp_path, folder, capsys):
+def test_folder_without_sequences_is_rejected(script, tmp_path, folder, capsys):
     assert script.main([str(tmp_path)]) == 2 and "holds no sequences" in capsys.readouterr().err
     assert script.main([str(folder), "--sequences", "linear/s9"]) == 2
     assert "Give the folder data/liver" in capsys.readouterr().err

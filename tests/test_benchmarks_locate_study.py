@@ -1,4 +1,4 @@
-"""Twin experiments: rivals on motions that are known by formula, figures by hand, and twins that are kept."""
+"""Synthetic test cases (twins) for `locate`: rival estimators, statistics and stored cases."""
 
 import json
 from dataclasses import replace
@@ -76,7 +76,7 @@ def scatter_columns(count, seed=0):
     return np.random.default_rng(seed).uniform(0.0, 0.08, (count, 3))
 
 
-def test_the_best_rigid_motion_is_one(tumour):
+def test_rigid_estimator_recovers_a_rigid_motion(tumour):
     rest = scatter_columns(30)
     turn = Rotation.from_rotvec([0.02, -0.05, 0.03])
 
@@ -86,7 +86,7 @@ def test_the_best_rigid_motion_is_one(tumour):
     assert rigid(tumour)(rest, motion(rest)) == pytest.approx(motion(tumour), abs=1e-12)
 
 
-def test_thin_plates_go_on_linearly_and_smooth_noise_away(tumour):
+def test_thin_plates_extrapolate_linearly_and_smooth_noise(tumour):
     rest = scatter_columns(40)
 
     def motion(at):
@@ -100,7 +100,7 @@ def test_thin_plates_go_on_linearly_and_smooth_noise_away(tumour):
     assert thin_plates(rest)(rest, wavy) == pytest.approx(wavy, abs=1e-4)
 
 
-def test_kelvinlets_match_kelvin_far_and_are_symmetric():
+def test_kelvinlets_equal_kelvin_solution_and_are_symmetric():
     """Kelvin 1848: u = (1 / r) ((3 - 4 nu) I + r r^T / r^2) f / (16 pi mu (1 - nu)), times 4 pi mu."""
     nu, arm = 0.49, np.array([0.3, -0.2, 0.4])
     found = compute_kelvinlets(arm[None], np.zeros((1, 3)), 1e-4, nu)[0, :, 0]
@@ -112,8 +112,8 @@ def test_kelvinlets_match_kelvin_far_and_are_symmetric():
     assert whole == pytest.approx(whole.T) and np.linalg.eigvalsh(whole).min() > 0.0
 
 
-def test_forces_at_the_points_are_found_again(tumour):
-    """All but what the ridge takes; forces that differ along each axis, so that no axis is mistaken for another."""
+def test_kelvinlet_estimator_recovers_point_forces(tumour):
+    """Recovered except for the ridge term; forces differ along each axis, which detects swapped axes."""
     rest = scatter_columns(12)
     force = np.random.default_rng(2).standard_normal((12, 3)) * [1e-5, 2e-5, 3e-5]
     seen, there = (np.einsum("nivj,ni->vj", compute_kelvinlets(at, rest, 10e-3, 0.49), force) for at in (rest, tumour))
@@ -124,7 +124,7 @@ def test_forces_at_the_points_are_found_again(tumour):
     assert np.abs(kelvin_forces(tumour)(twice, torn)).max() < 1e-3
 
 
-def test_soft_springs_follow_and_stiff_springs_hold(body):
+def test_spring_estimator_depends_on_skull_stiffness(body):
     motion = np.cross([0.02, 0.01, -0.03], body.mesh.nodes - body.mesh.nodes.mean(axis=0)) + [1e-3, 2e-3, -3e-3]
     seen, true = observed(body, motion, PointsSeen(40, 60, 0), (0,)), motion[body.tumour_nodes]
     found = springs(body, skull=1.0, point=100.0)(seen.rest, seen.now - seen.rest)
@@ -133,8 +133,8 @@ def test_soft_springs_follow_and_stiff_springs_hold(body):
     assert 0.05 < np.linalg.norm(held, axis=1).mean() / np.linalg.norm(true, axis=1).mean() < 0.9
 
 
-def test_on_stiff_springs_compliance_is_that_of_held_tissue(body):
-    """As the finite elements have it, of linear tissue under a force at one vertex."""
+def test_stiff_spring_compliance_matches_bonded_fem(body):
+    """Reference: finite elements of linear tissue with a force at one vertex."""
     cortex = np.unique(body.open_surface)
     force = np.zeros((1, len(body.mesh.nodes), 3))
     force[0, cortex[7]] = [0.0, 0.02, -0.01]
@@ -145,7 +145,7 @@ def test_on_stiff_springs_compliance_is_that_of_held_tissue(body):
     assert found == pytest.approx(true.displacement[0, np.append(cortex, body.tumour_nodes)], rel=1e-3, abs=1e-8)
 
 
-def test_the_oracle_finds_what_its_shapes_can_make(locator, body):
+def test_oracle_reproduces_motions_of_its_shapes(locator, body):
     motion = some_motion(locator, 1)
     assert oracle(locator.prior, motion) == pytest.approx(motion[body.tumour_nodes], abs=1e-7)
     other = np.where(np.arange(len(motion))[:, None] % 2, 1e-3, -1e-3) * np.ones(3)
@@ -153,7 +153,7 @@ def test_the_oracle_finds_what_its_shapes_can_make(locator, body):
     assert 0.1e-3 < np.linalg.norm(off, axis=1).mean() < 2e-3
 
 
-def test_figures_of_a_row_are_those_by_hand():
+def test_row_statistics_match_hand_calculation():
     zeros = np.zeros((3, 3))
     true = 1e-3 * np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [3.0, 0.0, 0.0]])
     exact = estimate(true, true, 7.8, 0.010)
@@ -175,7 +175,7 @@ def test_figures_of_a_row_are_those_by_hand():
     assert row(PointsSeen(30, 20, 1), "it", [hundred]).p95 == pytest.approx(95.0)
 
 
-def test_squares_are_by_the_stated_covariance_of_the_centroid(locator, body):
+def test_squared_error_uses_the_centroid_covariance(locator, body):
     motion = some_motion(locator, 0)
     seen = observed(body, motion, PointsSeen(60, 60, 1), (0, 0))
     found, answer = ours(locator, motion, seen), locator.locate(seen)
@@ -203,8 +203,8 @@ def test_observations_use_same_points_at_any_noise(locator, body):
     assert np.ptp(exact.rest[:, :2], axis=0).max() < 0.8 * np.ptp(wide.rest[:, :2], axis=0).max()
 
 
-def test_levels_of_noise_have_their_translations(locator, body):
-    """Mean squares over many observations: those of white and smooth errors are the same at both levels."""
+def test_noise_levels_have_their_rigid_translations(locator, body):
+    """Mean squares over many observations: white and smooth errors are equal at both levels."""
     still, square = np.zeros_like(body.mesh.nodes), []
     for noise in (1, 2):
         seen = [observed(body, still, PointsSeen(60, 60, noise), (0, number)) for number in range(60)]
@@ -212,7 +212,7 @@ def test_levels_of_noise_have_their_translations(locator, body):
     assert 1.0 < square[0] < 1.5 and square[1] - square[0] == pytest.approx(3.0, abs=0.6)
 
 
-def test_every_twin_is_seen_on_points_of_its_own(locator, body):
+def test_every_twin_is_observed_at_its_own_points(locator, body):
     some = [Twin(drawn(0, number), some_motion(locator, number)) for number in (0, 1)]
     given = []
     spy = {"spy": lambda rest, motion: given.append(rest) or np.zeros((len(body.tumour_nodes), 3))}
@@ -240,8 +240,8 @@ def test_every_twin_is_seen_on_points_of_its_own(locator, body):
 
 
 @pytest.mark.parametrize("translation", [1e-3, 2e-3])
-def test_errors_are_as_large_as_is_said(translation):
-    """Of pairs far from other pairs: white and smooth errors by their differences, the rigid one by a fit."""
+def test_observation_errors_have_nominal_size(translation):
+    """White and smooth errors by differences of point pairs, the rigid error by a fit."""
     random = np.random.default_rng(0)
     site = random.uniform(-0.6, 0.6, (250, 3))
     way = random.standard_normal(site.shape)
@@ -273,7 +273,7 @@ def test_twins_depend_only_on_seed_and_number():
     assert 0.6 < (swelling > 0.0).mean() < 0.8
 
 
-def test_twins_have_their_own_tissue_and_only_their_cause(body):
+def test_twins_have_drawn_tissue_and_single_cause(body):
     for number in range(4):
         draw = drawn(3, number)
         elasticity = effects_of(draw)[0]
@@ -290,8 +290,8 @@ def test_twins_have_their_own_tissue_and_only_their_cause(body):
         assert full == ("drainage" not in draw.cause) and np.linalg.norm(posture.direction) == pytest.approx(1.0)
 
 
-def test_a_twin_is_an_equilibrium_of_its_loads(body):
-    """A tool that pushes moves the open cortex along its push, and the tumour less."""
+def test_twin_motion_follows_the_push_of_its_tool(body):
+    """The push moves the open cortex along its direction, and the tumour less."""
     draw = replace(drawn(0, 0), skull="slide", stiffness=1.0)
     motion = solved(body, draw, "cpu", "p1")
     pushed = loads_of(body, draw).get(Pushed)
@@ -330,7 +330,7 @@ def test_twins_are_stored_and_read_at_body_vertices(body, tmp_path, monkeypatch)
         list(twins(body, finer, 1, seed=7, folder=tmp_path))
 
 
-def test_two_brains_have_no_twins(body):
+def test_mesh_of_other_brain_or_without_tumour_is_rejected(body):
     moved = replace(body, mesh=replace(body.mesh, nodes=body.mesh.nodes + [0.0, 0.01, 0.0]))
     with pytest.raises(InputError, match="10 mm apart"):
         list(twins(body, moved, 1))
@@ -338,7 +338,7 @@ def test_two_brains_have_no_twins(body):
         list(twins(body, replace(body, mesh=replace(body.mesh, region=np.ones_like(body.mesh.region))), 1))
 
 
-def test_the_command_prints_a_row_for_each_estimator_and_goes_on(body, locator, tmp_path, monkeypatch, capsys):
+def test_locate_command_prints_estimator_rows_and_resumes(body, locator, tmp_path, monkeypatch, capsys):
     made = []
 
     def some(anatomy, draw, device, element):
@@ -378,6 +378,6 @@ def test_the_command_prints_a_row_for_each_estimator_and_goes_on(body, locator, 
         (["--anatomy", "own.vtu"], "--anatomy needs --finer"),
     ],
 )
-def test_unmeasurable_input_is_rejected_before_solving(words, match, capsys):
+def test_locate_bench_rejects_invalid_input(words, match, capsys):
     assert main(["locate", *words]) == 2
     assert match in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`python -m benchmarks shortcuts`: both solvers answer the same loads, and only what a solver has is measured."""
+"""`python -m benchmarks shortcuts`: equal loads for both solvers, and no row without a shortcut."""
 
 import json
 from dataclasses import replace
@@ -31,7 +31,7 @@ def some(site: CraniotomyFrame, **more) -> Work:
     return replace(Work("a", "b", SolverStep.LBFGS, single, effects, TRAIN, "p1"), **more)
 
 
-def test_with_and_without_are_timed_in_turn(site: CraniotomyFrame, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_with_and_without_shortcut_alternate(site: CraniotomyFrame, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, solve = [], Fem.deform
 
     def heard(fem: Fem, loads, start=None):
@@ -47,7 +47,7 @@ def test_with_and_without_are_timed_in_turn(site: CraniotomyFrame, monkeypatch: 
     assert row.ratio == pytest.approx(row.median_without / row.median) and row.total >= row.median > 0.0
 
 
-def test_frames_follow_and_what_is_warm_is_dropped(site: CraniotomyFrame, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_without_shortcut_drop_the_warm_start(site: CraniotomyFrame, monkeypatch: pytest.MonkeyPatch) -> None:
     starts, solve = [], Fem.deform
 
     def heard(fem: Fem, loads, start=None):
@@ -61,18 +61,18 @@ def test_frames_follow_and_what_is_warm_is_dropped(site: CraniotomyFrame, monkey
 
 
 @pytest.mark.parametrize("step", [SolverStep.FRAME, SolverStep.CONTACT, SolverStep.CLAMPED, SolverStep.STRAINED])
-def test_a_shortcut_that_is_not_taken_has_no_row(site: CraniotomyFrame, step: SolverStep) -> None:
+def test_unused_shortcut_has_no_row(site: CraniotomyFrame, step: SolverStep) -> None:
     assert measure(some(site, step=step), site, "cpu") is None
 
 
-def test_every_step_but_newton_is_some_work(site: CraniotomyFrame) -> None:
+def test_every_solver_step_except_newton_is_measured(site: CraniotomyFrame) -> None:
     found = list(works(site, 2, False))
     assert {work.step for work in found} == {None, *SolverStep} - {SolverStep.NEWTON}
     assert all(len(work.loads) == 3 for work in found)
     assert {len(work.loads[0]) for work in found} == {1, shortcuts.BATCH, shortcuts.POSES}
 
 
-def test_the_command_prints_what_was_measured(
+def test_shortcuts_command_prints_the_measured_row(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = Row(

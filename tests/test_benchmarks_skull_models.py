@@ -1,4 +1,4 @@
-"""What the skull decides, as the bench measures it."""
+"""Influence of the skull model, as measured by its benchmark."""
 
 import json
 from dataclasses import asdict
@@ -33,8 +33,8 @@ def brain(tmp_path_factory):
     return str(path), anatomy
 
 
-def test_the_bench_measures_what_it_says(brain, capsys):
-    """By the bench, and by finite elements and a mean over the tumour's volume put together here."""
+def test_skull_bench_matches_independent_finite_elements(brain, capsys):
+    """Compared with finite elements and a volume mean over the tumour, computed in this test."""
     path, anatomy = brain
     words = [path, "--loads", "2", "--poisson", "0.49", "--device", "cpu", "--json"]
     assert main(["benchmarks", "skull", *words]) == 0
@@ -61,7 +61,7 @@ def test_pressing_skull_allows_more_motion_than_bonded(brain, capsys):
     assert pressing["motion"] > 1.1 * bonded["motion"] and pressing["leaked"] is None and pressing["bond"] == 0.0
 
 
-def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkeypatch):
+def test_unconverged_tearing_is_excluded_from_the_mean(brain, capsys, monkeypatch):
     path, anatomy = brain
     (row,) = rows([anatomy], ["pressing"], [0.45], draw("palpation", anatomy, 1, 0), "cpu", Tearing(max_solves=1))
     assert row.failed == 1 and row.bond is None
@@ -70,7 +70,7 @@ def test_a_tear_that_does_not_come_to_rest_is_in_no_figure(brain, capsys, monkey
     assert json.loads(capsys.readouterr().out)["rows"] == [asdict(row) | {"motion": pytest.approx(np.nan, nan_ok=True)}]
 
 
-def test_skull_rows_under_strained_loads_count_them(brain):
+def test_skull_rows_count_strained_loads(brain):
     _, anatomy = brain
     loads = draw("palpation", anatomy, 3, 0).select(slice(2, 3)).scale(np.full(1, 4.0))
     tissue = Material("neo-hookean", 3000.0, 0.45)
@@ -83,13 +83,13 @@ def test_skull_rows_under_strained_loads_count_them(brain):
 @pytest.mark.parametrize(
     ("words", "reason"), [(["--loads", "0"], "--loads is 0: give a whole"), (["--device", "tpu"], "no device")]
 )
-def test_what_cannot_be_measured_is_a_sentence(brain, capsys, words, reason):
+def test_skull_bench_rejects_invalid_input(brain, capsys, words, reason):
     assert main(["benchmarks", "skull", brain[0], *words]) == 2
     assert reason in capsys.readouterr().err
 
 
-def test_what_is_learnt_of_a_skull_is_of_that_skull(tmp_path):
-    """From the command to the finite elements that a learner asks: they slide where the data did."""
+def test_learner_fem_uses_the_skull_model_of_the_data(tmp_path):
+    """Simulated data with a sliding or bonded skull: the learner's finite elements use the same model."""
     write_anatomy(
         tmp_path / "brain.vtu", make_anatomy(build_template_subject(Tumour()), MeshPlan(2000, craniotomy=0.03))
     )

@@ -1,4 +1,4 @@
-"""`python -m benchmarks throughput`: a row for each tissue and set of loads, every count and second accounted for."""
+"""`python -m benchmarks throughput`: a row for each tissue and preset, with counts and times."""
 
 import json
 from dataclasses import replace
@@ -47,7 +47,7 @@ def words(tmp_path_factory, box):
     return ["throughput", "--anatomy", str(path), "--device", "cpu", "--laws", "stable-neo-hookean"]
 
 
-def test_a_row_for_each_tissue_and_set(words, capsys):
+def test_throughput_prints_a_row_for_each_tissue_and_preset(words, capsys):
     few = ["--presets", "bipolar", "mixed", "--count", "6", "--batch", "4", "--repeats", "2"]
     assert main([*words, *few, "--poisson", "0.4", "0.45", "--json"]) == 0
     captured = capsys.readouterr()
@@ -75,8 +75,8 @@ def test_a_row_for_each_tissue_and_set(words, capsys):
     assert captured.err.count("the tools together (bipolar): 6 loads in") == 2
 
 
-def test_several_devices_solve_all_loads_each_at_the_same_time(words, capsys):
-    """Twice the loads, each checked; the rate is of all of them over one clock."""
+def test_two_devices_each_solve_all_loads_concurrently(words, capsys):
+    """Twice the loads, each checked; the rate is that of all loads over one clock."""
     few = [
         "--presets",
         "bipolar",
@@ -99,7 +99,7 @@ def test_several_devices_solve_all_loads_each_at_the_same_time(words, capsys):
     assert "Warp 1" not in captured.out
 
 
-def test_poses_of_a_ball_have_rows_too(words, capsys):
+def test_throughput_measures_ball_poses(words, capsys):
     few = ["--poses", "--presets", "palpation", "bipolar", "--count", "3", "--repeats", "1", "--poisson", "0.4"]
     assert main([*words, *few, "--json"]) == 0
     said = json.loads(capsys.readouterr().out)["rows"]
@@ -109,8 +109,8 @@ def test_poses_of_a_ball_have_rows_too(words, capsys):
     assert "no ball stands for the preset spatula" in capsys.readouterr().err
 
 
-def test_a_load_that_does_not_converge_is_counted_and_said(words, monkeypatch, capsys):
-    """Where no tool is asked for there is no sum over the tools."""
+def test_unconverged_loads_are_counted_with_exit_code_1(words, monkeypatch, capsys):
+    """Without a tool preset there is no sum over the tools."""
     deform = Fem.deform
 
     def failing(fem, loads, **at):
@@ -123,11 +123,11 @@ def test_a_load_that_does_not_converge_is_counted_and_said(words, monkeypatch, c
     assert "set-up" in text and "tools together" not in text
 
 
-def test_the_middle_repeat_counts():
+def test_rate_uses_the_median_repeat():
     assert (ROW.median, ROW.rate) == (3.0, 20.0)
 
 
-def test_the_tools_are_summed_and_no_other_set():
+def test_only_tool_presets_are_summed():
     others = [replace(ROW, preset=preset, seconds=(1.0,)) for preset in ("mixed", "seed", "brutal")]
     stiff = replace(ROW, poisson=0.49, set_up=2.0)
     found = [ROW, replace(ROW, preset="spatula", loads=40, seconds=(17.0,)), *others, stiff]
@@ -137,7 +137,7 @@ def test_the_tools_are_summed_and_no_other_set():
     assert [one.rate for one in together(others)] == [None]
 
 
-def test_one_in_a_hundred_is_checked_and_every_solve_is_reported(box):
+def test_one_percent_of_loads_is_checked_in_double_precision(box):
     assert [len(checked(count)) for count in (3, 11, 400, 1101)] == [3, 4, 4, 12] and checked(1101)[-1] == 1100
     reported = []
     sets = drawn(box, ["bipolar"], 11)
@@ -145,7 +145,7 @@ def test_one_in_a_hundred_is_checked_and_every_solve_is_reported(box):
     assert (row.loads, row.checked, len(reported)) == (11, 4, 3)
 
 
-def test_strained_loads_that_converge_are_counted(box):
+def test_strained_converged_loads_are_counted_as_converged(box):
     soft = replace(BRAIN, young=600.0)
     (row,) = rows(Trial(box, (), "p1", "cpu", 12), soft, drawn(box, ["brutal"], 12), 1, lambda: None)
     assert row.converged == row.loads == 12
@@ -163,7 +163,7 @@ def test_strained_loads_that_converge_are_counted(box):
         (["--anatomy", "none.vtu"], "no such file"),
     ],
 )
-def test_bad_input_is_a_sentence(words, more, reason, capsys):
+def test_throughput_bench_rejects_invalid_input(words, more, reason, capsys):
     assert main([*words, *more]) == 2
     captured = capsys.readouterr()
     assert reason in captured.err and not captured.out

@@ -1,4 +1,4 @@
-"""What the trial of tracking measures, and the command that prints it."""
+"""Study of tracking: its statistics and its command."""
 
 import json
 
@@ -26,7 +26,7 @@ def shot(tip, off=None, deviation=1e-3, markers=30.0):
     return Shot(np.array(tip, float), markers, found, None if off is None else deviation**2 * np.eye(3), 0.01)
 
 
-def test_row_counts_findings_and_faults():
+def test_row_counts_detections_and_errors():
     shots = [shot([0, 0, 0], [1e-3, 0, 0]), shot([0, 0, 0], [0, 2e-3, 0]), shot([0, 0, 0]), shot([0, 0, 0], markers=10)]
     row = build_row(
         "trial", shots, lambda certain: np.array([np.linalg.norm(each.found - each.tip) for each in certain])
@@ -37,15 +37,15 @@ def test_row_counts_findings_and_faults():
     assert bad.wrong == 1 and bad.held == pytest.approx(100.0 * 2 / 3) and bad.milliseconds == pytest.approx(10.0)
 
 
-def test_a_common_error_does_not_count_between_points():
+def test_relative_error_ignores_a_common_offset():
     shots = [shot([k * 0.01, 0.0, 0.0], [1e-3, 1e-3, 0.0]) for k in range(4)]
     np.testing.assert_allclose(between(shots), 0.0, atol=1e-12)
     shots.append(shot([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
     assert between(shots)[-1] > 0.9e-3
 
 
-def test_poses_are_those_of_the_protocols():
-    """All in view and within the turns; where one point is touched the tip is there in every pose."""
+def test_generated_poses_satisfy_the_protocols():
+    """All poses are in view and within the tilt limit; in pivot protocols the tip is the same in every pose."""
     camera, evenly = trial_camera(), list(spread(40, 0))
     middle = np.mean([T[:3, 3] for T in evenly], axis=0)
     np.testing.assert_allclose(middle, [0.0, 0.0, AWAY], atol=0.01)
@@ -66,7 +66,7 @@ def first_turn(poses):
     return poses[0][:3, :3]
 
 
-def test_the_command_prints_a_row_for_each_protocol(capsys):
+def test_track_command_prints_a_row_for_each_protocol(capsys):
     assert main(["track", "--pictures", "2", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert len(rows) == 3 and all(row["wrong"] == 0 and row["certain"] in (100.0, None) for row in rows)

@@ -1,4 +1,4 @@
-"""The house rules, read from the code itself: who imports whom, whose job a library is, how a file looks."""
+"""Rules of the repository, read from its code: imports, owners of libraries, form of files."""
 
 import ast
 import re
@@ -142,8 +142,8 @@ def importers(library):
     return {name_of(path) for path in PACKAGED if library in libraries(path)}
 
 
-def test_the_reader_of_imports_reads():
-    """What all other tests here stand on."""
+def test_import_reader_finds_known_imports():
+    """All other tests of this file depend on this reader."""
     assert "sim.errors.InputError" in imports(HOUSE / "sim/geometry/tetmesh.py")
     assert "surrogate.regressors.baselines.Ann" in imports(HOUSE / "surrogate/training/learners.py")
     assert "sim.terms.dead_force.DeadForce" in imports(HOUSE / "sim/compile.py")
@@ -152,7 +152,7 @@ def test_the_reader_of_imports_reads():
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_rooms_import_one_way(room):
+def test_packages_import_in_one_direction(room):
     for path in FILES:
         if name_of(path).startswith(f"{room}/"):
             ours = libraries(path) & set(ROOMS)
@@ -169,7 +169,7 @@ def folder_of(module):
     return TOGETHER.get(found, found)
 
 
-def test_folders_import_one_way():
+def test_folders_import_in_one_direction():
     rank = {name: number for number, tier in enumerate(ORDER) for name in tier}
     for path in FILES:
         module = name_of(path).removesuffix(".py").replace("/", ".")
@@ -188,7 +188,7 @@ def modules_of(path):
     return {name if name in known else name.rpartition(".")[0] for name in imports(path, everywhere=False)} & known
 
 
-def test_no_module_imports_itself_by_way_of_others():
+def test_module_imports_have_no_cycle():
     graph = {name_of(path).removesuffix(".py").replace("/", "."): modules_of(path) for path in FILES}
     assert list(TopologicalSorter(graph).static_order())
 
@@ -207,16 +207,16 @@ def test_solver_imports_terms_only_where_compiled():
 
 
 @pytest.mark.parametrize("library", OWNERS)
-def test_each_library_has_its_owner(library):
+def test_each_library_is_imported_only_by_its_owners(library):
     assert importers(library) == OWNERS[library]
 
 
 @pytest.mark.parametrize("library", JOBS)
-def test_each_library_does_its_job(library):
+def test_each_library_is_imported_by_its_required_modules(library):
     assert importers(library) >= JOBS[library]
 
 
-def test_rooms_without_pictures_or_networks_import_none():
+def test_opencv_and_warp_are_imported_only_in_their_packages():
     outside = {name for name in importers("cv2") if not name.startswith("ar/")}
     assert outside == {"scenes/episodes/episode.py"}
     assert not {name for name in importers("warp") if name.startswith("surrogate/")}
@@ -234,25 +234,25 @@ def test_imports_and_declared_dependencies_agree():
 
 
 @pytest.mark.parametrize("library", ["pickle", "joblib", "dill", "shelve", "marshal"])
-def test_nothing_is_pickled(library):
+def test_no_module_uses_pickle(library):
     assert not importers(library)
     for path in FILES:
         assert not re.search(r"allow_pickle=True|weights_only=False", path.read_text())
 
 
-def test_files_are_short():
+def test_files_have_at_most_400_lines():
     lengths = {name_of(path): len(path.read_text().splitlines()) for path in FILES}
     tests = {path.name: len(path.read_text().splitlines()) for path in (HOUSE / "tests").glob("*.py")}
     assert not {name: count for name, count in (lengths | tests).items() if count > 400}
 
 
-def test_the_top_level_is_fixed_and_tests_are_flat():
+def test_top_level_packages_are_fixed_and_tests_are_flat():
     assert {path.parent.name for path in HOUSE.glob("*/__init__.py")} == set(ROOMS)
     assert not list((HOUSE / "tests").rglob("__init__.py"))
     assert not [path for path in (HOUSE / "tests").rglob("*.py") if path.parent.name != "tests"]
 
 
-def test_everything_public_has_a_docstring():
+def test_public_definitions_have_docstrings():
     missing = []
     for path in FILES:
         open_nodes = [(name_of(path), tree_of(path))]
@@ -268,8 +268,8 @@ def test_everything_public_has_a_docstring():
     assert not missing
 
 
-def test_names_have_the_words_of_the_field():
-    """Of packages, tests and examples: what a model was trained on is not what it was taught."""
+def test_identifiers_avoid_nonstandard_words():
+    """Names in packages, tests and examples: training words of the field only."""
     ours = re.compile(r"(?:^|_)(?:(?:un)?taught|told|teach(?:er|es|ing)?)(?:_|$)", re.IGNORECASE)
     search = cache(ours.search)
     assert ours.search("taught") and ours.search("FEWEST_TAUGHT") and ours.search("Told") and not ours.search("untold")
@@ -280,7 +280,7 @@ def test_names_have_the_words_of_the_field():
             assert not found, f"{name_of(path)}:{node.lineno}: {found[0]}"
 
 
-def test_names_say_what_things_are():
+def test_identifiers_avoid_vague_words():
     vague = re.compile(r"manager|util|helper|misc|common", re.IGNORECASE)
     for path in FILES:
         imposed = {"options"} if name_of(path).startswith("scenes/gym/") else set()  # Gymnasium calls it so
@@ -292,8 +292,8 @@ def test_names_say_what_things_are():
                 raise AssertionError(f"{name_of(path)}: an argument called {node.arg}: spell it out")
 
 
-def test_tests_set_no_constant_and_read_nothing_private():
-    """What a test must set is an argument, and what it must see is public."""
+def test_tests_use_no_constants_or_private_names():
+    """A test sets values by arguments and reads public names."""
     own = {name for path in FILES for name in re.findall(r"(?:def |class |self\.)(_[a-z]\w*)", path.read_text())}
     private = re.compile(r"(?:(?<!\bself)\.|\bimport .*)\b(_[a-z]\w*)")
     constant = re.compile(r"setattr\(\s*.*?[.\"]([A-Z][A-Z_\d]+)\",|^\s*[\w.]+\.([A-Z][A-Z_\d]+) = ", re.MULTILINE)
@@ -304,21 +304,21 @@ def test_tests_set_no_constant_and_read_nothing_private():
         assert not found, f"{path.name}: {found[0]}"
 
 
-def test_no_path_of_one_machine():
+def test_files_contain_no_machine_specific_path():
     machine = re.compile(r"(?<![\w.])/(?:home|root|Users|work|tmp|mnt|opt)/|[A-Z]:\\\\")
     texts = [*FILES, *(HOUSE / "tests").glob("*.py"), HOUSE / "pyproject.toml", HOUSE / "Makefile"]
     for path in [*texts, *HOUSE.glob("*.md")]:
         assert not machine.search(path.read_text()), name_of(path)
 
 
-def test_the_linter_reads_every_file():
-    """What .gitignore names, ruff passes over: a folder of artefacts there must not be one of ours too."""
+def test_linter_checks_every_source_file():
+    """Ruff skips paths listed in .gitignore; no source folder may be among them."""
     shown = [sys.executable, "-m", "ruff", "check", "--show-files", "."]
     read = subprocess.run(shown, cwd=HOUSE, capture_output=True, text=True, check=True).stdout.splitlines()
     assert {str(path) for path in FILES} <= set(read)
 
 
-def test_the_tests_that_the_makefile_names_are_there():
+def test_makefile_lists_existing_tests():
     text = (HOUSE / "Makefile").read_text()
     quick = re.search(r"^QUICK := ((?:.*\\\n)*.*)", text, re.MULTILINE)[1].replace("\\", " ").split()
     pages = re.search(r"^PAGES := (.*)", text, re.MULTILINE)[1].split()
@@ -327,8 +327,8 @@ def test_the_tests_that_the_makefile_names_are_there():
     assert not [name for name in pages if not (HOUSE / name).exists()]
 
 
-def test_files_that_are_named_are_there():
-    """In documents and docstrings; a name in a folder that was just named stands alone."""
+def test_referenced_files_exist():
+    """In documents and docstrings; a bare file name may follow the name of its folder."""
     named = re.compile(r"(?<![\w/.-])(?:sim|surrogate|ar|scenes|tests|examples|benchmarks)/[\w/]+\.py\b")
     alone = re.compile(r"`([A-Za-z_]+\.py)`")
     readers = {"my_scene.py", "MY_SCENE.py", "NAME.py", "nearest.py"}  # files that a reader writes

@@ -1,4 +1,4 @@
-"""Comparisons in tests compare something, and tests are skipped for known reasons alone."""
+"""Comparisons in tests have elements to compare, and tests are skipped only for listed reasons."""
 
 from types import SimpleNamespace
 
@@ -19,18 +19,18 @@ COMPARISONS = {
 
 
 @pytest.mark.parametrize("name", COMPARISONS)
-def test_comparison_of_nothing_fails(name):
+def test_comparison_of_empty_arrays_fails(name):
     with pytest.raises(AssertionError, match="array without elements"):
         COMPARISONS[name]()
 
 
 @pytest.mark.empty
 @pytest.mark.parametrize("name", COMPARISONS)
-def test_comparison_of_nothing_in_marked_test_passes(name):
+def test_comparison_of_empty_arrays_in_marked_test_passes(name):
     COMPARISONS[name]()
 
 
-def test_comparison_with_written_empty_list_passes():
+def test_comparison_with_literal_empty_list_passes():
     np.testing.assert_array_equal(EMPTY[:, 0], [])
     assert not np.array_equal(EMPTY, SOME) and pytest.approx(SOME) == SOME and pytest.approx([]) == []
 
@@ -39,6 +39,6 @@ def test_comparison_with_written_empty_list_passes():
     ("reason", "outcome"),
     [("no CUDA device here", "skipped"), ("needs SULCUS_PVPYTHON, ParaView's pvpython", "skipped"), ("slow", "failed")],
 )
-def test_skip_for_unlisted_reason_fails(reason, outcome):
+def test_skipped_test_with_unlisted_reason_fails(reason, outcome):
     report = SimpleNamespace(skipped=True, outcome="skipped", longrepr=("test_a.py", 1, f"Skipped: {reason}"))
     assert as_failed(report).outcome == outcome

@@ -1,4 +1,4 @@
-"""The container recipe: its instructions, the files that it copies, the documented commands, and a build."""
+"""Container recipe: instructions, copied files, documented commands, and a build."""
 
 import ast
 import os
@@ -31,7 +31,7 @@ def test_container_base_has_a_pinned_version():
     assert re.fullmatch(r"python:3\.11\.\d+-slim-[a-z]+", base)
 
 
-def test_container_names_no_host_and_adds_no_url():
+def test_container_contains_no_external_url():
     assert {name for name, _ in STEPS} == {"FROM", "ARG", "ENV", "WORKDIR", "COPY", "RUN", "USER", "EXPOSE", "CMD"}
     assert set(re.findall(r"\w+://[^\s\"/]+", TEXT)) == {"http://localhost:8080"}
     assert not re.search(r"(?:docker|quay|ghcr)\.io|pypi\.org|download\.", TEXT)
@@ -44,7 +44,7 @@ def test_container_runs_without_root():
     assert "RUN" not in names[names.index("USER") :]
 
 
-def test_container_copies_what_the_package_needs():
+def test_container_copies_the_files_of_the_package():
     project = tomllib.loads((HOUSE / "pyproject.toml").read_text())
     packages = {name for name in project["tool"]["setuptools"]["packages"]["find"]["include"] if "." not in name}
     files = {"pyproject.toml", "constraints.txt", project["project"]["readme"], *project["project"]["license-files"]}
@@ -65,7 +65,7 @@ def test_container_serves_the_page_to_its_host_only():
 
 
 @pytest.mark.timeout(1800)
-def test_container_builds_and_knows_its_version():
+def test_container_builds_and_prints_its_version():
     index = os.environ.get("SULCUS_TORCH_CPU_INDEX")
     if index is None:
         pytest.skip("needs SULCUS_TORCH_CPU_INDEX, the index that pytorch.org names for CPU builds")

@@ -1,4 +1,4 @@
-"""Examples in the docstrings of public names: each runs as it is printed."""
+"""Examples in docstrings of public names: each prints its documented output."""
 
 import doctest
 import importlib
@@ -27,7 +27,7 @@ EXAMPLES = find_examples()
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_example_prints_what_it_shows(name):
+def test_docstring_example_prints_its_output(name):
     test = doctest.DocTestParser().get_doctest(EXAMPLES[name], {"np": np}, name, None, None)
     assert not any(doctest.SKIP in example.options for example in test.examples)
     report = []
@@ -35,5 +35,5 @@ def test_example_prints_what_it_shows(name):
     assert attempted and not failed, "".join(report)
 
 
-def test_main_names_have_examples():
+def test_main_public_names_have_examples():
     assert len(EXAMPLES) >= LEAST

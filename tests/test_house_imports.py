@@ -1,4 +1,4 @@
-"""What importing costs and changes, each in an interpreter of its own."""
+"""Cost and side effects of imports, each in a separate interpreter."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ def fresh(code, *words):
     return done.stdout
 
 
-def test_the_command_line_waits_for_nothing():
+def test_command_line_imports_no_heavy_library():
     heavy = ("torch", "viser", "cv2", "sklearn", "trimesh", "meshio", "nibabel", "nilearn", "warp", "scipy", "h5py")
     print_heavy = f"import sys; print([name for name in {heavy} if name in sys.modules])"
     assert fresh(f"import scenes.cli; {print_heavy}").strip() == "[]"
@@ -43,7 +43,7 @@ def test_public_names_import_without_side_effects():
         assert (HOUSE / room / "py.typed").exists()
 
 
-def test_a_machine_that_only_trains_needs_no_meshes_and_no_pages():
+def test_training_commands_import_no_mesh_or_page_library():
     block = "import sys; sys.modules |= dict.fromkeys(['meshio', 'nibabel', 'nilearn', 'trimesh', 'viser', 'cv2'])"
     wanted = "scenes.commands.simulate, scenes.commands.train, surrogate.training.train, surrogate.model.store, sim.fem"
     fresh(f"{block}; import {wanted}")

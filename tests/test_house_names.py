@@ -1,4 +1,4 @@
-"""Names that point elsewhere: of the installed package, of code in docstrings and comments, of cited works."""
+"""Names of the installed package, of code in docstrings and comments, and of cited works."""
 
 import ast
 import builtins
@@ -39,7 +39,7 @@ def instructions():
             yield path.relative_to(HOUSE).as_posix(), rest
 
 
-def test_instructions_install_the_checkout_and_no_other_name():
+def test_install_instructions_name_only_the_checkout():
     found = list(instructions())
     assert len(found) > 10
     for name, rest in found:
@@ -51,7 +51,7 @@ def test_instructions_install_the_checkout_and_no_other_name():
 
 
 @pytest.mark.parametrize("extra", ["camera", "data", "gym", "heads", "onnx", "peers", "report", "slicer"])
-def test_install_hint_names_an_extra_that_exists(extra):
+def test_install_hint_names_an_existing_extra(extra):
     assert extra in EXTRAS and install_hint(extra).endswith(f"pip install -e '.[{extra}]'.")
 
 
@@ -86,7 +86,7 @@ def texts_and_names():
     return said, known
 
 
-def test_names_in_backticks_exist():
+def test_names_in_backticks_exist_in_the_code():
     said, known = texts_and_names()
     found = [(place, name) for place, text in said for name in re.findall(r"(?<!`)`([A-Za-z_][\w.]*)`(?!`)", text)]
     assert len(found) > 1000
@@ -94,15 +94,15 @@ def test_names_in_backticks_exist():
 
 
 @pytest.mark.parametrize("package", [sim, surrogate, ar, scenes])
-def test_former_public_names_are_the_present_ones(package):
+def test_former_public_names_are_aliases_of_current_names(package):
     assert package.FORMER and not set(package.FORMER) & set(package.__all__)
     assert all(getattr(package, former) is getattr(package, name) for former, name in package.FORMER.items())
     with pytest.raises(AttributeError, match="nothing_of_this_name"):
         package.nothing_of_this_name  # noqa: B018
 
 
-def test_cited_titles_match_their_checked_list():
-    """A new citation, or one that a rename has changed, is compared with its source, then listed."""
+def test_cited_titles_match_the_verified_list():
+    """A new or changed citation is compared with its source, then listed."""
     listed = set((HOUSE / "tests/data/citations.txt").read_text().splitlines())
     paths = [
         path

@@ -1,4 +1,4 @@
-"""Budgets of lines and of positional arguments, and options that are declared once."""
+"""Limits of lines and of positional arguments, and options that are declared once."""
 
 import ast
 import re
@@ -16,12 +16,12 @@ def lines(paths):
     return sum(path.read_text().count("\n") for path in paths)
 
 
-def test_lines_are_within_their_budget():
+def test_line_counts_are_within_their_budget():
     found = {"packages": lines(PACKAGED), "tests": lines((HOUSE / "tests").glob("*.py"))}
     assert not {name: count for name, count in found.items() if count > MOST[name]}
 
 
-def test_the_changelog_is_read_in_two_minutes():
+def test_changelog_has_at_most_8_kib():
     assert (HOUSE / "CHANGELOG.md").stat().st_size <= 8192
 
 
@@ -39,7 +39,7 @@ def test_shared_options_are_declared_in_one_file():
 
 
 def test_classes_take_at_most_eight_positional_values():
-    """One swap of more shows one number as another."""
+    """With more positional values a swap of two numbers is easily overlooked."""
     for path in [*FILES, *(HOUSE / "tests").glob("*.py")]:
         for node in nodes_of(path):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id[:1].isupper():
@@ -50,7 +50,7 @@ FACTORIES = ("build_kernel", "build_kernels", "build_functions")
 
 
 def test_functions_are_short_and_take_few_arguments():
-    """But kernels, and their factories, which are as long as what they make; constructors are called by keyword."""
+    """Exceptions: kernels, their factories, and constructors, which are called by keyword."""
     found = []
     for path in PACKAGED:
         for node in nodes_of(path):

@@ -30,31 +30,31 @@ def check(found, most):
 
 
 @pytest.mark.parametrize(("kind", "most"), [("docstring", 0), ("comment", 0), ("help", 0)])
-def test_first_words(kind, most):
+def test_texts_begin_with_allowed_words(kind, most):
     texts = (text for path in PACKAGED for text in find_texts(path) if text.kind == kind)
     check([f"{one.place} {one.text[:40]}" for one in texts if not begins_well(one.text)], most)
 
 
 @pytest.mark.parametrize(("kind", "most"), [("docstring", 0), ("comment", 0), ("help", 0), ("message", 0)])
-def test_banned_words(kind, most):
+def test_texts_contain_no_banned_words(kind, most):
     texts = (text for path in PACKAGED for text in find_texts(path) if text.kind == kind)
     check([f"{one.place} {word}" for one in texts for word in find_banned(one.text)], most)
 
 
-def test_headings_of_pages_are_nouns_or_imperatives():
+def test_page_headings_begin_with_allowed_words():
     check([f"{path.name}: {it}" for path in PAGES for it in find_headings(path.read_text()) if not begins_well(it)], 0)
 
 
-def test_banned_words_on_pages():
+def test_pages_contain_no_banned_words():
     pages = {path: re.sub(r"^```.*?^```", "", path.read_text(), flags=re.M | re.S) for path in PAGES}
     check([f"{path.name}: {word}" for path, text in pages.items() for word in find_banned(text)], 0)
 
 
-def test_user_pages_tell_no_history():
+def test_pages_contain_no_history():
     check([f"{path.name}: {word}" for path in PAGES for word in HISTORY.findall(path.read_text())], 0)
 
 
-def test_user_pages_are_short():
+def test_pages_have_at_most_3000_words():
     """At most 3,000 words a page and 220 kB in all."""
     pages = PAGES[2:]
     check([path.name for path in pages if len(path.read_text().split()) > 3000], 0)
@@ -70,13 +70,13 @@ def test_public_functions_begin_with_a_verb():
     check(sorted(name for name in names if name not in GIVEN and name.partition("_")[0] not in OPENERS), 0)
 
 
-def test_names_of_tests_are_short():
+def test_test_names_have_at_most_60_characters():
     names = [name for path in TESTS for name in re.findall(r"^ *def (test_\w+)", path.read_text(), re.M)]
     assert len(names) > 2000
     check([name for name in names if len(name) > LONGEST_TEST_NAME], 0)
 
 
-def test_rules_find_what_they_forbid(tmp_path):
+def test_style_rules_detect_violations(tmp_path):
     path = tmp_path / "a.py"
     path.write_text(
         '"""What it is."""\n# Of two lines\n# beside each other.\nX = 1  # which\n"""Quantity; `beside` is code."""\n'

@@ -1,4 +1,4 @@
-"""What a learnt model may be asked: effects, causes, bodies and tissue that it was trained on."""
+"""Applicability of a trained model: effects, causes, bodies and tissue of its training."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ from surrogate.model.applicability import find_rejection, read_trained_effects
 
 
 class TestLearnt:
-    def test_it_refuses_effects_that_it_was_not_trained_on(self, theatre):
+    def test_model_rejects_effects_outside_its_training(self, theatre):
         model = theatre.models["linear"]
         assert find_rejection(model, short().effects) is None
         why = find_rejection(model, (*short().effects, Gravity()))
@@ -35,14 +35,14 @@ class TestLearnt:
         ) == ("fem",)
         assert theatre.select_best(sinking()) == "fem"
 
-    def test_it_refuses_causes_that_it_does_not_know(self, theatre):
+    def test_model_rejects_loads_of_unsupported_causes(self, theatre):
         model, scene = theatre.models["linear"], sinking()
         with pytest.raises(InputError, match="causes Posture"):
             model.deform(scene.build_loads(theatre.site, Touch(), 0.0))
         with pytest.raises(InputError, match="causes none"):
             model.deform(Loads((), np.zeros(2)))
 
-    def test_its_file_says_what_it_was_trained_under(self, theatre):
+    def test_training_record_lists_the_trained_effects(self, theatre):
         model = theatre.models["linear"]
         assert read_trained_effects(model.training) == {
             "Elasticity",
@@ -58,14 +58,14 @@ class TestLearnt:
         why = find_rejection(stated, (Elasticity(), ToolForce()))
         assert why is not None and "never without Held" in why
 
-    def test_where_the_skull_slides_it_matters(self, theatre, box):
+    def test_model_of_sliding_skull_requires_slide_effect(self, theatre, box):
         normal = np.zeros_like(box.slide_normal)
         normal[0, 0] = 1.0
         model = replace(theatre.models["linear"], anatomy=replace(box, slide_normal=normal))
         why = find_rejection(model, (Elasticity(), Held(), ToolForce()))
         assert why is not None and "never without Slide" in why
 
-    def test_models_beside_an_anatomy_do_not_change_its_physics(self, theatre):
+    def test_fem_physics_is_independent_of_stored_models(self, theatre):
         training = {"element": "p1", "tissue": to_tissue_json(Material("neo-hookean", 9000.0, 0.3))}
         other = replace(theatre, models={"linear": replace(theatre.models["linear"], training=training)})
         assert other.build_fem(short(), LIVE).description == "finite elements (smoothed; neo-hookean, E 3 kPa, nu 0.49)"
@@ -80,7 +80,7 @@ class TestLearnt:
             ({"tissue": to_tissue_json(Material("neo-hookean", 9000.0, 0.3))}, "E 9 kPa, nu 0.3, and here it is .*E 3"),
         ],
     )
-    def test_a_model_of_another_body_is_refused(self, theatre, training, reason):
+    def test_model_of_other_tissue_or_element_is_rejected(self, theatre, training, reason):
         model = replace(theatre.models["linear"], training=training)
         other = replace(theatre, models={"linear": model})
         assert other.list_deformers(short()) == ("fem",)
@@ -89,7 +89,7 @@ class TestLearnt:
         tissue, element = (Material("neo-hookean", 9000.0, 0.3), None) if "tissue" in training else (None, "p1")
         assert other.build_deformer("linear", short().replace_tissue(tissue, element)) is model
 
-    def test_another_tissue_goes_on_relaxing(self):
+    def test_replaced_tissue_keeps_its_relaxation(self):
         scene = find_scene("retract").replace_tissue(Material("neo-hookean", 9000.0, 0.3), "p2")
         (effect,) = (each for each in scene.effects if isinstance(each, Elasticity))
         assert scene.element == "p2" and effect.default == Material("neo-hookean", 9000.0, 0.3, RELAXING_BRAIN.prony)

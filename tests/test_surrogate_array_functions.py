@@ -1,4 +1,4 @@
-"""Rounding of a model's tables, which decides the bytes of its file."""
+"""Rounding of a model's tables, which makes the bytes of its file reproducible."""
 
 import numpy as np
 import pytest
@@ -11,26 +11,26 @@ TABLE = np.random.default_rng(0).normal(size=(50, 4)) * [1.0, 10.0, 1e-3, 0.0]
 
 
 @pytest.mark.parametrize("step", [0.01, np.array([0.01, 0.1, 1e-5, 1.0])])
-def test_rounded_table_is_within_half_a_step(step):
+def test_rounded_table_error_is_at_most_half_a_step(step):
     rounded = Rounded.round_table(TABLE, step)
     assert rounded.whole.dtype == np.int16 and rounded.values.flags.c_contiguous
     assert (np.abs(rounded.values - TABLE) <= 0.5001 * np.asarray(step)).all()
 
 
-def test_step_grows_where_whole_numbers_would_overflow():
+def test_rounding_step_increases_to_avoid_integer_overflow():
     rounded = Rounded.round_table(TABLE, 1e-6)
     largest = np.abs(TABLE).max(axis=0)
     assert rounded.step == pytest.approx(np.maximum(1e-6, largest / 32767))
     np.testing.assert_allclose(rounded.values, TABLE, atol=largest.max() / 32767)
 
 
-def test_rows_and_products_are_those_of_the_values():
+def test_rounded_rows_and_products_equal_those_of_values():
     rounded, rows = Rounded.round_table(TABLE, 0.01), np.array([3, 1, 3])
     np.testing.assert_array_equal(take_rows_of(rows, rounded), rounded.values[rows])
     np.testing.assert_array_equal(multiply_rows(np.ones((1, 3)), rounded, rows)[0], rounded.values[rows].sum(axis=0))
 
 
-def test_half_precision_keeps_eleven_bits_of_any_size():
+def test_half_precision_keeps_eleven_bits_at_any_magnitude():
     numbers = np.array([1.0, -3.14159, 6.1e-9, 2.5e20, 0.0])
     found = round_to_half(numbers)
     assert found.dtype == np.float32
@@ -39,7 +39,7 @@ def test_half_precision_keeps_eleven_bits_of_any_size():
 
 
 def test_tables_of_earlier_versions_are_read():
-    """They have shares in half precision, and the rows of a Gaussian process in lengths."""
+    """They store ratios in half precision, and rows of a Gaussian process divided by length scales."""
     share = (TABLE[:, :3] / TABLE[:, :3].max(axis=0)).astype(np.float16)
     unit = TABLE[:, :3].max(axis=0).astype(np.float32)
     pairs = ForcePairs.restored({"pairs": np.zeros((50, 2), int), "share": share, "unit": unit})

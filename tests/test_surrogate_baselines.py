@@ -6,8 +6,8 @@ from test_surrogate_protocol import RANDOM, rows
 from surrogate.regressors.baselines import Pcr, Svr
 
 
-def test_principal_components_of_little_variance_are_left_out():
-    """A component of a thousandth of the variance is dropped, and with it what hangs on it alone."""
+def test_pcr_drops_components_of_small_variance():
+    """A component with 0.1 % of the variance is dropped, and outputs that depend only on it are lost."""
     scores = np.random.default_rng(5).normal(size=(200, 3)) * [10.0, 3.0, 0.1]
     turned = np.linalg.qr(RANDOM.normal(size=(6, 3)))[0]
     X, Y = scores @ turned.T + 7.0, scores / [10.0, 3.0, 0.1] + 2.0
@@ -17,8 +17,8 @@ def test_principal_components_of_little_variance_are_left_out():
     assert np.linalg.matrix_rank(few.map_, tol=1e-9) == 2
 
 
-def test_svr_has_the_published_settings():
-    """The same machine as scikit-learn's with MATLAB's defaults, in the output's own units."""
+def test_svr_matches_scikit_learn_with_published_settings():
+    """Reference: scikit-learn's SVR with MATLAB's defaults, in the units of the output."""
     from sklearn.svm import SVR
 
     X, Y = rows(300, 0)

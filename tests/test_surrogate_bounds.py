@@ -1,4 +1,4 @@
-"""Errors of distances, and the scale of bounds that they calibrate."""
+"""Errors of distances, and the scale of error bounds."""
 
 from dataclasses import replace
 
@@ -28,8 +28,8 @@ class Proportional:
 
 
 @pytest.mark.parametrize("count", [600, CALIBRATION_STRIDE * MIN_SCALE_LOADS])
-def test_where_many_loads_calibrate_one_in_three_tells_the_scale(pretender, tmp_path, count):
-    """Of few loads the errors on the discs tell it."""
+def test_bound_scale_source_depends_on_calibration_count(pretender, tmp_path, count):
+    """With few loads the scale comes from errors on held-out discs, with many from a third of the calibration."""
     simulate(tmp_path / "data.h5", pretender, draw("palpation", pretender.anatomy, count, 0), {"preset": "palpation"})
     data = read_dataset(tmp_path / "data.h5")
     trained = train(data, ["linear"])
@@ -45,8 +45,8 @@ def test_where_many_loads_calibrate_one_in_three_tells_the_scale(pretender, tmp_
     assert [np.allclose(*pair) for pair in pairs] == 2 * [trained.calibrated >= MIN_SCALE_LOADS] == 2 * [count > 600]
 
 
-def test_a_correction_that_does_not_help_is_left_out(box, pretender, tmp_path):
-    """Of tissue that gives in proportion the table of compliances knows all."""
+def test_distance_correction_without_benefit_is_omitted(box, pretender, tmp_path):
+    """For linear tissue the compliance table is already exact."""
     linear = Proportional(pretender)
     simulate(tmp_path / "data.h5", linear, draw("palpation", box, 120, 0), {"preset": "palpation"})
     model = train(read_dataset(tmp_path / "data.h5"), ["linear"]).models["linear"]

@@ -1,4 +1,4 @@
-"""Covariances that hold: the factor by which they grow, and the patches on which they are tried."""
+"""Calibration of covariances: covering factor, and trials on patches of the cortex."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def evidence(body):
     return sample_seen_patch(body, motion, np.random.default_rng(0), 60, 0.5)
 
 
-def test_patch_points_lie_on_moving_open_cortex(body, evidence):
+def test_sampled_patch_points_lie_on_the_open_cortex(body, evidence):
     assert len(evidence) == 180 and evidence.value.reshape(60, 3) == pytest.approx(np.tile(MOTION, (60, 1)))
     places = evidence.at[::3]
     on = body.mesh.nodes[np.unique(body.open_surface)]
@@ -56,7 +56,7 @@ def test_likeness_uses_relative_motion_and_point_count(evidence):
 
 
 def test_likeness_uses_patch_size_not_point_count(body, evidence):
-    """The same patch twice as wide is as far off for few points as for many; a patch of half the area is smaller."""
+    """Doubling the width changes only the size term, equally for few and many points; less area gives a smaller one."""
     wide = replace(evidence, at=2.0 * evidence.at)
     few, many = (
         compute_likeness(wide.select(np.arange(n))) - compute_likeness(evidence.select(np.arange(n))) for n in (60, 180)
@@ -70,7 +70,7 @@ def test_likeness_uses_patch_size_not_point_count(body, evidence):
     assert max(sizes[0]) < min(sizes[1]) and max(sizes[1]) < min(sizes[2])
 
 
-def test_patch_trials_give_covariance_growth(evidence):
+def test_covering_factor_follows_trials_of_similar_patches(evidence):
     small = replace(evidence, at=0.5 * evidence.at)
     tried = np.concatenate(
         [
@@ -81,8 +81,8 @@ def test_patch_trials_give_covariance_growth(evidence):
     assert compute_covering_factor(tried, small) == pytest.approx(9.0 * compute_covering_factor(tried, evidence))
 
 
-def test_a_cloud_is_like_no_named_points(evidence):
-    """One row a point, as clouds have, and three."""
+def test_cloud_likeness_differs_from_named_points(evidence):
+    """A cloud has one row per point, named points have three."""
     cloud = evidence.select(np.arange(0, 180, 3))
     assert np.array_equal(compute_likeness(cloud)[1:3], compute_likeness(evidence)[1:3])
     assert compute_likeness(cloud)[3] > 100.0 + compute_likeness(evidence)[3]
@@ -102,8 +102,8 @@ def some_members(body, skull, group):
     return Ensemble(body, still, np.zeros(count, int), np.array(skull), np.array(group))
 
 
-def test_whole_groups_are_left_out_one_of_each_skull(body):
-    """A trial's tissue is unknown to its estimator, and each skull is known to every estimator."""
+def test_held_out_folds_take_whole_groups_of_each_skull(body):
+    """The tissue of a trial is unknown to its estimator; every estimator knows each skull model."""
     some = some_members(body, [0, 0, 0, 0, 0, 1, 1, 1, 2, 2], [0, 0, 1, 1, 2, 3, 4, 4, 5, 5])
     turn = assign_held_out(some)
     assert turn.tolist() == [0, 0, 1, 1, 2, 0, 1, 1, -1, -1]
@@ -111,8 +111,8 @@ def test_whole_groups_are_left_out_one_of_each_skull(body):
         run_trials(some_members(body, [0, 0, 1], [0, 0, 1]), None)
 
 
-def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
-    """A spy sees which members each prior has, and which member each trial is made of."""
+def test_trial_prior_excludes_the_group_of_the_trial(body, monkeypatch):
+    """A replaced function records the members of each prior and the member of each trial."""
     random, group = np.random.default_rng(0), np.repeat(np.arange(6), 4)
     motion = random.normal(scale=2e-3, size=(24, *body.mesh.nodes.shape)).astype(np.float32)
     ensemble = Ensemble(body, motion, np.tile([0, 1], 12), group // 2, group)
@@ -137,8 +137,8 @@ def test_trial_prior_lacks_the_group_of_the_trial(body, monkeypatch):
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 4.0])
-def test_the_factor_makes_ellipsoids_hold_in_95_of_100_trials(evidence, times):
-    """Squares that are chi-square of three degrees, times a number, need just that number: by 115 of 120."""
+def test_covering_factor_gives_95_percent_coverage(evidence, times):
+    """Chi-square squares (3 degrees of freedom) times a number require this number as factor."""
     random = np.random.default_rng(1)
     squares = times * chi2.ppf((np.arange(NEAREST_TRIALS) + 0.5) / NEAREST_TRIALS, 3)
     spread = 0.01 * random.standard_normal((NEAREST_TRIALS, 4)) * [1.0, 1.0, 1.0, 0.0]
@@ -150,7 +150,7 @@ def test_the_factor_makes_ellipsoids_hold_in_95_of_100_trials(evidence, times):
     assert compute_covering_factor(np.concatenate([other, tried]), evidence) == compute_covering_factor(tried, evidence)
 
 
-def test_what_was_never_tried_is_said(evidence):
+def test_evidence_outside_the_trials_is_detected(evidence):
     around = compute_likeness(evidence) + np.array([[-0.1, -0.1, -0.1, 0.0], [0.1, 0.1, 0.1, 0.0]])
     assert is_within_trials(np.column_stack([around, [1.0, 1.0]]), evidence)
     assert not is_within_trials(np.column_stack([around + [0.2, 0.0, 0.0, 0.0], [1.0, 1.0]]), evidence)
@@ -160,8 +160,8 @@ def test_what_was_never_tried_is_said(evidence):
         assert is_within_trials(np.column_stack([around + [0.0, 0.0, larger, 0.0], [1.0, 1.0]]), evidence) == known
 
 
-def test_the_tumours_middle_is_that_of_its_volume(body):
-    """A motion that grows with x moves it as far as its middle's x says."""
+def test_tumour_centre_is_its_volume_centroid(body):
+    """A motion that increases linearly with x moves the tumour by its value at the centroid."""
     inside = body.mesh.region == 2
     middle = np.average(body.mesh.nodes[body.mesh.tets[inside]].mean(axis=1), axis=0, weights=body.mesh.volumes[inside])
     motion = np.zeros((1, *body.mesh.nodes.shape))

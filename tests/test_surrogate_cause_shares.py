@@ -7,8 +7,8 @@ from surrogate.locating.cause_shares import group_cause_shares
 from surrogate.locating.causes import KINDS
 
 
-def test_causes_are_grouped_as_finely_as_their_shares_are_known():
-    """Two that trade places are named together; one that is always the same, alone; one of nothing, not at all."""
+def test_inseparable_causes_are_grouped_together():
+    """Two causes with exchangeable shares form a group, a constant share stays alone, and zero shares are omitted."""
     first = np.random.default_rng(0).uniform(0.0, 0.8, 2000)
     drawn = np.stack([np.full(2000, 0.2), first, 0.8 - first, np.zeros(2000)], axis=1)
     both, alone = group_cause_shares(drawn)

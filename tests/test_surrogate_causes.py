@@ -1,4 +1,4 @@
-"""Causes of an ensemble: draws of them, and the skulls that they are solved in."""
+"""Causes of an ensemble: random draws, and skull models in which they are solved."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from test_surrogate_locator import FEW
 from surrogate.locating.causes import SEPARATING_SKULL, build_drainages, build_groups, build_pushes
 
 
-def test_draws_depend_on_the_seed_and_the_group_alone(body):
+def test_draws_depend_only_on_seed_and_group(body):
     first, second = build_groups(body, 0, FEW)[:2]
     draws = [(first, 0), (first, 0), (second, 0), (first, 1)]
     force, again, other, later = (build_pushes(group, body, seed, FEW).causes[0].force for group, seed in draws)
@@ -20,13 +20,13 @@ def test_draws_depend_on_the_seed_and_the_group_alone(body):
     assert np.array_equal(*down) and (falling[1].causes[1].csf_level < falling[0].causes[1].csf_level).all()
 
 
-def test_separating_skull_rejects_swollen_fluid_tissue(body):
+def test_separating_skull_excludes_nearly_incompressible_tissue(body):
     made = {(group.skull, group.poisson) for group in build_groups(body, 0, FEW)}
     assert (SEPARATING_SKULL, 0.45) in made and (SEPARATING_SKULL, 0.485) not in made and ("slide", 0.485) in made
 
 
-def test_each_skull_has_soft_and_stiff_tumours(body):
-    """One in each part of the range, for every seed; at small strain all have what their group says."""
+def test_each_skull_model_has_soft_and_stiff_tumours(body):
+    """Each third of the range has one for every seed; at small strain tissues have the parameters of their group."""
     for seed in range(20):
         for skull in ("bonded", "slide"):
             some = [

@@ -1,4 +1,4 @@
-"""Bounds: they hold as often as they say, class by class, and grow where nothing was promised."""
+"""Conformal error bounds: coverage in each force class, and growth outside the training range."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def bound():
     return fit_bound((features, error), *drawn(2000, 1))
 
 
-def test_fresh_loads_are_covered_in_every_class(bound):
+def test_bounds_cover_new_loads_in_every_force_class(bound):
     features, force, error = drawn(20000, 2)
     stated = bound.evaluate(features, force, lying(len(force)))
     covered = error <= stated
@@ -50,7 +50,7 @@ def test_fresh_loads_are_covered_in_every_class(bound):
     assert (stated[1] >= stated[0]).all()
 
 
-def test_outside_it_grows(bound):
+def test_bound_grows_outside_the_training_range(bound):
     features, force, _ = drawn(10, 3)
     inside, outside = (bound.evaluate(features, force, lying(10, beyond=excess)) for excess in (0.0, 1.0))
     assert (outside > 2.0 * inside).all()
@@ -68,18 +68,18 @@ def far_and_near(growth, seed, near=400, far=300):
 
 
 @pytest.mark.parametrize("growth", [0.0, 300.0, 1500.0])
-def test_growth_is_that_by_which_errors_grow_with_the_distance(growth):
+def test_fitted_growth_matches_error_growth_with_distance(growth):
     found = np.array([fit_growth(*far_and_near(growth, seed)) for seed in range(20)])
     assert abs(np.median(found) - growth) < 0.3 * growth + 40.0
 
 
-def test_too_few_far_loads_give_no_growth():
+def test_too_few_far_loads_give_default_growth():
     near, far = far_and_near(300.0, 0)
     assert fit_growth(near, (far[0][:18], far[1][:18])) == USUAL_GROWTH
     assert fit_growth(near, (1e9 * far[0], far[1])) == MAX_GROWTH
 
 
-def test_bounds_that_grow_with_the_distance_hold_near_and_far():
+def test_growing_bounds_cover_near_and_far_loads():
     features, force, error = drawn(3000, 5)
     away = np.random.default_rng(6).uniform(0.0, 6e-3, 3000)
     error = error * (1.0 + 800.0 * away)
@@ -91,13 +91,13 @@ def test_bounds_that_grow_with_the_distance_hold_near_and_far():
     assert abs(held[near].mean() - 0.95) < 0.02 and abs(held[away > 4e-3].mean() - 0.95) < 0.03
 
 
-def test_conformal_takes_the_rank_that_covers_one_more():
+def test_conformal_quantile_has_finite_sample_rank():
     values = np.arange(1.0, 100.0)  # 99 of them
     assert compute_conformal_quantile(values, 0.95) == 95.0 and compute_conformal_quantile(values, 0.99) == 99.0
     assert compute_conformal_quantile(values[:9], 0.95) == np.inf
 
 
-def test_loads_of_one_force_are_one_class():
+def test_loads_of_equal_force_form_one_class():
     features, _, error = drawn(500, 4)
     bound = fit_bound((features, error), features, np.full(500, 0.2), error)
     assert not len(bound.edges) and bound.quantile.shape == (2, 1)
@@ -116,7 +116,7 @@ def placed(count, seed, discs=None):
 
 
 @pytest.mark.parametrize("curved", [True, False])
-def test_scale_from_few_discs_stays_bounded_between_them(curved):
+def test_bound_scale_from_few_discs_is_bounded_between_them(curved):
     discs = np.array([[-12.0, -9.0, 5.0], [2.0, 11.0, -8.0], [13.0, -4.0, 9.0]])
     features, _, error = placed(400, 5, discs)
     bound = fit_bound((features, error), *placed(1000, 6), BoundSettings(curved=curved))
@@ -129,7 +129,7 @@ def test_scale_from_few_discs_stays_bounded_between_them(curved):
 
 
 @pytest.mark.parametrize("curved", [True, False])
-def test_a_scale_is_of_the_load_and_the_same_everywhere(curved):
+def test_bound_scale_is_independent_of_contact_position(curved):
     features, _, error = placed(400, 5)
     bound = fit_bound((features, error), *placed(1000, 6), BoundSettings(curved=curved))
     elsewhere = features + [0.0, 0.0, 0.0, 0.0, 9.0, -9.0, 30.0]

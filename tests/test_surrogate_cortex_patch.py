@@ -1,4 +1,4 @@
-"""Places drawn on a cortex."""
+"""Random points on a cortex."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ import pytest
 from surrogate.data.cortex_patch import Patch
 
 
-def test_places_are_uniform_within_a_triangle_too():
-    """Two triangles, one nine times as large: each quarter of the large one gets its share."""
+def test_sampled_points_are_uniform_within_triangles():
+    """Two triangles, one nine times as large; each quarter of the large one gets the same share."""
     points = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     two = Patch(np.arange(5), np.array([[0, 1, 2], [0, 3, 4]]), points)
     found, _ = two.place(np.random.default_rng(0).random((20_000, 3)))

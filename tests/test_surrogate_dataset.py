@@ -1,4 +1,4 @@
-"""Data sets: nothing is lost to a kill, nothing is mixed, failed cases stay."""
+"""Data sets: resuming after a kill, no mixed parameters, and marked failed cases."""
 
 import subprocess
 import sys
@@ -25,7 +25,7 @@ def loads(box):
     return draw("palpation", box, 20, 0)
 
 
-def test_what_is_written_is_read(tmp_path, box, pretender, loads):
+def test_written_dataset_is_read_unchanged(tmp_path, box, pretender, loads):
     path = tmp_path / "data.h5"
     seen = []
     said = simulate(path, pretender, loads, SAID, 8, lambda done, total: seen.append((done, total)))
@@ -45,7 +45,7 @@ def test_what_is_written_is_read(tmp_path, box, pretender, loads):
     assert data.good.all() and (data.iterations == 4).all() and (data.residual == 1e-5).all()
 
 
-def test_postures_are_stored(tmp_path):
+def test_posture_loads_round_trip_through_the_file(tmp_path):
     both = Loads(
         (*push(np.zeros(3), np.ones((2, 3)), 0.01).causes, *build_posture([[0.0, -1.0, 0.0]], [0.01, 0.02]).causes)
     )
@@ -58,7 +58,7 @@ def test_postures_are_stored(tmp_path):
 
 
 @pytest.mark.parametrize("mesh", [cube((2, 2, 2)), quadratic(cube((2, 2, 2)), curved=0.05)], ids=["p1", "p2"])
-def test_the_body_travels_with_its_data(tmp_path, mesh):
+def test_anatomy_is_embedded_in_the_dataset(tmp_path, mesh):
     with h5py.File(tmp_path / "data.h5", "w") as file:
         write_embedded(file, base_held(mesh))
         assert read_embedded(file).digest == base_held(mesh).digest
@@ -78,7 +78,7 @@ def test_unit_responses_superpose_to_small_loads(tmp_path, box, pretender, loads
     assert np.linalg.norm(predicted - truth) < 1e-3 * np.linalg.norm(truth)
 
 
-def test_failed_cases_stay_marked(tmp_path, pretender, loads):
+def test_failed_cases_are_stored_with_their_outcome(tmp_path, pretender, loads):
     size = np.linalg.norm(loads.get(Pushed).force, axis=1)
     limit = np.median(size)
     simulate(tmp_path / "data.h5", type(pretender)(pretender.anatomy, limit), loads, SAID)
@@ -142,7 +142,7 @@ def undated(path):
     return raw
 
 
-def test_killed_run_resumes_to_the_same_bytes(tmp_path, pretender, loads):
+def test_killed_run_resumes_to_an_identical_file(tmp_path, pretender, loads):
     whole, killed = tmp_path / "whole.h5", tmp_path / "killed.h5"
     simulate(whole, pretender, loads, SAID, 8)
     # Before the first batch; in the middle of one of unit responses, and one of answers; while the file is written.
@@ -160,7 +160,7 @@ def test_killed_run_resumes_to_the_same_bytes(tmp_path, pretender, loads):
     assert sorted(tmp_path.iterdir()) == [killed, whole] and undated(killed) == undated(whole)
 
 
-def test_a_finished_file_is_left_alone_and_extended(tmp_path, box, pretender, loads):
+def test_finished_dataset_is_unchanged_or_extended(tmp_path, box, pretender, loads):
     path, direct = tmp_path / "data.h5", tmp_path / "direct.h5"
     simulate(path, pretender, loads, SAID, 8)
     before = path.read_bytes()
@@ -177,7 +177,7 @@ def test_a_finished_file_is_left_alone_and_extended(tmp_path, box, pretender, lo
     assert simulate(path, pretender, loads, SAID, 8).rows == 0 and path.read_bytes() == after
 
 
-def test_other_parameters_are_refused(tmp_path, box, pretender, loads):
+def test_finished_dataset_rejects_other_parameters(tmp_path, box, pretender, loads):
     path = tmp_path / "data.h5"
     simulate(path, pretender, loads, SAID, 8)
     with pytest.raises(InputError, match="preset palpation, but now preset is mixed"):
@@ -188,7 +188,7 @@ def test_other_parameters_are_refused(tmp_path, box, pretender, loads):
         simulate(path, pretender, draw("palpation", box, 20, 1), SAID, 8)
 
 
-def test_an_unfinished_run_goes_on_with_its_own_loads_alone(tmp_path, box, pretender, loads):
+def test_unfinished_dataset_rejects_other_loads(tmp_path, box, pretender, loads):
     path = unfinished(tmp_path, pretender, loads)
     with pytest.raises(InputError, match=r"number of loads 20, but now number of loads is 30.*delete it"):
         simulate(path, pretender, draw("palpation", box, 30, 0), SAID, 8)
@@ -198,7 +198,7 @@ def test_an_unfinished_run_goes_on_with_its_own_loads_alone(tmp_path, box, prete
         simulate(path, pretender, loads, {**SAID, "preset": "mixed"}, 8)
 
 
-def test_bad_files_are_sentences(tmp_path, pretender, loads):
+def test_invalid_dataset_files_are_rejected(tmp_path, pretender, loads):
     with pytest.raises(InputError, match="no such file"):
         read_dataset(tmp_path / "none.h5")
     (tmp_path / "text.h5").write_text("not HDF5")

@@ -1,6 +1,6 @@
-"""What `sulcus locate` does not know, it says: registrations that slip, causes that look alike, and stillness.
+"""Warnings of `sulcus locate`: registration slip, inseparable causes, and no motion.
 
-Of the template and the locator that ship.
+With the shipped template and locator.
 """
 
 from dataclasses import replace
@@ -45,8 +45,8 @@ def sideways(body, length):
 
 
 @pytest.mark.parametrize("length", [8e-3, 12e-3, 20e-3])
-def test_sideways_slip_is_marked_and_within_error(locator, length):
-    """Nothing moved but the registration."""
+def test_lateral_registration_slip_is_reported_within_error(locator, length):
+    """Only the registration is displaced."""
     seen = observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), NAMED, (0, 0))
     found = locator.locate(replace(seen, now=seen.now + sideways(locator.anatomy, length)))
     assert found.slipped and not found.calibrated and "may have slipped" in found.doubt
@@ -55,8 +55,8 @@ def test_sideways_slip_is_marked_and_within_error(locator, length):
 
 
 @pytest.mark.parametrize("way", ["right", "axis"])
-def test_points_that_are_turned_are_in_doubt_as_those_that_slip(locator, way):
-    """By 10 degrees about their middle, tilted or twisted. They are shifted by 0.5 mm, as a brain that sinks."""
+def test_rotated_points_are_reported_as_possible_slip(locator, way):
+    """Rotated by 10 degrees about their centre (tilt or twist) and shifted by 0.5 mm as by sinking."""
     axis = open_cortex(locator.anatomy).axis
     seen = observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), PointsSeen(100, 90, 0), (0, 0))
     turn = Rotation.from_rotvec(np.radians(10.0) * getattr(open_cortex(locator.anatomy), way))
@@ -69,7 +69,7 @@ def test_points_that_are_turned_are_in_doubt_as_those_that_slip(locator, way):
     assert "The two cannot be distinguished" in found.doubt and found.warnings == (found.doubt,)
 
 
-def test_shift_is_judged_by_the_given_registration_error(locator):
+def test_slip_report_depends_on_given_registration_error(locator):
     """A shift of 12 mm is plausible with 8 mm per axis, and suspected with 4 mm."""
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
@@ -79,8 +79,8 @@ def test_shift_is_judged_by_the_given_registration_error(locator):
     assert far.slipped and "where 4 mm and 1.5 degrees are reported" in far.doubt
 
 
-def test_checked_registration_is_not_suspected(locator):
-    """Then even an observation that resembles a registration shift is a motion."""
+def test_verified_registration_is_not_suspected(locator):
+    """With a verified registration an observation that resembles a shift counts as motion."""
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
     seen = replace(seen, now=seen.now + sideways(body, 12e-3))
@@ -89,7 +89,7 @@ def test_checked_registration_is_not_suspected(locator):
     assert np.linalg.norm(believed.centroid) > np.linalg.norm(doubted.centroid) and believed.p95 < doubted.p95
 
 
-def test_axial_shift_is_reported_as_ambiguous_with_sinking(locator):
+def test_axial_shift_warning_names_sinking_as_alternative(locator):
     body = locator.anatomy
     seen = observed(body, np.zeros_like(body.mesh.nodes), NAMED, (0, 0))
     found = locator.locate(replace(seen, now=seen.now + 12e-3 * open_cortex(body).axis))
@@ -100,8 +100,8 @@ def test_axial_shift_is_reported_as_ambiguous_with_sinking(locator):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("skull", range(3))
-def test_locate_true_motion_warns_of_no_registration(locator, skull, seed):
-    """Drained, with a dent of the last shape of a tool; most of it looks like a shift of all points."""
+def test_true_motion_gives_no_registration_warning(locator, skull, seed):
+    """Drainage with a dent of the last tool shape; most of it resembles a shift of all points."""
     prior, body = locator.prior, locator.anatomy
     random, motion = np.random.default_rng([skull, seed]), np.zeros_like(body.mesh.nodes)
     for kind, size in ((DRAINAGE, 4.0), (SWELLING, 1.0), (TOOL, 1.0)):
@@ -113,8 +113,8 @@ def test_locate_true_motion_warns_of_no_registration(locator, skull, seed):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])
-def test_locate_shifted_registration_warns(locator, sight, seed):
-    """Nothing moved but the registration, by 7 mm along the axis and across it."""
+def test_shifted_registration_gives_a_registration_warning(locator, sight, seed):
+    """Only the registration is displaced, by 7 mm along and across the axis."""
     body, axis = locator.anatomy, open_cortex(locator.anatomy).axis
     seen = observed(body, np.zeros_like(body.mesh.nodes), sight, (0, seed))
     shift = 5e-3 * axis + sideways(body, 5e-3)
@@ -123,8 +123,8 @@ def test_locate_shifted_registration_warns(locator, sight, seed):
 
 
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])
-def test_a_brain_that_sinks_is_not_taken_for_a_slip(locator, sunk, sight):
-    """Its tumour is found, and the error holds."""
+def test_sinking_brain_is_not_reported_as_slip(locator, sunk, sight):
+    """The tumour is located, and its error is within the bound."""
     found = locator.locate(observed(locator.anatomy, sunk, sight, (0, 0)))
     off = np.linalg.norm(found.centroid - compute_middle(locator.anatomy, sunk[None])[0])
     assert not found.slipped and found.calibrated and not found.doubt and off < found.p95
@@ -132,15 +132,15 @@ def test_a_brain_that_sinks_is_not_taken_for_a_slip(locator, sunk, sight):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_locate_cloud_rounding_changes_no_result(locator, sunk, seed):
-    """Over an edge of the surface two triangles are equally near, so that rounding selects one."""
+def test_rounding_of_cloud_points_changes_no_result(locator, sunk, seed):
+    """Two triangles are equally near at an edge of the surface, and rounding selects one."""
     seen = observed(locator.anatomy, sunk / 2.0, PointsSeen(300, 28, 2, named=False), (0, seed))
     found, again = (locator.locate(replace(seen, now=seen.now * factor)).centroid for factor in (1.0, 1.0 + 4e-16))
     assert again == pytest.approx(found, abs=1e-8)
 
 
-def test_point_cloud_drainage_and_atrophy_look_alike(locator):
-    """All of it by 5 mm, along the opening's axis."""
+def test_point_cloud_does_not_separate_drainage_and_shrinking(locator):
+    """All points move by 5 mm along the axis of the opening."""
     body = locator.anatomy
     still = observed(body, np.zeros_like(body.mesh.nodes), PointsSeen(100, 90, 1, named=False), (0, 0))
     found = locator.locate(replace(still, now=still.now + 5e-3 * open_cortex(body).axis))
@@ -150,14 +150,14 @@ def test_point_cloud_drainage_and_atrophy_look_alike(locator):
 
 
 @pytest.mark.parametrize("sight", [NAMED, CLOUD])
-def test_where_nothing_moved_no_cause_is_named(locator, sight):
+def test_motionless_observation_names_no_cause(locator, sight):
     found = locator.locate(observed(locator.anatomy, np.zeros_like(locator.anatomy.mesh.nodes), sight, (0, 0)))
     assert found.within_errors and not found.cause_shares and not any(found.causes.values())
     assert found.named_causes == "none, as what was seen is within its errors"
 
 
-def test_dent_of_error_size_is_seen_by_its_form(locator):
-    """Of 3 mm, 12 mm wide, at 60 points that are off by less than is stated; and such points without a dent."""
+def test_dent_of_error_size_is_detected_by_its_shape(locator):
+    """Dent of 3 mm depth and 12 mm width at 60 noisy points, compared with no dent."""
     body, random = locator.anatomy, np.random.default_rng(0)
     cortex = body.mesh.nodes[np.unique(body.open_surface)]
     rest = cortex[random.choice(len(cortex), 60, replace=False)]
@@ -169,8 +169,8 @@ def test_dent_of_error_size_is_seen_by_its_form(locator):
     assert not dented.within_errors and dented.cause_shares and still.within_errors
 
 
-def test_points_on_a_few_millimetres_were_not_tried(locator, sunk):
-    """On all of the open cortex they were, and on a tenth of it, named or not."""
+def test_points_on_tiny_patch_are_marked_uncalibrated(locator, sunk):
+    """The trials cover patches of a tenth to all of the open cortex, with named and unnamed points."""
     body = locator.anatomy
     for cover, known in ((0.12, True), (0.9, True), (0.01, False)):
         evidence = sample_seen_patch(body, sunk, np.random.default_rng(3), 60, cover)
@@ -181,7 +181,7 @@ def test_points_on_a_few_millimetres_were_not_tried(locator, sunk):
 
 
 @pytest.mark.parametrize("kind", [SWELLING, OEDEMA])
-def test_what_swells_may_be_oedema_and_that_is_said(locator, sunk, kind):
+def test_swelling_gives_an_oedema_warning(locator, sunk, kind):
     prior, body = locator.prior, locator.anatomy
     motion = np.zeros_like(body.mesh.nodes)
     motion[prior.nodes] = prior.shape[np.flatnonzero((prior.kind == kind) & (prior.skull == 0))[0]]

@@ -1,4 +1,4 @@
-"""Oedema among the causes of an ensemble: which tissue swells, how it is drawn and solved, and what sees it."""
+"""Oedema among the causes of an ensemble: swelling tissue, draws, solves and observation."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def test_swelling_near_tumour_includes_marked_oedema(body):
             assert np.array_equal(marked.mesh.region[~near], anatomy.mesh.region[~near])
 
 
-def test_oedema_reaches_near_and_far_in_each_skull(body):
+def test_oedema_reaches_cover_their_range_in_each_skull(body):
     made = build_groups(body, 0, replace(FEW, poisson=(0.45, 0.47, 0.49)))
     for skull, count in (("bonded", 6), ("contact", 2)):
         reach = np.concatenate([group.reach for group in made if group.skull == skull])
@@ -50,8 +50,8 @@ def test_oedema_bulges_more_than_brain_swelling(body):
     assert bulge[kind == OEDEMA].min() > 1.05 * bulge[kind == SWELLING][0]
 
 
-def test_members_of_one_group_share_one_factor(body, monkeypatch):
-    """Only changes of volume differ; results agree with those of factors of their own within the tolerance."""
+def test_group_members_share_one_preconditioner(body, monkeypatch):
+    """Only volume changes differ; results agree with separate preconditioners within the tolerance."""
     group, made, choose = build_groups(body, 0, FEW)[0], [], fem.choose_preconditioner
     monkeypatch.setattr(fem, "choose_preconditioner", lambda *given: made.append(given) or choose(*given))
     motion, kind = solve_members(body, group, 0, "cpu", FEW)
@@ -64,8 +64,8 @@ def test_members_of_one_group_share_one_factor(body, monkeypatch):
     assert motion[kind == OEDEMA][: len(apart)] == pytest.approx(apart.displacement, abs=1e-2 * largest)
 
 
-def test_a_cloud_is_not_taken_for_oedema(body):
-    """Its errors look like it (docs/locate.md). The same points with names may be."""
+def test_unnamed_points_are_not_attributed_to_oedema(body):
+    """Errors of clouds resemble oedema (docs/locate.md); the same points with names may indicate it."""
     locator = locator_of(body)
     prior = locator.prior
     moved = 4.0 * prior.shape[np.flatnonzero(prior.kind == OEDEMA)[0]].astype(float)

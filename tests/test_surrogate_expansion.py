@@ -1,4 +1,4 @@
-"""The tabulated series, and what is learnt of its remainder."""
+"""Tabulated series, and learning of its remainder."""
 
 from dataclasses import replace
 
@@ -47,7 +47,7 @@ def every_motion(fem, nodes):
     return fem.build_reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
 
 
-def test_the_table_is_the_finite_elements_series(box, patch, tmp_path):
+def test_tabulated_series_matches_finite_element_series(box, patch, tmp_path):
     fem = Fem(box, build_push_effects(box, TISSUE), REFERENCE, "cpu", batch=200, element="p1")
     nodes = box.tumour_nodes
     loads = pushes(patch, 30, 3, (7e-3, 7e-3))
@@ -105,7 +105,7 @@ def trained(data, expansion):
     return train(data, ["linear", *SERIES_MODELS], expansion=expansion)
 
 
-def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, patch):
+def test_tabulated_series_matches_fem_in_the_example_basis(data, expansion, box, patch):
     pushed = data.loads.get(Pushed)
     some = np.flatnonzero(data.good)[:90]
     loads = Pushed(pushed.point[some], pushed.force[some], pushed.footprint[some])
@@ -126,8 +126,8 @@ def test_the_basis_of_examples_lies_in_that_of_the_table(data, expansion, box, p
             assert miss < 0.06 * np.linalg.norm(wanted[:, terms])  # rounded to 1 in 500 of the largest
 
 
-def test_two_series_orders_are_exact_for_any_tool(expansion, box):
-    """Of loads inside the rim nothing is left of them; over it the table holds what is missing."""
+def test_first_two_series_orders_are_exact_for_any_tool(expansion, box):
+    """Inside the rim no remainder is left; over the rim the table holds the missing part."""
     fem = Fem(box, build_push_effects(box, TISSUE), REFERENCE, "cpu", element="p1")
     loads = pushes(expansion.patch, 40, 8, (7e-3, 7e-3))
     inside = expansion.patch.compute_edge_distance(loads.point) > loads.footprint
@@ -149,7 +149,7 @@ def test_two_series_orders_are_exact_for_any_tool(expansion, box):
         np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)
 
 
-def test_resumed_run_has_same_table_without_seconds(tmp_path):
+def test_resumed_series_has_equal_table_and_no_solve_time(tmp_path):
     small = make_box(cells=(8, 8, 4), spacing=8e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
     data = simulated(tmp_path / "data.h5", small, 100)
     whole, later = (Expansion(data, "cpu", begun=tmp_path / "rows", most_pairs=0) for _ in range(2))
@@ -159,7 +159,7 @@ def test_resumed_run_has_same_table_without_seconds(tmp_path):
     assert took[0] > 0.0 and took[1] is None
 
 
-def test_of_too_many_pairs_the_second_order_is_interpolated(data, trained):
+def test_second_order_is_interpolated_above_pair_limit(data, trained):
     known = Expansion(data, "cpu", most_pairs=100)
     assert [len(parts) for parts in known.exact] == [1, 1]
     again = train(data, ["series"], expansion=known)
@@ -173,16 +173,16 @@ def replaced(loads, times):
     return Pushed(*(np.concatenate([each] * times) for each in (loads.point, loads.force, loads.footprint)))
 
 
-def test_a_series_beats_the_table_of_first_order(trained):
+def test_series_has_smaller_error_than_linear_table(trained):
     linear, series, learnt = trained.scores
     # A hundred loads are nothing to the process yet: it must do no harm.
     assert series.mean_mm < 0.2 * linear.mean_mm and learnt.mean_mm < 1.5 * series.mean_mm
 
 
-def test_gp_halves_series_error_on_known_cortex(tmp_path):
-    """What `series-gp` is there for: nine open nodes, 300 loads among them, every fourth tested wherever it lies.
+def test_gp_correction_halves_series_error_on_trained_cortex(tmp_path):
+    """Benefit of `series-gp`: nine open nodes and 300 loads, every fourth a test load anywhere.
 
-    A process that has lost its units leaves the series as it is.
+    A Gaussian process with wrong units would leave the error of the series unchanged.
     """
     small = make_box(cells=(6, 6, 4), spacing=9e-3, tumour=12e-3, depth=20e-3, opening=15e-3)
     data = simulated(tmp_path / "data.h5", small, 300)
@@ -192,8 +192,8 @@ def test_gp_halves_series_error_on_known_cortex(tmp_path):
     assert learnt.mean_percent < 0.5 * series.mean_percent and learnt.mean_mm < 0.5 * series.mean_mm
 
 
-def test_held_out_discs_are_unknown_to_series(trained, data, expansion, tmp_path):
-    """Bit for bit: wild answers to all loads that were not trained on, and wild series at all places of the discs."""
+def test_series_training_ignores_held_out_discs(trained, data, expansion, tmp_path):
+    """Bit-identical with random displacements of untrained loads and random series in held-out discs."""
     split = trained.split
     rows = np.flatnonzero(data.good)[~split.train]
     wild = read_dataset(poisoned(data.path, tmp_path / "wild.h5", rows)[0])
@@ -211,8 +211,8 @@ def test_held_out_discs_are_unknown_to_series(trained, data, expansion, tmp_path
     assert min(row.mean_mm for row in after.scores) > 1.0
 
 
-def test_every_solve_is_counted(trained, data):
-    """By hand: 19 terms at each place and radius outside the discs, 3 unit forces a node, and the loads.
+def test_training_solve_counts_match_hand_count(trained, data):
+    """Hand count: 19 terms at each place and radius outside the discs, 3 unit forces a node, and the loads.
 
     Unit forces on nodes inside the discs are counted once more.
     """
@@ -231,7 +231,7 @@ def test_every_solve_is_counted(trained, data):
     assert silent.scores[0].solves == replace(linear, seconds=None)
 
 
-def test_the_cortex_moves_as_the_finite_elements_say(trained, data, box, patch):
+def test_series_reduces_cortex_motion_error(trained, data, box, patch):
     cortex = np.setdiff1d(patch.nodes, box.tumour_nodes)
     truth = data.read_displacement(cortex)
     miss = {name: np.linalg.norm(model.deform(data.loads, at=cortex).displacement - truth, axis=2).mean()
@@ -239,7 +239,7 @@ def test_the_cortex_moves_as_the_finite_elements_say(trained, data, box, patch):
     assert miss["series"] < 0.7 * miss["linear"] and miss["series-gp"] < 0.7 * miss["linear"]
 
 
-def test_stored_series_answer_alike(trained, data, box, tmp_path):
+def test_stored_series_predict_identically(trained, data, box, tmp_path):
     save(tmp_path / "model.npz", trained.models)
     again = load(tmp_path / "model.npz", box)
     for name in SERIES_MODELS:
@@ -247,7 +247,7 @@ def test_stored_series_answer_alike(trained, data, box, tmp_path):
         assert np.array_equal(before.displacement, after.displacement) and np.array_equal(before.bound, after.bound)
 
 
-def test_series_need_a_tissue(data):
+def test_series_models_require_a_tissue(data):
     untold = replace(data, provenance={})
     assert not set(SERIES_MODELS) & set(list_learners(untold)) and set(SERIES_MODELS) < set(list_learners(data))
     with pytest.raises(InputError, match="does not state its tissue"):

@@ -1,4 +1,4 @@
-"""Exported models: ONNX Runtime answers as they do."""
+"""Exported models: ONNX Runtime predicts the same values."""
 
 import json
 import sys
@@ -105,7 +105,7 @@ def assert_alike(answer, wanted):
 
 @pytest.mark.parametrize("cortex", [False, True])
 @pytest.mark.parametrize("name", LEARNERS)
-def test_runtime_answers_as_the_model(models, block, loads, name, cortex):
+def test_onnx_runtime_predicts_as_the_model(models, block, loads, name, cortex):
     model, patch = models[name], open_patch(block)
     session = opened(build_onnx_model(name, model, cortex))
     answer, heard = asked(session, loads, patch)
@@ -125,13 +125,13 @@ def test_runtime_answers_as_the_model(models, block, loads, name, cortex):
         assert_alike(alone, wanted.select(np.array([row])))
 
 
-def test_a_graph_is_the_formula_that_numpy_runs(models, block, loads, monkeypatch):
+def test_onnx_graph_follows_the_numpy_kernel(models, block, loads, monkeypatch):
     monkeypatch.setattr("surrogate.regressors.gp.compute_matern", lambda distance: np.exp(-distance))
     answer, heard = asked(opened(build_onnx_model("gp", models["gp"])), loads, open_patch(block))
     assert_alike(answer, models["gp"].deform(heard, at=block.tumour_nodes))
 
 
-def test_a_curved_cortex_and_the_model_that_ships():
+def test_onnx_graph_matches_the_shipped_model():
     anatomy = read_anatomy(get_template_path())
     for name, model in load(get_template_path().with_suffix(".model.npz"), anatomy).items():
         answer, heard = asked(
@@ -140,7 +140,7 @@ def test_a_curved_cortex_and_the_model_that_ships():
         assert_alike(answer, model.deform(heard, at=anatomy.tumour_nodes))
 
 
-def test_bounds_have_classes_of_force_or_are_none(models, block, loads):
+def test_exported_bounds_support_force_classes_or_none(models, block, loads):
     model, patch = models["svr"], open_patch(block)
     classes = replace(model.bounds, edges=np.array([0.11, 0.21]), quantile=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
     for bounds in (classes, None):
@@ -160,7 +160,7 @@ def _series_of(model, nodes):
 
 
 @pytest.mark.parametrize("taken", [[1], [0, 2, 1, 0, 2]])
-def test_a_series_has_one_radius_or_many(models, block, loads, taken):
+def test_exported_series_supports_one_or_many_radii(models, block, loads, taken):
     model = models["series"]
     (number, part), radii = _series_of(model, block.tumour_nodes), np.linspace(5e-3, 8e-3, len(taken))
     series = part.regressor
@@ -181,7 +181,7 @@ def folder(models, block, tmp_path):
     return tmp_path
 
 
-def test_a_file_says_what_it_holds(folder, models, block, loads, capsys):
+def test_onnx_file_contains_descriptive_metadata(folder, models, block, loads, capsys):
     out = folder / "model.onnx"
     assert main(["export", str(folder / "block.model.npz"), "--out", str(out), "--learner", "ann"]) == 0
     assert str(out) in capsys.readouterr().out
@@ -197,7 +197,7 @@ def test_a_file_says_what_it_holds(folder, models, block, loads, capsys):
     assert_alike(answer, models["ann"].deform(heard, at=block.tumour_nodes))
 
 
-def test_the_mesh_may_lie_elsewhere_and_the_best_is_taken(folder, models, block):
+def test_export_accepts_mesh_path_and_selects_best_learner(folder, models, block):
     best = min(("linear", "ann"), key=lambda name: models[name].bound)
     (folder / "block.model.npz").rename(folder / "other.npz")
     words = ["export", str(folder / "other.npz"), "--out", str(folder / "model.onnx"), "--cortex"]
@@ -213,7 +213,7 @@ class Foreign(Ann):
     """A regressor without an ONNX graph."""
 
 
-def test_what_cannot_be_exported_is_a_sentence(folder, models, capsys, monkeypatch):
+def test_export_errors_are_reported_as_messages(folder, models, capsys, monkeypatch):
     model, out = str(folder / "block.model.npz"), str(folder / "model.onnx")
     for words, said in (
         ([str(folder / "none.model.npz"), "--out", out], "none.model.npz: no such file"),

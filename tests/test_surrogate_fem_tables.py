@@ -1,4 +1,4 @@
-"""A ball on condensed linear tissue: what it must obey, whatever else answers the same, and what is learnt on top."""
+"""Ball on condensed linear tissue: contact conditions, reference solutions and learned corrections."""
 
 import shutil
 from dataclasses import dataclass, replace
@@ -54,11 +54,11 @@ def pressed(box):
     )
 
 
-def test_the_ball_enters_no_facet_and_pulls_nothing(box, pressed):
-    """Signorini's conditions: a dense lattice of every facet is outside, and every force goes away from the middle.
+def test_ball_contact_satisfies_signorini_conditions(box, pressed):
+    """A dense lattice of every facet is outside the ball, which pushes and does not pull (Signorini's conditions).
 
-    Forces through the middle have no moment about it; those of bent facets alone are at their nodes, which are given
-    apart by it.
+    Contact forces act along lines through the centre, with no moment about it. Nodes far from the ball bear no
+    force.
     """
     contact, loads = pressed[0], draw_poses("palpation", box, 30, 2)
     X = features(box, loads)
@@ -79,8 +79,8 @@ def test_the_ball_enters_no_facet_and_pulls_nothing(box, pressed):
     assert not force[idle].any()
 
 
-def test_it_answers_as_finite_elements_of_linear_tissue_do(box, pressed):
-    """The same body, condensed or not, deep and oblique: what differs is how the barrier keeps its gap."""
+def test_ball_contact_matches_linear_finite_elements(box, pressed):
+    """Same body with and without condensation, deep and oblique; the difference is the gap of the barrier."""
     contact, bases = pressed
     fem = Fem(box, [Elasticity(SOFT), Held(), ToolContact((BALL,))], device="cpu", batch=1, element="p1")
     loads, cortex = draw_poses("palpation", box, 8, 5), bases[1].nodes
@@ -99,8 +99,8 @@ def test_it_answers_as_finite_elements_of_linear_tissue_do(box, pressed):
     assert (np.linalg.norm(bears - reads, axis=1) < 0.05 * np.linalg.norm(reads, axis=1)).all()
 
 
-def test_bone_under_the_ball_bears_nothing(box, pressed):
-    """Over the rim the ball is in what cannot give: what can is pushed away, and no force grows beyond all bounds."""
+def test_bone_nodes_under_the_ball_give_bounded_force(box, pressed):
+    """Over the rim the ball overlaps rigid bone: soft nodes are displaced, and forces stay bounded."""
     contact, rim = pressed[0], open_patch(box).points
     middle, pose = 0.5 * (rim.min(axis=0) + rim.max(axis=0)), np.tile(np.eye(4), (8, 1, 1, 1))
     pose[:, 0, :3, 3] = middle + np.linspace([0.0, 0.0, -4e-3], [1.25 * (rim[:, 0].max() - middle[0]), 0.0, -4e-3], 8)
@@ -110,7 +110,7 @@ def test_bone_under_the_ball_bears_nothing(box, pressed):
     assert np.linalg.norm(force.sum(axis=1), axis=1).max() < 20.0
 
 
-def test_how_stiff_tissue_is_does_not_matter(box, pressed):
+def test_contact_motion_is_independent_of_tissue_stiffness(box, pressed):
     soft = pressed[0]
     stiff = condense_contact(bodily(box, replace(SOFT, young=7500.0)), [box.tumour_nodes])[0]
     X = features(box, draw_poses("palpation", box, 10, 3))
@@ -123,8 +123,8 @@ def test_how_stiff_tissue_is_does_not_matter(box, pressed):
     assert not soft.predict(air).any()
 
 
-def test_unit_responses_are_those_of_small_forces(box):
-    """Against solves under nodal forces."""
+def test_unit_responses_match_fem_under_small_forces(box):
+    """Reference: solves under nodal forces."""
     nodes, at = open_patch(box).nodes[[3, 20]], box.tumour_nodes[:9]
     found = compute_unit_responses(bodily(box, SOFT), nodes, at)
     force = np.zeros((6, len(box.mesh.nodes), 3))
@@ -183,8 +183,8 @@ def trained(data):
     return train(data, CONTACT_MODELS)
 
 
-def test_contact_learns_how_forces_grow_and_a_process_the_rest(trained, elements, box):
-    """On discs left out and on fresh poses; and bounds hold about as often as they say."""
+def test_contact_models_reach_error_and_coverage_limits(trained, elements, box):
+    """On held-out discs and new poses; bounds have about their nominal coverage."""
     contact, both = (trained.models[name] for name in CONTACT_MODELS)
     regressor = contact.parts[0].regressor
     assert isinstance(regressor, RigidContact)
@@ -205,7 +205,7 @@ def test_contact_learns_how_forces_grow_and_a_process_the_rest(trained, elements
     assert np.linalg.norm(both.deform(fresh, at=cortex).displacement - exact) < 0.05 * np.linalg.norm(exact)
 
 
-def test_the_tool_s_force_is_answered_with_a_bound_of_its_own(data, trained, elements, box):
+def test_tool_force_is_predicted_with_its_own_bound(data, trained, elements, box):
     contact, both = (trained.models[name] for name in CONTACT_MODELS)
     regressor = contact.parts[0].regressor
     assert isinstance(regressor, RigidContact)
@@ -233,8 +233,8 @@ def test_the_tool_s_force_is_answered_with_a_bound_of_its_own(data, trained, ele
     assert not both.deform(Loads((lifted,))).reaction.any()
 
 
-def test_without_reactions_the_force_is_not_answered(tmp_path, data, box):
-    """Files of earlier versions, whose rows end before the reaction, are read and train models all the same."""
+def test_dataset_without_reactions_gives_no_force_model(tmp_path, data, box):
+    """Files of older versions end their rows before the reaction; they are read and train models."""
     older = tmp_path / "older.h5"
     shutil.copy(data.path, older)
     with h5py.File(older, "r+") as file:
@@ -252,7 +252,7 @@ def test_without_reactions_the_force_is_not_answered(tmp_path, data, box):
     assert answer.reaction.shape == (2, 0, 6) and np.isnan(answer.reaction_bound).all()
 
 
-def test_it_is_stored_and_answers_alone_as_in_company(tmp_path, trained, box):
+def test_stored_contact_models_predict_same_alone_and_batched(tmp_path, trained, box):
     save(tmp_path / "model.npz", trained.models)
     again, fresh = load(tmp_path / "model.npz", box), draw_poses("palpation", box, 6, 1)
     for name in CONTACT_MODELS:
@@ -266,7 +266,7 @@ def test_it_is_stored_and_answers_alone_as_in_company(tmp_path, trained, box):
         np.testing.assert_allclose(alone, together, atol=1e-8)
 
 
-def test_what_contact_needs_is_said(data):
+def test_contact_models_require_tissue_and_poses(data):
     assert set(CONTACT_MODELS) < set(list_learners(data))
     untold = replace(data, provenance={"ball": repr(BALL.radius)})
     assert not set(CONTACT_MODELS) & set(list_learners(untold))

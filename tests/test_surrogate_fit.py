@@ -1,4 +1,4 @@
-"""Fitting tissue to several frames: a small body whose motions obey the tissue that is to be found, and bad input."""
+"""Fit of tissue to several frames: a small body with known tissue, and invalid input."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def drained_frames(body, drained, skull, poisson, ratio):
 
 
 @pytest.mark.parametrize(("skull", "poisson", "ratio"), [("bonded", 0, 0), ("slide", 2, 3), ("slide", 0, 2)])
-def test_the_tissue_that_moved_so_is_found(body, locator, drained, skull, poisson, ratio):
+def test_fit_recovers_the_tissue_of_simulated_frames(body, locator, drained, skull, poisson, ratio):
     frames = drained_frames(body, drained, skull, poisson, ratio)
     tissue = FittedTissue("", 3, compute_probability(weigh_tissues(locator, frames, drained, None)), np.zeros(0))
     assert tissue.skulls[skull] > 0.9
@@ -62,7 +62,7 @@ def test_the_tissue_that_moved_so_is_found(body, locator, drained, skull, poisso
     assert high / low < 0.7 * FINE_RATIOS[-1] / FINE_RATIOS[0]
 
 
-def test_more_frames_say_more(body, locator, drained):
+def test_more_frames_reduce_posterior_entropy(body, locator, drained):
     frames = drained_frames(body, drained, "slide", 1, 2)
     entropy = []
     for some in (frames[:1], frames):
@@ -71,14 +71,14 @@ def test_more_frames_say_more(body, locator, drained):
     assert entropy[1] < entropy[0] - 0.1
 
 
-def test_points_that_hardly_move_leave_the_prior(body, locator, drained):
+def test_nearly_motionless_points_leave_stiffness_unknown(body, locator, drained):
     frame = build_tool_frame(body, np.random.default_rng(0).normal(scale=2e-5, size=body.mesh.nodes.shape))
     frame = replace(frame, observation=replace(frame.observation, sigma=np.full(60, 5e-3), rigid=5e-3))
     tissue = FittedTissue("", 1, compute_probability(weigh_tissues(locator, [frame], drained, None)), np.zeros(0))
     assert "the tumour's stiffness" in tissue.not_known and "Young's modulus" in tissue.not_known
 
 
-def test_a_force_that_is_read_gives_the_modulus(body):
+def test_measured_force_gives_young_modulus(body):
     tip = find_foot(body, Tool(tuple(body.mesh.nodes[np.unique(body.open_surface)].mean(axis=0).tolist())))
     loads = build_force_loads(body, tip[None], np.array([6e-3]), np.array([[0.0, 0.02, -0.12]]))
     motion = (
@@ -98,7 +98,7 @@ def test_a_force_that_is_read_gives_the_modulus(body):
     assert not len(estimate_young_moduli(body, silent, FittedTissue("", 1, share, np.zeros(0)), pressed, "cpu"))
 
 
-def test_solved_tissues_are_read_again(body, parts, drained, monkeypatch):
+def test_solved_responses_are_read_from_cache(body, parts, drained, monkeypatch):
     monkeypatch.setattr("surrogate.fitting.responses.Fem", None)
     again = solve_responses(body, build_drained_loads(body), "cpu", parts)
     assert all(np.array_equal(again.motion[name], drained.motion[name]) for name in ("bonded", "slide"))

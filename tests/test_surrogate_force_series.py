@@ -1,4 +1,4 @@
-"""The power series of a force: its forms, and what lies between its places."""
+"""Power series of a force: its forms, and interpolation between its places."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from surrogate.regressors.force_series import Series, compute_forms, fill_table
 from surrogate.training.fem_tables import add_edge_midpoints, choose_radii
 
 
-def test_fields_of_second_degree_are_met_between_the_places(patch):
+def test_quadratic_fields_are_interpolated_exactly(patch):
     triangles, places = add_edge_midpoints(patch)
     radii = choose_radii(5e-3, 8e-3)
     random = np.random.default_rng(1)
@@ -34,7 +34,7 @@ def test_fields_of_second_degree_are_met_between_the_places(patch):
     assert np.allclose(alone, predicted[:5], rtol=1e-5, atol=1e-7)
 
 
-def test_of_no_loads_there_are_no_responses(patch):
+def test_empty_loads_give_empty_responses(patch):
     (triangles, places), radii = add_edge_midpoints(patch), choose_radii(5e-3, 8e-3)
     series = Series(patch.points, triangles, radii, unrounded(np.ones((len(places), len(radii), 19, 2))))
     none = compute_tool_features(patch, Pushed(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)))
@@ -45,7 +45,7 @@ def _row(loads, k):
     return Pushed(loads.point[k : k + 1], loads.force[k : k + 1], loads.footprint[k : k + 1])
 
 
-def test_forms_are_those_of_their_degree():
+def test_force_forms_span_polynomials_of_their_degree():
     random = np.random.default_rng(0)
     direction = random.normal(size=(40, 3))
     values = compute_forms(direction, np.ones(40))
@@ -56,8 +56,8 @@ def test_forms_are_those_of_their_degree():
         assert np.allclose(values[:, columns] @ found, wanted)
 
 
-def test_what_is_left_out_is_interpolated(patch):
-    """Fields that are linear in the place are met, on a flat cortex too; what is left out has no say."""
+def test_omitted_table_entries_are_interpolated(patch):
+    """Linear fields are reproduced, on a flat cortex too; omitted entries have no influence."""
     places = add_edge_midpoints(patch)[1]
     left_out = np.linalg.norm(places[:, :2] - [5e-3, 0.0], axis=1) < 6e-3
     wanted = (places @ np.random.default_rng(0).normal(size=(3, 4)) + 2.0).reshape(-1, 2, 2)

@@ -1,4 +1,4 @@
-"""Points of a frame that the others do not support."""
+"""Points of a frame that no other point supports."""
 
 from dataclasses import replace
 
@@ -17,8 +17,8 @@ def locator(body):
     return locator_of(body)
 
 
-def test_points_that_no_other_supports_are_left_out(body, locator, monkeypatch):
-    """They are those that `locate` leaves out, and nothing is fitted to them; more than a third is refused."""
+def test_unsupported_points_are_excluded_from_the_fit(body, locator, monkeypatch):
+    """Same points as excluded by `locate`; a frame with more than a third of them is rejected."""
     clean = build_tool_frame(body, dent(body, np.random.default_rng(1)))
     clean = replace(clean, observation=replace(clean.observation, sigma=np.full(60, 3e-4)))
     wild = np.where(np.isin(np.arange(60), (5, 17))[:, None], [0.0, 0.01, -0.012], 0.0)

@@ -1,4 +1,4 @@
-"""A model with finite elements behind it: who answers which load, and what is said of the answer."""
+"""Model with finite elements as fallback: choice for each load, and description of the source."""
 
 import argparse
 import threading
@@ -45,21 +45,21 @@ def limited(guarded, limit):
     return replace(guarded, limit=limit, model=replace(guarded.model, bounds=None, bound=1e-3))
 
 
-def test_the_model_answers_what_it_is_sure_of(guarded, loads, predicted):
+def test_model_predicts_loads_with_bound_below_limit(guarded, loads, predicted):
     sure = limited(guarded, 2e-3).deform(loads)
     inside = [row for row, outcome in enumerate(predicted.outcome) if outcome.good]
     assert inside and np.array_equal(sure.displacement[inside], predicted.displacement[inside])
     assert all(sure.outcome[row] is Outcome.PREDICTED for row in inside)
 
 
-def test_the_finite_elements_answer_the_rest(guarded, loads, solved):
+def test_fem_solves_loads_with_bound_above_limit(guarded, loads, solved):
     answer = limited(guarded, 0.5e-3).deform(loads)
     assert answer.displacement == pytest.approx(solved.displacement, abs=1e-9) and answer.outcome == solved.outcome
     assert answer.source == solved.source and np.isnan(answer.bound).all()
 
 
-def test_each_load_is_judged_by_its_own_bound(guarded, loads, predicted, solved):
-    """Bounds of their own: half of the loads lie below the limit; asked at vertices, in the order asked for."""
+def test_each_load_is_compared_with_its_own_bound(guarded, loads, predicted, solved):
+    """Half of the bounds are below the limit; result at vertices in the requested order."""
     bounds = np.linspace(1e-4, 6e-4, len(loads))
     bounds[2] = np.nan
     marked = replace(predicted, bound=np.stack([bounds, bounds]), outcome=(Outcome.PREDICTED,) * len(loads))
@@ -80,13 +80,13 @@ def test_each_load_is_judged_by_its_own_bound(guarded, loads, predicted, solved)
     assert f"for {handed.sum()} of {len(loads)} loads" in answer.source
 
 
-def test_model_stands_with_bound_where_fem_fails(guarded, loads, predicted, box):
+def test_failed_fem_solve_keeps_the_model_prediction(guarded, loads, predicted, box):
     answer = replace(guarded, limit=0.0, fem=AtRest(box)).deform(loads)
     assert np.array_equal(answer.displacement, predicted.displacement) and answer.outcome == predicted.outcome
     assert answer.bound == pytest.approx(predicted.bound, nan_ok=True)
 
 
-def test_frames_start_from_the_last_solved_one(guarded, loads):
+def test_fem_solve_starts_from_the_last_solution(guarded, loads):
     one, strict = loads.select(np.array([0])), replace(guarded, limit=0.0)
     first = strict.deform(one)
     again = strict.deform(one, start=first)
@@ -97,7 +97,7 @@ def test_frames_start_from_the_last_solved_one(guarded, loads):
 
 
 @pytest.mark.parametrize("limit", [0.0, 1.0])
-def test_a_frame_says_who_answered(theatre, limit):
+def test_frame_names_model_or_fem_as_source(theatre, limit):
     play = player(theatre, small(), GUARDED)
     play = replace(play, deformer=replace(play.deformer, limit=limit))
     frame = play.draw(0, 0.0, Touch(force=0.1))
@@ -110,7 +110,7 @@ def test_a_frame_says_who_answered(theatre, limit):
     assert frame.moved == pytest.approx(moved.moved, abs=1e-9)
 
 
-def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
+def test_page_solve_starts_from_the_previous_solution(theatre):
     cast = SceneSolvers(theatre, small(), GUARDED, threading.Lock())
     play = cast.get_player(GUARDED)
     cast.players[GUARDED, ALL_ACTIVE] = replace(play, deformer=replace(play.deformer, limit=0.0))
@@ -120,7 +120,7 @@ def test_on_a_page_each_solve_starts_from_the_last_answer(theatre):
     assert again.displacement == pytest.approx(first.displacement, abs=1e-6)
 
 
-def test_the_limit_is_the_user_s(theatre):
+def test_guard_limit_is_set_by_the_user(theatre):
     strict = replace(theatre, limit=5e-5)
     assert (
         strict.build_deformer(GUARDED, small()).limit == 5e-5
@@ -137,7 +137,7 @@ def test_the_limit_is_the_user_s(theatre):
             build_requested_theatre(parser.parse_args(["--guard", words, "--device", "cpu"]))
 
 
-def test_scene_model_is_named_with_description(theatre):
+def test_guarded_deformer_is_listed_with_description(theatre):
     assert GUARDED in theatre.list_deformers(
         small()
     ) and "where its error may exceed 0.2 mm" in theatre.describe_deformer(GUARDED, small())
@@ -156,8 +156,8 @@ def test_held_out_errors_count_fem_solutions_as_exact():
     assert measure_held_out(distance[1:2], np.full(1, 10e-3), np.full(1, np.nan), np.zeros(1, bool)).solved == 1.0
 
 
-def test_fem_share_matches_held_out_errors(theatre):
-    """The widest limit that leaves 1 % of the motion, and 0.2 mm at 99.9 % of the vertices; at none all are solved."""
+def test_guard_limit_is_chosen_from_held_out_errors(theatre):
+    """Largest limit that leaves 1 % of the motion, and 0.2 mm at 99.9 % of the vertices; otherwise FEM solves all."""
     bound, inside = 1e-3 * np.array([0.15, 0.08, 0.03, 0.005]), np.zeros(4, bool)
     distance = 1e-3 * np.array([[0.30], [0.06], [0.02], [0.004]])
     wide, middle, none = (measure_held_out(distance, np.full(4, size), bound, inside) for size in (1e-2, 1e-3, 5e-5))
@@ -184,7 +184,7 @@ def test_fem_share_matches_held_out_errors(theatre):
         (None, np.nan, GUARDED),
     ],
 )
-def test_default_deformer_is_model_alone_where_valid(theatre, mean, bound, who):
+def test_default_deformer_depends_on_bound_and_held_out_error(theatre, mean, bound, who):
     (_, model), *_ = theatre.models.items()
     stated = None if mean is None else HeldOutErrors(mean, 0.001, None, 0.3)
     some = replace(theatre, models={"series-gp": replace(model, bound=bound, held_out=stated)})
@@ -193,7 +193,7 @@ def test_default_deformer_is_model_alone_where_valid(theatre, mean, bound, who):
     assert said.endswith(": scenes play it guarded" if who == GUARDED else ": scenes play it without FEM")
 
 
-def test_a_file_keeps_errors_on_left_out_cortex(theatre, tmp_path):
+def test_model_file_stores_held_out_errors(theatre, tmp_path):
     (name, model), *_ = theatre.models.items()
     stated = HeldOutErrors(0.02, 0.004, 0.3e-3, 0.4)
     save(tmp_path / "a.npz", {name: replace(model, held_out=stated)})
@@ -204,6 +204,6 @@ def test_a_file_keeps_errors_on_left_out_cortex(theatre, tmp_path):
             load(tmp_path / "b.npz", model.anatomy)
 
 
-def test_where_no_model_knows_the_scene_the_reason_is_said(theatre):
+def test_unsupported_scene_is_rejected_with_reason(theatre):
     with pytest.raises(InputError, match=r"could ask knows the scene retract: .*Retraction\. Choose fem\."):
         theatre.build_deformer(GUARDED, small("retract"))

@@ -1,4 +1,4 @@
-"""What a scored model knows of the discs of cortex that it is held to: how linear tissue gives, and no answer."""
+"""Data from held-out discs in scored models: linear responses, but no displacements of loads."""
 
 from dataclasses import replace
 
@@ -31,8 +31,8 @@ def scored(data, trained):
     return train(data, ["linear"], split=trained.split).models["linear"]
 
 
-def test_nothing_of_held_out_loads_reaches_an_envelope(trained, scored, data):
-    """Bit for bit, wherever they lie and however strong they are."""
+def test_envelope_is_independent_of_held_out_loads(trained, scored, data):
+    """Bit-identical for other positions and forces of held-out loads."""
     rows = np.flatnonzero(~trained.split.train)
     pushed = data.loads.get(Pushed)
     moved = Pushed(pushed.point.copy(), pushed.force.copy(), pushed.footprint.copy())
@@ -42,8 +42,8 @@ def test_nothing_of_held_out_loads_reaches_an_envelope(trained, scored, data):
     assert all(np.array_equal(value, vars(again)[name]) for name, value in vars(scored.envelope).items())
 
 
-def test_unit_responses_inside_the_discs_are_given_and_counted(trained, data, box):
-    """Linear tissue is known everywhere: the table answers weak loads in the discs exactly, and the row says so."""
+def test_unit_responses_inside_held_out_discs_are_counted(trained, data, box):
+    """Linear tissue is known everywhere: the table is exact for unit forces in the discs, and the row counts them."""
     inside = int(trained.split.is_covered(open_patch(box).points).sum())
     assert inside and trained.scores[0].solves.inside == 3 * inside
     model = train(data, ["linear"], split=trained.split).models["linear"]
@@ -56,8 +56,8 @@ def test_unit_responses_inside_the_discs_are_given_and_counted(trained, data, bo
         np.testing.assert_allclose(found, unit[node, 2], atol=2e-3 * np.abs(unit[node, 2]).max())
 
 
-def test_learners_without_table_get_no_unit_response(trained, data, tmp_path):
-    """Bit for bit: wild ones change the cortex alone, which is not scored."""
+def test_learners_without_table_ignore_unit_responses(trained, data, tmp_path):
+    """Bit-identical: random unit responses change only the cortex part, which is not scored."""
     rows = np.arange(len(data.unit_good))
     wild, _ = poisoned(data.path, tmp_path / "wild.h5", rows, "unit")
     known, again = (train(each, ["gp"], split=trained.split) for each in (data, read_dataset(wild)))

@@ -24,8 +24,8 @@ def samples(patch: Patch) -> np.ndarray:
     return np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)
 
 
-def test_a_pose_is_where_the_ball_is_deepest(box):
-    """Its point is on the surface, nowhere else is nearer to its middle, and depth is what is left of the radius."""
+def test_pose_point_is_the_deepest_contact_of_the_ball(box):
+    """The point is the nearest one on the surface; depth is the radius minus this distance."""
     patch = open_patch(box)
     bumpy = replace(patch, points=domed(patch.points))
     loads = draw_poses("palpation", box, 60, 3)
@@ -53,8 +53,8 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def test_how_a_ball_came_there_is_nothing(box):
-    """On a flat cortex an oblique way is a straight one to beside it; a ball sunk to its middle has the normal."""
+def test_indentation_is_independent_of_the_approach_path(box):
+    """Flat cortex: an oblique path equals a vertical one at the end point; a half-embedded ball has the normal."""
     patch = open_patch(box)
     forces = draw("palpation", box, 40, 0).get(Pushed)
     assert forces is not None
@@ -68,7 +68,7 @@ def test_how_a_ball_came_there_is_nothing(box):
     np.testing.assert_allclose(sunk.force, BALL.radius * normal, atol=1e-9)
 
 
-def test_ball_without_contact_has_no_depth(box):
+def test_ball_without_contact_has_zero_depth(box):
     patch = open_patch(box)
     point = patch.points[[3, 3]] + [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]]
     away = compute_poses(BALL, point, np.array([[0.0, 0.0, -1.0]] * 2), np.array([[0.0, 0.0, -1e-3]] * 2))
@@ -78,7 +78,7 @@ def test_ball_without_contact_has_no_depth(box):
     assert np.isfinite(found.point).all()
 
 
-def test_half_embedded_ball_presses_inwards(box):
+def test_half_embedded_ball_has_inward_indentation(box):
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, -BALL.radius]  # its middle is on the box's top
     pushed = to_indentation(Loads((Touching(pose[None, None]),)), BALL, open_patch(box))

@@ -1,4 +1,4 @@
-"""Rounds that place points again: each starts from the result of the last."""
+"""Rounds of conditioning with new positions of points: each starts from the last result."""
 
 from dataclasses import replace
 
@@ -17,8 +17,8 @@ def prior():
 
 
 @pytest.mark.parametrize(("named", "lost"), [(True, (0,)), (True, (1,)), (True, (0, 2)), (False, ())])
-def test_settled_round_starts_from_the_last_result(prior, monkeypatch, named, lost):
-    """Its motion and rigid error place points again; tips that no point supports no longer tell where a tool is."""
+def test_each_conditioning_round_starts_from_the_last_result(prior, monkeypatch, named, lost):
+    """Its motion and rigid error give new positions; unsupported tips no longer locate a tool."""
     body = prior.anatomy
     cortex = np.unique(body.open_surface)
     rest, count = body.mesh.nodes[cortex], len(cortex)

@@ -1,4 +1,4 @@
-"""Arrays that a folder keeps while a run computes."""
+"""Cached arrays of a run in a folder."""
 
 from types import SimpleNamespace
 
@@ -6,7 +6,7 @@ from surrogate.model import kept_arrays
 from surrogate.model.kept_arrays import find_kept_path
 
 
-def test_kept_path_states_version_device_and_the_rest(tmp_path, monkeypatch):
+def test_cache_path_depends_on_version_device_and_inputs(tmp_path, monkeypatch):
     first = find_kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")
     assert (
         first == find_kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")

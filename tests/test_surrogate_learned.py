@@ -1,4 +1,4 @@
-"""Learned deformers: what they were trained on, what they refuse, how they are scored and stored."""
+"""Learned deformers: training, rejected input, scores and storage."""
 
 import json
 import threading
@@ -55,7 +55,7 @@ def fresh(box):
     return draw("palpation", box, 60, 99)
 
 
-def test_every_model_is_a_deformer(model, box, fresh):
+def test_every_learned_model_implements_deformer(model, box, fresh):
     answer = model.deform(fresh)
     assert isinstance(model, Deformer) and model.anatomy.digest == box.digest
     assert np.array_equal(answer.nodes, np.union1d(box.tumour_nodes, open_patch(box).nodes))
@@ -68,15 +68,15 @@ def test_every_model_is_a_deformer(model, box, fresh):
     assert np.allclose(single, answer.displacement[:5], atol=1e-8)
 
 
-def test_no_force_no_motion_and_weak_loads_in_proportion(model, fresh):
+def test_zero_load_gives_zero_motion_and_weak_loads_scale(model, fresh):
     assert not model.deform(stack([fresh.scale(0.0), fresh.scale(1e-200)])).displacement.any()  # 1e-400 is zero
     weak = fresh.scale(1e-6)
     assert np.allclose(3.0 * model.deform(weak).displacement, model.deform(weak.scale(3.0)).displacement, rtol=1e-5)
     assert model.deform(fresh.scale(0.0)).outcome[0] is Outcome.PREDICTED
 
 
-def test_learners_are_as_near_as_they_were(trained):
-    """Each within a fifth to a third of what it scored when this was written; the table does not depend on luck."""
+def test_learner_errors_do_not_regress(trained):
+    """Each is within a fifth to a third of its recorded score; the table is deterministic."""
     mean = {row.name: row.mean_percent for row in trained.scores}
     assert mean["linear"] == pytest.approx(7.15, rel=0.01)
     known = {"pcr": 16.0, "ann": 10.0, "svr": 8.5, "gp": 1.3, "residual": 1.4}
@@ -89,7 +89,7 @@ def scored(trained, data, short_fits):
     return train(data, split=trained.split)
 
 
-def test_no_load_of_a_left_out_disc_is_learnt(trained, scored, data):
+def test_held_out_disc_loads_are_excluded_from_training(trained, scored, data):
     split = trained.split
     for model in scored.models.values():
         away = np.linalg.norm(model.envelope.points[:, None] - split.centres, axis=2).min()
@@ -104,8 +104,8 @@ def arrays_of(model):
         yield from (part.basis.nodes, part.basis.modes, *part.regressor.state().values())
 
 
-def test_no_answer_to_a_held_out_load_reaches_a_scored_model(trained, scored, data, tmp_path):
-    """Bit for bit: wild answers to the loads of the discs and to those apart change scores alone."""
+def test_scored_model_ignores_held_out_displacements(trained, scored, data, tmp_path):
+    """Bit-identical: random displacements of loads in and out of the discs change only scores."""
     wild, _ = poisoned(data.path, tmp_path / "wild.h5", np.flatnonzero(data.good)[~trained.split.train])
     again = train(read_dataset(wild), ["linear", "pcr", "svr"], split=trained.split)
     for row in again.scores:
@@ -115,8 +115,8 @@ def test_no_answer_to_a_held_out_load_reaches_a_scored_model(trained, scored, da
         assert row.mean_mm > 5.0
 
 
-def test_no_answer_that_calibrates_reaches_a_model(trained, data, tmp_path):
-    """Bit for bit; the bounds themselves must follow."""
+def test_model_parameters_ignore_calibration_displacements(trained, data, tmp_path):
+    """Bit-identical parameters, while the bounds change."""
     apart = np.arange(data.good.sum()) >= data.good.sum() - trained.calibrated
     wild, _ = poisoned(data.path, tmp_path / "wild.h5", np.flatnonzero(data.good)[apart])
     again = train(read_dataset(wild), ["linear", "svr"])
@@ -129,7 +129,7 @@ def test_no_answer_that_calibrates_reaches_a_model(trained, data, tmp_path):
     assert [row.mean_mm for row in again.scores] == [before[name] for name in again.models]
 
 
-def test_what_is_used_was_trained_on_the_discs_too(trained, scored, data):
+def test_final_model_is_trained_on_held_out_discs(trained, scored, data):
     held_out = data.loads.select(np.flatnonzero(data.good)[trained.split.test])
     truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test]
     for name in ("ann", "svr", "gp", "residual"):
@@ -155,7 +155,7 @@ def test_bounds_are_calibrated_on_untrained_loads(trained, data, fresh, pretende
 
 
 def test_held_out_coverage_is_reported(trained, scored, data):
-    """Recomputed: the scored model, bounds from the loads that are apart and outside every disc."""
+    """Computed again: scored model, and bounds from calibration loads outside every disc."""
     good = data.loads.select(np.flatnonzero(data.good))
     truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good]
     place = np.linalg.norm(good.get(Pushed).point[:, None] - trained.split.centres, axis=2).min(axis=1)
@@ -189,7 +189,7 @@ def test_held_out_coverage_is_reported(trained, scored, data):
     assert scored.held_out_coverage == {}
 
 
-def test_outside_the_training_range_bounds_grow(trained):
+def test_bounds_grow_for_forces_above_training_range(trained):
     model = trained.models["residual"]
     point = model.envelope.points[0]
     here, strong = (model.deform(push(point, [0.0, 0.0, -size], 6e-3)).bound[0, 0] for size in (0.2, 0.8))
@@ -198,7 +198,7 @@ def test_outside_the_training_range_bounds_grow(trained):
     assert weak[0] == pytest.approx(2.0 * weak[1]) and weak[2] == 0.0
 
 
-def test_at_most_so_many_loads_are_trained_on(data):
+def test_training_uses_at_most_the_given_load_count(data):
     some = train(data, ["linear", "svr"], most=40)
     assert len(some.models["svr"].envelope.points) == 40
     assert some.models["svr"].parts[0].regressor.support_.shape[0] <= 40
@@ -206,8 +206,8 @@ def test_at_most_so_many_loads_are_trained_on(data):
         train(data, ["svr"], most=0)
 
 
-def test_scores_are_the_errors_of_the_held_out_loads(trained, scored, data, box):
-    """Recomputed here in another way, from the data file."""
+def test_scores_equal_errors_of_held_out_loads(trained, scored, data, box):
+    """Computed again in another way, from the data file."""
     name, model = "linear", scored.models["linear"]
     row = next(row for row in trained.scores if row.name == name)
     held_out = np.flatnonzero(data.good)[trained.split.test]
@@ -226,8 +226,8 @@ def test_scores_are_the_errors_of_the_held_out_loads(trained, scored, data, box)
     assert row.mean_mm <= row.p95_mm <= row.max_mm and row.p999_mm is None and row.microseconds > 0
 
 
-def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
-    """Of four loads in turn one misses by less than the bound at 95 %, two by less than that at 99 %, one by more."""
+def test_coverage_of_each_level_uses_its_own_bound(trained, fresh, box):
+    """Among four loads one error is below the bound at 95 %, two are below that at 99 %, and one is above."""
     known = trained.models["linear"]
     quantile = known.bounds.quantile[0] * np.array([[1.0], [2.0]])
     model = replace(known, bounds=replace(known.bounds, quantile=quantile))
@@ -248,7 +248,7 @@ def test_a_judge_counts_each_level_by_its_own_bound(trained, fresh, box):
     assert measure_shares(np.full(20, 3e-3), half[None]) == (0.0,)
 
 
-def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh):
+def test_predict_motion_equals_deform_displacement(model, box, fresh):
     size = np.linalg.norm(fresh.get(Pushed).force, axis=1)
     within = fresh.select((size >= model.envelope.force[0]) & (size <= model.envelope.force[1]))
     wanted = model.deform(within, at=box.tumour_nodes).displacement
@@ -257,7 +257,7 @@ def test_the_model_alone_in_numpy_answers_as_the_deformer_does(model, box, fresh
     )
 
 
-def test_outside_the_training_range_is_said(trained, box):
+def test_loads_outside_training_range_are_extrapolated(trained, box):
     model = trained.models["residual"]
     inside = push(model.envelope.points[0], [0.0, 0.0, -0.2], 6e-3)
     steep = 0.2 * np.array([np.sin(1.3), 0.0, -np.cos(1.3)])
@@ -281,8 +281,8 @@ def test_outside_the_training_range_is_said(trained, box):
 
 
 @pytest.mark.parametrize("name", ["svr", "residual"])
-def test_what_has_no_answer_is_refused_alone_and_among_others(trained, box, name):
-    """Only the tumour is asked for: nothing that integrates over a footprint is there to complain."""
+def test_invalid_load_is_rejected_alone_and_in_a_batch(trained, box, name):
+    """Only the tumour is requested, which needs no integral over a footprint."""
     model = trained.models[name]
     here, down, radius = model.envelope.points[0].astype(float), np.array([0.0, 0.0, -0.2]), 6e-3
     strongest = model.envelope.force[1]
@@ -304,8 +304,8 @@ def test_what_has_no_answer_is_refused_alone_and_among_others(trained, box, name
 
 
 @pytest.mark.parametrize("name", ["linear", "residual", "ann", "svr", "gp"])
-def test_threads_that_share_a_model_get_their_own_answers(trained, fresh, name):
-    """Each begins with nothing prepared, and presses the cortex elsewhere than the others do at the same time."""
+def test_threads_sharing_a_model_get_their_own_results(trained, fresh, name):
+    """Each thread starts without prepared data and presses another place at the same time."""
     wanted = [trained.models[name].deform(fresh.select(slice(k, k + 1))).displacement for k in range(60)]
     model, ready = replace(trained.models[name]), threading.Barrier(4)
 
@@ -318,7 +318,7 @@ def test_threads_that_share_a_model_get_their_own_answers(trained, fresh, name):
     assert all(np.array_equal(answer, wanted[k]) for k, answer in enumerate(sum(zip(*answers, strict=True), ())))
 
 
-def test_test_loads_are_inside_and_held_out_outside(trained, scored, data, fresh):
+def test_training_range_contains_new_but_not_held_out_loads(trained, scored, data, fresh):
     inside = [outcome is Outcome.PREDICTED for outcome in trained.models["linear"].deform(fresh).outcome]
     assert np.mean(inside) > 0.9  # a few exceed the extremes in training, or lie in a gap
     held_out = data.loads.select(np.flatnonzero(data.good)[trained.split.test])
@@ -326,7 +326,7 @@ def test_test_loads_are_inside_and_held_out_outside(trained, scored, data, fresh
     assert np.mean(strange) > 0.3
 
 
-def test_other_loads_and_other_vertices_are_refused(model, box):
+def test_unsupported_loads_and_vertices_are_rejected(model, box):
     point = np.zeros((1, 3))
     lying = Posture(np.ones((1, 3)), np.zeros(1), np.ones(1))
     for cause in (Displaced(point, point, np.full(1, 6e-3)), Nodal(np.zeros((1, len(box.mesh.nodes), 3))), lying):
@@ -345,7 +345,7 @@ def test_other_loads_and_other_vertices_are_refused(model, box):
         model.deform(push([0, 0, 0], [0, 0, -0.1], 6e-3), at=deep)
 
 
-def test_stored_models_answer_alike(trained, box, fresh, tmp_path):
+def test_stored_models_predict_identically(trained, box, fresh, tmp_path):
     path = tmp_path / "model.npz"
     save(path, trained.models)
     again = load(path, box)
@@ -363,7 +363,7 @@ def test_stored_models_answer_alike(trained, box, fresh, tmp_path):
     assert len(shared) == len(set(shared)) < 2 * 4 * len(LEARNERS) + 30
 
 
-def test_a_model_of_another_body_is_refused(trained, box, tmp_path):
+def test_model_of_other_anatomy_is_rejected(trained, box, tmp_path):
     path = tmp_path / "model.npz"
     save(path, {"linear": trained.models["linear"]})
     other = Anatomy(box.mesh, box.fixed, box.slide_normal, box.craniotomy & (box.mesh.nodes[:, 0] < 20e-3))
@@ -373,7 +373,7 @@ def test_a_model_of_another_body_is_refused(trained, box, tmp_path):
         save(path, {"a": trained.models["linear"], "b": replace(trained.models["linear"], anatomy=other)})
 
 
-def test_bad_training_is_a_sentence(data, pretender, tmp_path):
+def test_invalid_training_inputs_are_rejected(data, pretender, tmp_path):
     with pytest.raises(InputError, match="forest"):
         train(data, ["forest"])
     with pytest.raises(InputError, match="too few"):
@@ -385,6 +385,6 @@ def test_bad_training_is_a_sentence(data, pretender, tmp_path):
         train(unsolved)
 
 
-def test_data_without_one_good_case_are_refused(data):
+def test_dataset_without_converged_case_is_rejected(data):
     with pytest.raises(InputError, match="have 0 positions"):
         train(replace(data, outcome=(Outcome.BUDGET,) * len(data.loads)))

@@ -1,4 +1,4 @@
-"""Settings of regressors: how they are chosen, and what that gains."""
+"""Settings of regressors: selection and benefit."""
 
 from functools import partial
 
@@ -15,7 +15,7 @@ def nearby(count, seed):
     return X, np.sin(0.7 * bend) * [1.0, 0.3, 0.1]
 
 
-def test_tuned_settings_halve_the_error_of_the_published_ones():
+def test_tuned_settings_reduce_the_published_svr_error():
     (X, Y), (asked, truth) = nearby(600, 0), nearby(200, 2)
     miss = [np.abs(model.predict(asked) - truth).mean() for model in (Svr().fit(X, Y), Tuned(SVR_CANDIDATES).fit(X, Y))]
     assert miss[1] < 0.6 * miss[0]
@@ -26,7 +26,7 @@ def test_tuned_settings_halve_the_error_of_the_published_ones():
 
 
 def test_settings_are_chosen_on_inner_held_out_discs():
-    """One fit for each of the settings without the discs, and one of the best to all."""
+    """One fit without the discs for each setting, and one of the best setting to all rows."""
     X, Y = nearby(100, 0)
     seen, left_out = [], find_inner_discs(X[:, :3])
     assert 0.15 < left_out.mean() < 0.25

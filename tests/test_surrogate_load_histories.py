@@ -1,4 +1,4 @@
-"""How long a tool is held: histories, and finite elements of the same share."""
+"""Histories of loads in relaxing tissue, and finite elements of the same relaxed share."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from surrogate.data.tool_poses import draw_poses
 from surrogate.model.relaxation import follow_relaxation
 
 
-def test_a_history_is_what_two_steps_make_of_it():
+def test_single_step_history_equals_two_played_steps():
     for time in (0.0, 0.2, APPROACH_TIME, 3.0, 80.0):
         alone = follow_relaxation(SERIES, pressed(2e-3), np.array([time]), None, 1e-4)
         steps = [t for t in (min(time, APPROACH_TIME), time) if t > 0.0]
@@ -24,8 +24,8 @@ def test_a_history_is_what_two_steps_make_of_it():
         assert alone.share[0] == pytest.approx(0.7 - compute_unfaded(SERIES, np.array([time])).sum())
 
 
-def test_finite_elements_depend_on_the_share_alone(box):
-    """A tool that came in one long step, and one that stayed: of equal shares they move and press alike."""
+def test_fem_response_depends_only_on_the_relaxed_share(box):
+    """A slow approach and a held tool with equal shares give equal motion and force."""
     fem = Fem(box, list(EFFECTS), device="cpu", batch=1, element="p1")
     causes = draw_poses("palpation", box, 1, 5, BALL).causes
     slow = solve_histories(fem, Loads(causes, np.array([2.0])))
@@ -43,7 +43,7 @@ def test_finite_elements_depend_on_the_share_alone(box):
     assert np.linalg.norm(slow.reaction[0, 0, :3]) < 0.8 * np.linalg.norm(elastic.reaction[0, 0, :3])
 
 
-def test_the_command_draws_times_where_tissue_relaxes(tmp_path, box, capsys):
+def test_simulate_draws_times_for_relaxing_tissue(tmp_path, box, capsys):
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
     wanted = ["simulate", str(mesh), "--out", str(out), "--pose-control", "--count", "2", "--json"]

@@ -1,4 +1,4 @@
-"""Locating a tumour from what is seen: a small body's ensemble, motions that it does not hold, bad observations."""
+"""Locating a tumour from observations: small ensemble, motions outside it, and invalid observations."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def observed(body, motion, seed=0, count=60, bias=0.0, noise=1.0):
     )
 
 
-def test_an_ensemble_has_every_cause_in_every_skull(ensemble, body):
+def test_ensemble_contains_every_cause_for_every_skull(ensemble, body):
     assert {(kind, skull) for kind, skull in zip(ensemble.kind, ensemble.skull, strict=True)} == {
         (kind, skull) for kind in range(len(KINDS)) for skull in range(3)
     }
@@ -79,7 +79,7 @@ def test_prior_shapes_move_open_cortex_by_1_mm(locator, body):
     assert prior.place.max() == PRESS.place_count - 1 and not ((prior.kind == 0) & (prior.skull == 2)).any()
 
 
-def test_a_stopped_ensemble_goes_on(body, tmp_path, monkeypatch, ensemble):
+def test_stopped_ensemble_run_resumes(body, tmp_path, monkeypatch, ensemble):
     made = []
 
     def stopped(anatomy, group, *rest):
@@ -98,8 +98,8 @@ def test_a_stopped_ensemble_goes_on(body, tmp_path, monkeypatch, ensemble):
         assert np.array_equal(getattr(found, name), getattr(ensemble, name)), name
 
 
-def test_small_locator_agrees_with_full_one(locator, body, truth, tmp_path):
-    """Points with names, a cloud, and tips; read from its file, which is much smaller on a body with more inside."""
+def test_restricted_locator_agrees_with_the_full_locator(locator, body, truth, tmp_path):
+    """Named points, a cloud and tips, with a locator read from its smaller file."""
     save_locator(tmp_path / "small.npz", locator.restrict())
     small = load_locator(tmp_path / "small.npz", body)
     nodes = small.prior.nodes
@@ -119,7 +119,7 @@ def test_small_locator_agrees_with_full_one(locator, body, truth, tmp_path):
             assert ours.causes == pytest.approx(whole.causes, abs=1e-3)
 
 
-def test_a_small_locator_refuses_what_it_does_not_know(locator, body, truth):
+def test_restricted_locator_rejects_unknown_vertices(locator, body, truth):
     small = locator.restrict()
     seen = observed(body, truth[0][0])
     other = np.setdiff1d(np.arange(len(body.mesh.nodes)), small.prior.nodes)
@@ -136,7 +136,7 @@ def test_a_small_locator_refuses_what_it_does_not_know(locator, body, truth):
         small.locate(replace(deep, sigma=None))
 
 
-def test_locator_files_round_trip_and_reject_foreign(locator, body, tmp_path):
+def test_locator_files_round_trip_and_reject_foreign_nodes(locator, body, tmp_path):
     path = tmp_path / "box.locator.npz"
     save_locator(path, locator)
     again = load_locator(path, body)
@@ -165,8 +165,8 @@ def test_locator_files_round_trip_and_reject_foreign(locator, body, tmp_path):
             load_locator(tmp_path / "wild.npz", body)
 
 
-def test_most_tumour_motion_is_found_within_ellipsoids(locator, body, truth):
-    """Other tissue, loads and errors than the ensemble knows; the covariance holds for nine of ten at least."""
+def test_located_tumour_motion_is_within_error_ellipsoids(locator, body, truth):
+    """Tissue, loads and errors outside the ensemble; the ellipsoid covers at least 85 % of them."""
     left, all_of_it, held = 0.0, 0.0, []
     for seed, (motion, _) in enumerate(truth):
         found = locator.locate(observed(body, motion, seed))
@@ -181,8 +181,8 @@ def test_most_tumour_motion_is_found_within_ellipsoids(locator, body, truth):
     assert left < 0.35 * all_of_it and np.mean(held) > 0.85
 
 
-def test_covariances_grow_by_what_trials_ask_for(locator, body, truth):
-    """Errors twice as large in trials make covariances four times as large, and the radius twice."""
+def test_covariances_scale_with_trial_errors(locator, body, truth):
+    """Doubled errors in trials give fourfold covariances and a doubled radius."""
     seen = observed(body, truth[0][0])
     found = locator.locate(seen)
     wider = Locator(locator.prior, locator.tried * [1.0, 1.0, 1.0, 1.0, 4.0]).locate(seen)
@@ -194,8 +194,8 @@ def test_covariances_grow_by_what_trials_ask_for(locator, body, truth):
     assert np.mean(np.linalg.norm(drawn, axis=1) < found.p95) == pytest.approx(0.95, abs=0.012)
 
 
-def test_a_rigid_error_is_no_motion(locator, body, truth):
-    """Most of a translation of 2 mm along the surface goes into the bias, and little of it into the tumour."""
+def test_rigid_error_is_not_attributed_to_tumour_motion(locator, body, truth):
+    """Most of a translation by 2 mm along the surface is estimated as bias, and little as tumour motion."""
     moved, known = [], []
     for seed, (motion, _) in enumerate(truth[::2]):
         without = locator.locate(observed(body, motion, seed))
@@ -205,8 +205,8 @@ def test_a_rigid_error_is_no_motion(locator, body, truth):
     assert np.median(known) > 1e-3 and np.median(moved) < 1e-3
 
 
-def test_a_rigid_error_that_is_stated_is_found(locator, body, truth):
-    """One of 4 mm is believed if it is said that there may be one. If not, none is, or one that makes doubtful."""
+def test_reported_rigid_error_is_estimated(locator, body, truth):
+    """4 mm of rigid error are estimated if reported as possible; otherwise none is, or a slip is reported."""
     off = np.zeros(3)
     for seed, (motion, _) in enumerate(truth[::2]):
         seen = observed(body, motion, seed, bias=4e-3)
@@ -219,7 +219,7 @@ def test_a_rigid_error_that_is_stated_is_found(locator, body, truth):
     assert off[2] < off[1] < off[0]
 
 
-def test_point_cloud_gives_normal_motion(locator, body, truth):
+def test_point_cloud_recovers_the_normal_displacement(locator, body, truth):
     left, all_of_it = 0.0, 0.0
     for seed, (motion, _) in enumerate(truth):
         named = observed(body, motion, seed, count=150, noise=0.2)
@@ -229,8 +229,8 @@ def test_point_cloud_gives_normal_motion(locator, body, truth):
     assert left < 0.4 * all_of_it
 
 
-def test_a_cloud_may_lie_as_far_off_as_brains_sink(locator, body):
-    """Its points are where the surface is now; named points are looked for at rest, and not so far off."""
+def test_point_cloud_may_lie_14_mm_below_the_cortex(locator, body):
+    """A cloud lies on the displaced surface; named points are searched at rest, within a smaller distance."""
     rest = observed(body, np.zeros_like(body.mesh.nodes)).rest
     sunk = rest - [0.0, 0.0, 14e-3]
     assert to_evidence(body, Observation(sunk)).value == pytest.approx(-14e-3)
@@ -239,7 +239,7 @@ def test_a_cloud_may_lie_as_far_off_as_brains_sink(locator, body):
             to_evidence(body, far)
 
 
-def test_wild_points_change_nothing_much(locator, body, truth):
+def test_gross_outliers_change_the_result_little(locator, body, truth):
     motion = truth[0][0]
     clean = observed(body, motion, 3)
     now = clean.now.copy()
@@ -249,8 +249,8 @@ def test_wild_points_change_nothing_much(locator, body, truth):
     assert np.linalg.norm(found.centroid - without.centroid) < 0.3 * np.linalg.norm(without.centroid) + 0.2e-3
 
 
-def test_points_off_the_cortex_are_left_out_and_named(locator, body, truth):
-    """They change nothing but the number of points; more than a third of them are refused."""
+def test_points_off_the_cortex_are_excluded_and_reported(locator, body, truth):
+    """They change only the number of points; more than a third of them are rejected."""
     clean = observed(body, truth[0][0], 3)
     few, many = (np.arange(60) % 10 < number for number in (1, 4))
     spoilt = [
@@ -264,7 +264,7 @@ def test_points_off_the_cortex_are_left_out_and_named(locator, body, truth):
         locator.locate(spoilt[1])
 
 
-def test_unsupported_tip_is_left_out(locator, body, truth):
+def test_unsupported_tool_tip_is_excluded(locator, body, truth):
     clean = observed(body, truth[0][0], 3, noise=0.1)
     sure = replace(clean, sigma=np.full(60, 1e-4))
     wrong = replace(sure, tips=clean.now[:1] + [0.0, 0.0, 0.025])
@@ -276,16 +276,16 @@ def test_unsupported_tip_is_left_out(locator, body, truth):
 
 
 @pytest.mark.parametrize("rigid", [0.0, 0.8e-3])
-def test_where_nothing_moved_nothing_is_claimed(locator, body, rigid):
-    """Without a rigid error too: what is smaller than the noise is not known."""
+def test_motionless_observation_gives_zero_displacement(locator, body, rigid):
+    """With and without rigid error: motion below the noise is unknown."""
     seen = observed(body, np.zeros_like(body.mesh.nodes))
     found = locator.locate(replace(seen, now=seen.rest, rigid=rigid))
     assert not found.centroid.any() and found.explained == 0.0 and not found.calibrated
     assert found.causes == dict.fromkeys(KINDS, 0.0) and found.p95 > 0.0
 
 
-def test_what_a_rigid_error_alone_would_explain_is_known(locator, body, truth):
-    """All of a shift of the whole; little of a dent, for points and clouds."""
+def test_rigid_fit_reports_its_share_of_the_observed_motion(locator, body, truth):
+    """Nearly all of a uniform shift, and less of a dent, for points and clouds."""
     shifted = replace(observed(body, np.zeros_like(body.mesh.nodes)), rigid=0.8e-3)
     shifted = replace(shifted, now=shifted.rest + [0.0, 0.0, -4e-3])
     for seen in (shifted, replace(shifted, rest=None)):
@@ -294,8 +294,8 @@ def test_what_a_rigid_error_alone_would_explain_is_known(locator, body, truth):
     assert locator.locate(observed(body, truth[0][0], noise=0.2)).rigid_alone.share < 0.9
 
 
-def test_causes_are_named(locator, body, truth):
-    """Of motions by fluid that drains, drainage has the largest share, more often than not."""
+def test_drainage_motion_is_attributed_to_drainage(locator, body, truth):
+    """Drainage has the largest share in more than half of the drained motions."""
     found = [(kind, locator.locate(observed(body, motion, 1, noise=0.2)).causes) for motion, kind in truth]
     drained = [max(causes, key=causes.get) for kind, causes in found if kind == "drainage"]
     assert np.mean([name == "drainage" for name in drained]) > 0.5
@@ -334,12 +334,12 @@ def along_x(points):
         (lambda o: replace(o, now=o.rest + 0.01 * np.random.default_rng(0).standard_normal((60, 3))), "fit"),
     ],
 )
-def test_bad_observations_are_refused_with_the_reason(locator, body, truth, spoilt, match):
+def test_invalid_observations_are_rejected_with_reason(locator, body, truth, spoilt, match):
     with pytest.raises(InputError, match=match):
         locator.locate(spoilt(observed(body, truth[0][0])))
 
 
-def test_a_file_in_lps_is_named_as_such(locator, body):
+def test_observation_in_lps_is_rejected_with_hint(locator, body):
     there = observed(body, np.zeros_like(body.mesh.nodes))
     turned = replace(there, now=there.now * [-1.0, -1.0, 1.0], rest=there.rest * [-1.0, -1.0, 1.0])
     with pytest.raises(InputError, match=r"they are LPS\. Give mm and RAS"):

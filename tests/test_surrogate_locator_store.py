@@ -1,4 +1,4 @@
-"""Locators in files: of another version, or damaged."""
+"""Locator files of other versions, or damaged."""
 
 import json
 
@@ -17,7 +17,7 @@ def locator():
 
 
 def test_locator_without_patch_sizes_is_rejected(locator, tmp_path):
-    """Its format says so, before its arrays are looked at."""
+    """The format in the header is checked before the arrays."""
     with np.load(to_locator_path(get_template_path())) as file:
         arrays = {name: file[name] for name in file.files}
     header = json.loads(str(arrays["header"])) | {"format": "sulcus locator 3"}
@@ -28,7 +28,7 @@ def test_locator_without_patch_sizes_is_rejected(locator, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["header", "tried", "shape", "kind", "place", "centre", "nodes"])
-def test_locator_of_another_content_than_sealed_is_rejected(locator, tmp_path, name):
+def test_locator_file_with_wrong_digest_is_rejected(locator, tmp_path, name):
     with np.load(to_locator_path(get_template_path())) as file:
         arrays = {name: file[name] for name in file.files}
     if name == "header":

@@ -1,4 +1,4 @@
-"""Archives of arrays: sizes that are refused before memory is taken."""
+"""Archives of arrays: size limits before allocation."""
 
 import zipfile
 
@@ -10,7 +10,7 @@ from sim.errors import InputError
 from surrogate.model.npz_archive import Archive
 
 
-def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path):
+def test_arrays_above_the_size_limit_are_rejected(tmp_path):
     np.savez_compressed(tmp_path / "m.npz", few=np.zeros(10), many=np.zeros(1000))
     with (tmp_path / "m.npz").open("rb") as raw:
         for most, name, count in ((1000, "few", 10), (8200, "many", 1000)):  # less than both with their heads
@@ -21,7 +21,7 @@ def test_arrays_that_are_larger_than_a_model_may_be_are_refused(tmp_path):
 
 
 def test_oversized_array_is_rejected_before_allocation(tmp_path):
-    """As many bytes as the header has numbers, each of eight."""
+    """The file holds fewer bytes than its header declares."""
     np.savez(tmp_path / "m.npz", many=np.zeros(2**20))
     with zipfile.ZipFile(tmp_path / "m.npz") as source:
         raw = source.read("many.npy")

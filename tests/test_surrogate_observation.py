@@ -1,4 +1,4 @@
-"""Observations whose points lie far from vertices."""
+"""Observed points far from vertices."""
 
 import numpy as np
 import pytest
@@ -8,8 +8,8 @@ from sim.errors import InputError
 from surrogate.locating.observation import Observation, to_evidence
 
 
-def test_points_far_from_vertices_lie_on_the_cortex_all_the_same():
-    """In the middle of triangles of 40 mm, and as far above them as may be; farther ones are left out."""
+def test_points_inside_large_triangles_are_on_the_cortex():
+    """At centres of 40 mm triangles, and up to the limit above them; farther points are excluded."""
     body = make_box(cells=(4, 4, 2), spacing=40e-3, tumour=60e-3, depth=40e-3, opening=70e-3)
     middle = body.mesh.nodes[body.open_surface].mean(axis=1)
     for above, kept in ((0.0, len(middle)), (11e-3, len(middle)), (13e-3, len(middle) - 3)):

@@ -1,4 +1,4 @@
-"""Observations in files as other programs write them."""
+"""Observation files written by other programs."""
 
 import numpy as np
 from test_scenes_markups import markup
@@ -7,8 +7,8 @@ from sim.bodies.markups import read_markup
 from surrogate.locating.observed_files import read_observation
 
 
-def test_markup_and_table_that_begin_with_a_mark_are_read(tmp_path):
-    """Editors of Windows begin UTF-8 with a byte order mark; a table may name its points."""
+def test_files_with_byte_order_mark_are_read(tmp_path):
+    """Windows editors write UTF-8 with a byte order mark; a table may have point labels."""
     path = markup(tmp_path / "p.mrk.json", [[10.0, 20.0, 30.0]])
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     table = tmp_path / "p.csv"

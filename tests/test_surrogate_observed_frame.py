@@ -1,4 +1,4 @@
-"""Frames of a fit: what is refused, and tables of tools."""
+"""Frames of a fit: invalid input, and tables of tools."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from sim.errors import InputError
 from surrogate.fitting.observed_frame import Tool, check_frames, read_tools
 
 
-def test_bad_frames_are_refused(body):
+def test_invalid_frames_are_rejected(body):
     motion = np.zeros_like(body.mesh.nodes) + [0.0, 0.0, 1e-3]
     good = build_tool_frame(body, motion)
     tip = tuple((np.array(good.observation.rest)[0]).tolist())
@@ -34,7 +34,7 @@ def test_bad_frames_are_refused(body):
     check_frames(body, [good])
 
 
-def test_a_table_of_tools_is_read(tmp_path):
+def test_tool_table_is_read_and_invalid_rows_rejected(tmp_path):
     path = tmp_path / "tools.csv"
     path.write_text("frame,x,y,z,radius,force,sigma\n2,10,20,30,,0.2,\n2,11,20,30,5,,\n")
     first, second = read_tools(path, 2)

@@ -1,4 +1,4 @@
-"""Learners of a user's own: a file or a package brings them, and they are trained, stored and read like the others."""
+"""Learners of users: a file or package registers them; they are trained, stored and loaded like others."""
 
 import json
 import re
@@ -60,7 +60,7 @@ def forget(name: str) -> None:
     assert find_own(name) is None
 
 
-def test_a_file_brings_one_that_is_trained_stored_and_plays(folder, box, monkeypatch, capsys, clean):
+def test_plugin_learner_is_trained_stored_and_played(folder, box, monkeypatch, capsys, clean):
     monkeypatch.chdir(folder)
     words = ["train", "data.h5", "--out", "box.model.npz", "--learners", "nearest,linear", "--json"]
     assert main(words) == 2
@@ -93,14 +93,14 @@ READING = "train judge export patient scenes effects demo render collect sensiti
 
 
 @pytest.mark.parametrize("command", READING.split())
-def test_whoever_makes_or_reads_models_takes_ones_own(command, capsys):
-    """The sentences of `load` and `check_learners` name the option."""
+def test_model_commands_accept_the_plugin_option(command, capsys):
+    """Messages of `load` and `check_learners` refer to this option."""
     with pytest.raises(SystemExit):
         main([*command.split("-"), "--help"])
     assert "--plugin FILE.py" in capsys.readouterr().out
 
 
-def test_a_patients_learner_may_be_ones_own(folder, tmp_path, monkeypatch, capsys, clean):
+def test_patient_command_accepts_plugin_learner(folder, tmp_path, monkeypatch, capsys, clean):
     monkeypatch.chdir(folder)
     words = ["patient", "none.nii.gz", "--brain", "1", "--tumour", "2", "--out", str(tmp_path / "p.vtu")]
     words += ["--learners", "nearest", "--device", "cpu"]
@@ -110,7 +110,7 @@ def test_a_patients_learner_may_be_ones_own(folder, tmp_path, monkeypatch, capsy
     assert "none.nii.gz: no such file" in said and "no learner" not in said
 
 
-def test_package_tool_is_imported_only_when_named(tmp_path, monkeypatch, clean):
+def test_package_learner_is_imported_only_when_selected(tmp_path, monkeypatch, clean):
     (tmp_path / "labs_learners.py").write_text(NEAREST.read_text().replace('"nearest"', '"labs"'))
     made = tmp_path / "labs_learners-1.0.dist-info"
     made.mkdir()
@@ -125,13 +125,13 @@ def test_package_tool_is_imported_only_when_named(tmp_path, monkeypatch, clean):
     del sys.modules["labs_learners"]
 
 
-def test_ones_own_features(box, clean):
+def test_registered_learner_may_have_its_own_encoder(box, clean):
     own = run_script(NEAREST)
     register_learner("along", lambda patch, pushed: pushed.force)(type("Along", (own.Nearest,), {}))
     assert find_own("along").encoder == "along"
 
 
-def test_all_names_of_what_comes_with_sulcus_are_reserved():
+def test_built_in_learner_names_are_reserved():
     assert {*LEARNERS, *POSE_LEARNERS, *FITTED} == RESERVED_NAMES
     assert {"auto", "fem", GUARDED} == PLAYER_NAMES
 
@@ -145,13 +145,13 @@ def test_all_names_of_what_comes_with_sulcus_are_reserved():
         ("mine", "smell", "no encoder is called 'smell': choose one of nodal, rooted, tool"),
     ],
 )
-def test_names_that_cannot_be_are_sentences(name, encoder, words, clean):
+def test_invalid_learner_names_are_rejected(name, encoder, words, clean):
     own = run_script(NEAREST)
     with pytest.raises(InputError, match=words):
         register_learner(name, encoder)(own.Nearest)
 
 
-def test_a_class_that_lacks_something_is_a_sentence(clean):
+def test_learner_class_with_missing_methods_is_rejected(clean):
     with pytest.raises(InputError, match="the learner empty has no fit, predict, state, restored"):
         register_learner("empty")(type("Empty", (), {}))  # pyright: ignore[reportArgumentType]
 
@@ -163,7 +163,7 @@ def test_a_class_that_lacks_something_is_a_sentence(clean):
         (" * np.nan", r"returns shape \(\d+, \d+\) for \d+ loads: let `predict` give"),
     ],
 )
-def test_answers_that_are_none_are_refused_when_it_is_trained(folder, tmp_path, capsys, change, words, clean):
+def test_invalid_learner_predictions_are_rejected_in_training(folder, tmp_path, capsys, change, words, clean):
     path = tmp_path / "wrong.py"
     path.write_text(NEAREST.read_text().replace(".astype(np.float32)", change))
     out = tmp_path / "model.npz"
@@ -172,7 +172,7 @@ def test_answers_that_are_none_are_refused_when_it_is_trained(folder, tmp_path, 
     assert re.search(words, capsys.readouterr().err)
 
 
-def test_a_state_that_would_be_pickled_is_not_stored(folder, tmp_path, clean):
+def test_learner_state_with_object_array_is_rejected(folder, tmp_path, clean):
     own = run_script(NEAREST)
 
     class Sly(own.Nearest):

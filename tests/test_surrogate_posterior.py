@@ -1,4 +1,4 @@
-"""The Gaussian that is left of a prior once points are seen: against closed formulas, draws and planted faults."""
+"""Gaussian posterior of observed points compared with closed formulas, random draws and outliers."""
 
 from dataclasses import replace
 
@@ -61,20 +61,20 @@ def seen_unknowns(prior, evidence):
     return np.hstack([np.einsum("rmi,mi->mr", moved, evidence.axis), evidence.rigid * evidence.rigid_scale])
 
 
-def test_what_is_seen_of_shapes_is_their_motion_at_the_points(prior):
+def test_projected_shapes_equal_their_motion_at_the_points(prior):
     evidence = seen(prior, np.zeros((len(prior.anatomy.mesh.nodes), 3)))
     found = np.hstack([prior.project_shapes(*evidence.weights), evidence.rigid * evidence.rigid_scale])
     assert found == pytest.approx(seen_unknowns(prior, evidence), abs=1e-9)
 
 
-def test_rigid_error_at_places_is_what_their_rows_have_of_it(prior):
+def test_rigid_bias_at_points_matches_evidence_rows(prior):
     evidence = drawn(prior, np.random.default_rng(3))[1]
     found = Posterior(evidence, [], np.arange(1.0, 7.0), 1.0, np.zeros(0, int), 0.0, 0.0)
     own = np.einsum("mi,mi->m", found.compute_bias(evidence.at), evidence.axis)
     assert own == pytest.approx(evidence.rigid @ found.rigid, abs=1e-12)
 
 
-def test_cloud_is_compared_without_its_rigid_error(prior):
+def test_point_cloud_is_placed_without_its_rigid_error(prior):
     body, shift = prior.anatomy, np.array([[4e-3, -2e-3, 0.0]])
     open_nodes = body.mesh.nodes[np.unique(body.open_surface)]
     rest = open_nodes[np.linalg.norm(open_nodes - open_nodes.mean(axis=0), axis=1) < 10e-3]
@@ -83,7 +83,7 @@ def test_cloud_is_compared_without_its_rigid_error(prior):
     assert len(rest) > 3 and found.at == pytest.approx(rest, abs=1e-9)
 
 
-def test_hypotheses_cover_causes_skulls_and_tool(prior):
+def test_hypotheses_cover_all_causes_skulls_and_tools(prior):
     assert len(prior.hypotheses) == 3 * len(CAUSE_SETS) * len(RIGID_RATIOS)
     taking = set()
     for number, hypothesis in enumerate(prior.hypotheses):
@@ -100,9 +100,9 @@ def test_hypotheses_cover_causes_skulls_and_tool(prior):
 
 @pytest.mark.parametrize("single", [False, True])
 def test_posterior_matches_normal_equations_and_evidence(prior, single):
-    """Bayes' formula by precisions instead of covariances, and the density of what is seen, with a place or without.
+    """Bayes' formula with precisions instead of covariances, and the evidence, with and without a tool place.
 
-    Of whole motions, and of one with a row less, so that axes are not alike. A skull has fewer shapes of swelling.
+    Cases: complete motions, and one row less, with unequal axes. One skull model has fewer shapes of swelling.
     """
     _, evidence = drawn(prior, np.random.default_rng(1), 3)
     evidence = evidence.select(np.arange(len(evidence) - single))
@@ -131,7 +131,7 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
 
 
 def test_whitening_by_axis_equals_whitening_of_all_rows(prior):
-    """The shortcut for points with three equal axes agrees with the general method."""
+    """The fast method for points with three equal axes agrees with the general method."""
     _, evidence = drawn(prior, np.random.default_rng(2))
     short = evidence.build_whitening(1e-3)
     turned = evidence.select(np.random.default_rng(0).permutation(len(evidence)))
@@ -151,7 +151,7 @@ def test_whitening_by_axis_equals_whitening_of_all_rows(prior):
 
 @pytest.mark.parametrize("count", [12, 90])
 def test_block_rows_match_products_of_all_points(prior, count):
-    """Of fewer points than vertices and of more, which are seen as fewer rows; of whole motions, and of single rows."""
+    """Fewer and more points than vertices, with whole motions and single rows."""
     box, random = prior.anatomy, np.random.default_rng(0)
     some = random.integers(40, size=(count, 4))
     place = Located(box.mesh.tets[some[:, 0]], random.dirichlet(np.ones(4), count))
@@ -167,7 +167,7 @@ def test_block_rows_match_products_of_all_points(prior, count):
             assert found.apply_precision(some) == pytest.approx(precise[:, some], abs=1e-9 * np.abs(precise).max())
 
 
-def test_ellipsoids_hold_what_is_drawn(prior):
+def test_posterior_ellipsoids_have_chi_square_coverage(prior):
     random, hypothesis, square = np.random.default_rng(3), prior.hypotheses[3], []
     for _ in range(200):
         truth, evidence = drawn(prior, random, 3)
@@ -181,7 +181,7 @@ def test_ellipsoids_hold_what_is_drawn(prior):
     assert np.mean(square) == pytest.approx(degrees, abs=4.0 * np.sqrt(2.0 * degrees / 200))
 
 
-def test_a_mixture_lies_between_its_hypotheses(prior):
+def test_mixture_moments_match_its_hypotheses(prior):
     _, evidence = drawn(prior, np.random.default_rng(4))
     found = condition_prior(prior, evidence)
     assert not len(found.outliers) and 0.2 < found.surprise < 1.6
@@ -205,7 +205,7 @@ def test_a_mixture_lies_between_its_hypotheses(prior):
     )
 
 
-def test_gross_errors_are_left_out_and_named(prior):
+def test_gross_errors_are_excluded_and_reported(prior):
     truth, evidence = drawn(prior, np.random.default_rng(5))
     wrong = np.isin(evidence.point, [3, 11, 24])
     spoilt = replace(evidence, value=evidence.value + np.where(wrong, 0.03, 0.0))
@@ -216,16 +216,16 @@ def test_gross_errors_are_left_out_and_named(prior):
 
 
 @pytest.mark.parametrize(("deviations", "left_out"), [(2.3, []), (4.2, [7])])
-def test_point_is_left_out_once_one_in_ten_thousand_is_so_far(prior, deviations, left_out):
-    """The root of chi-square of three numbers is 4.6 at 1e-4, and 7.9 at 1e-12; half of the error is predictable."""
+def test_points_beyond_1e_4_probability_are_excluded(prior, deviations, left_out):
+    """The root of chi-square (3 degrees of freedom) is 4.6 at 1e-4, and 7.9 at 1e-12."""
     still = seen(prior, np.zeros(prior.anatomy.mesh.nodes.shape))
     far = np.where(still.point == 7, deviations * still.sigma / np.sqrt(3.0), 0.0)
     found = condition_prior(prior, replace(still, value=still.value + far))
     assert found.outliers.tolist() == left_out
 
 
-def test_points_with_one_row_are_left_out_too(prior):
-    """Motions along one axis only, as those of a cloud."""
+def test_outlier_observed_along_one_axis_is_excluded(prior):
+    """Motions along one axis only, as in a cloud."""
     _, evidence = drawn(prior, np.random.default_rng(6))
     single = replace(evidence.select(np.arange(0, len(evidence), 3)), point=np.arange(POINTS))
     assert not len(condition_prior(prior, single).outliers)
@@ -234,14 +234,14 @@ def test_points_with_one_row_are_left_out_too(prior):
     assert found.outliers.tolist() == [7] and np.isfinite(found.weight).all()
 
 
-def test_what_no_shape_explains_surprises(prior):
+def test_motion_outside_the_prior_gives_large_surprise(prior):
     motion = 0.01 * np.random.default_rng(7).standard_normal(prior.anatomy.mesh.nodes.shape)
     found = condition_prior(prior, seen(prior, motion))
     assert found.surprise > 2.5 or len(found.outliers) > 10
 
 
-def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
-    """The odds of a place fall with its distance from the nearest tip; without tips all are alike."""
+def test_tool_place_odds_decrease_with_tip_distance(prior):
+    """The odds of a place decrease with its distance from the nearest tip; without tips all are equal."""
     _, evidence = drawn(prior, np.random.default_rng(8))
     without, near = (
         build_observed_prior(prior, evidence),
@@ -253,8 +253,8 @@ def test_a_tool_is_believed_to_press_where_its_tip_touches(prior):
     assert near.logs[-1, 0] - without.logs[-1, 0] == pytest.approx(near.odds[0])  # with which no tool may press
 
 
-def test_motion_and_rigid_error_may_cancel(prior):
-    """Motions may then be as large as a rigid error: its prior's translation has a length of 1.4 mm."""
+def test_prior_scale_includes_rigid_error(prior):
+    """Motion may be as large as the rigid error, whose prior translation has a length of 1.4 mm."""
     little, much = (seen(prior, np.full_like(prior.anatomy.mesh.nodes, each)) for each in (1e-5, 3e-3))
     assert build_observed_prior(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
     assert build_observed_prior(prior, much).scale == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
@@ -262,8 +262,8 @@ def test_motion_and_rigid_error_may_cancel(prior):
     assert build_observed_prior(prior, exact).scale == pytest.approx(np.sqrt(3.0) * 3.0, rel=1e-3)
 
 
-def test_a_rigid_error_is_believed_to_be_as_large_as_is_stated(prior):
-    """A shift beyond what was stated moves the tumour; of none, none is found."""
+def test_estimated_rigid_error_follows_reported_size(prior):
+    """A shift above the reported error moves the tumour; with zero reported error none is estimated."""
     truth, evidence = drawn(prior, np.random.default_rng(10), 3)
     shifted = replace(evidence, value=evidence.value + evidence.rigid[:, :3] @ [2e-3, -2e-3, 2e-3])
     off, bias = [], []

@@ -1,4 +1,4 @@
-"""One suite for every regressor."""
+"""Common tests of every regressor."""
 
 import subprocess
 import sys
@@ -31,11 +31,11 @@ def fitted(request):
     return request.param, MAKE[request.param]().fit(*rows(300, 0))
 
 
-def test_every_regressor_is_tested():
+def test_protocol_tests_cover_every_regressor():
     assert set(MAKE) == set(REGRESSORS)
 
 
-def test_fit_returns_itself_and_predict_has_the_shape(fitted):
+def test_fit_returns_self_and_predict_has_output_shape(fitted):
     name, model = fitted
     X, Y = rows(50, 1)
     fresh = MAKE[name]()
@@ -43,13 +43,13 @@ def test_fit_returns_itself_and_predict_has_the_shape(fitted):
     assert model.predict(X).shape == Y.shape and model.predict(X).dtype == np.float32
 
 
-def test_a_second_fit_agrees(fitted):
+def test_repeated_fit_gives_equal_predictions(fitted):
     name, model = fitted
     X, _ = rows(50, 1)
     assert np.array_equal(MAKE[name]().fit(*rows(300, 0)).predict(X), model.predict(X))
 
 
-def test_state_holds_the_whole_model(fitted, tmp_path):
+def test_restored_state_predicts_identically(fitted, tmp_path):
     name, model = fitted
     X, _ = rows(50, 1)
     np.savez(tmp_path / "state.npz", **model.state())
@@ -58,7 +58,7 @@ def test_state_holds_the_whole_model(fitted, tmp_path):
     assert np.array_equal(again.predict(X), model.predict(X))
 
 
-def test_it_learns(fitted):
+def test_regressor_error_is_below_its_limit(fitted):
     """Far better than the mean in the largest output, and better in every output."""
     name, model = fitted
     X, Y = rows(400, 2)
@@ -66,28 +66,28 @@ def test_it_learns(fitted):
     assert (miss < 0.9).all() and miss[0] < LEARNT[name]
 
 
-def test_a_batch_is_its_rows(fitted):
+def test_batch_prediction_equals_row_predictions(fitted):
     _, model = fitted
     X, _ = rows(20, 4)
     single = np.concatenate([model.predict(row[None]) for row in X])
     assert np.allclose(model.predict(X), single, rtol=1e-5, atol=1e-8)
 
 
-def test_predictions_are_smooth(fitted):
-    """A step of a millionth of a feature's range moves no output by more than a thousandth of its own."""
+def test_predictions_are_continuous_in_the_features(fitted):
+    """A relative step of 1e-6 in the features changes no output by more than 0.1 % of its deviation."""
     _, model = fitted
     X, Y = rows(20, 5)
     nudged = model.predict(X * (1.0 + 1e-6))
     assert (np.abs(nudged - model.predict(X)) < 1e-3 * Y.std(axis=0)).all()
 
 
-def test_the_table_is_exact_from_unit_rows():
+def test_linear_table_is_exact_from_unit_rows():
     C = RANDOM.normal(size=(9, 3))
     X = RANDOM.normal(size=(4, 9))
     assert np.allclose(Linear().fit(np.eye(9), C).predict(X), X @ C, atol=1e-5)
 
 
-def test_predicting_needs_neither_torch_nor_sklearn():
+def test_prediction_imports_neither_torch_nor_sklearn():
     script = (
         "import sys, numpy as np, surrogate.model.store\n"
         "from surrogate.regressors.protocol import Linear\n"

@@ -1,4 +1,4 @@
-"""Regions of known stiffness in a brain of unknown one: what a locator of them knows, keeps and refuses."""
+"""Regions of known stiffness in a brain of unknown stiffness: locators, files and checks."""
 
 from dataclasses import replace
 
@@ -56,8 +56,8 @@ def locators(body):
     return [make_locator(body, causes=causes, device="cpu", count=60) for causes in both]
 
 
-def test_who_knows_a_stiff_region_finds_the_tumour_better(body, locators):
-    """Motions by other draws of a brain with the slab, seen at all nodes of the open cortex, without errors."""
+def test_known_stiff_region_reduces_the_locator_error(body, locators):
+    """Motions of new draws with the slab, observed without error at all nodes of the open cortex."""
     nodes, off = np.unique(body.open_surface), []
     for group in build_groups(body, seed=5, causes=replace(FEW, regions=(STIFF,)))[:2]:
         motion, _ = solve_members(body, group, seed=5, device="cpu", causes=FEW)
@@ -71,8 +71,8 @@ def test_who_knows_a_stiff_region_finds_the_tumour_better(body, locators):
     assert knowing < 0.7 * other, (knowing, other)
 
 
-def test_a_region_is_in_every_group_and_beside_every_force(body):
-    """Its stiffness goes with the brain's; its Poisson's ratio is its own where it is given."""
+def test_known_region_is_in_every_group_and_force_solve(body):
+    """Its stiffness is relative to the brain's; its Poisson's ratio is its own if given."""
     known = (replace(STIFF, poisson=0.3),)
     for group in build_groups(body, causes=replace(FEW, regions=known)):
         tissue = group.build_effects(FEW.swellings)[0]
@@ -87,7 +87,7 @@ def test_a_region_is_in_every_group_and_beside_every_force(body):
     assert stiff.regions == known and np.abs(stiff.motion["slide"] - plain.motion["slide"]).max() > 1e-6
 
 
-def test_a_file_keeps_the_regions_and_an_older_one_has_none(body, locators, tmp_path):
+def test_locator_file_stores_the_known_regions(body, locators, tmp_path):
     knowing, other = locators
     for name, locator in (("knows.npz", knowing), ("not.npz", other)):
         save_locator(tmp_path / name, locator)
@@ -95,12 +95,12 @@ def test_a_file_keeps_the_regions_and_an_older_one_has_none(body, locators, tmp_
     assert knowing.regions == (STIFF,) and knowing.restrict().regions == (STIFF,) and other.regions == ()
 
 
-def test_fit_finds_tumour_stiffness_for_any_locator(locators):
+def test_fitted_regions_exclude_the_tumour(locators):
     both = replace(locators[0], regions=(Region(2, 3.0), STIFF))
     assert list_fitted_regions(both) == (STIFF,)
 
 
-def test_what_regions_are_known_by(body):
+def test_known_regions_are_listed_and_checked(body):
     soft = Material("neo-hookean", 1500.0, 0.45)
     assert list_known_regions(Elasticity(BRAIN, {OEDEMA: soft, 2: replace(BRAIN, young=9000.0)})) == (
         Region(2, 3.0), Region(OEDEMA, 0.5, 0.45),
@@ -118,8 +118,8 @@ def test_what_regions_are_known_by(body):
             Region(*bad)
 
 
-def test_a_locator_is_held_against_a_scenes_own_regions(body):
-    """But for the tumour; a region as stiff as the brain is none."""
+def test_scene_regions_are_compared_with_the_locator(body):
+    """The tumour is ignored; a region as stiff as the brain does not count."""
     own, tumour = Region(OEDEMA, 0.5, 0.45), Region(2, 3.0)
     scene = Elasticity(BRAIN, {OEDEMA: Material("neo-hookean", 1500.0, 0.45), 2: replace(BRAIN, young=5000.0)})
     assert not find_differing_regions(scene, (own,)) and not find_differing_regions(scene, (own, tumour))
@@ -129,7 +129,7 @@ def test_a_locator_is_held_against_a_scenes_own_regions(body):
     assert find_differing_regions(Elasticity(BRAIN), (own,)) == (OEDEMA,)
 
 
-def test_a_file_whose_label_is_a_list_is_refused(body, locators, tmp_path):
+def test_locator_file_with_list_as_label_is_rejected(body, locators, tmp_path):
     spoilt = replace(STIFF)
     object.__setattr__(spoilt, "label", [OEDEMA])
     save_locator(tmp_path / "list.npz", replace(locators[0], regions=(spoilt,)))

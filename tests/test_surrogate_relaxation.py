@@ -1,4 +1,4 @@
-"""Models of poses in tissue that relaxes: the past that they carry, what they learn of it, and where they play."""
+"""Models of poses in relaxing tissue: history, training and playback."""
 
 from dataclasses import replace
 
@@ -64,8 +64,8 @@ def played(depths: list[float], times: list[float], x: list[float] | None = None
     return found[1:]
 
 
-def test_what_is_gone_is_the_hereditary_integral_of_the_depth():
-    """Of a tool that comes evenly within a second and stays, against its closed form; a frame is 30 ms."""
+def test_relaxed_share_equals_the_hereditary_integral():
+    """Tool that approaches linearly within one second and stays: closed form, frames of 30 ms."""
     times = list(np.arange(1, 91) / 30.0)
     found = played([4e-3 * min(t, 1.0) for t in times], times)
     for frame in (14, 29, 89):
@@ -76,8 +76,8 @@ def test_what_is_gone_is_the_hereditary_integral_of_the_depth():
         assert not found[frame].strange[0]
 
 
-def test_pasts_that_no_training_has_are_strange():
-    """A tool that was held and goes back, or that slid far; what it does for the first time is not."""
+def test_histories_outside_training_are_marked():
+    """A held tool that retracts, or one that slides far; a first contact is not marked."""
     back = played([4e-3, 4e-3, 3e-3, 0.0], [0.5, 6.0, 6.1, 6.2])
     assert [bool(each.strange[0]) for each in back] == [False, False, True, True]
     assert back[3].share[0] == 0.0
@@ -85,7 +85,7 @@ def test_pasts_that_no_training_has_are_strange():
     assert [bool(each.strange[0]) for each in slid] == [False, False, True]
 
 
-def test_a_start_without_that_past_is_refused():
+def test_start_without_matching_history_is_rejected():
     late = start_of(played([1e-3], [2.0])[0], 2.0)
     with pytest.raises(InputError, match=r"the start is 1 s later than the loads"):
         follow_relaxation(SERIES, pressed(1e-3), np.ones(1), late, 1e-4)
@@ -130,8 +130,8 @@ def model(data):
     return train(data, ["contact"]).models["contact"]
 
 
-def test_a_model_learns_what_time_does_and_keeps_it(tmp_path, model, box):
-    """Motion and force at fresh places and times, from a file too; `train` cannot know this without the times."""
+def test_relaxation_model_predicts_and_round_trips(tmp_path, model, box):
+    """Motion and force at new poses and times, from a file too; training needs the times."""
     assert model.series == SERIES
     causes, nodes = draw_poses("palpation", box, 30, 77, BALL).causes, box.tumour_nodes
     fresh, truth = Loads(causes, sample_times(30, 77)), Fading(box)
@@ -147,8 +147,8 @@ def test_a_model_learns_what_time_does_and_keeps_it(tmp_path, model, box):
     np.testing.assert_array_equal(again.deform(fresh).displacement, answer.displacement)
 
 
-def test_answers_follow_from_the_ones_before(model, box):
-    """A tool that is held: its force goes on falling, as its own history has it; lifted off it is not relied on."""
+def test_predictions_follow_the_load_history(model, box):
+    """The force of a held tool decreases with its history; after lifting off it is extrapolated."""
     loads = draw_poses("palpation", box, 3, 5, BALL)
     touching = loads.get(Touching)
     assert touching is not None
@@ -169,7 +169,7 @@ def test_answers_follow_from_the_ones_before(model, box):
     assert lifted.outcome == (Outcome.EXTRAPOLATED,) * 3 and np.abs(lifted.displacement).max() == 0.0
 
 
-def test_features_end_with_what_is_gone(box):
+def test_pose_features_end_with_the_relaxed_share(box):
     pushed = to_indentation(draw_poses("palpation", box, 2, 0, BALL), BALL, open_patch(box))
     assert get_relaxation(pushed) is None
     known = add_relaxation(pushed, np.array([0.1, 0.2]))
@@ -177,7 +177,7 @@ def test_features_end_with_what_is_gone(box):
     np.testing.assert_array_equal(get_relaxation(known), [0.1, 0.2])
 
 
-def test_a_model_plays_the_series_that_it_learned_and_no_other(model, box):
+def test_model_rejects_other_prony_series(model, box):
     assert find_rejection(model, EFFECTS) is None
 
     def under(series: tuple) -> str:
@@ -195,8 +195,8 @@ def test_a_model_plays_the_series_that_it_learned_and_no_other(model, box):
         read_series({**SAID, "history": "the tool fell"})
 
 
-def test_it_plays_alone_frame_by_frame(model, box):
-    """Finite elements cannot stand behind it, and a frame of a straight run depends on those before."""
+def test_relaxation_model_plays_frame_by_frame_without_fem(model, box):
+    """Finite elements are no fallback for it, and a frame depends on those before it."""
     scene = replace(find_scene("palpate"), effects=EFFECTS, tool=Probe(BALL.radius))
     theatre = PatientSetup(box, None, {"contact": model}, "cpu")
     scene = replace(scene, element="p1")

@@ -1,4 +1,4 @@
-"""Rods and blades moved by pose: how they are drawn, what contact says of them, and models that learn them."""
+"""Rods and blades moved by pose: draws, contact and trained models."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ def upright(box: Anatomy, tool: BuiltIn, depth: float) -> Loads:
 
 
 @pytest.mark.parametrize("preset", TOOLS)
-def test_drawn_poses_go_in_from_where_they_touch_first(box, preset):
+def test_drawn_poses_penetrate_from_first_contact(box, preset):
     tool, patch = TOOLS[preset], open_patch(box)
     loads = draw_poses(preset, box, 40, 3, tool)
     pose = get_poses(loads, tool)
@@ -78,8 +78,8 @@ def test_drawn_poses_go_in_from_where_they_touch_first(box, preset):
         assert cosine >= np.cos(known.max_blade_tilt if isinstance(tool, Spatula) else np.pi / 4.0) - 1e-9
 
 
-def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box):
-    """Where its side touches nothing: the same indentation, the same forces, and how it is turned does not matter."""
+def test_upright_rod_equals_the_ball_at_its_end(box):
+    """Without contact of its side: equal indentation and forces, independent of rotation."""
     loads, ball = upright(box, ROD_OF_4, 1.2e-3), Ball(ROD_OF_4.radius)
     rod, round_ = asked(box, loads, ROD_OF_4), to_indentation(loads, ball, open_patch(box))
     for name in ("point", "force", "footprint"):
@@ -95,8 +95,8 @@ def test_a_rod_that_stands_upright_is_the_ball_at_its_end(box):
     np.testing.assert_array_equal(asked(box, Loads((Touching(pose),)), ROD_OF_4).axes, rod.axes)
 
 
-def test_a_blade_may_be_laid_on_and_moved(box):
-    """`Retracted` loads are the pose that they end in; either way round the blade is the same to a learner."""
+def test_retracted_blade_uses_its_final_pose(box):
+    """`Retracted` loads equal their final pose; a blade rotated by half a turn has the same features."""
     there = upright(box, SMALL_BLADE, 2e-3)
     pose = get_poses(there, SMALL_BLADE)
     above = pose.copy()
@@ -119,8 +119,8 @@ def test_a_blade_may_be_laid_on_and_moved(box):
 
 
 @pytest.mark.parametrize("preset", TOOLS)
-def test_no_facet_is_entered_and_finite_elements_answer_so(box, preset):
-    """Signorini's conditions on a dense lattice of every facet; and against the barrier of the finite elements."""
+def test_rigid_contact_enters_no_facet_and_matches_fem(box, preset):
+    """Signorini's conditions on a dense lattice of every facet, and the finite elements with a barrier."""
     tool, patch = TOOLS[preset], open_patch(box)
     contact, bases = condensed_box(box, tool)
     loads = draw_poses(preset, box, 5, 5, tool)
@@ -183,7 +183,7 @@ def model(data):
     return train(data, ["contact"]).models["contact"]
 
 
-def test_a_model_learns_a_rod_and_keeps_it(tmp_path, data, model, elements, box):
+def test_rod_model_reaches_error_limit_and_round_trips(tmp_path, data, model, elements, box):
     assert data.tool == model.tool == ROD_OF_4
     fresh, nodes = draw_poses("dissector", box, 30, 77, ROD_OF_4), box.tumour_nodes
     truth, found = elements.deform(fresh), model.deform(fresh)
@@ -198,7 +198,7 @@ def test_a_model_learns_a_rod_and_keeps_it(tmp_path, data, model, elements, box)
     np.testing.assert_array_equal(again.deform(fresh).displacement, found.displacement)
 
 
-def test_rod_tilted_beyond_training_is_extrapolation(model, box):
+def test_rod_tilted_beyond_training_is_extrapolated(model, box):
     pose = get_poses(upright(box, ROD_OF_4, 1e-3), ROD_OF_4)
     angle = np.radians(70.0)
     pose[0, :3, :3] = [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
@@ -206,7 +206,7 @@ def test_rod_tilted_beyond_training_is_extrapolation(model, box):
     assert model.deform(Loads((Touching(pose[:, None]),))).outcome == (Outcome.EXTRAPOLATED,)
 
 
-def test_blade_models_play_retraction_without_relaxation(model):
+def test_blade_model_supports_retraction_but_no_relaxation(model):
     blade = SMALL_BLADE
     tissue = to_tissue_json(BRAIN)
     effects = (Elasticity(), Held(), ToolContact((blade,)))
@@ -220,7 +220,7 @@ def test_blade_models_play_retraction_without_relaxation(model):
     assert find_rejection(known, (relaxing, Held(), Retraction(blade))) == words
 
 
-def test_the_command_presses_rods_and_blades(tmp_path, box, capsys):
+def test_simulate_command_supports_rod_and_checks_tool_sizes(tmp_path, box, capsys):
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
     wanted = f"simulate {mesh} --out {out} --count 2 --tool-preset dissector --pose-control --json".split()

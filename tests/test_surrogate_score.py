@@ -1,4 +1,4 @@
-"""How deformers are scored: over all vertices, and by the worst vertex of each load."""
+"""Scores of deformers: over all vertices, and by the worst vertex of each load."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ def fresh(box):
     return draw("palpation", box, 60, 99)
 
 
-def test_score_sees_a_shift(pretender, box, fresh):
+def test_score_measures_a_known_shift(pretender, box, fresh):
     truth = pretender.deform(fresh, at=box.tumour_nodes).displacement
     nothing = score("same", pretender, fresh, truth, box.tumour_nodes)
     shifted = score("shifted", pretender, fresh, truth + [0.0, 3e-3, 4e-3], box.tumour_nodes)
@@ -28,7 +28,7 @@ def test_score_sees_a_shift(pretender, box, fresh):
     assert one.mean_mm == pytest.approx(29.5 / len(box.tumour_nodes)) and one.max_mm == pytest.approx(59.0)
 
 
-def test_a_table_says_what_learners_were_given(pretender, box, fresh):
+def test_score_table_lists_solve_counts(pretender, box, fresh):
     truth = pretender.deform(fresh, at=box.tumour_nodes).displacement + 1e-4
     rows = [
         score(name, pretender, fresh, truth, box.tumour_nodes, solves)
@@ -45,7 +45,7 @@ def test_a_table_says_what_learners_were_given(pretender, box, fresh):
     assert "solves" not in format_scores(rows[2:], 1.0)
 
 
-def test_scores_of_one_model_name_no_smallest_error(pretender, box, fresh):
+def test_score_of_single_model_names_no_smallest_error(pretender, box, fresh):
     truth = pretender.deform(fresh, at=box.tumour_nodes).displacement + 1e-4
     one, other = (score(name, pretender, fresh, truth, box.tumour_nodes) for name in ("one", "other"))
     assert "one has the smallest error: 0.17" in format_scores([one, other], 1.0) and " is fastest, " in format_scores(
@@ -56,8 +56,8 @@ def test_scores_of_one_model_name_no_smallest_error(pretender, box, fresh):
     assert "one: 0.1732 mm mean error at a mean motion of 1.000 mm" in alone
 
 
-def test_of_few_loads_no_percentile_of_a_thousand_is_reported(pretender, box, fresh):
-    """A dash stands in its columns, and a line says why; of 1,000 loads it is the percentile."""
+def test_permille_error_is_omitted_below_1000_loads(pretender, box, fresh):
+    """A dash and a note replace it; from 1,000 loads on it is the 99.9th percentile."""
     distance = np.random.default_rng(0).uniform(size=(1000, 3))
     few, many = compute_spread(distance[:999]), compute_spread(distance)
     assert few[2] is None and many[2] == pytest.approx(np.percentile(distance, 99.9)) and few[3] <= 1.0
@@ -71,7 +71,7 @@ def test_of_few_loads_no_percentile_of_a_thousand_is_reported(pretender, box, fr
     assert len(known[2]) == len(said[2]) and "0.2500" in known[2] and "fewer" not in known[3]
 
 
-def test_force_score_leaves_out_tools_that_do_not_press():
+def test_force_score_excludes_tools_without_force():
     truth = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0], [0.0, 4.0, 0.0]])
     found = score_forces(np.array([9.0, 0.2, 0.2]), truth, np.array([[0.1, 0.3, 0.1], [0.1, 0.5, 0.4]]))
     assert (found.loads, found.force, found.shares) == (2, 3.0, (0.5, 1.0))

@@ -1,4 +1,4 @@
-"""`sulcus simulate` and `sulcus train`, with the finite elements, as a user gives them."""
+"""Commands `sulcus simulate` and `sulcus train` with finite elements."""
 
 import json
 import re
@@ -23,7 +23,7 @@ def folder(tmp_path_factory, small_box):
     return path
 
 
-def test_data_say_where_they_come_from(folder, small_box):
+def test_dataset_records_its_provenance(folder, small_box):
     data = read_dataset(folder / "data.h5")
     assert data.good.all() and len(data.loads) == 100 and data.anatomy.digest == small_box.digest
     assert data.residual.max() <= 1e-4 and data.iterations.min() >= 1
@@ -43,15 +43,15 @@ def test_data_say_where_they_come_from(folder, small_box):
     assert "limit_strain=True" in data.provenance["accuracy"]
 
 
-def test_simulate_keeps_strained_answers_of_brutal_loads(folder, tmp_path):
-    """The published protocol's are kept too; its loads find no room on small bodies."""
+def test_simulate_keeps_strained_results_of_brutal_loads(folder, tmp_path):
+    """So are those of the published protocol, whose loads do not fit on small bodies."""
     out = tmp_path / "data.h5"
     words = f"simulate {folder / 'box.vtu'} --tool-preset brutal --count 2 --device cpu --json".split()
     assert main([*words, "--out", str(out)]) == 0 and OVERLOAD_PRESETS == ("seed", "brutal")
     assert "limit_strain=False" in read_dataset(out).provenance["accuracy"]
 
 
-def test_displacements_are_those_of_the_finite_elements(folder, small_box):
+def test_stored_displacements_match_finite_elements(folder, small_box):
     from sim.effects import Elasticity, Held, ToolForce
     from sim.fem import Fem
 
@@ -61,7 +61,7 @@ def test_displacements_are_those_of_the_finite_elements(folder, small_box):
     assert np.linalg.norm(stored - truth.displacement) < 1e-3 * np.linalg.norm(truth.displacement)
 
 
-def test_training_prints_every_figure_and_writes_every_model(folder, small_box, capsys, short_fits):
+def test_train_command_reports_and_writes_every_model(folder, small_box, capsys, short_fits):
     out = folder / "model.npz"
     assert main(["train", str(folder / "data.h5"), "--out", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -90,7 +90,7 @@ def test_training_prints_every_figure_and_writes_every_model(folder, small_box, 
     assert "a load's worst vertex" in printed and "NumPy model" in printed
 
 
-def test_the_same_command_again_solves_nothing(folder, capsys):
+def test_repeated_simulate_command_solves_no_load(folder, capsys):
     command = ["simulate", str(folder / "box.vtu"), "--out", str(folder / "data.h5"), "--count", "100", "--json"]
     before = (folder / "data.h5").read_bytes()
     assert main(command) == 0
@@ -101,7 +101,7 @@ def test_the_same_command_again_solves_nothing(folder, capsys):
     assert "effects" in capsys.readouterr().err and (folder / "data.h5").read_bytes() == before
 
 
-def test_stiffer_tissue_moves_less(folder, tmp_path, capsys):
+def test_doubled_stiffness_halves_unit_responses(folder, tmp_path, capsys):
     out = tmp_path / "stiff.h5"
     command = ["simulate", str(folder / "box.vtu"), "--out", str(out), "--count", "2", "--material", "linear", "--json"]
     assert main([*command, "--young", "6000"]) == 0
@@ -123,12 +123,12 @@ def test_stiffer_tissue_moves_less(folder, tmp_path, capsys):
         (["--device", "tpu"], "device"),
     ],
 )
-def test_bad_options_are_sentences(folder, tmp_path, capsys, options, words):
+def test_simulate_rejects_invalid_options(folder, tmp_path, capsys, options, words):
     assert main(["simulate", str(folder / "box.vtu"), "--out", str(tmp_path / "data.h5"), *options]) == 2
     assert words in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
-def test_bad_files_are_sentences(folder, tmp_path, capsys):
+def test_commands_reject_missing_files_and_wrong_suffixes(folder, tmp_path, capsys):
     assert main(["simulate", str(tmp_path / "none.vtu"), "--out", str(tmp_path / "data.h5")]) == 2
     assert "no such file" in capsys.readouterr().err
     assert main(["simulate", str(folder / "box.vtu"), "--out", str(tmp_path / "data.txt")]) == 2
@@ -142,7 +142,7 @@ def test_bad_files_are_sentences(folder, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_damaged_data_file_is_a_sentence(folder, tmp_path, capsys):
+def test_train_rejects_damaged_data_file(folder, tmp_path, capsys):
     damaged = tmp_path / "data.h5"
     content = (folder / "data.h5").read_bytes()
     damaged.write_bytes(content[: len(content) // 2])
@@ -155,7 +155,7 @@ def test_a_damaged_data_file_is_a_sentence(folder, tmp_path, capsys):
     assert "was changed" in capsys.readouterr().err
 
 
-def test_models_are_judged_by_loads_that_they_have_never_seen(folder, small_box, capsys):
+def test_judge_rejects_loads_of_the_training(folder, small_box, capsys):
     data, model, fresh = (str(folder / name) for name in ("data.h5", "table.npz", "fresh.h5"))
     assert (
         main(["train", data, "--out", model, "--learners", "linear", "--device", "cpu,cpu", "--json", "--force"]) == 0
@@ -194,8 +194,8 @@ def test_models_are_judged_by_loads_that_they_have_never_seen(folder, small_box,
     assert "was trained: simulate others" in capsys.readouterr().err
 
 
-def test_what_is_said_at_ctrl_c_stands_on_its_own_line(folder, tmp_path, monkeypatch, capsys):
-    """A bar of progress ends before; of a command that goes on nowhere it is said that it stopped."""
+def test_interrupt_message_is_on_its_own_line(folder, tmp_path, monkeypatch, capsys):
+    """The progress bar is ended first; a command that cannot resume reports only that it stopped."""
 
     def stopped(path, deformer, loads, provenance, batch, progress):
         progress(3, 40)

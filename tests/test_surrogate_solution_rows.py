@@ -1,4 +1,4 @@
-"""Data sets that were damaged, cut short or made up: no row of theirs is believed, and the sentence names it."""
+"""Damaged, truncated or forged data sets: their rows are rejected with a message."""
 
 import json
 import shutil
@@ -70,7 +70,7 @@ def put_right(path, group):
 
 
 class TestUnfinished:
-    def test_random_damage_never_ends_in_a_wrong_file(self, tmp_path, pretender, loads, whole, unfinished):
+    def test_random_damage_never_gives_wrong_results(self, tmp_path, pretender, loads, whole, unfinished):
         good = rows_in(whole)
         path = tmp_path / "data.h5"
         resumed = 0
@@ -90,7 +90,7 @@ class TestUnfinished:
             path.unlink()
         assert resumed >= 4  # what was not damaged was not solved again
 
-    def test_damaged_rows_are_named_and_those_alone_are_solved_anew(self, tmp_path, pretender, loads, unfinished):
+    def test_only_damaged_rows_are_reported_and_solved_again(self, tmp_path, pretender, loads, unfinished):
         raw = bytearray(unfinished)
         raw[raw.index(b"answers\0") + 30_000] ^= 1
         (tmp_path / "data.h5.partial").write_bytes(raw)
@@ -98,20 +98,20 @@ class TestUnfinished:
             solved = simulate(tmp_path / "data.h5", pretender, loads, SAID, 8)
         assert solved.loads == 8 + 4 and solved.units == 0  # the last, short batch was never solved
 
-    def test_a_damaged_beginning_is_no_loss(self, tmp_path, pretender, loads, unfinished):
+    def test_damaged_file_header_loses_no_row(self, tmp_path, pretender, loads, unfinished):
         (tmp_path / "data.h5.partial").write_bytes(unfinished[:20] + b"#" + unfinished[21:])
         with pytest.warns(DamageWarning, match="its beginning: damaged"):
             assert simulate(tmp_path / "data.h5", pretender, loads, SAID, 8).rows == 4
 
     @pytest.mark.parametrize("content", [b"", b"some text", b"\x89HDF\r\n\x1a\n" + bytes(5000), b"sulcus\r\n" * 500])
-    def test_a_foreign_file_is_named(self, tmp_path, pretender, loads, content):
+    def test_foreign_partial_file_is_rejected_and_kept(self, tmp_path, pretender, loads, content):
         partial = tmp_path / "data.h5.partial"
         partial.write_bytes(content)
         with pytest.raises(InputError, match=r"data\.h5\.partial: is not an unfinished run.*delete it"):
             simulate(tmp_path / "data.h5", pretender, loads, SAID, 8)
         assert partial.read_bytes() == content
 
-    def test_two_runs_do_not_write_one_file(self, tmp_path, pretender, loads):
+    def test_concurrent_run_on_the_same_file_is_rejected(self, tmp_path, pretender, loads):
         def again(done, total):
             simulate(tmp_path / "data.h5", pretender, loads, SAID, 8)
 
@@ -130,7 +130,7 @@ class TestFinished:
             ("unit/residual", 30, 0.5),
         ],
     )
-    def test_changed_rows_are_named_and_solved_anew(self, tmp_path, pretender, loads, whole, name, row, value):
+    def test_modified_rows_are_reported_and_solved_again(self, tmp_path, pretender, loads, whole, name, row, value):
         path = Path(shutil.copy(whole, tmp_path))
         with h5py.File(path, "r+") as file:
             file[name][row] = value
@@ -164,7 +164,7 @@ class TestFinished:
             (lambda file: swollen(file, "anatomy/nodes", (10**9, 3)), "declares more than such a file holds"),
         ],
     )
-    def test_what_cannot_be_is_refused(self, tmp_path, whole, change, sentence):
+    def test_dataset_with_invalid_contents_is_rejected(self, tmp_path, whole, change, sentence):
         path = Path(shutil.copy(whole, tmp_path))
         with h5py.File(path, "r+") as file:
             change(file)
@@ -172,15 +172,15 @@ class TestFinished:
             read_dataset(path)
         assert str(caught.value).startswith(str(path))
 
-    def test_no_array_is_larger_than_the_limit(self, whole):
-        """Not one whose length the file alone decides."""
+    def test_array_above_the_byte_limit_is_rejected(self, whole):
+        """Also an array whose length only the file determines."""
         with h5py.File(whole) as file:
             shape = read_stored(file, "anatomy/nodes", "f").shape
             assert read_stored(file, "anatomy/nodes", "f", shape, 10_000).nbytes > 10_000
             with pytest.raises(InputError, match=r"`anatomy/nodes` declares more than such a file holds"):
                 read_stored(file, "anatomy/nodes", "f", None, 10_000)
 
-    def test_a_tool_is_one(self, whole):
+    def test_invalid_tool_in_provenance_is_rejected(self, whole):
         data = read_dataset(whole)
         for radius in ("abc", "-1", "nan"):
             with pytest.raises(InputError, match=r"data.h5: 'Ball\(radius=.*' is no tool: .* damaged: simulate again"):
@@ -242,7 +242,7 @@ class TestTraining:
             ("unit", 1e6, "row 7 of `unit` move by more"),
         ],
     )
-    def test_absurd_rows_make_no_model(self, tmp_path, enough, group, value, sentence):
+    def test_training_rejects_implausible_displacements(self, tmp_path, enough, group, value, sentence):
         path = Path(shutil.copy(enough, tmp_path))
         with h5py.File(path, "r+") as file:
             file[f"{group}/displacement"][7] = value
@@ -250,7 +250,7 @@ class TestTraining:
         with pytest.raises(InputError, match=sentence):
             train(read_dataset(path), ["linear"])
 
-    def test_residuals_are_numbers(self, tmp_path, enough):
+    def test_nan_residual_of_converged_row_is_rejected(self, tmp_path, enough):
         path = Path(shutil.copy(enough, tmp_path))
         with h5py.File(path, "r+") as file:
             file["answers/residual"][2] = np.nan
@@ -262,7 +262,7 @@ class TestTraining:
 
 
 class TestRoom:
-    def test_a_full_disk_is_reported_before_the_work(self, tmp_path, pretender, loads, monkeypatch):
+    def test_full_disk_is_reported_before_solving(self, tmp_path, pretender, loads, monkeypatch):
         class Stingy:
             free = 1_000_000
 
@@ -279,8 +279,8 @@ class TestRoom:
             (3_250_000, False, r"data\.h5: cannot be written \(File too large\)"),
         ],
     )
-    def test_a_limit_on_files_is_a_sentence(self, tmp_path, pretender, loads, monkeypatch, size, asked, sentence):
-        """HDF5 ends the process where a write of its own fails: it does no writing of its own."""
+    def test_file_size_limit_is_reported_as_error(self, tmp_path, pretender, loads, monkeypatch, size, asked, sentence):
+        """HDF5 aborts the process if its own write fails; Python therefore writes the file."""
         if not asked:
             monkeypatch.setattr("surrogate.data.simulate.check_disk_space", lambda *sizes: None)
         with files_below(size), pytest.raises(InputError, match=sentence):
@@ -290,8 +290,8 @@ class TestRoom:
             assert simulate(tmp_path / "data.h5", pretender, loads, SAID, 8).rows == 0
 
 
-def test_a_data_set_explains_itself(tmp_path):
-    """By h5py and the attributes alone, one displacement is computed again."""
+def test_displacement_is_reproduced_from_file_attributes(tmp_path):
+    """Only h5py and the attributes are used to compute one displacement again."""
     body = base_held(cube((4, 4, 3), 0.02))
     top = np.isclose(body.mesh.nodes[:, 2], body.mesh.nodes[:, 2].max())
     inside = np.linalg.norm(body.mesh.nodes[body.mesh.tets].mean(axis=1) - [0.04, 0.04, 0.03], axis=1) < 0.015
@@ -328,7 +328,7 @@ def test_a_data_set_explains_itself(tmp_path):
     assert response[vertex].argmax() == 1 and response[vertex, 1] > 0.0  # row 4: the second node, along y
 
 
-def test_arrays_have_limits(tmp_path):
+def test_stored_arrays_of_wrong_type_or_shape_are_rejected(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["a"] = np.zeros(3)
         with pytest.raises(InputError, match="holds float64"):

@@ -1,4 +1,4 @@
-"""Data sets that several devices make: the same bytes, nothing lost with a process, and the commands."""
+"""Data sets of several devices: equal bytes, killed processes, and commands."""
 
 import json
 import os
@@ -54,7 +54,7 @@ def undated(path):
 
 
 @pytest.mark.parametrize("batch", [1, 8])
-def test_a_file_does_not_depend_on_how_many_devices_made_it(tmp_path, body, batch):
+def test_dataset_is_independent_of_device_count(tmp_path, body, batch):
     effects, loads = (*build_push_effects(body, BRAIN), NodalForce()), draw("palpation", body, COUNT, 0)
     counts = []
     for devices in (["cpu"], ["cpu", "cpu"]):
@@ -72,8 +72,8 @@ def test_a_file_does_not_depend_on_how_many_devices_made_it(tmp_path, body, batc
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
-def test_two_processes_on_one_card_answer_as_one(tmp_path, body):
-    """To the tolerance: sums on a card are taken in any order, so that not even one process repeats its last bits."""
+def test_two_processes_on_one_gpu_match_one_process(tmp_path, body):
+    """Within the tolerance: GPU sums have no fixed order, and one process does not repeat its last bits either."""
     effects, loads = (*build_push_effects(body, BRAIN), NodalForce()), draw("palpation", body, 64, 0)
     found = []
     for devices in (["cuda:0"], ["cuda:0", "cuda:0"]):
@@ -88,21 +88,21 @@ def test_two_processes_on_one_card_answer_as_one(tmp_path, body):
 
 
 @pytest.mark.parametrize("devices", [("cpu",), ("cpu", "cpu")])
-def test_a_batch_that_no_memory_holds_begins_no_file(body, devices):
-    """A file keeps its batch, so that a smaller one would be refused beside it."""
+def test_batch_above_memory_limit_is_rejected_before_start(body, devices):
+    """A file keeps its batch size, and would reject a smaller one later."""
     asked = LazyFem(body, (*build_push_effects(body, BRAIN), NodalForce()), TRAIN, "p1", 10**9, 2 * 10**9)
     refused = pytest.raises(InputError, match=r"the results of 1000000000 loads take about .* are free: solve at most")
     with refused, open_solvers(asked, devices, print):
         pytest.fail("it would begin")
 
 
-def test_batches_are_shared_evenly():
+def test_batch_size_is_divided_evenly_among_devices():
     assert [choose_even_batch(10_000, count, 4) for count in (5, 5_000, 40_000, 50_000)] == [2, 1_250, 10_000, 6_250]
     assert choose_even_batch(0, 7, 2) == 1 and choose_even_batch(64, 7, 1) == 7
 
 
 def test_run_resumes_on_other_devices_in_same_batches(tmp_path, box_file, capsys):
-    """What was begun with another batch than the default is finished with it, unless another is asked for."""
+    """A run keeps its batch size unless another one is requested."""
     words = ["simulate", box_file, "--out", str(tmp_path / "a.h5"), "--json"]
     assert main([*words, "--count", "12", "--batch", "5", "--device", "cpu,cpu"]) == 0
     assert main([*words, "--count", "20", "--device", "cpu"]) == 0
@@ -125,7 +125,7 @@ def test_run_resumes_on_other_devices_in_same_batches(tmp_path, box_file, capsys
         ),
     ],
 )
-def test_bad_lists_are_sentences(tmp_path, box_file, capsys, monkeypatch, words, reason):
+def test_invalid_device_lists_are_rejected(tmp_path, box_file, capsys, monkeypatch, words, reason):
     monkeypatch.chdir(tmp_path)
     assert main([box_file if word == "BOX" else word for word in words]) == 2
     assert reason in capsys.readouterr().err and not list(tmp_path.iterdir())
@@ -144,8 +144,8 @@ def children_of(parent):
     return found
 
 
-def test_ctrl_c_ends_all_processes_and_the_same_command_goes_on(tmp_path, box_file):
-    """As a terminal gives it, to the whole group; nothing is said but how to go on."""
+def test_interrupt_ends_all_processes_with_a_resume_message(tmp_path, box_file):
+    """Signal to the whole process group, as by a terminal; the only message says how to resume."""
     command = [sys.executable, "-m", "scenes.cli", "simulate", box_file, "--out", str(tmp_path / "a.h5")]
     command += ["--count", "5000", "--batch", "4", "--device", "cpu,cpu", "--json"]
     root = Path(__file__).parents[1]

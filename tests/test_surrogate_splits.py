@@ -1,4 +1,4 @@
-"""Directions and discs of the cortex left out for tests; and training on a split of one's own."""
+"""Held-out directions and discs of the cortex, and training with a given split."""
 
 from dataclasses import replace
 
@@ -21,8 +21,8 @@ def pushed(box):
     return draw("palpation", box, 400, 0).get(Pushed)
 
 
-def test_whole_sectors_are_left_out(box, pushed):
-    """The box's cortex looks up: azimuths in the plane and angles from the normal are those of the axes."""
+def test_sector_split_holds_out_whole_sectors(box, pushed):
+    """The cortex of the box faces +z: azimuth and tilt are those of the axes."""
     split = leave_sectors_out(pushed, open_patch(box))
     first = np.degrees(np.arctan2(split.centres[0, 1], split.centres[0, 0]))
     azimuth = np.degrees(np.arctan2(pushed.force[:, 1], pushed.force[:, 0])) - first
@@ -35,13 +35,13 @@ def test_whole_sectors_are_left_out(box, pushed):
     assert "2 sectors of 45 degrees" in split.summarise() and f"{split.test.sum()} loads to test" in split.summarise()
 
 
-def test_upright_loads_cannot_be_split(box, pushed):
+def test_sector_split_rejects_upright_loads(box, pushed):
     upright = replace(pushed, force=np.tile([0.0, 0.0, -0.1], (400, 1)))
     with pytest.raises(InputError, match="more directions"):
         leave_sectors_out(upright, open_patch(box))
 
 
-def test_training_sees_what_its_split_allows(box, pretender, tmp_path):
+def test_training_uses_only_loads_of_its_split(box, pretender, tmp_path):
     simulate(tmp_path / "data.h5", pretender, draw("palpation", box, 200, 0), {})
     data = read_dataset(tmp_path / "data.h5")
     split = leave_sectors_out(data.loads.get(Pushed), open_patch(box))
@@ -53,7 +53,7 @@ def test_training_sees_what_its_split_allows(box, pretender, tmp_path):
     assert trained.split is fewer and fewer.train.sum() == 50 and fewer.test.sum() == split.test.sum()
 
 
-def test_whole_discs_are_left_out(box, patch):
+def test_disc_split_holds_out_whole_discs(box, patch):
     points = pushes("palpation", box, 600, 0).point
     split = leave_discs_out(points, patch)
     distance = np.linalg.norm(points[:, None] - split.centres, axis=2)
@@ -63,7 +63,7 @@ def test_whole_discs_are_left_out(box, patch):
     assert 0.1 < split.test.mean() <= 0.5
 
 
-def test_a_wide_patch_gets_more_discs(box, patch):
+def test_disc_split_has_more_discs_on_wide_patch(box, patch):
     points = pushes("palpation", box, 300, 0).point
     centres = leave_discs_out(points, patch).centres
     wide = type(patch)(patch.nodes, patch.triangles, 3.0 * patch.points)
@@ -71,19 +71,19 @@ def test_a_wide_patch_gets_more_discs(box, patch):
     assert split.share >= 0.15 and len(split.centres) > len(centres)
 
 
-def test_loads_at_few_positions_are_left_out_by_position(box, patch):
+def test_disc_split_holds_out_single_positions(box, patch):
     points = pushes("seed", box, 2000, 0).point
     split = leave_discs_out(points, patch)
     assert len(split.centres) == 6 and len(np.unique(points[split.test], axis=0)) == 6
     assert len(np.unique(points[~split.test], axis=0)) == 5
 
 
-def test_discs_shrink_where_they_would_take_more_than_half(patch):
+def test_disc_split_holds_out_at_most_half_of_the_loads(patch):
     points = np.random.default_rng(0).normal(0, 5e-3, (500, 3)) * [1, 1, 0]
     split = leave_discs_out(points, patch)
     assert split.radius < 6e-3 and split.test.mean() <= 0.5 and len(split.centres) >= 6
 
 
-def test_too_few_positions_are_refused(patch):
+def test_disc_split_rejects_too_few_positions(patch):
     with pytest.raises(InputError, match="simulate more"):
         leave_discs_out(np.repeat(np.eye(3)[:2] * 0.01, 5, axis=0), patch)

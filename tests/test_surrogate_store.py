@@ -1,4 +1,4 @@
-"""Model files from outside: bounded, believed only where a training could have made them, and refused in sentences."""
+"""Untrusted model files: size limits, checks of contents, and messages for rejected files."""
 
 import json
 import re
@@ -62,7 +62,7 @@ def test_model_without_vertices_or_numbers_is_rejected(models, box, tmp_path, ch
     assert str(caught.value).startswith(str(tmp_path / "model.npz")) and "sulcus train" in str(caught.value)
 
 
-def test_what_a_regressor_knows_is_finite(models, box, tmp_path):
+def test_regressor_with_nan_parameters_is_rejected(models, box, tmp_path):
     model = models["linear"]
     linear = type(model.parts[0].regressor).restored({"compliance": model.parts[0].regressor.compliance_ * np.nan})
     save(tmp_path / "model.npz", {"linear": replace(model, parts=(replace(model.parts[0], regressor=linear),))})
@@ -70,8 +70,8 @@ def test_what_a_regressor_knows_is_finite(models, box, tmp_path):
         load(tmp_path / "model.npz", box)
 
 
-def test_what_no_model_refers_to_is_not_read(stored, box, tmp_path):
-    """64 MB of zeros beside the models, in 64 kB."""
+def test_unreferenced_arrays_are_not_read(stored, box, tmp_path):
+    """64 MB of zeros next to the models, compressed to 64 kB."""
     path = tmp_path / "model.npz"
     path.write_bytes(stored.read_bytes())
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open("bomb.npy", "w") as member:
@@ -99,7 +99,7 @@ def rewritten(stored, path, change, seal=""):
     [('"bound": 0.', '"bound": 1.'), ('"svr"', '"gp"'), ('"reach": ', '"reach": 1'), ('"space"', '"space2"')],
 )
 @pytest.mark.parametrize("read", [load, read_learned_tissue, lambda path, _: read_reported_errors(path)])
-def test_header_of_another_content_than_sealed_is_rejected(stored, box, tmp_path, read, old, new):
+def test_header_with_wrong_digest_is_rejected(stored, box, tmp_path, read, old, new):
     path = rewritten(stored, tmp_path / "model.npz", lambda text: text.replace(old, new), r"\g<0>")
     with pytest.raises(InputError, match=r"do not have the digest that it states: it is damaged\. Make one with"):
         read(path, box)
@@ -107,7 +107,7 @@ def test_header_of_another_content_than_sealed_is_rejected(stored, box, tmp_path
 
 
 @pytest.mark.parametrize("change", [lambda array: 10.0 * array, lambda array: array[::-1], lambda array: array[:, :3]])
-def test_model_with_another_array_than_named_is_rejected(stored, models, box, tmp_path, change):
+def test_array_with_wrong_digest_is_rejected(stored, models, box, tmp_path, change):
     with np.load(stored) as file:
         arrays = {name: file[name] for name in file.files}
     modes = compute_digest(models["svr"].parts[0].basis.modes)
@@ -120,7 +120,7 @@ READERS = {"truth": lambda path: read_truth(path, "digest", 3, 2**20), "stated":
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_npz_that_inflates_beyond_its_limit_is_not_read(name, tmp_path):
+def test_npz_above_decompressed_size_limit_is_not_read(name, tmp_path):
     """40 MB in 40 kB, in the header and in an array."""
     many, header = np.zeros(5_000_000), np.array(json.dumps({"format": "sulcus film 1", "anatomy": "digest"}))
     arrays = dict.fromkeys(("times", "displacement", "T_camera_scan", "T_scan_tool"), many)
@@ -131,17 +131,17 @@ def test_npz_that_inflates_beyond_its_limit_is_not_read(name, tmp_path):
         assert not READERS[name](tmp_path / "a.npz")
 
 
-def test_archives_are_opened_by_the_reader_with_limits_alone():
+def test_only_the_limited_reader_opens_archives():
     paths = [path for room in ("sim", "surrogate", "ar", "scenes") for path in (HOUSE / room).rglob("*.py")]
     found = {path.name for path in paths if re.search(r"np\.load\(|ZipFile\(|torch\.load\(", path.read_text())}
     assert found == {"npz_archive.py"}
 
 
-def test_a_file_says_its_space(stored):
+def test_model_file_states_its_coordinate_system(stored):
     assert json.loads(str(np.load(stored)["header"]))["space"] == "RAS [m]"
 
 
-def test_bounds_of_older_files_grow_beyond_the_reach_alone(stored, models, box, tmp_path):
+def test_bounds_of_older_files_grow_only_beyond_the_reach(stored, models, box, tmp_path):
     def older(text):
         header = json.loads(text)
         for model in header["models"].values():
@@ -160,7 +160,7 @@ def test_bounds_of_older_files_grow_beyond_the_reach_alone(stored, models, box, 
     assert stated[0] == stated[1] and stated[2] == pytest.approx((1.0 + GROWTH) * stated[0])
 
 
-def test_declared_sizes_are_held_against_what_there_is(stored, box, tmp_path):
+def test_declared_array_size_above_content_is_rejected(stored, box, tmp_path):
     path = tmp_path / "model.npz"
     with zipfile.ZipFile(stored) as source, zipfile.ZipFile(path, "w") as target:
         for name in source.namelist():
@@ -173,7 +173,7 @@ def test_declared_sizes_are_held_against_what_there_is(stored, box, tmp_path):
         load(path, box)
 
 
-def test_a_learner_that_nobody_registered_is_a_sentence(stored, box, tmp_path):
+def test_model_of_unregistered_learner_is_rejected(stored, box, tmp_path):
     path = rewritten(stored, tmp_path / "model.npz", lambda text: text.replace('"svr"', '"forest"'))
     with pytest.raises(InputError, match=r"made by the learner 'forest'.*--plugin"):
         load(path, box)
@@ -191,7 +191,7 @@ def test_a_learner_that_nobody_registered_is_a_sentence(stored, box, tmp_path):
         lambda text: text.replace('"reach": ', '"reach": "far", "r": '),
     ],
 )
-def test_a_header_that_says_something_else_is_a_sentence(stored, box, tmp_path, change):
+def test_invalid_header_is_rejected_with_one_line_message(stored, box, tmp_path, change):
     path = rewritten(stored, tmp_path / "model.npz", change)
     with pytest.raises(InputError, match="Make one with `sulcus train`") as caught:
         load(path, box)
@@ -199,7 +199,7 @@ def test_a_header_that_says_something_else_is_a_sentence(stored, box, tmp_path, 
 
 
 @pytest.mark.parametrize(("offset", "value"), [(6, 1), (8, 99)])
-def test_encrypted_and_oddly_packed_members_are_sentences(stored, box, tmp_path, offset, value):
+def test_encrypted_or_unsupported_members_are_rejected(stored, box, tmp_path, offset, value):
     raw = bytearray(stored.read_bytes())
     place = -1
     for mark, field in ((b"PK\x03\x04", offset), (b"PK\x01\x02", offset + 2)):
@@ -211,7 +211,7 @@ def test_encrypted_and_oddly_packed_members_are_sentences(stored, box, tmp_path,
         load(path, box)
 
 
-def test_memory_that_is_not_there_is_a_sentence(stored, box, monkeypatch):
+def test_memory_error_is_reported_as_input_error(stored, box, monkeypatch):
     def starved(*given, **named):
         raise MemoryError
 
@@ -220,7 +220,7 @@ def test_memory_that_is_not_there_is_a_sentence(stored, box, monkeypatch):
         load(stored, box)
 
 
-def test_random_damage_is_a_sentence_or_no_damage(stored, models, box, tmp_path):
+def test_randomly_damaged_model_file_is_rejected(stored, models, box, tmp_path):
     path = tmp_path / "model.npz"
     for seed in range(25):
         random = np.random.default_rng(seed)
@@ -231,7 +231,7 @@ def test_random_damage_is_a_sentence_or_no_damage(stored, models, box, tmp_path)
             load(path, box)
 
 
-def test_bad_model_files_are_sentences(box, tmp_path):
+def test_invalid_model_files_are_rejected(box, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         load(tmp_path / "none.npz", box)
     for name, content in (("text.npz", b"text"), ("zip.npz", b"PK\x03\x04broken"), ("empty.npz", b"")):

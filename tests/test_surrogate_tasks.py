@@ -1,4 +1,4 @@
-"""Batches shared by processes: what a killed one leaves."""
+"""Batches shared by processes after one process is killed."""
 
 import pytest
 from on_devices import mortal, small_body
@@ -16,8 +16,8 @@ def body():
     return small_body()
 
 
-def test_killed_process_loses_no_finished_case(tmp_path, body):
-    """Resume after one of two processes died at the sixth of ten batches: the bytes are those of an undisturbed run."""
+def test_killed_solver_process_loses_no_finished_case(tmp_path, body):
+    """One of two processes dies at the sixth of ten batches; the resumed file equals that of a complete run."""
     loads, whole, path = draw("palpation", body, COUNT, 0), tmp_path / "whole.h5", tmp_path / "data.h5"
     undisturbed = mortal("cpu", COUNT, 0, tmp_path)
     simulate(whole, undisturbed, loads, SAID, 2)

@@ -1,4 +1,4 @@
-"""The distance from tip to tumour: measured as the tool is drawn, learnt with a correction, bounded and stored."""
+"""Distance from tip to tumour: geometry, learned correction, bounds and storage."""
 
 from dataclasses import replace
 
@@ -65,7 +65,7 @@ def fresh(pretender, gauge):
     return loads, gauge.compute_distances(loads, answer.displacement, answer.nodes)
 
 
-def test_what_it_needs_it_asks_for(box, gauge, fresh):
+def test_tip_gauge_requires_cortex_and_tumour(box, gauge, fresh):
     loads = fresh[0].select(slice(0, 1))
     nodes = box.tumour_nodes
     with pytest.raises(InputError, match="request the open cortex and the tumour"):
@@ -77,7 +77,7 @@ def test_what_it_needs_it_asks_for(box, gauge, fresh):
         )
 
 
-def test_the_bound_holds_as_often_as_it_says(model, fresh):
+def test_distance_bound_has_nominal_coverage(model, fresh):
     found = measure_distance_coverage(model, *fresh)
     # Of 200 loads that calibrate and 300 that judge the share scatters by 0.02.
     assert 0.89 <= found.shares[0] <= 0.99 and found.shares[1] >= found.shares[0]
@@ -87,7 +87,7 @@ def test_the_bound_holds_as_often_as_it_says(model, fresh):
     assert np.median(predicted.bound[0]) < 0.7 * np.quantile(error, 0.95)
 
 
-def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, gauge):
+def test_distance_bound_covers_every_force_decile(model, pretender, gauge):
     def known(count, seed):
         loads = draw("palpation", pretender.anatomy, count, seed)
         answer = pretender.deform(loads)
@@ -104,8 +104,8 @@ def test_with_enough_loads_it_holds_in_every_tenth_of_force(model, pretender, ga
     assert 0.93 <= found.shares[0] <= 0.97 and min(found.tenths) > 0.85 and found.shares[1] > 0.975
 
 
-def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
-    """Recomputed: the scored model, a bound from the loads that are apart and outside every disc."""
+def test_held_out_distance_coverage_is_reported(trained, data, gauge):
+    """Computed again: scored model, and a bound from calibration loads outside every disc."""
     good, split = data.loads.select(np.flatnonzero(data.good)), trained.split
     distance = gauge.compute_distances(good, data.read_displacement(gauge.nodes)[data.good], gauge.nodes)
     place = np.linalg.norm(get_only_pushes(good).point[:, None] - split.centres, axis=2).min(axis=1)
@@ -128,14 +128,14 @@ def test_held_out_coverage_of_its_bound_is_reported(trained, data, gauge):
     assert found.loads == held.shape[1] == split.test.sum() and found.shares == (held[0].mean(), None)
 
 
-def test_the_correction_brings_distances_nearer(model, fresh):
+def test_correction_halves_the_distance_error(model, fresh):
     plain = replace(model, tip=None).predict_distance(fresh[0])
     assert np.isnan(plain.bound).all()
     off, left = (np.abs(predicted.value - fresh[1]).mean() for predicted in (plain, model.predict_distance(fresh[0])))
     assert left < 0.5 * off
 
 
-def test_no_push_gives_zero_and_far_bound_is_wide(model, fresh):
+def test_distance_bound_is_zero_at_rest_and_wide_when_strong(model, fresh):
     loads = fresh[0].select(slice(0, 20))
     idle = model.predict_distance(loads.scale(0.0))
     still = np.zeros((20, len(model.nodes), 3))
@@ -145,14 +145,14 @@ def test_no_push_gives_zero_and_far_bound_is_wide(model, fresh):
     assert (strong.bound[0] > 2.0 * model.predict_distance(loads).bound[0]).all() and (strong.value >= 0.0).all()
 
 
-def test_an_answer_at_hand_is_taken(model, fresh):
+def test_given_deformation_predicts_the_same_distance(model, fresh):
     loads = fresh[0].select(slice(0, 3))
     answer = model.deform(loads, at=build_tip_gauge(model.anatomy).nodes)
     given, asked = model.predict_distance(loads, answer), model.predict_distance(loads)
     assert given.value == pytest.approx(asked.value, abs=1e-9) and np.array_equal(given.bound, asked.bound)
 
 
-def test_the_store_keeps_it(model, fresh, tmp_path):
+def test_model_file_stores_the_distance_correction(model, fresh, tmp_path):
     bare = replace(model, tip=None)
     save(tmp_path / "m.npz", {"whole": model, "bare": bare, "none": replace(model, tip=TipModel())})
     with pytest.raises(InputError, match="with this extension"):
@@ -164,7 +164,7 @@ def test_the_store_keeps_it(model, fresh, tmp_path):
     assert models["bare"].tip is None and models["none"].tip == TipModel()
 
 
-def test_shipped_models_bound_strong_press_distance():
+def test_shipped_models_bound_the_distance_of_strong_presses():
     theatre, scene = open_theatre(device="cpu"), find_scene("press")
     at = open_cortex(theatre.anatomy).place()
     loads = Loads((Pushed(at.point[None], 0.3 * at.inward[None], np.array([7e-3])),))
@@ -177,7 +177,7 @@ def test_shipped_models_bound_strong_press_distance():
     assert np.isnan(replace(model, tip=None).predict_distance(loads).bound).all()  # a model of before promises nothing
 
 
-def test_a_frame_reads_it_with_its_bound_where_one_is_promised(model, pretender, gauge, fresh):
+def test_frame_distance_uses_the_error_bound_of_its_model(model, pretender, gauge, fresh):
     loads, tool = fresh[0].select(slice(2, 3)), Probe()
     answer, truth = model.deform(loads), pretender.deform(loads)
     predicted = model.predict_distance(loads)

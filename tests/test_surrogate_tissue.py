@@ -1,4 +1,4 @@
-"""Fitted tissue: draws from it, and its file."""
+"""Fitted tissue: random draws from it, and its file."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from sim.errors import InputError
 from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue, load_tissue, save_tissue
 
 
-def test_what_is_drawn_is_what_was_fitted():
+def test_sampled_tissues_follow_the_fitted_shares():
     share = np.zeros((3, 13, 33))
     share[0, 3, 20], share[1, 3, 20], share[1, 9, 30] = 0.25, 0.25, 0.5
     tissue = FittedTissue("", 4, share, np.array([1500.0]))
@@ -23,7 +23,7 @@ def test_what_is_drawn_is_what_was_fitted():
         sample_from_fit(tissue, 3000.0, ("contact",), 8)
 
 
-def test_a_file_keeps_the_tissue_and_refuses_others(tmp_path):
+def test_tissue_file_round_trips_and_rejects_other_anatomy(tmp_path):
     share = np.random.default_rng(0).uniform(size=(3, 13, 33))
     tissue = FittedTissue("abc", 4, share / share.sum(), np.array([1500.0, 2000.0]))
     path = tmp_path / "brain.tissue.json"

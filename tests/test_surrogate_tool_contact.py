@@ -1,4 +1,4 @@
-"""Blades that go on from where an answer had them, how hard they press, and the spatula's model that ships."""
+"""Blades with warm start, their pressure, and the shipped model of the spatula."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -52,8 +52,8 @@ def model(box):
     return Learned(box, (part,), known, tool=BLADE, force=ForceModel())
 
 
-def test_a_blade_goes_on_from_where_it_was(model, box):
-    """To the contact that it finds straight from the air; the same start gives the same bytes."""
+def test_warm_started_blade_reaches_the_direct_contact(model, box):
+    """Same contact as directly from the air; the same start gives the same bytes."""
     first, second = over(box, (0.0, 2.5)), over(box, (0.4, 3.0))
     start = model.deform(first)
     on, straight = model.deform(second, start), model.deform(second)
@@ -70,8 +70,8 @@ def test_a_blade_goes_on_from_where_it_was(model, box):
     assert dropped.displacement.tobytes() == straight.displacement.tobytes()
 
 
-def test_it_comes_straight_in_where_that_is_nearer(model, box):
-    """From the air, from far aside, and out of the tissue again; each row goes its own way."""
+def test_distant_start_gives_the_direct_contact(model, box):
+    """Starts in the air, far aside and deeper in the tissue; each row is solved separately."""
     starts = [model.deform(over(box, place)) for place in ((0.0, -2.0), (9.0, 0.5), (0.3, 1.5))]
     there = over(box, (0.0, 1.0), (0.0, 1.0), (0.0, 1.5))
     found, straight = model.deform(there, join_deformations(starts)), model.deform(there)
@@ -87,8 +87,8 @@ def test_it_comes_straight_in_where_that_is_nearer(model, box):
     assert model.deform(alone, spoiled).displacement.tobytes() == model.deform(alone).displacement.tobytes()
 
 
-def test_pressure_is_that_of_the_finite_elements(model, box):
-    """Its sum over areas is the force; its highest is that of the barrier's forces."""
+def test_tool_pressure_matches_finite_elements(model, box):
+    """Its integral is the force; its maximum is that of the barrier forces."""
     loads = over(box, (0.0, 2.0), (2.0, 3.0), (0.0, -1.0))
     answer = model.deform(loads)
     found = compute_tool_pressure(model, loads, answer)
@@ -104,8 +104,8 @@ def test_pressure_is_that_of_the_finite_elements(model, box):
         compute_tool_pressure(replace(model, force=None), loads, answer)
 
 
-def test_the_spatula_that_ships_has_the_finite_elements_answers():
-    """Fresh poses, two of which have contacts whose single precision is no longer positive definite."""
+def test_shipped_spatula_model_matches_finite_elements():
+    """New poses, two of them with contacts that are not positive definite in single precision."""
     model = load(get_gym_model_path(), read_anatomy(get_template_path()))["contact-gp"]
     kept = np.load(Path(__file__).parent / "data" / "spatula_poses.npz")
     answer = model.deform(Loads((Touching(kept["pose"][:, None]),)))

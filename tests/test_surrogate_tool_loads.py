@@ -1,4 +1,4 @@
-"""Loads are those of the tools, spread over the open cortex; tests are whole discs."""
+"""Loads of surgical tools on the open cortex, and rejected nominal loads."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def pushes(*args):
 
 
 @pytest.mark.parametrize("name", TOOLS)
-def test_tools_stay_in_their_ranges(box, patch, name):
+def test_tool_loads_stay_in_their_ranges(box, patch, name):
     tool, loads = TOOLS[name], pushes(name, box, 200, 1)
     force = np.linalg.norm(loads.force, axis=1)
     pressure = force / (np.pi * loads.footprint**2)
@@ -35,7 +35,7 @@ def test_tools_stay_in_their_ranges(box, patch, name):
     assert (patch.compute_edge_distance(loads.point) >= loads.footprint).all()
 
 
-def test_points_directions_and_forces_are_uniform(box, patch):
+def test_load_points_directions_and_forces_are_uniform(box, patch):
     loads = pushes("bipolar", box, 4000, 0)
     inner = np.linalg.norm(loads.point[:, :2], axis=1) < 10e-3
     allowed = patch.compute_covered(np.zeros((1, 3)), 10e-3) * patch.areas.sum()
@@ -49,20 +49,20 @@ def test_points_directions_and_forces_are_uniform(box, patch):
     assert np.mean(cosine) == pytest.approx((1 + np.cos(np.pi / 4)) / 2, abs=0.01)
 
 
-def test_a_load_depends_on_its_number_alone(box):
+def test_load_depends_only_on_seed_and_number(box):
     for preset in ("palpation", "mixed", "seed"):
         few, many = pushes(preset, box, 7, 5), pushes(preset, box, 40, 5)
         assert np.array_equal(few.point, many.point[:7]) and np.array_equal(few.force, many.force[:7])
     assert not np.array_equal(pushes("palpation", box, 7, 6).point, few.point)
 
 
-def test_mixed_uses_every_tool(box):
+def test_mixed_preset_uses_every_tool(box):
     radii = pushes("mixed", box, 200, 0).footprint
     for tool in TOOLS.values():
         assert ((radii >= tool.footprint[0]) & (radii <= tool.footprint[1])).sum() > 20
 
 
-def test_published_protocol(box):
+def test_seed_preset_follows_the_published_protocol(box):
     loads = pushes("seed", box, 100_000, 0)
     centre = box.mesh.nodes[box.tumour_nodes].mean(axis=0)
     distance = np.linalg.norm(loads.point - centre, axis=1)
@@ -79,12 +79,12 @@ def test_published_protocol(box):
     ("preset", "count", "seed", "words"),
     [("hammer", 5, 0, "palpation"), ("palpation", 0, 0, "--count"), ("palpation", 5, -1, "--seed")],
 )
-def test_bad_draws_are_sentences(box, preset, count, seed, words):
+def test_invalid_draw_parameters_are_rejected(box, preset, count, seed, words):
     with pytest.raises(InputError, match=words):
         draw(preset, box, count, seed)
 
 
-def test_a_tool_too_large_for_the_patch_is_refused(make_small_opening):
+def test_tool_too_large_for_the_patch_is_rejected(make_small_opening):
     with pytest.raises(InputError, match="--craniotomy"):
         draw("spatula", make_small_opening, 3, 0)
 
@@ -97,22 +97,22 @@ def make_small_opening(box):
     return Anatomy(box.mesh, box.fixed | ~near[:, None], box.slide_normal, near)
 
 
-def test_spread_points_are_far_from_each_other():
+def test_spread_selects_points_far_from_each_other():
     points = np.random.default_rng(0).random((400, 3)) * [1, 1, 0]
     chosen = points[spread(points, 9)]
     gaps = np.linalg.norm(chosen[:, None] - chosen, axis=2) + np.eye(9) * 9
     assert gaps.min() > 0.3  # a 3 x 3 grid has 0.33-0.5
 
 
-def test_covered_share_is_that_of_discs(box, patch):
+def test_covered_share_equals_disc_area_share(box, patch):
     assert patch.compute_covered(np.zeros((1, 3)), 12e-3) == pytest.approx(
         np.pi * 12e-3**2 / patch.areas.sum(), rel=0.03
     )
 
 
 @pytest.mark.parametrize("name", TOOLS)
-def test_the_share_of_nominal_loads_that_are_not_drawn(name):
-    """Recounted on random ones, with the limits written out here."""
+def test_rejected_share_matches_random_recount(name):
+    """Counted again with random loads and the limits written in this test."""
     tool, random = TOOLS[name], np.random.default_rng(0)
     radius = random.uniform(*tool.footprint, 40_000)
     force = np.exp(random.uniform(*np.log(tool.force), 40_000))
@@ -121,7 +121,7 @@ def test_the_share_of_nominal_loads_that_are_not_drawn(name):
     assert compute_rejected_share(name) == pytest.approx(refused.mean(), abs=0.01)
 
 
-def test_nominal_loads_of_palpation_are_refused_in_words():
+def test_rejected_share_is_described_in_words():
     assert describe_rejected("palpation").startswith("10 % of the nominal loads of palpation")
     assert compute_rejected_share("mixed") == pytest.approx(np.mean([compute_rejected_share(name) for name in TOOLS]))
     assert (

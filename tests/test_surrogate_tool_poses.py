@@ -1,4 +1,4 @@
-"""Models that are given where the tool is: poses as indentations, how they are drawn, learnt, stored and refused."""
+"""Models of tool poses: indentations, draws, training, storage and rejected input."""
 
 from dataclasses import dataclass, replace
 
@@ -34,7 +34,7 @@ EFFECTS = (Elasticity(), Held(), ToolContact((BALL,)))
 SAID = {"shape": repr(BALL), "effects": repr(EFFECTS)}
 
 
-def test_draws_are_each_of_their_own_number(box):
+def test_pose_draw_depends_only_on_seed_and_number(box):
     few, many = draw_poses("palpation", box, 10, 4), draw_poses("palpation", box, 30, 4)
     some, all_of = few.get(Touching), many.get(Touching)
     assert some is not None
@@ -78,8 +78,8 @@ def trained(data):
     return train(data, ["gp"])
 
 
-def test_poses_train_where_there_is_no_force(data, trained, pretender, box):
-    """Fresh poses, as drawn: learnt to a few per cent, and bounds hold about as often as they say."""
+def test_pose_models_train_without_reaction_forces(data, trained, pretender, box):
+    """Errors of a few per cent on new poses, and bounds with about their nominal coverage."""
     assert list_learners(data) == POSE_MODELS
     model, fresh = trained.models["gp"], draw_poses("palpation", box, 100, 77)
     nodes = box.tumour_nodes
@@ -95,7 +95,7 @@ def test_poses_train_where_there_is_no_force(data, trained, pretender, box):
     assert np.linalg.norm(model.deform(fresh, at=cortex).displacement - exact) < 0.2 * np.linalg.norm(exact)
 
 
-def test_deeper_or_elsewhere_than_in_training_is_said(trained, box):
+def test_poses_outside_training_range_are_extrapolated(trained, box):
     model, patch = trained.models["gp"], open_patch(box)
     middle = patch.points.mean(axis=0, keepdims=True)
     way = patch.find_normals(middle)
@@ -108,15 +108,15 @@ def test_deeper_or_elsewhere_than_in_training_is_said(trained, box):
     assert model.deform(air).outcome == (Outcome.PREDICTED,)
 
 
-def test_a_stored_model_knows_its_tool(tmp_path, trained, box):
+def test_stored_model_keeps_its_tool(tmp_path, trained, box):
     save(tmp_path / "model.npz", trained.models)
     again, fresh = load(tmp_path / "model.npz", box)["gp"], draw_poses("palpation", box, 5, 1)
     assert again.tool == BALL
     np.testing.assert_array_equal(again.deform(fresh).displacement, trained.models["gp"].deform(fresh).displacement)
 
 
-def test_poses_sharing_nearest_corner_stay_distinct():
-    """A data set to judge by is told apart from the training's own by what is not a vertex of the cortex."""
+def test_training_poses_are_identified_despite_shared_vertices():
+    """Points that are no vertices of the cortex distinguish a test data set from the training set."""
     template = read_anatomy(get_template_path())
     patch, corners = open_patch(template), template.mesh.nodes
     first, same, other = (
@@ -149,7 +149,7 @@ def test_pose_and_force_models_reject_each_others_loads(trained, box):
     assert "here is none, but ToolContact" in str(find_rejection(forces, EFFECTS))
 
 
-def test_what_poses_cannot_train_is_refused(data, box):
+def test_unsupported_pose_training_is_rejected(data, box):
     with pytest.raises(
         InputError, match="poses, of which linear, series cannot be had: choose from contact, contact-gp, gp"
     ):
@@ -162,7 +162,7 @@ def test_what_poses_cannot_train_is_refused(data, box):
         train(replace(data, provenance={}), ["gp"])
 
 
-def test_the_command_makes_poses_that_finite_elements_answer(tmp_path, box, capsys):
+def test_simulate_command_solves_poses_with_fem(tmp_path, box, capsys):
     mesh, out = tmp_path / "box.vtu", tmp_path / "data.h5"
     write_anatomy(mesh, box)
     wanted = ["simulate", str(mesh), "--out", str(out), "--count", "3", "--json"]

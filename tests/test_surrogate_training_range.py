@@ -1,4 +1,4 @@
-"""The range of loads that a model was trained on."""
+"""Range of loads in the training of a model."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from surrogate.data.cortex_patch import open_patch
 from surrogate.model.training_range import Envelope, Measured, compute_training_range
 
 
-def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
+def test_envelope_reach_is_spacing_of_training_loads(box):
     patch = open_patch(box)
     points = [[0.0, 0.0, 0.0], [3e-3, 0.0, 0.0], [3e-3, 4e-3, 0.0]]
     training = push(points, [[0.0, 0.0, -0.1], [0.0, 0.0, -0.2], [0.0, 0.0, -0.15]], [5e-3, 6e-3, 5e-3]).get(Pushed)
@@ -37,7 +37,7 @@ def test_an_envelope_reaches_as_far_as_training_loads_lie_apart(box):
         (0.2, 0.3, 1e-3, 6e-3, 3e-3, 0.0, 2.0),
     ],
 )
-def test_envelope_measures_how_far_a_load_is_outside(force, angle, overhang, radius, away, beyond, excess):
+def test_envelope_measures_distance_outside_training_range(force, angle, overhang, radius, away, beyond, excess):
     envelope = Envelope(np.zeros((1, 3)), 1e-3, 2e-3, 0.5, (0.1, 0.3), (4e-3, 8e-3), 50.0)
     pushed = Pushed(np.array([[away, 0.0, 0.0]]), np.array([[0.0, 0.0, force]]), np.array([radius]))
     found = envelope.locate_outside(pushed, Measured(*(np.array([each]) for each in (force, angle, overhang))))

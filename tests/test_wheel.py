@@ -1,4 +1,4 @@
-"""The wheel holds what it must, and its commands run where the dependencies are and no checkout is."""
+"""Contents of the wheel, and its commands without a checkout."""
 
 import os
 import shutil
@@ -57,7 +57,7 @@ def sulcus(programs, tmp_path_factory):
     return lambda *words: ran(programs / "sulcus", *words, cwd=folder)
 
 
-def test_it_holds_the_packages_whole_and_nothing_else(wheel):
+def test_wheel_contains_exactly_the_package_files(wheel):
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
     files = [path for room in ROOMS for path in (HOUSE / room).rglob("*") if path.is_file()]
@@ -67,7 +67,7 @@ def test_it_holds_the_packages_whole_and_nothing_else(wheel):
     assert names >= data | {f"{room}/{name}" for room in ROOMS for name in ("__init__.pyi", "py.typed")}
 
 
-def test_the_commands_run_where_there_is_no_checkout(programs, sulcus, tmp_path):
+def test_installed_commands_run_without_the_checkout(programs, sulcus, tmp_path):
     where = ran(programs / "python", "-c", "import sim, scenes; print(sim.__file__, scenes.__file__)", cwd=tmp_path)
     assert all(Path(path).is_relative_to(programs.parent) for path in where.split())
     assert sulcus("--version").startswith("sulcus ")
