@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the anatomy, write it, and print what it is."""
+    """Build the anatomy, write it to a file, and print a summary."""
     began = time.perf_counter()
     read = (args.labels, args.mask, args.tumour_in, args.t1)
     check_output_path(args.out, ".vtu", args.force, read)
@@ -171,7 +171,7 @@ def _summarise_anatomy(
 
 
 def _place(subject: Subject, place: np.ndarray) -> dict[str, Any]:
-    """Describe the position of a point (3,) [m]: in mm, and in words."""
+    """Describe the position of a point (3,) [m] in millimetres and in words."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     return {"at_mm": [round(1e3 * value, 1) for value in place.tolist()], "side": describe_side(place, low, high)}
 
@@ -192,7 +192,7 @@ def _format_pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
 
 
 def _format_region(name: str, volume: float, figures: dict) -> str:
-    """Return a region's line."""
+    """Format the line of output about a region."""
     missed = figures["regions_volume_error_percent"][name]
     off = "" if missed is None else f" ({missed:+} % of the label's)"
     return f"{name} {volume:g} ml{off}, region {PART_LABELS[name]}{' of the tumour' if name == 'necrosis' else ''}"

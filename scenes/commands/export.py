@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        A model or a mesh that is not there, or a learner that is not in the file; what `write_onnx` and `write_html`
+        A missing model or mesh, or a learner that is not in the file; input that `write_onnx` and `write_html`
         reject.
     """
     if (args.to or Path(args.out).suffix[1:]) == HTML:

@@ -216,7 +216,7 @@ def _check_video_path(path: Path, force: bool, inputs: list[str | Path | None]) 
 
 
 def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
-    """Read the inputs of a run; those that are read quickly come first."""
+    """Read the inputs of a run; small files come first."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
@@ -260,7 +260,7 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
 
 
 def _draw_video(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
-    """Draw all frames, into a video if requested; return them without their colours."""
+    """Draw the overlay on all frames, and write a video if requested; return the results without images."""
     from ar.screen import write_film
     from ar.tracking.image_sequences import read_frame_rate, read_video
 
@@ -305,7 +305,7 @@ def _report(shown: list[Shown], who: str) -> dict[str, object]:
 
 
 def _format_report(report: dict) -> str:
-    """Return the same for people."""
+    """Format the summary of a run as text."""
     count, latency = report["pictures"], report["latency"]
     lines = [f"{count} images; motion by {report['motion_by']}"]
     lines += [f"  {100.0 * number / count:5.1f} %  {state}" for state, number in report["states"].items()]

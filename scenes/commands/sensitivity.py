@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_factorial(args: argparse.Namespace) -> int:
-    """Every combination: which factors decide, alone and together; 1 if a solve did not converge."""
+    """Solve every combination of factors, and print shares of variance; return 1 if a solve did not converge."""
     from math import prod
 
     from ar.screen import write_png

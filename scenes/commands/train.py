@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0 when the models are written."""
+    """Train, compare and write the models; return 0."""
     out = check_output_path(args.out, ".npz", args.force)
     device = parse_device_names(args.device)[0]
     if args.force:
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     learners = asked or list(list_learners(data))
     for note in list_notes(data, learners):
         print(f"sulcus train: {note}", file=sys.stderr)
-    # Without the time that is left: learners take seconds or minutes, whatever the first of them took.
+    # No estimate of the remaining time: learners differ between seconds and minutes.
     shown = "{l_bar}{bar}| {n_fmt}/{total_fmt} learners [{elapsed}{postfix}]"
     with tqdm(total=len(learners), bar_format=shown, disable=args.json, file=sys.stderr) as bar:
         expansion = Expansion(

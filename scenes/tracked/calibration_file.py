@@ -98,7 +98,7 @@ def write_calibration(path: str | Path, calibration: Calibration, form: Literal[
     Raises
     ------
     InputError
-        An unknown form, a name of another ending, or a file that cannot be written.
+        An unknown format, a wrong file ending, or a file that cannot be written.
     """
     path = to_path(path)
     if form not in FORMATS:

@@ -98,7 +98,7 @@ class Painter:
         return Layer("tool", TOOL, *self.tool.build_surface(pose, cubed), TOOL_COLOUR)
 
     def measure_tip(self, known: TrackingResult, tumour: Layer) -> Gauge | None:
-        """From the tool's tip to the tumour, with the error of both; None where one is not known."""
+        """Measure from the tool's tip to the tumour, with the error of both; None if a position is unknown."""
         if known.T_scan_tool is None or known.tip_covariance is None or known.band is None:
             return None
         gauge = measure_gauge(known.T_scan_tool[:3, 3], tumour)

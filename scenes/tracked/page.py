@@ -203,7 +203,7 @@ class OverlayPage:
 
     @contextmanager
     def _show_failure(self, end: float) -> Iterator[None]:
-        """Say on the page, for a while, why it cannot go on."""
+        """Show the reason of a failure on the page for some time, then raise the error again."""
         try:
             yield
         except ValueError as error:
@@ -228,13 +228,13 @@ class OverlayPage:
         self._draw(one)
 
     def _measure_gauge(self, known: TrackingResult) -> Gauge | None:
-        """From tip to tumour, where both are known."""
+        """Measure from tip to tumour; None if the tumour is lost or outdated."""
         if known.state in GREY_STATES:
             return None
         return self.painter.measure_tip(known, self.painter.stage.build_tumour(known.motion.positions))
 
     def _draw(self, one: Shown) -> None:
-        """Put an image, its text, bodies, slices and chart on the page."""
+        """Show an image, its text, bodies, slices and chart on the page."""
         known, look, painter = one.known, self.through, self.painter
         self.drawn = self.style, self.through
         said = report(one, self._measure_gauge(known), self.tooled, self.place)
@@ -255,7 +255,7 @@ class OverlayPage:
             self.browser.tint(name, colour)
 
     def _draw_in_style(self) -> None:
-        """Draw the same image in another style, if requested."""
+        """Draw the newest image in another style, if requested."""
         if self.newest is None or self.taken is None or self.drawn == (self.style, self.through):
             return
         assert self.taken.picture.colour is not None

@@ -60,11 +60,11 @@ class Shown:
     stamped: bool = False
 
     def drop_image(self) -> Shown:
-        """Return the same without its colours, which take memory."""
+        """Return the result without the image's colours, which take memory."""
         return replace(self, colour=np.empty((0, 0, 3), np.uint8))
 
     def drop_mesh(self) -> Shown:
-        """Return the same without where the brain is, and without its colours."""
+        """Return the result without the brain's vertex positions, and without the image's colours."""
         motion = replace(self.known.motion, positions=np.empty((0, 3)), solution=None)
         return replace(self.drop_image(), known=replace(self.known, motion=motion))
 
@@ -82,7 +82,7 @@ class Timed:
 
 
 def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[Timed]:
-    """Yield images with their time stamps, and with their masks: all that is not black is foreground.
+    """Yield images with their time stamps, and with their masks, in which pixels that are not black are foreground.
 
     A 24-hour clock is continued at midnight.
 
@@ -115,7 +115,7 @@ def _mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
 
 
 def pace_images(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
-    """Yield images like a live camera: the newest taken at the time of the request, and the moment [s] of its time 0.
+    """Yield images like a live camera: the newest image at each request, and the clock time [s] of image time 0.
 
     Images that arrive between requests are lost.
     """

@@ -49,7 +49,7 @@ class TrackingFigures:
     pictures
         Number of images.
     confident
-        Number of images in which a lost or old position is drawn in the ink of a known one.
+        Number of images in which a lost or old position is drawn in the colour of a known one.
     unsaid
         Number of images with a lost or old position that do not show the reason in their pixels.
     back
@@ -66,7 +66,7 @@ class TrackingFigures:
     off: float
 
     def find_violations(self) -> list[str]:
-        """Return a sentence for each bound that is not kept."""
+        """Return a sentence for each metric that exceeds its limit."""
         back, near = self.back <= CHECK.max_search_images, self.off <= CHECK.max_outline_error
         rules = {
             f"{self.confident} images draw a lost or old position as if it were known": self.confident == 0,
@@ -77,7 +77,7 @@ class TrackingFigures:
         return [sentence for sentence, kept in rules.items() if not kept]
 
     def to_row(self) -> dict[str, float | None]:
-        """For machines: None is a figure that could not be measured."""
+        """Convert to a row of JSON; None: not measured."""
         return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
 
 
