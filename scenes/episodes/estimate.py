@@ -1,4 +1,4 @@
-"""A run planned on paper: time, disk and processes of many episodes, from those that were made."""
+"""Estimate of a run: time, disk space and processes of many episodes, from measured ones."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ PROCESS_COUNTS = (1, 8, 64, 512)
 
 @dataclass(frozen=True)
 class Amount:
-    """A sum that is expected, and its standard error; the latter NaN where one was measured and no more."""
+    """Expected total and its standard error, which is NaN if only one value was measured."""
 
     mean: float
     error: float
@@ -124,7 +124,7 @@ def _add_amounts(amounts: Sequence[Amount]) -> Amount:
 
 
 def format_estimate(estimate: RunEstimate) -> list[str]:
-    """Return a table of it."""
+    """Format the estimate as a table."""
     found = estimate
     rows = [
         ("disk", _format_amount(found.bytes, 1e9, "GB")),

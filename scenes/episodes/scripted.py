@@ -101,7 +101,7 @@ def build_scene(
 
 
 def make_relaxing(tissue: Elasticity) -> Elasticity:
-    """Return the same tissues, relaxing."""
+    """Return the tissues with viscoelastic relaxation."""
 
     def relaxed(each: object) -> Any:
         return replace(cast(Any, each), prony=PRONY)
@@ -135,7 +135,7 @@ def _build_viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int,
 
 
 def _look(look: Mapping[str, Any], site: CraniotomyFrame, seed: int, number: int) -> Appearance:
-    """Light, colour and covers of an episode."""
+    """Return light, colour and occluders of an episode."""
     random = build_generator(seed, number, "look.covers")
     vessels = int(random.integers(2**31)) if random.random() < look["vessels"] else None
     tint = 1.0 - look["tint"] * MAX_TINTS * random.random(3)

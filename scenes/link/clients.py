@@ -1,4 +1,4 @@
-"""Connections of many OpenIGTLink clients: input is checked, each is sent the newest, and none blocks another."""
+"""Connections of many OpenIGTLink clients: input is checked, and no client blocks another."""
 
 import asyncio
 import socket
@@ -60,12 +60,12 @@ class Client:
     leaving: bool = False
 
     def offer(self, key: str, messages: tuple[bytes, ...]) -> None:
-        """Have messages sent when the connection is free; older ones of the same key are dropped."""
+        """Queue messages for sending; older ones of the same key are dropped."""
         self.waiting[key] = messages
         self.news.set()
 
     def leave(self) -> None:
-        """End, once what waits is sent."""
+        """End the connection once the queued messages are sent."""
         self.leaving = True
         self.news.set()
 
@@ -103,14 +103,14 @@ class LinkClients:
         return len(self._clients)
 
     def publish(self, key: str, messages: Iterable[bytes]) -> None:
-        """Send messages to all clients, together; they take the place of those of the same key that still wait."""
+        """Send messages to all clients, together; they replace queued messages of the same key."""
         self._newest[key] = tuple(messages)
         for client in self._clients.values():
             if not client.asks:
                 client.offer(key, self._newest[key])
 
     def reject(self, number: int, code: Code, why: str, text: str) -> None:
-        """Count a rejected message, and send a STATUS to one client; of many at once it gets the newest."""
+        """Count a rejected message, and send a STATUS to one client; a newer STATUS replaces a queued one."""
         self._count(why, text)
         client = self._clients.get(number)
         if client is not None and not client.asks:
@@ -132,7 +132,7 @@ class LinkClients:
         await _close(writer)
 
     async def close(self) -> None:
-        """Send what waits, for a moment, and end all connections."""
+        """Send the queued messages within a time limit, and end all connections."""
         for client in self._clients.values():
             client.leave()
         for patience in (CLIENT_LIMITS.last_message_time, CLIENT_LIMITS.farewell_time):
@@ -142,7 +142,7 @@ class LinkClients:
                 client.writer.transport.abort()
 
     async def listen(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Hear a server that was connected to, until it ends, and send nothing."""
+        """Receive the messages of a server until the connection ends, and send nothing."""
         await self._attend(Client(next(self._numbers), writer, asks=True), reader)
 
     async def _noted(self, client: Client, reader: asyncio.StreamReader) -> None:
@@ -171,7 +171,7 @@ class LinkClients:
             await _close(client.writer)
 
     async def _send(self, client: Client) -> None:
-        """Send what waits, as fast as the client reads it."""
+        """Send the queued messages, as fast as the client reads them."""
         try:
             async with asyncio.timeout(CLIENT_LIMITS.greeting_time):
                 await client.spoke.wait()
@@ -207,7 +207,7 @@ class LinkClients:
                     )
                 async with asyncio.timeout(CLIENT_LIMITS.timeout):
                     await self._hear(client, reader, header)
-                await asyncio.sleep(0)  # a client that sends without pause blocks no other
+                await asyncio.sleep(0)  # lets other tasks run if a client sends without pause
         except TimeoutError:
             self.reject(client.number, Code.TIMEOUT, "message that does not end", "a message did not end: reconnect")
         except BadMessageError as error:
@@ -241,7 +241,7 @@ class LinkClients:
             self.reject(client.number, code, why, f"{_format_name(header)} is rejected: {error}")
 
     def _ask(self, client: Client, header: Header) -> None:
-        """Send a client without stream its requested messages only."""
+        """Handle a request: send one message (GET), or stop (STP) or start the stream of messages."""
         client.asks = header.kind.startswith(QUERIES)
         client.spoke.set()
         if header.kind.startswith("STP_"):
@@ -257,14 +257,14 @@ class LinkClients:
             client.news.set()
 
     def _count(self, why: str, text: str = "") -> None:
-        """Count a rejected message, and note the first for each reason."""
+        """Count a rejected message, and report the first one of each reason."""
         self.refused[why] += 1
         if self.refused[why] == 1:
             self._note(f"rejected: {text or why}")
 
 
 def _find_message(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
-    """Return a message of a type: that of a name if there is one, else the first of those with the last time stamp."""
+    """Return the message of a type with a name if there is one, else the message with the latest time stamp."""
     every = [(read_header(each[: HEADER.size]), each) for messages in newest.values() for each in messages]
     alike = [(header, each) for header, each in every if header.kind == kind]
     named = (each for header, each in alike if header.name == name)

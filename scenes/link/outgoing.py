@@ -178,7 +178,7 @@ class Outgoing:
 
     @property
     def _of(self) -> str:
-        """Sources included in an error, and those that are unknown."""
+        """Describe the sources included in an error, and those that are unknown."""
         if self.registered:
             return "of tracking, registration and model; not known of tissue and segmentation"
         return "of tracking and model; not known of registration, tissue and segmentation"
@@ -190,7 +190,7 @@ def _format_doubt(known: TrackingResult) -> str:
 
 
 def _format_names(names: list[str]) -> str:
-    """Return some of many, and how many others there are."""
+    """Format the first names, and the number of the others."""
     others = len(names) - MAX_NAMED_POINTS
     return ", ".join(names[:MAX_NAMED_POINTS]) + (f" and {others} others" if others > 0 else "")
 
@@ -202,7 +202,7 @@ def _is_motion_known(known: TrackingResult, vertices: np.ndarray) -> bool:
 
 
 def fit_rigid(rest: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Return the rigid motion (4, 4) that takes points (n, 3) nearest to where they are now (n, 3), in their unit."""
+    """Fit the rigid motion (4, 4) that maps points (n, 3) to their current positions (n, 3), in their unit."""
     middle, there = rest.mean(axis=0), now.mean(axis=0)
     T = np.eye(4)
     T[:3, :3] = Rotation.align_vectors(now - there, rest - middle)[0].as_matrix()

@@ -209,7 +209,7 @@ class PoseResponder:
         return add_bound(known, band, parts)
 
     def _build_unknown(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
-        """Nothing is known now, and why."""
+        """Build the result without a known position, with the reason."""
         tool_time = None if before is None else before.tool_time
         near = before is not None and before.near
         state = TumourState.NO_TOOL if tool_time is None else TumourState.STALE

@@ -1,4 +1,4 @@
-"""Comparison of a page's deformers with the finite elements: of what is shown, and of time against accuracy."""
+"""Comparison of a page's deformers with FEM: the shown solution, and a table of time and accuracy."""
 
 import time as clock
 from collections.abc import Sequence
@@ -87,7 +87,7 @@ def format_comparison(comparison: Comparison | None, stale: bool, waiting_text: 
 
 
 def describe_change(truth: FemResult, player: Player, shown: Deformation, disabled: Sequence[str]) -> str:
-    """Describe the tumour's distance from its position under all effects, for a solution without some."""
+    """Describe the tumour's distance from its position under all effects, for a solution with some effects disabled."""
     mean = 1e3 * float(compute_distances(truth, player, shown).mean())
     return f"<p>without {escape(', '.join(disabled))} the tumour position differs by {mean:.2f} mm</p>"
 
@@ -173,7 +173,7 @@ class AccuracyTimeTable:
     def rows(self) -> list[ComparisonRow]:
         """Rows of the deformers with a time and an error, fastest first.
 
-        If all of them were shown some of the same loads, only those count, and the rows are ranked. Otherwise each row
+        If there are loads that all deformers were shown, only these count, and the rows are ranked. Otherwise each row
         uses its own loads, without ranking: medians over different loads are not comparable.
         """
         loads_of = {name: self._times.get(name, {}).keys() & missed.keys() for name, missed in self._errors.items()}

@@ -175,7 +175,7 @@ def build_tool_controls(
 
 
 def to_slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
-    """Values of the tool's sliders at a touch, by their labels."""
+    """Convert a touch to the values of the tool's sliders, by label."""
     strength = {"depth [mm]": 1e3 * touch.depth} if scene.posed else {"force [N]": touch.force}
     positions = {"place right [mm]": 1e3 * touch.x, "place up [mm]": 1e3 * touch.y}
     tilts = {f"direction {key} [deg]": np.degrees(tilt) for key, tilt in zip(("right", "up"), touch.tilt, strict=True)}

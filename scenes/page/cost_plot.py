@@ -61,7 +61,7 @@ def _format_name(row: ComparisonRow) -> str:
 
 
 def _scale(values: Sequence[float], start: float, end: float) -> tuple[list[float], list[tuple[float, float]]]:
-    """Return the places of values between two ends, and those of the powers of ten round them."""
+    """Return the positions of values on a logarithmic axis between two ends, and those of the powers of ten."""
     low, high = np.floor(np.log10(min(values))), np.ceil(np.log10(max(values)))
     span = max(high - low, 1.0)
 
@@ -72,7 +72,7 @@ def _scale(values: Sequence[float], start: float, end: float) -> tuple[list[floa
 
 
 def _draw_text(x: float, y: float, text: str, anchor: str) -> str:
-    """Return a text of the plot."""
+    """Return a text element of the SVG."""
     return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}">{escape(text)}</text>'
 
 

@@ -59,8 +59,8 @@ TRUTH_TEXT = "what an estimate is held against is the truth, as finite elements 
 class PatientSetup:
     """Anatomy, its T1 scan if there is one, models by name, uncertainties and costs of effects by scene.
 
-    `locator_file` is the locator of its tumour, for scenes with an observation model. `limit` [m] is that of a guarded
-    model; None: the limit derived from its own errors on held-out cortex. `families`: those that were built.
+    `locator_file` has the locator of the tumour, for scenes with an observation model. `limit` [m] is that of a guarded
+    model; None: the limit derived from its own errors on held-out cortex. `families`: available families.
     """
 
     anatomy: Anatomy
@@ -113,7 +113,7 @@ class PatientSetup:
         return scene.observation_model is not None and (self.locator_file is None or not self.locator_file.is_file())
 
     def build_stage(self, scene: Scene) -> Stage:
-        """Build a scene's stage on this anatomy, rendered on this theatre's device.
+        """Build a scene's stage on this anatomy, rendered on the device of this setup.
 
         Raises
         ------
@@ -141,8 +141,8 @@ class PatientSetup:
     def list_rejections(self, scene: Scene) -> dict[str, str | None]:
         """Find the reason why each trained model does not support a scene, by name; None if it does.
 
-        A model supports only the effects, the tissue and the element that it was trained on. None is the reference with
-        which an estimate is compared.
+        A model supports only the effects, the tissue and the element that it was trained on. No model is the
+        reference of an estimate.
         """
         if scene.observation_model is not None:
             return dict.fromkeys(self.models, TRUTH_TEXT)
@@ -254,7 +254,7 @@ class PatientSetup:
         Raises
         ------
         InputError
-            See `deformer`; an anatomy without open cortex.
+            See `build_deformer`; an anatomy without open cortex.
         """
         return self.build_player_of(self.build_stage(scene), self.build_deformer(name, scene), name)
 
@@ -275,7 +275,7 @@ class PatientSetup:
         return found if found and found.mark == self.compute_mark(scene) else None
 
     def select_recorded(self, scene: Scene) -> dict[str, FamilyFigures]:
-        """Select the families with figures that hold in a scene: of a tool's force on this tissue, fixed to bone."""
+        """Select the families with figures that apply to a scene: a tool's force on this tissue, fixed to bone."""
         kinds = {type(effect): str(effect) for effect in scene.get_effects_on(self.anatomy)}
         pushed = {*kinds, Bonded} == {Elasticity, Held, Bonded, ToolForce}
         return {name: one for name, one in self.family_figures.items() if pushed and one.tissue == kinds[Elasticity]}
@@ -303,12 +303,12 @@ class PatientSetup:
 
 @dataclass(frozen=True, eq=False)
 class AtRest:
-    """A Deformer that solves nothing: the body stays where the scan has it."""
+    """Deformer without motion: the body stays undeformed, as in the scan."""
 
     anatomy: Anatomy
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Return a guess that nothing moves, whatever acts."""
+        """Return zero displacement under any loads, as `guess` marks it."""
         rest = guess(np.zeros((len(loads), *self.anatomy.mesh.nodes.shape)))
         return rest if at is None else rest.restrict(at)
 

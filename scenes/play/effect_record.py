@@ -45,12 +45,12 @@ def format_unphysical(count: int) -> str:
 
 
 def read_effect_records(path: Path) -> dict[str, EffectRecord]:
-    """Read the records of a file, by scene; none where there is no file.
+    """Read the records of a file, by scene; empty without a file.
 
     Raises
     ------
     InputError
-        A file that cannot be read as such.
+        An invalid or unreadable file.
     """
     if not path.is_file():
         return {}

@@ -146,7 +146,7 @@ def format_tumour_error(error: TumourError, brief: bool = False) -> str:
 
 
 def find_worst(errors: Sequence[TumourError]) -> TumourError:
-    """Return the largest of several frames' errors; not known where one is not."""
+    """Return the largest error of several frames; not available if it is not available for one frame."""
     known = [error for error in errors if error.bound is not None]
     if len(known) < len(errors) or not known:
         return TumourError(None)

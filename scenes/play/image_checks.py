@@ -68,19 +68,19 @@ def measure_truth_error(frame: Frame, mask: np.ndarray) -> float:
 
 
 def _mask_foreground(frame: Frame) -> np.ndarray:
-    """(H, W) bool: words and tools."""
+    """Return the mask (H, W) bool of text and tools."""
     return find_ink(frame.shown, WHITE, 0) | (frame.picture.segmentation == TOOL)
 
 
 def find_closed_ground(frame: Frame) -> np.ndarray:
-    """(H, W) bool: ground that the tumour is not seen through, and no tool."""
+    """Return the mask (H, W) bool of pixels that show neither a tool nor cortex through which the tumour is seen."""
     return ~np.isin(frame.picture.segmentation, (*OPENING.ids, TOOL))
 
 
 def is_hidden_part_marked(frame: Frame, mask: np.ndarray) -> bool:
     """Return True if the image marks the occluded part of a silhouette (H, W) bool, if there is one.
 
-    There the outline must be broken, without shading, and the image must name the occluder.
+    In this part the outline must be broken, without shading, and the image must name the occluder.
     """
     ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), find_closed_ground(frame)
     least, most = BROKEN_SHARES
@@ -160,7 +160,7 @@ def _estimate_printed(player: Player, frame: Frame) -> bool:
 
 
 def _get_corners(player: Player, frame: Frame) -> np.ndarray:
-    """Corners (S, 3, 3) [m] of the tumour's triangles as they are drawn."""
+    """Return the corners (S, 3, 3) [m] of the tumour's triangles as they are drawn."""
     return player.estimate_positions(frame)[player.stage.select_stage(frame.loads).anatomy.tumour_surface]
 
 

@@ -52,7 +52,7 @@ class TumourEstimate:
     location
         Result of the locator; None if it rejects the observation.
     refusal
-        Reason of the rejection, in its words; else empty.
+        Reason of the rejection in the locator's words; else empty.
     middle, true
         (3,) [m]: centroid of the tumour in the scan, and its true displacement.
     seconds
@@ -74,7 +74,7 @@ class TumourEstimate:
 
     @property
     def moved(self) -> float:
-        """Its length [m]."""
+        """Length [m] of `motion`."""
         return float(np.linalg.norm(self.motion))
 
     @property
@@ -195,12 +195,12 @@ class Observer:
         return np.einsum("nc,nci->ni", weights, positions[vertices])
 
     def _as_a_whole(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) [m] with the rigid error."""
+        """Add the rigid error to points (n, 3) [m]."""
         return self._rigid.apply(points, self._interpolate_points(self._rest).mean(axis=0))
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
-        """The points: vertices (n, 3) of the mesh, and weights (n, 3)."""
+        """Observed points: vertices (n, 3) of the mesh, and weights (n, 3)."""
         site, random = self.site, np.random.default_rng([self.observation_model.seed, 0])
         triangles = site.anatomy.open_surface
         corners = self._rest[triangles]
@@ -243,7 +243,7 @@ def sample_rigid_error(model: PointObservation | StereoObservation, number: int)
 def find_touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
     """Return the place of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches.
 
-    (0, 3) where it is in the air.
+    Empty, (0, 3), if the tool is in the air.
     """
     triangles = anatomy.open_surface
     near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:SEARCHED_CORNERS]]

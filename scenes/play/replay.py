@@ -1,4 +1,4 @@
-"""Frames asked for in any order, of a run in which each is found from another one near it."""
+"""Frames of a run in any requested order, each computed from another frame near it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -62,7 +62,7 @@ class FrameCache(Generic[T]):
         self._last: dict[int, T] = {}
 
     def approach_frame(self, number: int) -> tuple[int, T]:
-        """Return the frame, or one nearer to it, and its number: a call takes one step at most."""
+        """Take at most one step towards a frame; return the number and the frame that is reached."""
         computed = self.kept | self._last
         starts = computed if self._course.back else [other for other in computed if other <= number]
         reached = min(starts, key=lambda other: abs(number - other), default=-1)

@@ -39,7 +39,7 @@ NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", COTTON: "cotton", GLOVE
 
 CORTEX_COLOUR = (0.86, 0.60, 0.54)  # Colour of the cortex (RGB, 0 to 1).
 TOOL_COLOUR = (0.78, 0.80, 0.83)  # Colour of the tool (RGB, 0 to 1).
-# Lines that eyes without red or green tell apart, and see on cortex and drape: tests/test_scenes_checks.py.
+# Line colours that colour-blind users can distinguish, on cortex and drape: tests/test_scenes_checks.py.
 TUMOUR_COLOUR = (0.20, 0.94, 0.42)
 TRUTH_COLOUR = (0.90, 0.35, 0.78)
 """Colour of the tumour surface computed by FEM."""
@@ -68,7 +68,7 @@ DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of th
 
 @dataclass(frozen=True, eq=False)
 class Cortex:
-    """Part of the surface: mesh vertices (n,), triangles (m, 3) of them; the scan, and where it is read (n, 3) [m]."""
+    """Part of the surface: mesh vertices (n,), their triangles (m, 3), the scan, and its sampling points (n, 3) [m]."""
 
     vertices: np.ndarray
     triangles: np.ndarray
@@ -110,7 +110,7 @@ class Stage:
 
     @cached_property
     def _after(self) -> tuple[Stage, ...]:
-        """The stage after 0, 1, ... steps."""
+        """Stages after 0, 1, ... resection steps."""
         whole = self.site.anatomy
         return tuple(
             replace(self, left=left) for left in list_remaining_bodies(whole, self.scene.get_effects_on(whole))
@@ -129,7 +129,7 @@ class Stage:
 
     @cached_property
     def camera(self) -> Camera:
-        """The scene's camera as it starts. One that stays is always this object: a `Renderer` keeps its backdrop."""
+        """Initial camera of the scene. A static camera is always this object: a `Renderer` caches its backdrop."""
         return self.scene.viewpoint.build_camera(self.site)
 
     @cached_property
@@ -177,7 +177,7 @@ class Stage:
 
     @cached_property
     def brain(self) -> Layer:
-        """The closed part of the brain's surface, at rest."""
+        """Undeformed surface of the brain without the open cortex."""
         mesh, craniotomy = self.anatomy.mesh, self.anatomy.craniotomy
         vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
         return Layer("brain", CORTEX, mesh.nodes[vertices], triangles, CORTEX_COLOUR)
@@ -254,7 +254,7 @@ class Stage:
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
     def smooth_tumour(self, tumour: Layer) -> Layer:
-        """Return a layer of the tumour's surface with rounded facets: for its outline, not for numbers."""
+        """Return a layer of the tumour's surface with rounded facets: for its outline, not for measurements."""
         surface = self.round_tumour
         return replace(
             tumour, vertices=surface.place(tumour.vertices), triangles=surface.triangles, colour=tumour.colour[0]

@@ -32,7 +32,7 @@ class StereoObserver:
         """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""
         shot, anatomy = self.render_pair(number, positions, tool), self.stage.site.anatomy
         tips = NO_POINTS.now if tool is None else find_touched(anatomy, positions, tool)
-        _ = self._first_shot  # to draw it takes long
+        _ = self._first_shot  # rendered here, so that its time is not counted
         begun = clock.perf_counter()
         return locate_tumour(anatomy, self.locator, lambda: self.observe(shot, tips), positions, begun)
 

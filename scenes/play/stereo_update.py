@@ -109,7 +109,7 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
     Raises
     ------
     InputError
-        See `StereoPair.rectify`; too few points; points off the scan's cortex.
+        See `StereoPair.rectify`; too few points; points too far from the scan's cortex.
     """
     view = shot.rectify(site)
     pixels = build_pixel_grid(site, view, count)

@@ -157,7 +157,7 @@ class ExternalTracker:
 
     @property
     def streams(self) -> dict[str, PoseStream]:
-        """Pose streams by body."""
+        """Streams of poses by body: tool, patient, and a tracked camera."""
         camera = {} if self.eye is None or self.eye.body is None else {"camera": self.eye.body}
         return {"tool": self.tool, "patient": self.patient, **camera}
 

@@ -228,7 +228,7 @@ class OverlayPage:
         self._draw(one)
 
     def _measure_gauge(self, known: TrackingResult) -> Gauge | None:
-        """Measure from tip to tumour; None if the tumour is lost or outdated."""
+        """Measure from tip to tumour; None if the tumour is drawn in grey or not at all."""
         if known.state in GREY_STATES:
             return None
         return self.painter.measure_tip(known, self.painter.stage.build_tumour(known.motion.positions))

@@ -70,7 +70,7 @@ class ToolMotion:
     ) -> BrainMotion:
         """Compute the brain under a tool at a pose (4, 4) [m], whose tip has an error covariance (3, 3) [m^2].
 
-        The influence of this error on the tumour is computed by a second solution, for a tool that is 1.96 standard deviations deeper.
+        Its influence on the tumour is found by a second solution, for a tool that is 1.96 standard deviations deeper.
         """
         if self.deformer is None:
             return self.rest

@@ -165,7 +165,7 @@ def _compute_lateral_lengths(apart: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def _compute_edge_distance(true: np.ndarray, drawn: np.ndarray) -> float:
-    """Compute the mean distance [pixel] between the edges of a mask and the true one, both ways; infinite without one."""
+    """Compute the mean distance [pixel] between the edges of a mask and the true mask; infinite without one."""
     edges = [mask & (np.asarray(binary_erosion(mask)) == 0) for mask in (true, drawn)]
     if not all(edge.any() for edge in edges):
         return np.inf

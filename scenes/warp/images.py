@@ -1,4 +1,4 @@
-"""A patient's own images and label maps, as they would be now: on their own grids, as NIfTI."""
+"""Deformed images and label maps of a patient, on their original grids, as NIfTI."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,7 +111,7 @@ def _is_label_like(values: np.ndarray) -> bool:
 
 
 def _compute_equal_share(values: np.ndarray) -> float:
-    """Return the share of voxels, but for those that are 0, that have the value of the next along the first axis."""
+    """Return the share of the nonzero voxels that have the value of the next voxel along the first axis."""
     thin = values[:, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE]
     one, two = thin[:-1:SAMPLING_STRIDE], thin[1::SAMPLING_STRIDE]
     full = (one != 0) & (two != 0)
@@ -227,9 +227,9 @@ def write_warped(folder: Path, picture: PatientImage, fields: WarpFields, order:
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Count the voxels that moved, came from outside the image, or from resected tissue.
+    """Numbers of voxels that moved, that came from outside the image, and that came from resected tissue.
 
-    Also return the blank ones (I, J, K).
+    `blank` (I, J, K) bool: voxels without a source.
     """
 
     moved: int
@@ -276,7 +276,7 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
 
 
 def _find_moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Backward displacements (m, 3) [m] of those rows (m,) of places (n, 3) [m] that have one."""
+    """Find the nonzero backward displacements (m, 3) [m] at points (n, 3) [m], and their rows (m,)."""
     index = fields.grid.index(now)
     held = np.flatnonzero(((index > 0.0) & (index < np.array(fields.grid.shape) - 1)).all(axis=1))
     went = fields.grid.read(fields.backward, now[held])

@@ -50,7 +50,7 @@ def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str
 
 
 def format_range_row(key: str, found: Sequence[Any]) -> str:
-    """Return a row of what varies."""
+    """Format the table row of a varied parameter."""
     if all(is_number(one) for one in found):
         return f"| `{key}` | {format_cell(min(found))} | {format_cell(max(found))} | {len(found)} |"
     often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, found)).most_common(8))
@@ -63,12 +63,12 @@ def is_number(value: Any) -> bool:
 
 
 def format_cell(value: Any) -> str:
-    """Return a value in a table: whole numbers in full, others to four digits."""
+    """Format a value for a table: whole numbers in full, others to four digits."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def list_leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Numbers and texts of nested JSON by their dotted names; lists are numbered."""
+    """List numbers and texts of nested JSON by their dotted names; items of lists are numbered."""
     match value:
         case dict():
             for key, inner in value.items():

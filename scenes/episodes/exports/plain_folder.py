@@ -23,7 +23,7 @@ SEPARATE_TABLES = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_pred
 def write_folder(
     episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write a folder for each episode; the whole appears at once. Returns what it holds.
+    """Write a folder for each episode, atomically; return a summary.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def write_table(path: Path, columns: dict[str, Any]) -> None:
 
 
 def write_description(path: Path, file: h5py.File, contents: EpisodeContents) -> None:
-    """Write the attributes, what each array is, and the arrays that an episode has once."""
+    """Write the attributes, the meaning of each array, and the arrays without frames."""
     arrays = {}
     for name in contents.shapes:
         item = file[f"pictures/{name}" if name in PICTURES else name]

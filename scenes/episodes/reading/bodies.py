@@ -28,7 +28,7 @@ def is_template(digest: str) -> bool:
 
 
 def find_surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Those triangles (S, 3) of mesh vertices whose corners are all among sorted `nodes` (n,), as numbers of these."""
+    """Select the triangles (S, 3) whose corners are all in sorted `nodes` (n,), as indices into `nodes`."""
     places = np.searchsorted(nodes, surface).clip(max=len(nodes) - 1)
     return places[(nodes[places] == surface).all(axis=1)]
 
