@@ -77,10 +77,10 @@ def _compute_mean_motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
 
 
 def compute_variance_shares(found: Sequence[Cell], response: str = "force") -> dict[str, float]:
-    """Return the share of variance of the logarithmic motion explained by each factor, and by each pair beyond its two.
+    """Return the share of variance of the logarithmic motion explained by each factor, and by each interaction of two.
 
-    The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. What
-    three and more do together is the rest to 1.
+    The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. The
+    remainder to 1 is the interaction of three and more factors.
     """
     values = np.log([getattr(cell, response) for cell in found])
     good = np.isfinite(values)

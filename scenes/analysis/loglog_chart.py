@@ -192,7 +192,7 @@ def _is_within(box: Bbox, frame: Bbox) -> bool:
 
 
 def _compute_axis_limits(values: np.ndarray) -> tuple[float, float]:
-    """Limits of an axis: a margin round the values, and at least a factor of ten apart."""
+    """Compute the limits of an axis: a margin around the values, and at least a factor of ten apart."""
     low, high = float(values.min()) / 1.4, float(values.max()) * 1.4
     spare = max(10.0 * low / high, 1.0) ** 0.5
     return low / spare, high * spare

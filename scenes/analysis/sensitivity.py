@@ -36,7 +36,7 @@ class BodyVariant:
 class Aim:
     """Perturbation of a load: force or motion scaled by `share` and turned by `turn` [rad], point moved by `shift` [m].
 
-    In several ways each: more and less, about two axes, to four sides.
+    Each perturbation has several directions: more and less, about two axes, to four sides.
     """
 
     share: float = 0.0
@@ -56,7 +56,7 @@ class Variant:
 
 
 def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) -> list[Variant]:
-    """Return the tool's uncertainty, the tissue's, the skull's, and other `elements`."""
+    """List the variants of tool, tissue and skull, and of other `elements`."""
     tissue = body.tissue
     young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
     changed = [
@@ -85,7 +85,7 @@ def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] =
 
 
 def apply_aim(loads: Loads, aim: Aim, patch: Patch) -> Loads:
-    """Return the loads of one tool as `aim` has them, one block for each way.
+    """Perturb the loads of one tool by `aim`: one block of loads for each direction.
 
     Points are shifted along the open cortex.
     """

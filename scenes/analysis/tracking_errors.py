@@ -83,5 +83,5 @@ def project_by_rows(
 
 
 def compute_row_delay(camera: Camera, row: float) -> float:
-    """When a row [pixel] is read, after the middle one, as a share of the readout."""
+    """Compute the delay of a row [pixel] after the middle row, as a share of the readout time."""
     return (row + 0.5) / camera.height - 0.5

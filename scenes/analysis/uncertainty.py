@@ -358,7 +358,7 @@ def collect_contributor_values(draws: Sequence[PatientSample], scene: Scene) -> 
 
 
 def compute_field_size(field: np.ndarray) -> float:
-    """Root mean square over draws of the largest length in each: vectors (draws, n, 3)."""
+    """Compute the root mean square over draws of the largest length in each: vectors (draws, n, 3)."""
     return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
 
 

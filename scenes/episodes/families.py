@@ -84,7 +84,7 @@ class Retract(FamilyMotion, frozen=True):
 
 
 class Drain(FamilyMotion, frozen=True):
-    """Fluid drains to a share of its height, and the head turns; the brain may separate from the skull; solved by FEM."""
+    """Fluid drains to a share of its height and the head turns; the skull may separate; solved by FEM."""
 
     fluid: Annotated[Number, ValueLimits(0, 1)] = (0.0, 0.7)
     turn_deg: Annotated[Number, ValueLimits(-60, 60, "°")] = (-30.0, 30.0)

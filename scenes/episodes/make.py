@@ -49,7 +49,7 @@ def add_noise(colour: np.ndarray, deviation: float, random: np.random.Generator)
 
 
 def add_jitter(poses: np.ndarray, metres: float, radians: float, random: np.random.Generator) -> np.ndarray:
-    """Add tracking errors to poses (n, 4, 4), independent along and about their own axes, of these standard deviations."""
+    """Add tracking errors to poses (n, 4, 4): Gaussian, along and about the axes of each pose's own frame."""
     off = np.tile(np.eye(4), (len(poses), 1, 1))
     off[:, :3, 3] = metres * random.standard_normal((len(poses), 3))
     off[:, :3, :3] = Rotation.from_rotvec(radians * random.standard_normal((len(poses), 3))).as_matrix()

@@ -47,7 +47,7 @@ def compute_states(
     task: GymTask, goal: Goal, hand: RobotTool, sensed: np.ndarray, time: float, done: float, frame: np.ndarray,
     origin: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """State vector (24,) float32, in the axes (3, 3) of twists, relative to the open cortex's centre (3,) [m].
+    """Compute the state (24,) float32, in the axes (3, 3) of twists, relative to the open cortex's centre (3,) [m].
 
     Parameters
     ----------

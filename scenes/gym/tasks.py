@@ -142,7 +142,7 @@ def find_task(name: object) -> GymTask:
     Raises
     ------
     InputError
-        There is none of that name.
+        No task has this name.
     """
     if isinstance(name, str) and name in TASKS:
         return TASKS[name]

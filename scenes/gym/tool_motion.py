@@ -27,7 +27,7 @@ class RobotTool:
     turned: np.ndarray
 
     def compute_pose(self, tool: Instrument) -> np.ndarray:
-        """T_world_tool (4, 4)."""
+        """Return T_world_tool (4, 4)."""
         T = np.eye(4)
         T[:3, :3] = self.turned
         T[:3, 3] = self.place - compute_lever(tool) * self.turned[:, 2]

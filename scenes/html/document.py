@@ -158,7 +158,7 @@ def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> 
 
 
 def _describe_errors(theatre: PatientSetup, scene: Scene) -> dict[str, Any]:
-    """Return the error of the tumour position in proportion to its motion, and the words of the page."""
+    """Return the error of the tumour position in proportion to its motion, and its description for the page."""
     error, registration = theatre.estimate_motion_error(scene), scene.registration
     known = None if error is None else {"rest": error.rest[registration], "surface": error.surface}
     words = {
@@ -209,7 +209,7 @@ def _read(name: str) -> str:
 
 
 def _digest(text: str) -> str:
-    """Digest by which the page's policy allows an inline script or style, and no other."""
+    """Compute the digest by which the page's security policy allows one inline script or style."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 

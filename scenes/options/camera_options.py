@@ -45,7 +45,7 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """WxH as two numbers, for argparse."""
+    """Parse WxH into two numbers, for argparse."""
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 640x480 [pixel]")

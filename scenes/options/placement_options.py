@@ -40,7 +40,7 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def point(text: str) -> Point:
-    """X,Y,Z as three numbers, for argparse."""
+    """Parse X,Y,Z into three numbers, for argparse."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
@@ -59,7 +59,7 @@ def parse_opening(text: str) -> int | Point | Path:
 
 
 def to_opening_options(args: argparse.Namespace) -> list[str]:
-    """Return the options as words for another command."""
+    """Return the options as arguments of another command."""
     given = {name: getattr(args, name) for name in ("nodes", "craniotomy", "opening_at", "opening_over")}
     texts = {
         name.replace("_", "-"): ",".join(map(repr, value)) if isinstance(value, tuple) else str(value)
@@ -70,7 +70,7 @@ def to_opening_options(args: argparse.Namespace) -> list[str]:
 
 
 def get_trajectory_option(args: argparse.Namespace) -> Path | None:
-    """Return the file of the trajectory that the options name, if they name one."""
+    """Return the file of the requested trajectory; None without a request."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     return given if isinstance(given, Path) and read_markup(given).kind == "Line" else None
 

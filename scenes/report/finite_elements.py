@@ -71,7 +71,7 @@ class FemVariant:
 
 @dataclass(frozen=True)
 class FamilySpec:
-    """One of `FAMILIES`, on the mesh of the data set."""
+    """Family of `FAMILIES`, on the mesh of the data set."""
 
     name: str
 
@@ -149,7 +149,7 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
 
 
 def _build_fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
-    """Set up for single loads."""
+    """Build FEM for single loads."""
     effects = build_push_effects(body, change_law(study.get_tissue_on(body), spec.law))
     return Fem(
         body, effects, spec.accuracy, spec.device or study.device, None, spec.element or study.element, live=True

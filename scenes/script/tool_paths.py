@@ -131,9 +131,9 @@ def _interpolate_depth(share: float, depth: float) -> float:
 
 
 def stroke_cortex(force: float, radius: float, speed: float) -> Path:
-    """Straight strokes without a pause at `speed` [m/s] from point to point of a circle of `radius` [m].
+    """Stroke without a pause at `speed` [m/s] in straight lines between points of a circle of `radius` [m].
 
-    Each point is the golden angle on from the last: no stroke repeats another, and they cover the circle evenly.
+    Successive points differ by the golden angle: no stroke is repeated, and strokes cover the circle evenly.
     """
     turn = np.pi * (3.0 - np.sqrt(5.0))
     stroke = 2.0 * radius * np.sin(turn / 2.0)

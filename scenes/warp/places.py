@@ -160,7 +160,7 @@ def compute_fields(
 def find_finer_spacing(
     moment: DeformedAnatomy, fields: WarpFields, settings: SpacingSettings = SpacingSettings()
 ) -> float | None:
-    """Return a spacing [m] that reaches the tolerance, as far as `max_nodes` allows; None if no finer one is needed."""
+    """Return a finer spacing [m] that meets the tolerance, or is as near as size allows; None if none is needed."""
     now = fields.grid.spacing
     places = list_places(moment)
     worst = float(places.compute_errors(fields)[places.tumour | places.landmarks].max(initial=0.0))

@@ -70,7 +70,7 @@ def write_robomimic(
 
 
 def write_demo(demo: h5py.Group, obs: h5py.Group, contents: EpisodeContents, numbers: dict[str, np.ndarray]) -> None:
-    """Write all but the images of one episode: a state has the tool, then the tumour if all are of equal size."""
+    """Write one episode without images: a state is the tool's, then the tumour's if it has the same size in all."""
     actions, state = numbers.pop("action"), numbers.pop("state")
     tumour = [numbers[name].reshape(contents.frames, -1) for name in ("tumour_predicted",) if name in numbers]
     dones = np.zeros(contents.frames, np.int64)

@@ -45,7 +45,7 @@ def _find_anatomy(digest: str, folder: Path) -> Anatomy | None:
 
 @cache
 def _read(path: Path) -> Anatomy | None:
-    """Return an anatomy that can be read."""
+    """Read an anatomy; None if it cannot be read."""
     try:
         return read_anatomy(path)
     except InputError:
