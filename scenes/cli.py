@@ -82,7 +82,7 @@ MODEL_READING_COMMANDS = (
 MAX_THREADS = 4  # Maximum number of threads of a library: BLAS does not scale on these small products.
 
 POINT_PATTERN = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+(?:,[^,]+)?")
-"""A point, or a load there, whose first coordinate is negative: argparse would take it for an option."""
+"""Pattern of a point or load with a negative first coordinate, which argparse would read as an option."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

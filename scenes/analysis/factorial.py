@@ -25,7 +25,7 @@ LEVELS: Levels = {
     "nu": (0.45, 0.49, 0.499),
     "tumour's stiffness": (1.0, 3.0),
 }
-"""Combined factors: depth of the top of the tumour below the cortex, stiffness relative to the brain, and others."""
+"""Combined factors: depth of the tumour's top below the cortex, stiffness relative to the brain, and others."""
 DEFAULT = {"skull": "bonded", "nu": 0.49, "tumour's stiffness": 1.0}  # Default values of a body's factors.
 FORCE = 0.2  # Force of the tool [N].
 FOOTPRINT = 7e-3  # Radius of the tool [m].

@@ -22,7 +22,7 @@ from surrogate.data.tool_loads import find_perpendiculars
 class BodyVariant:
     """Variant of the body: tissue, relative stiffness of the tumour, skull model, element.
 
-    `skull` is one of `sim.effects.SKULLS`. Linear tetrahedra lock as nu nears 0.5, which would pass for an influence of
+    `skull` is one of `sim.effects.SKULLS`. Linear tetrahedra lock near nu = 0.5, which would look like an influence of
     nu: hence smoothed ones.
     """
 
@@ -164,7 +164,7 @@ class SensitivityStudy:
 
 
 def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Iterator[SensitivityRow]:
-    """Yield the default, whose change is its whole motion, then each variant's change from it.
+    """Yield the default, whose change is the whole motion, then the change of each variant from the default.
 
     Prescribed motions are those of the default under its forces: the mean motion of each footprint. Every solve starts
     at the default's solution, so that the same equilibrium is followed if a load has several.

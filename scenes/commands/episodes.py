@@ -81,8 +81,8 @@ def _parse_natural(text: str) -> int:
     return _parse_integer(text, 0)
 
 
-def _plan(args: argparse.Namespace) -> str:
-    """Return the path of the plan that is valid from any folder."""
+def _get_plan_path(args: argparse.Namespace) -> str:
+    """Return the plan's name, or a path that is valid from any folder."""
     return str(Path(args.plan).absolute()) if args.plan.endswith(".toml") else args.plan
 
 
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
         return _print_script(args, out)
     from ..episodes.plan import load_plan
 
-    plan = load_plan(_plan(args))  # bodies may be files next to the plan, and workers run elsewhere
+    plan = load_plan(_get_plan_path(args))  # bodies may be files next to the plan, and workers run elsewhere
     if args.estimate:
         return _print_estimate(args, plan, out)
     try:
@@ -270,6 +270,6 @@ def _print_script(args: argparse.Namespace, out: Path) -> int:
     if args.workers or args.scheduler:
         raise InputError("--slurm gives each machine its workers: leave --workers and --scheduler out.")
     words = ["--count", args.count, "--seed", args.seed, "--first", args.first, "--out", out, "--device", args.device]
-    command = [sys.executable, "-m", "scenes.cli", "episodes", _plan(args), *map(str, words)]
+    command = [sys.executable, "-m", "scenes.cli", "episodes", _get_plan_path(args), *map(str, words)]
     print(write_sbatch_script(command, args.slurm, args.device, f"sulcus-{Path(args.plan).stem}"), end="")
     return 0

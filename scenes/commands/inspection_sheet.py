@@ -112,7 +112,7 @@ def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject,
     picture = Image.new("RGB", (2 * SIDE + COLUMN_WIDTH, 2 * SIDE), GROUND_COLOUR)
     for number, panel in enumerate(panels):
         picture.paste(Image.fromarray(panel), (SIDE * (number % 2), SIDE * (number // 2)))
-    _write(ImageDraw.Draw(picture), found, [name for name in COLOURS if name in drawn])
+    _write_text(ImageDraw.Draw(picture), found, [name for name in COLOURS if name in drawn])
     return np.asarray(picture)
 
 
@@ -235,7 +235,7 @@ def _draw_frame(colour: np.ndarray, view: InspectionView) -> np.ndarray:
     return np.asarray(picture)
 
 
-def _write(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
+def _write_text(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
     """Draw numbers, warnings and colours in the right column."""
     left, top = 2 * SIDE + PAD, PAD
     rows: list[tuple[str, Colour]] = [("Model to be built", TEXT_COLOUR)]

@@ -1,4 +1,4 @@
-"""`sulcus markers`: the pages to print for tracking, and the list of what is on them."""
+"""`sulcus markers`: pages with tracking targets to print, and a list of the targets."""
 
 import argparse
 import json

@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def parse_learners(words: str) -> list[str]:
-    """Return the names in `--learners`, of which none is empty."""
+    """Parse the names in `--learners`; an empty name is an error."""
     names = [name.strip() for name in words.split(",")]
     if not all(names):
         raise InputError(f"--learners {words!r}: name each learner, with one comma between two, or leave it out.")
@@ -132,7 +132,7 @@ def _describe_calibration(trained: Trained) -> str:
 
 
 def _describe_error(model: Learned) -> dict[str, object]:
-    """Describe the model's own reported errors, next to its score."""
+    """Describe the errors that the model reports, next to its score."""
     reported = get_reported_errors(model)
     discs = None if reported.held_out is None else asdict(reported.held_out)
     return {"bound_mm": 1e3 * reported.bound, "discs": discs, "weak": reported.weak}

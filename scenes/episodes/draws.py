@@ -30,9 +30,9 @@ class Distribution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 Number = float | tuple[float, float] | Distribution
-"""In a plan: a number; its least and greatest, with evenly spread values between; or a `Distribution`."""
+"""Number of a plan: a fixed value; limits of a uniform distribution; or a `Distribution`."""
 Word = str | list[str] | Distribution
-"""In a plan: a word; words of which each is as probable; or a `Distribution`."""
+"""Word of a plan: a fixed word; equally probable words; or a `Distribution`."""
 
 
 @dataclass(frozen=True)

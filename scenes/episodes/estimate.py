@@ -13,7 +13,7 @@ from .tasks import FIRST, FIRST_OF_BODY, FIRST_OF_PROCESS, NOT_FIRST
 
 DAY = 86400.0  # One day [s].
 UNITS = (DAY, "days"), (3600.0, "h"), (60.0, "min")
-"""Units of printed times [s], the longest first; a unit is used from twice its length."""
+"""Units of printed times [s], the longest first; a unit is used for times of at least twice its length."""
 PROCESS_COUNTS = (1, 8, 64, 512)
 """Numbers of processes for which the time is printed."""
 
@@ -83,7 +83,7 @@ def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEs
 
     def amount(what: str, those: Mapping[str, Sequence[Rate]]) -> Amount:
         return _add_amounts(
-            [_sum([getattr(one, what) for one in those[kind]], counts[kind]) for kind in those if those[kind]]
+            [_compute_total([getattr(one, what) for one in those[kind]], counts[kind]) for kind in those if those[kind]]
         )
 
     return RunEstimate(
@@ -112,8 +112,8 @@ def _compute_mean(values: Sequence[float]) -> Amount:
     return Amount(float(np.mean(values)), error)
 
 
-def _sum(values: Sequence[float], count: int) -> Amount:
-    """Return the total of `count` such values with the standard error of their mean; exact if all were measured."""
+def _compute_total(values: Sequence[float], count: int) -> Amount:
+    """Return the total of `count` values with the standard error of their mean; exact if all were measured."""
     mean = _compute_mean(values)
     return Amount(count * mean.mean, 0.0 if len(values) >= count else count * mean.error)
 

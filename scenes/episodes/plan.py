@@ -27,7 +27,7 @@ TYPE_NAMES = {
     "object": "a table", "array": "a list", "str": "text in quotation marks", "float": "a number",
     "int": "a whole number", "bool": "true or false", "null": "nothing",
 }  # fmt: skip
-"""Kinds of values, by the names that msgspec has for them."""
+"""Descriptions of types, by their names in msgspec."""
 SHIPPED_PLANS = Path(__file__).parent.parent / "data" / "plans"
 """Folder of the shipped plans."""
 NO_LEARNER = "none"

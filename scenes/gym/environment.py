@@ -1,4 +1,4 @@
-"""A task as a `gymnasium.Env`."""
+"""Environments of a task for Gymnasium: single and vectorised."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

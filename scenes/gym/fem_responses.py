@@ -106,7 +106,7 @@ class CutElements:
     _surfaces: dict[int, HealthySurface] = field(default_factory=dict)
 
     def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Solve as `TissueModel.compute_responses`; independent of earlier requests, as the order of levels is fixed."""
+        """Solve as `TissueModel.compute_responses`; independent of earlier requests: levels have a fixed order."""
         return [self._solve_touch(each) for each in asked]
 
     def _solve_touch(self, asked: TissueRequest) -> Touched:

@@ -16,7 +16,7 @@ POSITION_NOISE = 1e-4  # Standard deviation of a tracked position [m].
 FORCE_NOISE = 2e-3  # Standard deviation of a component of the measured force [N].
 MOTION_NOISE = 2e-4  # Standard deviation of an observed motion of the cortex [m].
 STATE_BOUND = 10.0
-"""Bound of all numbers of an observation, which are clipped to it."""
+"""Limit to which the absolute values of an observation are clipped."""
 STATE_SIZE = 24
 """Number of components of a state."""
 MAX_DEPTH = 2.0

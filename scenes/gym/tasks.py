@@ -110,7 +110,7 @@ class GymTask:
 
 @dataclass(frozen=True)
 class Aspirator(Probe):
-    """The tip of an ultrasonic aspirator: a small ball on a straight, thin shaft."""
+    """Tip of an ultrasonic aspirator: a small ball on a straight, thin shaft."""
 
     radius: float = 2e-3
     shaft: float = 1e-3

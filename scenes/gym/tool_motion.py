@@ -13,7 +13,7 @@ MAX_HEIGHT = 0.02  # Largest height of a tool above the centre of the open corte
 
 @dataclass(frozen=True, eq=False)
 class RobotTool:
-    """A tool in a robot's hand.
+    """Tool held by a robot.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def build_tool_frame(site: CraniotomyFrame) -> np.ndarray:
 
 
 def lay_tool(site: CraniotomyFrame, tool: Instrument, tip: np.ndarray) -> RobotTool:
-    """Return a tool in its first posture, its lowest point at `tip` (3,) [m]."""
+    """Return a tool in its initial orientation, with its lowest point at `tip` (3,) [m]."""
     turned = tool.pose(tip, site.axis, site.right)[:3, :3]
     return RobotTool(tip - compute_lever(tool) * site.axis, turned)
 

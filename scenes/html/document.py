@@ -1,4 +1,4 @@
-"""One HTML file of a scene: the tool is dragged over the cortex, and a fast model moves the tumour in the browser."""
+"""HTML file of a scene: the user drags the tool over the cortex, and a fast model moves the tumour in the browser."""
 
 import base64
 import hashlib
@@ -43,7 +43,7 @@ SCRIPTS = ("graph.js", "contact.js", "model.js", "outline.js", "draw.js", "page.
 
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
-    """Fast model that a page evaluates: its name, the model, its graph, and whether that moves the cortex too."""
+    """Fast model that a page evaluates: its name, the model, its graph, and True if the model also moves the cortex."""
 
     name: str
     model: Learned
@@ -127,7 +127,7 @@ def _count_bytes(sheet: Sheet) -> int:
 
 
 def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> str:
-    """Build the text of the page, with all that it needs: model, surfaces, scripts and style."""
+    """Build the text of the page with model, surfaces, scripts and style."""
     stage, model = theatre.build_stage(scene).plain, exported.model
     nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
     table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})

@@ -1,4 +1,4 @@
-"""Surfaces, colours, light and camera of a scene, as its page draws them."""
+"""Surfaces, colours, light and camera of a scene, as arrays for its page."""
 
 from collections.abc import Mapping
 from typing import Any

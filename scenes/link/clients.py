@@ -42,9 +42,9 @@ CLIENT_LIMITS = ClientLimits()
 REQUESTS, QUERIES = ("GET_", "STT_", "STP_"), ("GET_", "STP_")
 
 Receive = Callable[[int, Header, bytes], None]
-"""Takes a client's number, a message's header and its content; raises `BadMessageError`."""
+"""Function of a client's number, a message's header and its content; raises `BadMessageError`."""
 Longest = Callable[[str], int]
-"""The size in bytes up to which messages of a type are wanted; 0: none."""
+"""Function that returns the maximum size [bytes] of messages of a type; 0: not wanted."""
 
 
 @dataclass(eq=False)
@@ -111,7 +111,7 @@ class LinkClients:
 
     def reject(self, number: int, code: Code, why: str, text: str) -> None:
         """Count a rejected message, and send a STATUS to one client; a newer STATUS replaces a queued one."""
-        self._count(why, text)
+        self._count_rejection(why, text)
         client = self._clients.get(number)
         if client is not None and not client.asks:
             client.offer(REJECTED_DEVICE, (pack_message("STATUS", REJECTED_DEVICE, encode_status(code, text), 0),))
@@ -122,11 +122,11 @@ class LinkClients:
         assert task is not None
         self._attending.add(task)
         task.add_done_callback(self._attending.discard)
-        _hold_little(writer)
+        _limit_send_buffer(writer)
         if len(self._clients) < self._most:
-            await self._noted(Client(next(self._numbers), writer), reader)
+            await self._serve_client(Client(next(self._numbers), writer), reader)
             return
-        self._count("too many clients")
+        self._count_rejection("too many clients")
         text = f"{self._most} clients are connected, and no more are taken: end one of them"
         writer.write(pack_message("STATUS", REJECTED_DEVICE, encode_status(Code.BUSY, text), 0))
         await _close(writer)
@@ -145,7 +145,7 @@ class LinkClients:
         """Receive the messages of a server until the connection ends, and send nothing."""
         await self._attend(Client(next(self._numbers), writer, asks=True), reader)
 
-    async def _noted(self, client: Client, reader: asyncio.StreamReader) -> None:
+    async def _serve_client(self, client: Client, reader: asyncio.StreamReader) -> None:
         peer = client.writer.get_extra_info("peername")
         name = f"client {peer[0]}:{peer[1]}" if peer else "a client"
         self._note(f"{name} comes; clients: {len(self) + 1}")
@@ -190,10 +190,10 @@ class LinkClients:
                     async with asyncio.timeout(CLIENT_LIMITS.timeout):
                         await client.writer.drain()
         except TimeoutError:
-            self._count("client that does not read")
+            self._count_rejection("client that does not read")
             client.writer.transport.abort()
         except OSError:
-            self._count("client that vanished")
+            self._count_rejection("client that vanished")
 
     async def _read(self, client: Client, reader: asyncio.StreamReader) -> None:
         """Receive messages of a client until it closes, or sends an invalid message."""
@@ -206,7 +206,7 @@ class LinkClients:
                         f"{_format_name(header)} announces {header.size} bytes; {MAX_BODY_BYTES} are the most"
                     )
                 async with asyncio.timeout(CLIENT_LIMITS.timeout):
-                    await self._hear(client, reader, header)
+                    await self._receive_body(client, reader, header)
                 await asyncio.sleep(0)  # lets other tasks run if a client sends without pause
         except TimeoutError:
             self.reject(client.number, Code.TIMEOUT, "message that does not end", "a message did not end: reconnect")
@@ -214,20 +214,20 @@ class LinkClients:
             self.reject(client.number, Code.OVERFLOW, "no message", f"{error}: reconnect")
         except asyncio.IncompleteReadError as error:
             if error.partial:
-                self._count("message that breaks off")
+                self._count_rejection("message that breaks off")
         except OSError:
-            self._count("client that vanished")
+            self._count_rejection("client that vanished")
 
-    async def _hear(self, client: Client, reader: asyncio.StreamReader, header: Header) -> None:
+    async def _receive_body(self, client: Client, reader: asyncio.StreamReader, header: Header) -> None:
         """Receive one message's body, and reply."""
         if header.kind[:4] in REQUESTS:
-            await _pass_over(reader, header.size)
-            self._ask(client, header)
+            await _skip_bytes(reader, header.size)
+            self._handle_request(client, header)
             return
         client.spoke.set()
         longest = self._longest(header.kind)
         if header.size > longest:
-            await _pass_over(reader, header.size)
+            await _skip_bytes(reader, header.size)
             why, code = ("too long", Code.OVERFLOW) if longest else ("type not used", Code.UNKNOWN_INSTRUCTION)
             self.reject(client.number, code, why, f"{_format_name(header)} is passed over: {why}")
             return
@@ -240,7 +240,7 @@ class LinkClients:
             why = str(error).partition(":")[0]  # The text after a colon differs from message to message.
             self.reject(client.number, code, why, f"{_format_name(header)} is rejected: {error}")
 
-    def _ask(self, client: Client, header: Header) -> None:
+    def _handle_request(self, client: Client, header: Header) -> None:
         """Handle a request: send one message (GET), or stop (STP) or start the stream of messages."""
         client.asks = header.kind.startswith(QUERIES)
         client.spoke.set()
@@ -256,7 +256,7 @@ class LinkClients:
             client.waiting = dict(self._newest)
             client.news.set()
 
-    def _count(self, why: str, text: str = "") -> None:
+    def _count_rejection(self, why: str, text: str = "") -> None:
         """Count a rejected message, and report the first one of each reason."""
         self.refused[why] += 1
         if self.refused[why] == 1:
@@ -275,13 +275,13 @@ def _format_name(header: Header) -> str:
     return f"{header.kind} {header.name}".strip()
 
 
-async def _pass_over(reader: asyncio.StreamReader, size: int) -> None:
+async def _skip_bytes(reader: asyncio.StreamReader, size: int) -> None:
     """Read `size` bytes, and discard them."""
     while size:
         size -= len(await reader.readexactly(min(size, CLIENT_LIMITS.chunk_bytes)))
 
 
-def _hold_little(writer: asyncio.StreamWriter) -> None:
+def _limit_send_buffer(writer: asyncio.StreamWriter) -> None:
     """Limit the system's send buffer for unread bytes, and enable keep-alive to detect lost clients."""
     writer.transport.set_write_buffer_limits(high=0)
     own = writer.get_extra_info("socket")

@@ -167,18 +167,18 @@ class Outgoing:
         if gauge is None:
             return f"not known: {known.words}"
         inside = "inside the tumour, its edge " if gauge.inside else ""
-        return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._of}){_format_doubt(known)}"
+        return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._source}){_format_doubt(known)}"
 
     def _format_motion(self, known: TrackingResult) -> str:
         """Describe the tumour's displacement, with its error and sources; or why it is unknown."""
         if known.band is None:
             return f"not known: {known.words}"
         moved = format_millimetres(known.motion.moved, known.motion.error)
-        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._of}){_format_doubt(known)}"
+        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._source}){_format_doubt(known)}"
 
     @property
-    def _of(self) -> str:
-        """Describe the sources included in an error, and those that are unknown."""
+    def _source(self) -> str:
+        """Description of the sources included in an error, and of the unknown ones."""
         if self.registered:
             return "of tracking, registration and model; not known of tissue and segmentation"
         return "of tracking and model; not known of registration, tissue and segmentation"

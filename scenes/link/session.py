@@ -195,8 +195,8 @@ class LinkSession:
         self.clients.publish("scan", (self._speaks.build_scan(0),))
         self._show(self._solved, self._speaks.build_messages(self._solved))
         with ThreadPoolExecutor(1, "answer") as answering, ThreadPoolExecutor(1, "draw") as drawing:
-            work = [self._reporting(), self._answering(answering)]
-            work += [] if self._eye is None else [self._drawing(self._eye, drawing)]
+            work = [self._keep_reporting(), self._keep_solving(answering)]
+            work += [] if self._eye is None else [self._keep_drawing(self._eye, drawing)]
             tasks = [asyncio.create_task(each) for each in work]
             ended = asyncio.create_task(self._ended.wait())
             limit = seconds if np.isfinite(seconds) else None
@@ -211,7 +211,7 @@ class LinkSession:
             for task in done:
                 task.result()  # raises the exception of the task
 
-    async def _answering(self, thread: ThreadPoolExecutor) -> None:
+    async def _keep_solving(self, thread: ThreadPoolExecutor) -> None:
         """Compute the solution of the newest pose, repeatedly."""
         while True:
             await self._posed.wait()
@@ -227,7 +227,7 @@ class LinkSession:
             # A pose may have grown old while its solution was computed.
             self._show(current, messages if current is result else self._speaks.build_messages(current, places))
 
-    async def _reporting(self) -> None:
+    async def _keep_reporting(self) -> None:
         """Publish at each check, independent of the solver, that a pose or its solution is too old, and a STATUS."""
         said: object = None
         beat = 0.0
@@ -278,7 +278,7 @@ class LinkSession:
             words += f"; other transforms received: {', '.join(self._others)}"
         return words
 
-    async def _drawing(self, eye: OverlayCamera, thread: ThreadPoolExecutor) -> None:
+    async def _keep_drawing(self, eye: OverlayCamera, thread: ThreadPoolExecutor) -> None:
         """Draw into the newest image, repeatedly."""
         while True:
             await self._pictured.wait()

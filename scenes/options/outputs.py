@@ -1,4 +1,4 @@
-"""Checks of output files before the work, for all commands; files that were made of a mesh are next to it.
+"""Checks of output files before the work, for all commands; files derived from a mesh are next to the mesh.
 
 An existing file is replaced only with --force. Commands that resume or extend their own output need no --force.
 """

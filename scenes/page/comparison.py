@@ -145,7 +145,7 @@ MAX_RECENT_LOADS = 120  # Number of last loads that are kept for each deformer.
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """A deformer's medians over `loads` loads; `best` where no other equals or beats it in both. None: no ranking."""
+    """A deformer's medians over `loads` loads; `best`: True on the Pareto front of both, None without ranking."""
 
     name: str
     milliseconds: float

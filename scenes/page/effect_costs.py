@@ -1,4 +1,4 @@
-"""Switches of a scene's effects, with the time that each costs and how far it moves the tumour."""
+"""Switches of a scene's effects, with the time that each effect costs and the tumour motion that it causes."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial

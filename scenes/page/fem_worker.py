@@ -16,7 +16,7 @@ from ..script.scene import Scene
 from ..script.tool_paths import Touch
 
 FrameRequest = tuple[int, Touch | None]
-"""A frame's number, and the hand's touch if it has the tool."""
+"""Number of a frame, and the touch under manual control, else None."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from .fem_worker import FemResult
 
 FEM_COLOUR = TRUTH_COLOUR  # Colour of the FEM tumour.
 STALE_COLOUR = (0.45, 0.45, 0.45)
-"""Colour of the FEM tumour while it belongs to another load than the one shown."""
+"""Colour of the FEM tumour while its load differs from the shown one."""
 BRAIN_COLOUR = (0.50, 0.38, 0.36)  # Colour of the inside of the brain's far side: its near side would hide the rest.
 CORTEX_COLOURS = {"cortex": (0.80, 0.53, 0.47), "sulci": (0.45, 0.15, 0.16)}  # Colours of crowns and sulci.
 EDGE_COLOUR, EDGE_WIDTH = (0.93, 0.86, 0.72), 2.5e-3

@@ -133,7 +133,7 @@ def measure(
         ).mean()
         for row, frame in enumerate(frames)
     ]
-    finite = [_is_finite(frame) and _is_carried(player, frame) for frame in frames]
+    finite = [_is_finite(frame) and _is_cortex_embedded(player, frame) for frame in frames]
     misses = [
         _measure_miss(player, camera_at(frame.time), frame, truth, row) if finite[row] else WORST_MISS
         for row, frame in enumerate(frames)
@@ -229,7 +229,7 @@ def _is_finite(frame: Frame) -> bool:
     return bool(np.isfinite(frame.picture.depth).all() and np.isfinite(frame.deformation.displacement).all())
 
 
-def _is_carried(player: Player, frame: Frame) -> bool:
+def _is_cortex_embedded(player: Player, frame: Frame) -> bool:
     """Return True if the visible cortex moves as the FEM surface in which it is embedded."""
     stage = player.stage.select_stage(frame.loads)
     if not stage.scene.look.natural:

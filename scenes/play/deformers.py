@@ -259,7 +259,7 @@ class PatientSetup:
         return self.build_player_of(self.build_stage(scene), self.build_deformer(name, scene), name)
 
     def build_player_of(self, stage: Stage, deformer: Deformer, name: str) -> Player:
-        """Return a player of a stage and a deformer of that name, with its errors on this anatomy."""
+        """Return a player of a stage and the deformer `name`, with the deformer's errors on this anatomy."""
         ensemble, motion_error = self.estimate_uncertainty(stage.scene), self.estimate_motion_error(stage.scene)
         recorded = self.select_recorded(stage.scene).get(name)
         return Player(stage, deformer, uncertainty=ensemble, motion_error=motion_error, recorded=recorded)

@@ -107,7 +107,7 @@ def _is_ground_labelled(frame: Frame, mask: np.ndarray) -> bool:
 def has_printed_numbers(player: Player, frame: Frame) -> bool:
     """Return True if the image shows the frame number, the distance from tip to tumour, and the estimate."""
     labelled = all(has_text(frame.shown, line, TEXT_SCALE) for line in label_frame(frame.number))
-    if not labelled or not _estimate_printed(player, frame):
+    if not labelled or not _has_printed_estimate(player, frame):
         return False
     return frame.tip is None or _find_number(player, frame, frame.tip) is not None
 
@@ -139,7 +139,7 @@ def _find_number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, in
     return None
 
 
-def _estimate_printed(player: Player, frame: Frame) -> bool:
+def _has_printed_estimate(player: Player, frame: Frame) -> bool:
     """Return True if the image shows the estimated tumour motion and its error as computed here."""
     found = frame.estimate
     if found is None or found.location is None:

@@ -156,7 +156,7 @@ class Sees(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Observer:
-    """Observer that samples the points of a `PointObservation`, with its errors, and calls a locator without loads."""
+    """Observer that samples the points and errors of a `PointObservation`, and calls a locator without loads."""
 
     site: CraniotomyFrame
     locator: Locator
@@ -181,9 +181,9 @@ class Observer:
         if tool is not None:
             shown = KDTree(tool).query(now)[0] > HIDING_DISTANCE
             tips = find_touched(self.site.anatomy, positions, tool)
-            tips = self._as_a_whole(tips + model.white * random.standard_normal(tips.shape))
+            tips = self._move_rigid(tips + model.white * random.standard_normal(tips.shape))
         sigma = np.full(shown.sum(), np.hypot(model.white, model.smooth))
-        return Observation(self._as_a_whole(now + off)[shown], self._interpolate_points(self._rest)[shown], sigma, tips)
+        return Observation(self._move_rigid(now + off)[shown], self._interpolate_points(self._rest)[shown], sigma, tips)
 
     @property
     def _rest(self) -> np.ndarray:
@@ -194,7 +194,7 @@ class Observer:
         vertices, weights = self._places
         return np.einsum("nc,nci->ni", weights, positions[vertices])
 
-    def _as_a_whole(self, points: np.ndarray) -> np.ndarray:
+    def _move_rigid(self, points: np.ndarray) -> np.ndarray:
         """Add the rigid error to points (n, 3) [m]."""
         return self._rigid.apply(points, self._interpolate_points(self._rest).mean(axis=0))
 

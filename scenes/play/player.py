@@ -100,7 +100,7 @@ class Frame:
     remark
         Further text in the image, for example that the bone stops the tool; usually empty.
     seconds
-        Wall time by stage, see `STAGES`; that of an estimate as "locate".
+        Wall time by stage, see `STAGES`; "locate" is the time of an estimate.
     estimate
         Estimated tumour position, in a scene with an observation model: it is drawn, and `deformation` is the truth.
     """

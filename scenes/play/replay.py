@@ -67,14 +67,14 @@ class FrameCache(Generic[T]):
         starts = computed if self._course.back else [other for other in computed if other <= number]
         reached = min(starts, key=lambda other: abs(number - other), default=-1)
         if reached != number:
-            before, reached = computed.get(reached), self._stop(reached, number)
+            before, reached = computed.get(reached), self._find_step_end(reached, number)
             computed = {reached: self._step(reached, before)}
             if reached % self._every == 0:
                 self.kept |= computed
         self._last = {reached: computed[reached]}
         return reached, computed[reached]
 
-    def _stop(self, start: int, number: int) -> int:
+    def _find_step_end(self, start: int, number: int) -> int:
         """Return the frame at which a step from `start` towards a frame ends."""
         leap = self._course.leap
         if start < number:

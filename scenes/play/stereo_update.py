@@ -45,7 +45,7 @@ LARGE_MOTION_HINT = (
 )
 """Reasons why points of the first pair may not be found again."""
 Rigid = Callable[[np.ndarray], np.ndarray]
-"""Takes places (n, 3) [m] to where a tracked microscope has them."""
+"""Function that adds the error of a tracked microscope to positions (n, 3) [m]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,7 +39,7 @@ def debulk_tumour(anatomy: Anatomy) -> Anatomy:
 
 
 def build_debulked_study(study: ReportStudy) -> ReportStudy:
-    """Return the same study of the debulked body, once `simulate_debulked` has made its data."""
+    """Return the study of the debulked body, after `simulate_debulked` has made its data."""
     return replace(study, data=_to_answers_path(study))
 
 

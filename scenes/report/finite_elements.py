@@ -187,7 +187,7 @@ def get_law_name(tissue: Elasticity) -> str | None:
 
 
 def change_law(tissue: Elasticity, law: str | None) -> Elasticity:
-    """Return the tissue, in all regions, with another law of the same constants.
+    """Return the tissue with another law and unchanged constants, in all regions.
 
     Raises
     ------
@@ -207,7 +207,7 @@ def change_law(tissue: Elasticity, law: str | None) -> Elasticity:
 
 
 def move_pushes_onto(body: Anatomy, loads: Loads) -> Loads:
-    """Return the same pushes at the nearest points of another mesh's open cortex."""
+    """Return the pushes moved to the nearest points of another mesh's open cortex."""
     (pushed,) = loads.get_all(Pushed)
     corners = body.mesh.nodes[body.open_surface]
     return Loads(

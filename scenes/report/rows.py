@@ -87,7 +87,7 @@ CORES = 4  # Number of CPU cores per measured learner, which uses one; the other
 
 
 def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
-    """Return the data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`.
+    """List the FEM variant of the data set, and variants that differ in one factor; also in the mesh if `remesh`.
 
     The reference itself is left out: it would show only its tolerance.
     """

@@ -37,7 +37,7 @@ class HeadPose:
 
 
 Lie = Callable[[float], HeadPose]
-"""Time [s] -> Lying."""
+"""Function of time [s] that returns a head pose."""
 
 
 def get_supine_pose(time: float) -> HeadPose:

@@ -154,7 +154,7 @@ def sample_priors(count: int, seed: int = 0) -> list[PatientSample]:
 def sample_from_fit(
     tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0, ratio: float = 1.0
 ) -> list[PatientSample]:
-    """Draw `count` samples whose tissue and skull are from a fit; all else as in `sample_priors`.
+    """Draw `count` samples whose tissue and skull are from a fit; the other parameters as in `sample_priors`.
 
     `young` [Pa] is the scene's own modulus, `ratio` its tumour's relative stiffness, and `skulls` the skulls that it
     may have. Parameters that were not fitted keep their prior.

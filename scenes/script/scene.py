@@ -272,7 +272,7 @@ SCENES = (
     "spatula", "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag",
     "lost_force", "microscope",
 )  # fmt: skip
-"""The built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
+"""Names of the built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
 
 
 def find_scene(name: str) -> Scene:

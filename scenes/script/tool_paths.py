@@ -31,7 +31,7 @@ class Touch:
 
 
 Path = Callable[[float], Touch]
-"""Time [s] -> Touch."""
+"""Function of time [s] that returns a touch."""
 
 IDLE_HEIGHT = 4e-3  # Height of an idle tool above the tissue [m].
 

@@ -71,7 +71,7 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """Image whose time [s] is read from its pixels, if it is written there, and from its source otherwise.
+    """Image with its time [s], read from a stamp in its pixels if there is one, otherwise from the source.
 
     `covered` (H, W) bool is the foreground in front of the brain, such as a hand, if a mask is given.
     """
@@ -93,7 +93,7 @@ def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> I
     """
     before, days = -np.inf, 0.0
     for number, picture in enumerate(film):
-        covered = None if masks is None else _mask(masks, picture, number)
+        covered = None if masks is None else _get_mask(masks, picture, number)
         stamp = read_stamp(picture.grey)
         time = days + (picture.time if stamp is None else stamp)
         if time < before - 0.5 * DAY_SECONDS:
@@ -104,8 +104,8 @@ def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> I
         raise ValueError("there are more masks than images. Give one for each image, in order.")
 
 
-def _mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
-    """Return the foreground mask of the image of a number."""
+def _get_mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
+    """Return the foreground mask of image `number`."""
     mask = next(masks, None)
     if mask is None:
         raise ValueError(f"{picture.name} has no mask: there are {number}. Give one for each image, in order.")
@@ -150,7 +150,7 @@ def draw_overlays(film: Iterator[Timed], follower: Follower, painter: Painter, l
 def overlay_one(
     taken: Timed, begun: float | None, before: TrackingResult | None, follower: Follower, painter: Painter
 ) -> Shown:
-    """Compute one image with its overlay, from the result `before`.
+    """Compute the overlay of one image, from the result `before`.
 
     `begun` is the clock time [s] of the images' time 0, if they are live: old images are marked stale.
 

@@ -1,4 +1,4 @@
-"""The tool that carries the printed cube: its shape, and where it is on the cube."""
+"""Tool that carries the printed cube: its shape, and its pose relative to the cube."""
 
 import json
 from dataclasses import dataclass, field
@@ -56,7 +56,7 @@ class TrackedTool:
 
     @cached_property
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Surface, as far as known, with its cube: vertices (n, 3) [m] in its own frame, triangles (m, 3).
+        """Surface with the cube, as far as the shape is known: vertices (n, 3) [m] in its own frame, triangles (m, 3).
 
         Only the printed faces are included, with their borders.
         """

@@ -1,4 +1,4 @@
-"""Verification of an overlay by its pixels, when markers are lost and found again, and images are late."""
+"""Verification of an overlay by its pixels, with lost and recovered markers and late images."""
 
 import time as clock
 from collections.abc import Iterator
@@ -83,7 +83,7 @@ class TrackingFigures:
 
 @dataclass(frozen=True, eq=False)
 class Event:
-    """Image at its arrival: its age [s], and the required text; empty without a disturbance."""
+    """Image at its arrival, with its age [s] and the required text, which is empty without a disturbance."""
 
     shot: VideoFrame
     late: float = 0.0
@@ -138,7 +138,7 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
 
 
 def _has_warning(colour: np.ndarray, words: str, wanted: str) -> bool:
-    """Return True if text that begins as wanted is found in an image."""
+    """Return True if the image contains text with the wanted beginning."""
     lines = format_warning(words, colour.shape[1])
     return words.startswith(wanted) and all(
         has_text(colour, line, TEXT_SCALE, compute_ink(WARNING_COLOUR)) for line in lines

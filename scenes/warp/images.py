@@ -148,7 +148,7 @@ class PatientImage:
 
 @dataclass(frozen=True)
 class Warped:
-    """Name of a warped image, and its numbers of voxels that moved, came from outside, and were resected."""
+    """Name of a warped image, and numbers of voxels that moved, came from outside, and were resected."""
 
     name: str
     moved: int
@@ -269,7 +269,7 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
             source, np.clip(place, 0, last).T, order=order, mode="nearest", prefilter=False, output=source.dtype
         )
         numbers = np.ravel_multi_index(index[rows].T - np.array([[first], [0], [0]]), (len(slab), *sides))
-        slab.reshape(-1)[numbers] = np.where(off | cut, 0, _as(read, values.dtype))
+        slab.reshape(-1)[numbers] = np.where(off | cut, 0, _cast_values(read, values.dtype))
         blank[first : first + BATCH_SLICES].reshape(-1)[numbers] = off | cut
         outside, resected = outside + int(off.sum()), resected + int(cut.sum())
     return out, Counts(moved, outside, resected, blank)
@@ -284,7 +284,7 @@ def _find_moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.nd
     return went[moves], held[moves]
 
 
-def _as(values: np.ndarray, kind: np.dtype) -> np.ndarray:
+def _cast_values(values: np.ndarray, kind: np.dtype) -> np.ndarray:
     if kind.kind not in "iu":
         return values.astype(kind)
     limits = np.iinfo(kind)

@@ -14,9 +14,9 @@ from sim.fields.grid_interpolation import interpolate_in_tetrahedra
 TYPES = {"f4": "float", "u1": "unsigned char"}  # Names of data types in NRRD.
 LEVEL = 1  # Lowest compression level: higher levels hardly reduce floats.
 DIGITS = 4
-"""Decimals of displacements in millimetres: further ones have no meaning, and take half of a file."""
+"""Decimals of displacements [mm]: further decimals have no meaning, and double the file size."""
 TUMOUR, SHELL = 1, 2
-"""Labels of the segments: tumour, what may be tumour."""
+"""Labels of the segments: tumour, and tissue that may be tumour."""
 COLOURS = {TUMOUR: (0.20, 0.94, 0.42), SHELL: (0.95, 0.75, 0.20)}  # Colours (RGB, 0 to 1) of the segments.
 VOXEL = 0.5e-3  # Edge of a voxel [m].
 MARGIN = 2e-3  # Margin round the segments [m].

@@ -1,4 +1,4 @@
-"""The data sheet of a data set, by the questions of Gebru et al. (2021), "Datasheets for Datasets", CACM 64(12)."""
+"""Data sheet of a data set, by the questions of Gebru et al. (2021), "Datasheets for Datasets", CACM 64(12)."""
 
 import json
 from collections import Counter
@@ -83,7 +83,7 @@ def list_leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 TEMPLATE, DRAWN, UNSTATED = "template", "drawn", ""
 """Origin of an anatomy: the shipped one, the same brain with another tumour, or unknown.
 
-Else the name of an own one.
+Other values: the name of a custom anatomy.
 """
 
 
@@ -237,7 +237,7 @@ def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
 
 
 def format_value(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
-    """Return an attribute of all episodes that have it."""
+    """Format the values of an attribute over all episodes that have it."""
     return [one.said[key] for one in episodes if key in one.said]
 
 

@@ -17,7 +17,7 @@ from ..reading.windows import read_image_bytes, read_numbers, read_rows
 from .columns import measure_stored_size, name_files, write_along
 
 SEPARATE_TABLES = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
-"""Arrays with many numbers a frame, each in a table of its own."""
+"""Arrays with many numbers per frame, each in its own table."""
 
 
 def write_folder(

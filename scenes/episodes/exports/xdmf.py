@@ -17,7 +17,7 @@ from ..reading.windows import read_numbers
 from .columns import SPACE, measure_stored_size, name_files, write_along
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
-"""Contents to write, and the surface of their anatomy."""
+"""Exported surfaces, and the attribute of the anatomy with the triangles of each."""
 
 
 def write_xdmf(

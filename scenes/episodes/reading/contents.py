@@ -240,14 +240,14 @@ def _check_shapes(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ..
         array = arrays[name]
         if array.dtype.kind not in wanted.kind or (picture and h5py.check_vlen_dtype(array.dtype) != np.uint8):
             raise InputError(f"{name!r} holds {array.dtype}: another kind is needed. {REMEDY}")
-        _fit(name, array.shape, wanted, sizes)
+        _check_shape(name, array.shape, wanted, sizes)
         shapes[last if picture else name] = array.shape
     if not 0 < sizes[FRAMES] <= MAX_FRAMES:
         raise InputError(f"it has {sizes[FRAMES]} frames: 1 to {MAX_FRAMES} are read. {REMEDY}")
     return shapes
 
 
-def _fit(name: str, shape: tuple[int, ...], wanted: Array, sizes: dict[str, int]) -> None:
+def _check_shape(name: str, shape: tuple[int, ...], wanted: Array, sizes: dict[str, int]) -> None:
     """Reject a shape that contradicts known lengths; record new ones."""
     axes = wanted.axes
     if axes[-1] is None:
