@@ -58,7 +58,7 @@ def measure_peak_memory() -> float | None:
 
 @contextmanager
 def watch_gpu_memory(device: str) -> Iterator[list[int]]:
-    """Yield the GPU memory [bytes] used while the block runs, in excess of that used before.
+    """Yield the additional GPU memory [bytes] that is used while the block runs.
 
     Zero without a GPU.
     """

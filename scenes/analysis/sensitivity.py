@@ -146,7 +146,7 @@ class SensitivityRow:
 
 @dataclass(frozen=True, eq=False)
 class SensitivityStudy:
-    """The same `Pushed` loads on variants of a body."""
+    """Study of fixed `Pushed` loads on variants of a body."""
 
     anatomy: Anatomy
     loads: Loads
@@ -155,7 +155,7 @@ class SensitivityStudy:
     device: str = "auto"
 
     def build_fem(self, body: BodyVariant) -> Fem:
-        """Return the finite elements of a body, for tools of either kind."""
+        """Build FEM of a body, for tools of prescribed force or motion."""
         tissue = body.tissue
         _, *others = build_push_effects(self.anatomy, tissue, body.skull)
         elasticity = Elasticity(tissue, {TUMOUR_LABEL: replace(tissue, young=body.tumour * tissue.young)})

@@ -45,7 +45,7 @@ def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarr
 
 
 def change_calibration(calibration: Calibration, step: np.ndarray) -> Calibration:
-    """Return a calibration whose nine parameters differ by `step` (9,); further coefficients of its lens stay."""
+    """Return a calibration whose nine parameters differ by `step` (9,); further lens coefficients are unchanged."""
     fx, fy, cx, cy = (np.array([*calibration.focal, *calibration.principal]) + step[:4]).tolist()
     coefficients = calibration.lens.coefficients.copy()
     coefficients[:5] += step[4:]

@@ -144,7 +144,7 @@ def estimate_mesh_deviations(scene: Scene, draws: Sequence[PatientSample]) -> np
 
 
 def get_tissue(scene: Scene) -> Material:
-    """Return the brain's tissue in a scene; regions may have another.
+    """Return the brain's tissue in a scene; regions may have other tissues.
 
     Raises
     ------
@@ -358,7 +358,7 @@ def collect_contributor_values(draws: Sequence[PatientSample], scene: Scene) -> 
 
 
 def compute_field_size(field: np.ndarray) -> float:
-    """Compute the root mean square over draws of the largest length in each: vectors (draws, n, 3)."""
+    """Compute the root mean square over draws of the largest vector length in each draw; vectors (draws, n, 3)."""
     return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
 
 

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def build_episode_writer(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
-    """Return the function that writes episodes in the requested format; its output path is free.
+    """Return the function that writes episodes in the requested format, after a check of its output path.
 
     Raises
     ------

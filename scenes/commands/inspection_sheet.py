@@ -92,7 +92,7 @@ class InspectionView:
 
 
 def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
-    """Return the sheet (H, W, 3) uint8.
+    """Draw the sheet as an image (H, W, 3) uint8.
 
     `opened` (n,) bool says which points of the subject's cortex are in the opening.
     """

@@ -88,7 +88,7 @@ def make_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, reg
 
 
 def find_locator(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
-    """Load the locator next to the anatomy, or build one; it covers every vertex, unless it may be `small`.
+    """Load the locator next to the anatomy, or build one; a locator covers every vertex, unless it may be `small`.
 
     Raises
     ------

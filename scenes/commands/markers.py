@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0 when all files are written.
+    """Write the pages and the list of targets; return 0.
 
     Raises
     ------

@@ -106,7 +106,7 @@ class Parts:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw the overlay; return 0, or 1 if the tumour position is reliable in no frame.
+    """Draw the overlay; return 0, or 1 if no frame has a reliable tumour position.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def _build_page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name
 def _print_summary(
     args: argparse.Namespace, report: dict[str, object], shown: list[Shown], out: Path | None, table: Path | None
 ) -> int:
-    """Print the summary of a run; return 1 if the tumour position is reliable in no frame."""
+    """Print the summary of a run; return 1 if no frame has a reliable tumour position."""
     report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
     print(to_json_line(report) if args.json else _format_report(report))
     return 0 if any(each.known.relied for each in shown) else 1

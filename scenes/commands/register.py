@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0 when the registration is written.
+    """Register the scan, and write the registration; return 0.
 
     Raises
     ------

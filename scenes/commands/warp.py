@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def check_warp_options(args: argparse.Namespace) -> None:
-    """Reject options that conflict or are out of range.
+    """Reject conflicting options and values out of range.
 
     Raises
     ------

@@ -29,7 +29,7 @@ class FamilyMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pushing(FamilyMotion, frozen=True):
-    """Push of a ball with a force; `spread` is its distance from the centre relative to that of the bone."""
+    """Push of a ball with a force; `spread`: distance from the craniotomy's centre, relative to the reach."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.35)
     radius_mm: Annotated[Number, ValueLimits(1, 15, "mm")] = (5.0, 7.5)
@@ -49,7 +49,7 @@ class SlideMotion(Pushing, frozen=True):
 
 
 class DrawMotion(Pushing, frozen=True):
-    """Lay on, and draw the tissue aside."""
+    """Press, and draw the tissue aside."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.25)
     tilt_deg: Annotated[Number, ValueLimits(0, 45, "°")] = (20.0, 40.0)

@@ -95,7 +95,7 @@ class TissuePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LearnerPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Training of a body's model: learner and number of loads. `name` "none": FEM plays."""
+    """Training of a body's model: learner and number of loads. `name` "none": FEM is used."""
 
     name: Annotated[str, (NO_LEARNER, *LEARNERS)] = "series-gp"
     loads: Annotated[int, ValueLimits(40, 100_000)] = 200
@@ -261,7 +261,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
 
 
 def list_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | None, tuple[str, ...]]]:
-    """List every field that may be sampled: name, value, limits of a number, and known words."""
+    """List every field that may be sampled: name, value, limits of a number, and allowed words."""
     found = []
     for name, (kind, about) in _list_field_types(type(table)).items():
         if kind in (Number, Word):

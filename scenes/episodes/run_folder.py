@@ -144,7 +144,7 @@ def list_failed(folder: Path) -> set[int]:
 
 
 def read_failure(folder: Path, number: int) -> Failure | None:
-    """Read the reason why an episode failed; None if it exists by now, or if the reason cannot be read."""
+    """Read the reason why an episode failed; None if the episode exists, or if the reason cannot be read."""
     with suppress(OSError, ValueError, TypeError):  # another client is removing it
         return Failure(**json.loads(_to_failed_path(folder, number).read_text()))
     return None

@@ -66,7 +66,7 @@ class EpisodeScore:
 
 
 def compute_reward(before: EpisodeScore, now: EpisodeScore, success: bool, ended: bool) -> float:
-    """Return the reward of a step from one state to the next; `ended`: at a limit, without success."""
+    """Return the reward of a step from one state to the next; `ended`: True if the episode ends at a limit."""
     reward = now.potential - before.potential - REWARD.step_penalty
     if now.load > 1.0:
         reward -= REWARD.limit_penalty

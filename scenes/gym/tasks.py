@@ -92,7 +92,7 @@ class GymTask:
 
     @property
     def surgery(self) -> Debulking | None:
-        """Return the resection: the corridor, then share after share; the last remains."""
+        """Return the resection: the corridor, then share after share; the last share remains."""
         return Debulking(tuple(float(each) for each in range(int(self.amount[1]) + 1))) if self.cuts else None
 
     def build_scene(self, size: tuple[int, int]) -> Scene:

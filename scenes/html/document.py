@@ -84,7 +84,7 @@ def write_html(path: str | Path, theatre: PatientSetup, scene: Scene, learner: s
 
 
 def choose_model(theatre: PatientSetup, learner: str | None = None) -> ExportedModel:
-    """Trace the model of that name, or the one with the fewest numbers.
+    """Trace the named model, or the model with the fewest parameters.
 
     Raises
     ------

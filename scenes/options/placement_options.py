@@ -49,12 +49,12 @@ def point(text: str) -> Point:
 
 
 def point_or_file(text: str) -> Point | Path:
-    """X,Y,Z or a file of markups, for argparse."""
+    """Parse X,Y,Z or the name of a markups file, for argparse."""
     return Path(text) if text.lower().endswith((".json", ".fcsv")) else point(text)
 
 
 def parse_opening(text: str) -> int | Point | Path:
-    """Return a piece's number, X,Y,Z or a file of markups, for argparse."""
+    """Parse a piece's number, X,Y,Z or the name of a markups file, for argparse."""
     return int(text) if text.isdecimal() else point_or_file(text)
 
 

@@ -69,7 +69,7 @@ def parse_labels(text: str) -> tuple[Label, ...]:
 
 
 def parse_sources(args: argparse.Namespace) -> Sources:
-    """Return the files and labels that the options name."""
+    """Return the files and labels named by the options."""
     return Sources(
         args.labels,
         args.brain or (),

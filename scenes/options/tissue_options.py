@@ -173,7 +173,7 @@ def parse_optional_tissue(args: argparse.Namespace) -> Tissue | None:
 
 
 def reject_option(given: Mapping[str, object], material: str, owner: str) -> None:
-    """Raise InputError for an option that is given but that only `owner` has."""
+    """Raise InputError if an option is given that only `owner` supports."""
     for name, value in given.items():
         if value is not None:
             raise InputError(

@@ -68,7 +68,7 @@ def compute_distances(truth: FemResult, player: Player, shown: Deformation) -> n
 
 
 def format_comparison(comparison: Comparison | None, stale: bool, waiting_text: str, fem_text: str = FEM_SHOWN) -> str:
-    """Format the comparison; that of a previous load is greyed and marked, with the state of the FEM solver.
+    """Format the comparison; a comparison of a previous load is grey and marked, with the state of the FEM solver.
 
     `fem_text` is the text for a solution by FEM itself.
     """
@@ -122,7 +122,7 @@ class PageState:
     max_render_time: float = 0.015
 
     def choose_resolution(self) -> bool:
-        """Return whether the next image, drawn now, is coarse."""
+        """Return True if the next image is to be coarse."""
         time = clock.perf_counter()
         self.coarse = self.render_time > self.max_render_time and time < self.still_at
         self.still_at = time + self.still_time

@@ -117,7 +117,7 @@ def build_slice_control(current: str, choose: Callable[[str], None]) -> Dropdown
 
 
 def build_camera_sliders(scene: Scene, site: CraniotomyFrame, requests: Requests) -> tuple[Slider, Slider]:
-    """Build the sliders of the camera's tilt and distance, at the scene's own."""
+    """Build the sliders of the camera's tilt and distance, with the scene's values."""
     camera = scene.viewpoint.build_camera(site)
     offset = camera.centre - scene.viewpoint.find_target(site)
     distance = float(np.linalg.norm(offset))

@@ -82,7 +82,7 @@ class Requests:
             return Look(self.style, self.path, self.through, self.tilt, self.distance, self.registration)
 
     def read_current(self) -> tuple[int, str, Touch | None, frozenset[str]]:
-        """Frame number, deformer, hand-set touch (None: the script's) and disabled effects."""
+        """Return frame number, deformer, manual touch (None: the script's) and disabled effects."""
         with self.lock:
             return self.number, self.deformer, self.touch if self.tool == HAND else None, self.off
 

@@ -43,7 +43,7 @@ def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
 
 
 def get_tool_force(loads: Loads, deformation: Deformation) -> tuple[float | None, float | None]:
-    """Return the tool force and its error [N]: a prescribed force has none; None: not known."""
+    """Return the tool force and its error [N]: a prescribed force has no error. None: not available."""
     pushed = loads.get_all(Pushed)
     if pushed:
         return float(np.linalg.norm(pushed[0].force[0])), 0.0

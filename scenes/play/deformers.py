@@ -265,7 +265,7 @@ class PatientSetup:
         return Player(stage, deformer, uncertainty=ensemble, motion_error=motion_error, recorded=recorded)
 
     def estimate_uncertainty(self, scene: Scene) -> Uncertainty | None:
-        """Return the expected error of the tumour position in a scene; None without an ensemble of exactly it."""
+        """Return the expected error of the tumour position in a scene; None without an ensemble of this scene."""
         found = self.uncertainties.get(scene.name)
         return found if found and found.mark == self.compute_mark(scene) else None
 
@@ -315,7 +315,7 @@ class AtRest:
 
 @lru_cache(1)
 def read_template_uncertainties() -> Mapping[str, Uncertainty]:
-    """Return the uncertainties that ship with the template, by scene."""
+    """Return the shipped uncertainties of the template, by scene."""
     return read_uncertainties(to_uncertainty_path(get_template_path()))
 
 
@@ -325,12 +325,12 @@ def plan_of(deformer: Deformer) -> tuple[str, ...]:
 
 
 def to_model_path(anatomy: Path, kind: str = "model") -> Path:
-    """Return the path of models next to MESH.vtu: MESH.model.npz by default, MESH.SCENE.npz for those of one scene."""
+    """Return the path of models next to MESH.vtu: MESH.model.npz by default, MESH.SCENE.npz for models of one scene."""
     return anatomy.with_suffix(f".{kind}.npz")
 
 
 def load_models(path: Path, anatomy: Anatomy) -> dict[str, Learned]:
-    """Load the models next to an anatomy, by name; those of one scene are called NAME-SCENE.
+    """Load the models next to an anatomy, by name; models for one scene are called NAME-SCENE.
 
     Raises
     ------

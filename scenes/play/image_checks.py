@@ -46,7 +46,7 @@ def render_silhouette(camera: Camera, layer: Layer) -> np.ndarray:
 
 
 def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
-    """Compute the distance between the outline in a frame's image and that of a silhouette (H, W) bool [pixel].
+    """Compute the distance between the outline in a frame's image and the outline of a silhouette (H, W) bool [pixel].
 
     Outlines drawn broken, because they are occluded or unreliable, may have gaps.
     """

@@ -102,7 +102,7 @@ def has_instrument(tool: object) -> TypeGuard[Probe | Blade]:
 
 @lru_cache(maxsize=8)
 def build_instrument(tool: Probe | Blade, kind: BallInstrument, number: int) -> tuple[Layer, ...]:
-    """Build the layers of a brain spatula, or of an instrument of a kind for a ball, in the tool's frame."""
+    """Build the layers of a brain spatula, or of an instrument with a ball, in the tool's frame."""
     if isinstance(tool, Blade):
         return (build_metal([build_spatula(tool)], [STEEL], number, BLADE_LIGHT),)
     lift = np.array([0.0, 0.0, 1e3 * tool.radius, 0.0, 0.0])

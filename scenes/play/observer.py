@@ -120,7 +120,7 @@ class TumourEstimate:
 
     @property
     def source(self) -> str:
-        """Description of the observation; or the reason why it was rejected."""
+        """Description of the observation, or the reason of its rejection."""
         if self.location is None:
             return f"rejected, {self.refusal}"
         tip = ", and where the tool touches" if len(self.observation.tips) else ""
@@ -241,7 +241,7 @@ def sample_rigid_error(model: PointObservation | StereoObservation, number: int)
 
 
 def find_touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
-    """Return the place of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches.
+    """Find the point of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches.
 
     Empty, (0, 3), if the tool is in the air.
     """

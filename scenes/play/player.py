@@ -181,7 +181,7 @@ class Player:
 
     @property
     def camera(self) -> Camera:
-        """The scene's camera as it starts."""
+        """Initial camera of the scene."""
         return self.stage.camera
 
     def get_camera(self, time: float) -> Camera:

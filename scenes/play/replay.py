@@ -18,7 +18,7 @@ MAX_TIME_STEP = 0.2
 
 @dataclass(frozen=True)
 class ReplayOrder:
-    """Order in which frames are reached from others.
+    """Order in which frames are computed from other frames.
 
     Parameters
     ----------

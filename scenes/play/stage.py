@@ -134,7 +134,7 @@ class Stage:
 
     @cached_property
     def lamp(self) -> Lamp:
-        """A lamp over the surgeon's shoulder."""
+        """Lamp over the surgeon's shoulder."""
         site, look = self.site, self.scene.look
         lamp = build_lamp(self.camera, site.origin, radius=1.6 * site.radius)
         turned = Rotation.from_rotvec(look.turn * site.axis).apply(lamp.position - site.origin)
@@ -183,7 +183,7 @@ class Stage:
         return Layer("brain", CORTEX, mesh.nodes[vertices], triangles, CORTEX_COLOUR)
 
     def build_layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
-        """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
+        """Build cortex at `positions` (V, 3) [m], drape, and a tool, if any, at T_world_tool `pose` (4, 4)."""
         tool, look = self.scene.tool, self.scene.look
         if pose is None or not look.natural or not has_instrument(tool):
             return self._list_layers(positions, self.compute_corners(pose))
@@ -192,7 +192,7 @@ class Stage:
         return [*self._list_layers(positions, None), *placed]
 
     def compute_corners(self, pose: np.ndarray | None) -> np.ndarray | None:
-        """Corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
+        """Compute the corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
         if self.scene.tool is None or pose is None:
             return None
         return np.asarray(self.scene.tool.mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
@@ -313,7 +313,7 @@ class Stage:
 
     @cached_property
     def scan(self) -> Solid | None:
-        """The scan as a solid texture, with vessels where the scene has some; None where there is neither."""
+        """The scan as a solid texture, with the vessels of the scene; None without scan and vessels."""
         model, seed = self.scene.observation_model, self.scene.look.vessels
         if isinstance(model, StereoObservation) and model.vessels:
             seed = model.seed

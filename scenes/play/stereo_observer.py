@@ -19,7 +19,7 @@ from .stereo_update import First, StereoPair, observe_first, observe_point_cloud
 
 @dataclass(frozen=True, eq=False)
 class StereoObserver:
-    """Observer that renders both eyes' images, with camera noise, and locates from them. Loads are not used.
+    """Observer that renders both eyes' images, with camera noise, and locates the tumour from both. Loads are not used.
 
     `stage` is the rendered stage.
     """
@@ -68,7 +68,7 @@ class StereoObserver:
 
     @cached_property
     def first(self) -> First:
-        """First image pair: of the brain in the scan's configuration.
+        """First image pair, of the brain as in the scan.
 
         Raises
         ------

@@ -65,7 +65,7 @@ class StereoPair:
     tool: tuple[np.ndarray, np.ndarray] | None = None
 
     def rectify(self, site: CraniotomyFrame) -> StereoView:
-        """Return the windows about an opening.
+        """Rectify the pair to windows centred on an opening.
 
         Raises
         ------

@@ -165,7 +165,7 @@ def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
 
 
 def find_body(study: ReportStudy, mesh: str) -> Anatomy:
-    """Return the body on a mesh by name; meshes of the template are made once and kept."""
+    """Return the body on a mesh by name; meshes of the template are built once and cached."""
     if mesh == OWN_MESH:
         return study.anatomy
     if mesh == HALVED_MESH:
@@ -174,7 +174,7 @@ def find_body(study: ReportStudy, mesh: str) -> Anatomy:
 
 
 def build_template_mesh(folder: Path, size: int) -> Path:
-    """Return the template's brain of about `size` nodes; made if it is not there."""
+    """Return the template's brain of about `size` nodes; build the mesh if it does not exist."""
     path = folder / f"template_{size}.vtu"
     if not path.exists():
         write_anatomy(path, make_anatomy(build_template_subject(Tumour()), MeshPlan(size)))

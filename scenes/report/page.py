@@ -66,7 +66,7 @@ class Section:
 
 
 def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> None:
-    """Write `index.html`, `report.json`, and for each section `NAME.csv` and its plots, each whole."""
+    """Write `index.html`, `report.json`, and for each section `NAME.csv` and its plots, each atomically."""
     bodies = []
     for section in sections:
         plots = []

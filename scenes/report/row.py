@@ -21,7 +21,7 @@ MIN_LOADS_FOR_P99 = 1000  # Minimum number of loads for a 99th percentile.
 
 @dataclass(frozen=True)
 class ErrorSpread:
-    """Mean, 95 and 99.9 percentile, and maximum of distances over load x vertex; no 99.9 percentile of few loads."""
+    """Mean, 95 and 99.9 percentile, and maximum of distances over load x vertex; no 99.9 percentile for few loads."""
 
     mean: float
     p95: float
@@ -57,7 +57,7 @@ class ErrorFigures:
 
 
 def compute_distance_figures(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> ErrorFigures | None:
-    """Compute the errors from distances (B, n) [m] to `truth` (B, n, 3) [m] under forces (B,) [N]; None of no load.
+    """Compute the errors from distances (B, n) [m] to `truth` (B, n, 3) [m] under forces (B,) [N]; None without loads.
 
     A load's motion is the mean displacement of its n vertices in `truth`.
     """

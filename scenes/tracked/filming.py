@@ -50,7 +50,7 @@ KINDS = {
 """Disturbances of a video, with their description."""
 
 
-def from_where_it_sees_all(view: Viewpoint) -> Viewpoint:
+def scale_distance(view: Viewpoint) -> Viewpoint:
     """Return the camera at the distance at which its image shows as much as that of `VIEW`."""
     assert view.calibration is not None
     longer = (view.calibration.focal[1] / view.height) / (USUAL_CALIBRATION.focal[1] / USUAL_CALIBRATION.height)

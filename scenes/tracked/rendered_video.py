@@ -26,9 +26,9 @@ from .filming import (
     Taking,
     Trouble,
     VideoFrame,
-    from_where_it_sees_all,
     mount_targets,
     render_shots,
+    scale_distance,
 )
 
 SCENE = "palpate"
@@ -105,7 +105,7 @@ def build_synthetic_video(theatre: PatientSetup) -> DrawnFilm:
     view = replace(VIEW.calibrate(CAMERA), path=HandHeld(0))
     whole = find_scene(SCENE)
     scene = replace(
-        whole, path=lambda time: whole.path(time + START_TIME), viewpoint=from_where_it_sees_all(view),
+        whole, path=lambda time: whole.path(time + START_TIME), viewpoint=scale_distance(view),
         frames_per_second=FRAME_RATE, duration=DURATION, look=PLAIN_APPEARANCE,
     )  # fmt: skip
     stage = theatre.build_stage(scene)

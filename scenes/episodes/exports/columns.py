@@ -29,7 +29,7 @@ HELD_OUT_STRIDE = 10  # One in this many bodies (or episodes, if there are fewer
 
 
 def describe_task(contents: EpisodeContents) -> str:
-    """Return the sentence for an episode's family; of one that has none, its scene's name."""
+    """Return the sentence for an episode's family; without a family, the name of its scene."""
     return TASKS.get(contents.family, f"Play the scene {contents.family}.")
 
 

@@ -88,7 +88,7 @@ Other values: the name of a custom anatomy.
 
 
 def find_origin(contents: EpisodeContents) -> str:
-    """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, the name of an own one, or `UNSTATED`."""
+    """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, the name of a custom one, or `UNSTATED`."""
     stated = read_parameters(contents).get("bodies.anatomies")
     if stated is not None:
         return str(stated)

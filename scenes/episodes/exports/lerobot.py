@@ -254,7 +254,7 @@ def measure_image_statistics(file: h5py.File, contents: EpisodeContents, name: s
 
 
 def to_lerobot_statistics(name: str, spread: RowStatistics) -> dict[str, list]:
-    """Convert statistics to LeRobot's form: of an image (channels, 1, 1)."""
+    """Convert statistics to LeRobot's form; those of an image have shape (channels, 1, 1)."""
     said = spread.to_lists()
     if not name.startswith("observation.images."):
         return said

@@ -54,7 +54,7 @@ def write_pictures(place: Path, file: h5py.File, contents: EpisodeContents) -> N
 
 
 def write_tables(place: Path, file: h5py.File, contents: EpisodeContents) -> None:
-    """Write `frames.csv`, a row for each frame, and a table for each array that is wide. NaN is an empty field."""
+    """Write `frames.csv`, a row for each frame, and a table for each array with many columns. NaN is an empty field."""
     columns: dict[str, Sequence[object] | np.ndarray] = {"frame": range(contents.frames)}
     for name in contents.shapes:
         described = ARRAYS.get(name)

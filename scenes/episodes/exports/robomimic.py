@@ -70,7 +70,7 @@ def write_robomimic(
 
 
 def write_demo(demo: h5py.Group, obs: h5py.Group, contents: EpisodeContents, numbers: dict[str, np.ndarray]) -> None:
-    """Write one episode without images: a state is that of the tool, then of the tumour if recorded."""
+    """Write one episode without images: a state is that of the tool, then of the tumour if exported."""
     actions, state = numbers.pop("action"), numbers.pop("state")
     tumour = [numbers[name].reshape(contents.frames, -1) for name in ("tumour_predicted",) if name in numbers]
     dones = np.zeros(contents.frames, np.int64)
