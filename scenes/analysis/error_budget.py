@@ -302,7 +302,7 @@ def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | No
 
 
 def choose_moment(still: SurfaceMotions, answers: Sequence[tuple[np.ndarray, ...]], meshes: np.ndarray) -> int:
-    """Return the moment of a scene at which its bodies differ the most; `meshes` (b,) as of `compute_error`."""
+    """Return the moment of a scene at which its bodies differ the most; `meshes` (b,): see `compute_error`."""
     sizes = []
     for number, here in enumerate(still.fields):
         off = compute_error(np.stack([result[number] for result in answers]), here, meshes)

@@ -147,7 +147,7 @@ def collect(
     solved: Callable[[int], object] = lambda more: None,
     recording: EpisodeRecording = FULL_RECORDING,
 ) -> dict[str, object]:
-    """Play a scene and write its episode, whole or not at all; return its contents.
+    """Play a scene and write its episode, atomically; return its contents.
 
     `progress` passes the frames on as they are drawn; `solved` receives the number of newly solved frames.
 

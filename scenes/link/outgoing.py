@@ -87,7 +87,7 @@ class Outgoing:
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * at, mesh), stamp)
 
     def build_messages(self, result: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
-        """Build all messages of a result, with its stamp: unknown surfaces are sent without points."""
+        """Build all messages of a result, with the result's stamp; unknown surfaces are sent without points."""
         known, stamp = result.known, result.stamp
         none = encode_polydata(np.empty((0, 3)), EMPTY_MESH)
         out = []

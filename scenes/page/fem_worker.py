@@ -34,9 +34,9 @@ class FemResult:
 
 
 class FemWorker:
-    """Thread that solves the newest frame by FEM; older requests that it did not reach are dropped.
+    """Thread that solves the newest frame by FEM; older pending requests are dropped.
 
-    It pauses while an image is drawn.
+    The thread pauses while an image is drawn.
     It is prepared at the first request. Frames on the way to the requested one are solved too. If FEM fails, `failure`
     is the reason, and no further frames are solved; if loads are rejected, only that frame is skipped, and `refused` is
     its request. After the setup, `player` has the solver, and `plan` lists its solvers as sentences.

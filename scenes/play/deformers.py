@@ -367,7 +367,7 @@ def open_theatre(
     """
     for name in scenes:
         check_scene_exists(name)
-    # # Trained models alone would not detect this, and the FEM fallback would fail too late.
+    # Trained models alone would not detect this, and the FEM fallback would fail too late.
     find_device(device, LIVE.precision)
     path = get_template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)

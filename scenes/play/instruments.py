@@ -130,7 +130,7 @@ def build_metal(
 
 
 def build_spatula(blade: Blade) -> trimesh.Trimesh:
-    """Build a brain spatula: the lower half of a blade, from whose end a thinner strip goes up and away."""
+    """Build a brain spatula: the lower half of a blade, with a thinner strip that leads up and away from its end."""
     edge, half = blade.edge, 0.5 * blade.length
     rounded = edge * np.sin(np.linspace(-0.48 * np.pi, 0.0, 9))
     y = np.append(rounded + edge - half, np.linspace(edge - half, half - SPATULA_BEND, 12)[1:])

@@ -173,7 +173,7 @@ class Observer:
         )
 
     def observe(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
-        """Sample the observation of a frame; arguments as of `estimate`."""
+        """Sample the observation of a frame; for the arguments see `estimate`."""
         model, random = self.observation_model, np.random.default_rng([self.observation_model.seed, 1 + number])
         now = self._interpolate_points(positions)
         off = self._smooth + model.white * random.standard_normal(now.shape)

@@ -122,5 +122,5 @@ def plan_replay_order(player: Player) -> ReplayOrder | None:
         return IN_ORDER
     if not any(isinstance(effect, SkullContact) for effect in scene.get_effects_on(player.site.anatomy)):
         return None
-    # # Only displacements of such a state are stored, a third of a megabyte each.
+    # Only displacements of states with skull contact are stored, a third of a megabyte each.
     return ReplayOrder(max(1, round(MAX_TIME_STEP * scene.frames_per_second)), back=True, kept=64)

@@ -58,8 +58,8 @@ ESTIMATED_LINES = LegendNames(
 READING_DEPTH = 2.0e-3
 # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
 RIM_DISTANCE = 10e-3
-TUMOUR_DEPTH = 0.03e-3  # Depth of that outline below the rounded facets [m]: it cuts corners of the mesh off.
-TUMOUR_HEIGHT = 0.06e-3  # Largest height of that outline above the facets [m]: coarse meshes stay visible as such.
+TUMOUR_DEPTH = 0.03e-3  # Depth of the tumour's outline below rounded facets [m]: it cuts off mesh corners.
+TUMOUR_HEIGHT = 0.06e-3  # Largest height of the outline above the facets [m]: coarse meshes stay recognisable.
 DARK_SHARE = 0.6  # Brightness of a sulcus as a share of the brightest crown.
 RELIEF_EDGE = 1.0e-3  # Largest edge of the cortex of `relief` [m].
 TUMOUR_EDGE = 1.8e-3  # Largest edge of the tumour's surface where its outline is drawn [m].
@@ -290,7 +290,7 @@ class Stage:
 
     @cached_property
     def round_tumour(self) -> EmbeddedSurface:
-        """Fine surface with rounded facets upon the tumour's surface."""
+        """Fine surface with rounded facets on the tumour's surface."""
         at, triangles = self.site.anatomy.mesh.nodes[self._tumour[0]], self._tumour[1]
         fine = build_embedded_surface(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
         return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, highest=TUMOUR_HEIGHT)

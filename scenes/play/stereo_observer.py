@@ -29,7 +29,7 @@ class StereoObserver:
     observation_model: StereoObservation
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
-        """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""
+        """Estimate the tumour in a frame; arguments: see `Observer.estimate`. Rendering time is not counted."""
         shot, anatomy = self.render_pair(number, positions, tool), self.stage.site.anatomy
         tips = NO_POINTS.now if tool is None else find_touched(anatomy, positions, tool)
         _ = self._first_shot  # rendered here, so that its time is not counted

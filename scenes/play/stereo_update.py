@@ -130,7 +130,7 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
 def observe_points(
     site: CraniotomyFrame, first: First, shot: StereoPair, rigid: Rigid, tips: np.ndarray
 ) -> Observation:
-    """Track points of the first pair in a later pair; `tips` (k, 3) [m] are contact points of a tool.
+    """Track the points of the first pair in a later pair; `tips` (k, 3) [m] are contact points of a tool.
 
     Raises
     ------
@@ -158,7 +158,7 @@ def observe_point_cloud(
 ) -> Observation:
     """Return `count` cortex points without correspondences, from one pair.
 
-    Arguments and errors as of `observe_points`.
+    For arguments and errors see `observe_points`.
     """
     view = shot.rectify(site)
     pixels = build_pixel_grid(site, view, count)

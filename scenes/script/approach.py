@@ -31,7 +31,7 @@ class Approach:
     line: bool = False
 
     def follow(self, path: Path) -> Path:
-        """Return the same tool path, starting at the entry instead of the centre, and along the trajectory."""
+        """Return the tool path shifted from the centre to the entry, and along the trajectory."""
 
         def along(time: float) -> Touch:
             touch = path(time)

@@ -127,7 +127,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class Blade:
-    """Brain spatula: a flat blade with a round edge, on an arm that goes up from one end.
+    """Brain spatula: a flat blade with a round edge, on an arm that leads up from one end.
 
     Parameters
     ----------

@@ -93,7 +93,7 @@ def write_exactly_known(path: str | Path, calibration: Calibration) -> None:
 
 
 def write_calibration(path: str | Path, calibration: Calibration, form: Literal["opencv", "ros"] = "opencv") -> None:
-    """Write a calibration as OpenCV's YAML or ROS's, .yaml or .yml; it appears whole or not at all.
+    """Write a calibration as OpenCV's YAML or ROS's, .yaml or .yml, atomically.
 
     Raises
     ------

@@ -137,12 +137,12 @@ def as_stored(registration: Registration) -> dict[str, object]:
 
 
 def write_registration(path: str | Path, registration: Registration) -> None:
-    """Write a registration, .json; it appears whole or not at all.
+    """Write a registration, .json, atomically.
 
     Raises
     ------
     InputError
-        A file that cannot be written, or a name of another ending.
+        A file that cannot be written, or a wrong file ending.
     """
     with write_atomically(to_path(path), ".json") as partial:
         partial.write_text(json.dumps(as_stored(registration), indent=1) + "\n", encoding="utf-8")

@@ -114,7 +114,7 @@ def _check_rigid(T: np.ndarray) -> None:
 
 
 def write_tool(path: Path, tool: TrackedTool) -> None:
-    """Write a tool as JSON, in millimetres; the file appears whole or not at all."""
+    """Write a tool as JSON, in millimetres, atomically."""
     T = tool.T_cube_tool.copy()
     T[:3, 3] *= 1e3
     stored = {
