@@ -216,7 +216,7 @@ def _check_video_path(path: Path, force: bool, inputs: list[str | Path | None]) 
 
 
 def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
-    """Read the inputs of a run; small files come first."""
+    """Read the inputs of a run, starting with those that take little time."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device

@@ -212,7 +212,7 @@ def sample_reach_scenario(chance: ScenarioInputs) -> Scenario:
     def path(time: float) -> Touch:
         number = min(int(time / takes), count - 1)
         share = time / takes - number
-        # On to the next place in the last part, lifted; down and up again before it.
+        # In the last part the tool moves to the next place, lifted; before, it presses and releases.
         on = smooth((share - (1.0 - REST_SHARE)) / REST_SHARE)
         x, y = (1.0 - on) * places[number] + on * places[min(number + 1, count - 1)]
         half = 0.5 * (1.0 - REST_SHARE)

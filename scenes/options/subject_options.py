@@ -19,7 +19,7 @@ from .placement_options import point
 
 
 def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None:
-    """Declare --brain, --tumour, --mask, --tumour-in, and by these `names` the convention that labels follow."""
+    """Declare --brain, --tumour, --mask, --tumour-in, and the option `names` for the label convention."""
     parser.add_argument("--brain", type=parse_labels, metavar="1,2", help="labels of brain, by number or segment name")
     parser.add_argument(
         "--tumour", type=parse_labels, metavar="3,4", help="labels of tumour, by number or segment name"

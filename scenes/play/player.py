@@ -56,7 +56,7 @@ STAGES = ("deform", "render", "overlay")
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Frame of a scene.
+    """Rendered frame of a scene, with its solution, distances and errors.
 
     Parameters
     ----------
@@ -315,7 +315,7 @@ class Player:
         return replace(error, observed=worst, registration=deviation)
 
     def play_frames(self, every: int = 1, together: int = 1) -> Iterator[Frame]:
-        """Yield the frames of the scene, or each `every`-th.
+        """Yield every frame of the scene, or each `every`-th frame.
 
         A model whose solutions are independent computes `together` frames together. This takes a quarter of the time,
         and the first frame waits for the last solution.

@@ -182,7 +182,7 @@ def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.
 
 
 def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> Cloud:
-    """Select the pixels (n, 2) with a depth inside the drape's hole.
+    """Triangulate pixels (n, 2), and keep the points inside the drape's hole.
 
     Raises
     ------

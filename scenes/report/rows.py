@@ -132,7 +132,7 @@ def list_learner_specs() -> tuple[LearnerSpec, ...]:
 
 
 def measure_in_process(turn: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
-    """Measure a row in its own process, which starts immediately and measures in its `turn`."""
+    """Measure a row in its own process, which starts immediately and measures once it enters `turn`."""
     try:
         # Data that the study has already read are not copied to the process.
         with process_pool(["cpu"], prepare_rows, replace(study)) as children, turn:

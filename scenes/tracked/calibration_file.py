@@ -81,7 +81,7 @@ def build_intrinsics_header(calibration: Calibration, covariance: np.ndarray) ->
 
 
 def write_exactly_known(path: str | Path, calibration: Calibration) -> None:
-    """Write the K.json of a camera that is exactly known, as that of a rendered video; the write is atomic.
+    """Write, atomically, the K.json of an exactly known camera, for example of a rendered video.
 
     Raises
     ------
