@@ -82,11 +82,11 @@ MODEL_READING_COMMANDS = (
 MAX_THREADS = 4  # Maximum number of threads of a library: BLAS does not scale on these small products.
 
 POINT_PATTERN = re.compile(r"-[\d.][^,]*,[^,]+,[^,]+(?:,[^,]+)?")
-"""A point, or a load there, whose first coordinate is negative: argparse would take it for an option."""
+"""Pattern of a point or load with a negative first coordinate, which argparse would read as an option."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command. Returns 0 (done), 1 (ran, but did not reach what was asked) or 2 (bad input)."""
+    """Run one command. Returns 0 (done), 1 (the result misses a requirement) or 2 (bad input)."""
     if argv is None:
         limit_threads()
     arguments = join_points(replace_former(sys.argv[1:] if argv is None else argv))
@@ -99,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run_command(args: argparse.Namespace, package: str) -> int:
-    """Run a command, of `package`, and say what is wrong with its input. Returns as `main`."""
+    """Run a command of `package`, and report invalid input. Returns as `main`."""
     warnings.formatwarning = lambda message, *rest: f"{args.program}: {message}\n"
     try:
         ensure_writable_cache()
@@ -123,7 +123,7 @@ def limit_threads() -> None:
 def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
     """Return the parser of `sulcus`, and that of each command by name.
 
-    Those asked for know their arguments and examples.
+    Only the requested commands get arguments and examples.
     """
     parser = CommandParser(prog="sulcus", description=__doc__, epilog=_list_commands())
     parser.add_argument("--version", action="version", version=f"sulcus {get_version('sulcus')}")
@@ -140,7 +140,7 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
 
 
 def _list_commands() -> str:
-    """Commands by group, with their purposes, and the first steps."""
+    """List the commands by group, with their purposes, and the first steps."""
     lines = []
     for title, group in GROUPS.items():
         lines += [f"{title}:", *(f"  {name:<12}{text}" for name, text in group.items()), ""]

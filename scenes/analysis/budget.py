@@ -23,7 +23,7 @@ MAX_LIVE_ERROR = 5e-5  # Largest distance of a node from the converged solution 
 def choose_within(
     theatre: PatientSetup, scene: Scene, budget: tuple[float | None, float | None], report: Callable[[str], object]
 ) -> ModelChoice:
-    """Choose among the deformers of a scene, timed on its frames, and the families with figures of such loads.
+    """Choose among the deformers of a scene, timed on its frames, and the families with recorded figures.
 
     Families are timed when they are chosen by their recorded time, and the choice is made again. `budget`: largest
     error [mm] and time [ms]; `report` receives sentences for the user.

@@ -100,7 +100,7 @@ class Filmed:
 
     @cached_property
     def believed(self) -> tuple[Calibration, ...]:
-        """Sampled calibrations; building one takes much longer than using it."""
+        """Sampled calibrations, cached because building one takes long."""
         scale = np.sqrt(np.diag(self.covariance))
         scale[scale == 0.0] = 1.0  # exact inputs
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
@@ -167,7 +167,7 @@ def _generate_samples(
         taken = filmed.believed[drawn] if CALIBRATION in contributors else filmed.calibration
         off = of(MARKERS, filmed.corner * random.standard_normal((corners, 2)))
         aside = of(SURROGATE, filmed.surrogate / np.sqrt(RADIUS_SQUARED) * random.standard_normal(3))
-        shift = of(REGISTRATION, _shift(filmed, random.standard_normal(6)))
+        shift = of(REGISTRATION, _sample_registration_error(filmed, random.standard_normal(6)))
         wide = of(SEGMENTATION, SEGMENTATION_PRIOR.range[1] * random.standard_normal(1))
         mesh = of(MESH, (filmed.meshes if PARAMETERS in contributors else filmed.own_mesh)[body])
         readout = filmed.calibration.readout if SHUTTER in contributors else 0.0
@@ -212,7 +212,7 @@ def _build_delayed_camera(filmed: Filmed, time: float, seconds: float) -> Camera
     return filmed.viewpoint.build_camera(filmed.site, time + seconds)
 
 
-def _shift(filmed: Filmed, numbers: np.ndarray) -> np.ndarray:
+def _sample_registration_error(filmed: Filmed, numbers: np.ndarray) -> np.ndarray:
     """Return an error of registration (6,): a shift [m] and a turn [rad] in the frame of the patient's reference."""
     if filmed.registration is None:
         return np.append(REGISTRATION_PRIOR.range[1] * numbers[:3], np.zeros(3))
@@ -276,7 +276,7 @@ def compute_budget(
     twins: Filmed | None = None,
     progress: Callable[[Sequence[str]], Iterable[str]] = iter,
 ) -> ErrorBudget:
-    """Compute the budget from `count` samples; `twins`, other bodies, test its band with other random numbers."""
+    """Compute the budget from `count` samples; `twins`, other bodies, test the band with other random numbers."""
     alone = {name: sample_errors(filmed, [name], count, seed) for name in progress(CLINICAL)}
     technical, clinical = (sample_errors(filmed, names, count, seed) for names in (TECHNICAL, CLINICAL))
     budget = ErrorBudget(alone, technical, clinical)
@@ -302,7 +302,7 @@ def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | No
 
 
 def choose_moment(still: SurfaceMotions, answers: Sequence[tuple[np.ndarray, ...]], meshes: np.ndarray) -> int:
-    """Return the moment of a scene at which its bodies differ the most; `meshes` (b,) as of `compute_error`."""
+    """Return the moment of a scene at which its bodies differ the most; `meshes` (b,): see `compute_error`."""
     sizes = []
     for number, here in enumerate(still.fields):
         off = compute_error(np.stack([result[number] for result in answers]), here, meshes)

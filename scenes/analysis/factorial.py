@@ -25,7 +25,7 @@ LEVELS: Levels = {
     "nu": (0.45, 0.49, 0.499),
     "tumour's stiffness": (1.0, 3.0),
 }
-"""Combined factors: depth of the top of the tumour below the cortex, stiffness relative to the brain, and others."""
+"""Combined factors: depth of the tumour's top below the cortex, stiffness relative to the brain, and others."""
 DEFAULT = {"skull": "bonded", "nu": 0.49, "tumour's stiffness": 1.0}  # Default values of a body's factors.
 FORCE = 0.2  # Force of the tool [N].
 FOOTPRINT = 7e-3  # Radius of the tool [m].
@@ -77,10 +77,10 @@ def _compute_mean_motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
 
 
 def compute_variance_shares(found: Sequence[Cell], response: str = "force") -> dict[str, float]:
-    """Return the share of variance of the logarithmic motion explained by each factor, and by each pair beyond its two.
+    """Return the share of variance of the logarithmic motion explained by each factor, and by each interaction of two.
 
-    The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. What
-    three and more do together is the rest to 1.
+    The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. The
+    remainder to 1 is the interaction of three and more factors.
     """
     values = np.log([getattr(cell, response) for cell in found])
     good = np.isfinite(values)

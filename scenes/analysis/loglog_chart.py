@@ -25,7 +25,7 @@ NAME_GREY = "0.45"  # Grey level of pale names, 0 to 1.
 DOT_DIAMETER = 7.0  # Diameter of a dot [pt].
 NAME_DISTANCE = 6.0  # Distance of a name from the centre of its dot [pt].
 SIDES = ((1, 0), (-1, 0), (0, -1), (0, 1), (1, -1), (1, 1), (-1, -1), (-1, 1))
-"""Sides of a dot where its name may be (right, up), the best first."""
+"""Positions of a name relative to its dot (right, up), in order of preference."""
 # Matplotlib's text alignment, horizontal and vertical, by the side of the dot.
 HORIZONTAL_ALIGNMENT, VERTICAL_ALIGNMENT = {-1: "right", 0: "center", 1: "left"}, {-1: "top", 0: "center", 1: "bottom"}
 
@@ -56,7 +56,7 @@ class Dot:
 
 @dataclass(frozen=True)
 class ChartPanel:
-    """One pair of axes: title, what they show, curves, dots, and `marks`: labelled vertical lines.
+    """One pair of axes: title, axis labels, curves, dots, and `marks`: labelled vertical lines.
 
     size: width and height [pixel]; y_range: limits of the axis (default: those of the data and a margin); front:
     points that a stepped line joins.
@@ -74,7 +74,7 @@ class ChartPanel:
 
 
 def draw_panels(panels: Sequence[ChartPanel]) -> np.ndarray:
-    """Panels of one height side by side, (height, sum of widths, 3) uint8.
+    """Draw panels of equal height side by side: image (height, sum of widths, 3) uint8.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def draw_svg(panel: ChartPanel) -> str:
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "sulcus"}), io.StringIO() as file:
         canvas = _build_canvas(panel)
         canvas.draw()
-        canvas.figure.set_layout_engine("none")  # names and axes stay where this resolution has them
+        canvas.figure.set_layout_engine("none")  # names and axes keep their positions at this resolution
         canvas.figure.savefig(file, format="svg", metadata={"Date": None})
         text = file.getvalue()
     text = re.sub(
@@ -151,11 +151,11 @@ def _build_canvas(panel: ChartPanel) -> FigureCanvasAgg:
         axes.legend(fontsize="small")
     if panel.dots:
         canvas.draw()
-        _name(axes, panel.dots)
+        _write_names(axes, panel.dots)
     return canvas
 
 
-def _name(axes: Axes, dots: Sequence[Dot]) -> None:
+def _write_names(axes: Axes, dots: Sequence[Dot]) -> None:
     """Write the name of each dot where it overlaps least; that of a pale dot without free space is left out."""
     reach = 0.5 * DOT_DIAMETER * DPI / 72.0
     centres = axes.transData.transform([(dot.x, dot.y) for dot in dots])
@@ -192,7 +192,7 @@ def _is_within(box: Bbox, frame: Bbox) -> bool:
 
 
 def _compute_axis_limits(values: np.ndarray) -> tuple[float, float]:
-    """Limits of an axis: a margin round the values, and at least a factor of ten apart."""
+    """Compute the limits of an axis: a margin around the values, and at least a factor of ten apart."""
     low, high = float(values.min()) / 1.4, float(values.max()) * 1.4
     spare = max(10.0 * low / high, 1.0) ** 0.5
     return low / spare, high * spare

@@ -1,4 +1,4 @@
-"""Measurement of wall time and memory, with the machine that it was done on; tables of figures as CSV."""
+"""Measurement of wall time and memory, with a description of the machine; tables of results as CSV."""
 
 import csv
 import os
@@ -19,7 +19,7 @@ from sim.runtime.versions import get_version
 
 
 def describe_machine(device: str) -> str:
-    """Hardware, versions and date, in one line.
+    """Describe hardware, versions and date in one line.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def describe_machine(device: str) -> str:
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a line for each row, and a column for each name that one has, whole or not at all."""
+    """Write a CSV table, atomically: a line for each row, and a column for each name that occurs in a row."""
     names = dict.fromkeys(name for row in rows for name in row)
     with write_atomically(path, ".csv") as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(names))
@@ -58,7 +58,7 @@ def measure_peak_memory() -> float | None:
 
 @contextmanager
 def watch_gpu_memory(device: str) -> Iterator[list[int]]:
-    """Yield the GPU memory [bytes] used while the block runs, in excess of that used before.
+    """Yield the additional GPU memory [bytes] that is used while the block runs.
 
     Zero without a GPU.
     """

@@ -22,7 +22,7 @@ from surrogate.data.tool_loads import find_perpendiculars
 class BodyVariant:
     """Variant of the body: tissue, relative stiffness of the tumour, skull model, element.
 
-    `skull` is one of `sim.effects.SKULLS`. Linear tetrahedra lock as nu nears 0.5, which would pass for an influence of
+    `skull` is one of `sim.effects.SKULLS`. Linear tetrahedra lock near nu = 0.5, which would look like an influence of
     nu: hence smoothed ones.
     """
 
@@ -36,7 +36,7 @@ class BodyVariant:
 class Aim:
     """Perturbation of a load: force or motion scaled by `share` and turned by `turn` [rad], point moved by `shift` [m].
 
-    In several ways each: more and less, about two axes, to four sides.
+    Each perturbation has several directions: more and less, about two axes, to four sides.
     """
 
     share: float = 0.0
@@ -56,7 +56,7 @@ class Variant:
 
 
 def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) -> list[Variant]:
-    """Return the tool's uncertainty, the tissue's, the skull's, and other `elements`."""
+    """List the variants of tool, tissue and skull, and of other `elements`."""
     tissue = body.tissue
     young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
     changed = [
@@ -85,7 +85,7 @@ def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] =
 
 
 def apply_aim(loads: Loads, aim: Aim, patch: Patch) -> Loads:
-    """Return the loads of one tool as `aim` has them, one block for each way.
+    """Perturb the loads of one tool by `aim`: one block of loads for each direction.
 
     Points are shifted along the open cortex.
     """
@@ -146,7 +146,7 @@ class SensitivityRow:
 
 @dataclass(frozen=True, eq=False)
 class SensitivityStudy:
-    """The same `Pushed` loads on variants of a body."""
+    """Study of fixed `Pushed` loads on variants of a body."""
 
     anatomy: Anatomy
     loads: Loads
@@ -155,7 +155,7 @@ class SensitivityStudy:
     device: str = "auto"
 
     def build_fem(self, body: BodyVariant) -> Fem:
-        """Return the finite elements of a body, for tools of either kind."""
+        """Build FEM of a body, for tools of prescribed force or motion."""
         tissue = body.tissue
         _, *others = build_push_effects(self.anatomy, tissue, body.skull)
         elasticity = Elasticity(tissue, {TUMOUR_LABEL: replace(tissue, young=body.tumour * tissue.young)})
@@ -164,7 +164,7 @@ class SensitivityStudy:
 
 
 def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Iterator[SensitivityRow]:
-    """Yield the default, whose change is its whole motion, then each variant's change from it.
+    """Yield the default, whose change is the whole motion, then the change of each variant from the default.
 
     Prescribed motions are those of the default under its forces: the mean motion of each footprint. Every solve starts
     at the default's solution, so that the same equilibrium is followed if a load has several.

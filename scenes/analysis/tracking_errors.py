@@ -45,7 +45,7 @@ def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarr
 
 
 def change_calibration(calibration: Calibration, step: np.ndarray) -> Calibration:
-    """Return a calibration whose nine parameters differ by `step` (9,); further coefficients of its lens stay."""
+    """Return a calibration whose nine parameters differ by `step` (9,); further lens coefficients are unchanged."""
     fx, fy, cx, cy = (np.array([*calibration.focal, *calibration.principal]) + step[:4]).tolist()
     coefficients = calibration.lens.coefficients.copy()
     coefficients[:5] += step[4:]
@@ -83,5 +83,5 @@ def project_by_rows(
 
 
 def compute_row_delay(camera: Camera, row: float) -> float:
-    """When a row [pixel] is read, after the middle one, as a share of the readout."""
+    """Compute the delay of a row [pixel] after the middle row, as a share of the readout time."""
     return (row + 0.5) / camera.height - 0.5

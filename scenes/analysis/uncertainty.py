@@ -59,14 +59,14 @@ SKULL_EFFECTS = Bonded | Slide | SkullContact  # Effects of the skull on the bra
 
 @dataclass(frozen=True, eq=False)
 class SolvedMotions:
-    """Motions (n, 3) [m] of the tumour's surface at each moment, and the most tetrahedra inside out at any of them."""
+    """Motions (n, 3) [m] of the tumour's surface at each moment, and maximum number of inverted tetrahedra."""
 
     motions: tuple[np.ndarray, ...]
     inverted: int = 0
 
 
 Answer = SolvedMotions | None
-"""None where some moment has no equilibrium."""
+"""Motions of a draw; None if some moment has no equilibrium."""
 SoundDraws = list[tuple[PatientSample, tuple[np.ndarray, ...]]]
 """Draws with an equilibrium at each moment, and their motions [m]."""
 
@@ -144,7 +144,7 @@ def estimate_mesh_deviations(scene: Scene, draws: Sequence[PatientSample]) -> np
 
 
 def get_tissue(scene: Scene) -> Material:
-    """Return the brain's tissue in a scene; regions may have another.
+    """Return the brain's tissue in a scene; regions may have other tissues.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def list_moments(scene: Scene) -> tuple[float, ...]:
 
 
 def solve_nominal(theatre: PatientSetup, scene: Scene) -> SurfaceMotions:
-    """Solve the scene as it is.
+    """Solve the scene without changes.
 
     Raises
     ------
@@ -358,7 +358,7 @@ def collect_contributor_values(draws: Sequence[PatientSample], scene: Scene) -> 
 
 
 def compute_field_size(field: np.ndarray) -> float:
-    """Root mean square over draws of the largest length in each: vectors (draws, n, 3)."""
+    """Compute the root mean square over draws of the largest vector length in each draw; vectors (draws, n, 3)."""
     return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
 
 
@@ -370,7 +370,7 @@ def measure_coverage(
     answers: Iterable[Answer],
     seed: int,
 ) -> Uncertainty:
-    """Return the uncertainty with its coverage on synthetic patients: other draws, with other errors of registration.
+    """Return the uncertainty with the coverage on synthetic patients: new draws, with new registration errors.
 
     Raises
     ------

@@ -1,1 +1,1 @@
-"""The scenes that come with sulcus, one file each: copy one to add yours."""
+"""Built-in scenes, one file each: copy one to add your own."""

@@ -21,7 +21,7 @@ SCENE = Scene(
     lying=build_drainage(3.0, to=0.2),
     observation_model=PointObservation(),
     viewpoint=Viewpoint(width=800, height=600),
-    # # The truth's dashed outline is drawn with an error of up to 0.4 pixels at a live solution: in one frame that
+    # The truth's dashed outline is drawn with an error of up to 0.4 pixels at a live solution: in one frame that
     # makes 2.2.
     bounds=Bounds(overlap=0.7, error=3e-3, drawn=2.5, removed=0.5),
 )

@@ -1,1 +1,1 @@
-"""The subcommands of `sulcus`, one file each: `add_arguments(parser)` and `run(args) -> exit code`."""
+"""Subcommands of `sulcus`, one file each: `add_arguments(parser)` and `run(args) -> exit code`."""

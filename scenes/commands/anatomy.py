@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the anatomy, write it, and print what it is."""
+    """Build the anatomy, write it to a file, and print a summary."""
     began = time.perf_counter()
     read = (args.labels, args.mask, args.tumour_in, args.t1)
     check_output_path(args.out, ".vtu", args.force, read)
@@ -161,17 +161,17 @@ def _summarise_anatomy(
         "tumour_volume_error_percent": round(100.0 * float(volume / subject.tumour_volume - 1.0), 3),
         "surface_error_mean_mm": round(1e3 * float(np.average(error, weights=weight)), 3),
         "surface_error_p95_mm": round(1e3 * float(np.quantile(error, 0.95, weights=weight, method="inverted_cdf")), 3),
-        "opening": {"over": describe_opening(args), **_place(subject, subject.site)},
+        "opening": {"over": describe_opening(args), **_describe_position(subject, subject.site)},
         "tumour_pieces": [
-            {"ml": round(1e6 * piece.volume, 3), "lost": gone, **_place(subject, piece.centre)}
+            {"ml": round(1e6 * piece.volume, 3), "lost": gone, **_describe_position(subject, piece.centre)}
             for piece, gone in zip(subject.pieces, lost, strict=True)
         ],
         "digest": anatomy.digest,
     }
 
 
-def _place(subject: Subject, place: np.ndarray) -> dict[str, Any]:
-    """Describe the position of a point (3,) [m]: in mm, and in words."""
+def _describe_position(subject: Subject, place: np.ndarray) -> dict[str, Any]:
+    """Describe the position of a point (3,) [m], in millimetres and in words."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     return {"at_mm": [round(1e3 * value, 1) for value in place.tolist()], "side": describe_side(place, low, high)}
 
@@ -192,7 +192,7 @@ def _format_pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
 
 
 def _format_region(name: str, volume: float, figures: dict) -> str:
-    """Return a region's line."""
+    """Format the line of output about a region."""
     missed = figures["regions_volume_error_percent"][name]
     off = "" if missed is None else f" ({missed:+} % of the label's)"
     return f"{name} {volume:g} ml{off}, region {PART_LABELS[name]}{' of the tumour' if name == 'necrosis' else ''}"

@@ -174,7 +174,7 @@ def _read_intrinsic_covariance(args: argparse.Namespace, calibration: Calibratio
     Raises
     ------
     InputError
-        A file that is missing, no such covariance, or of another camera.
+        A missing file, a file without a valid covariance, or one of another camera.
     """
     from ..analysis.tracking_errors import sample_usual_covariance
 
@@ -222,7 +222,7 @@ def _extract_motions_at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.n
 
 
 def _compute_model_bound(theatre: PatientSetup, scene: Scene, time: float) -> float:
-    """Return the bound [m] of the model that plays a scene, at a time [s]; 0 where finite elements do."""
+    """Compute the error bound [m] of a scene's deformation model at a time [s]; 0 for FEM."""
     player = theatre.build_player(theatre.select_default(scene), scene)
     number = int(np.abs(scene.times - time).argmin())
     return player.draw(number, time, scene.path(time)).model_error or 0.0
@@ -231,7 +231,7 @@ def _compute_model_bound(theatre: PatientSetup, scene: Scene, time: float) -> fl
 def _collect_figures(
     args: argparse.Namespace, filmed: Filmed, found: ErrorBudget, split: dict[str, float]
 ) -> dict[str, Any]:
-    """All figures [mm, pixel]."""
+    """Collect the results for JSON, in millimetres and pixels."""
     from ..analysis.error_budget import PARAMETERS
 
     calibration, rows = filmed.calibration, found.alone | {"technical": found.technical, "clinical": found.clinical}
@@ -266,7 +266,7 @@ def _compute_quantiles(errors: OverlayErrors) -> dict[str, dict[str, float]]:
 
 
 def _format_report(report: dict[str, Any]) -> list[str]:
-    """Return the same in lines."""
+    """Format the results as lines of text."""
     camera = report["camera"]
     lines = [
         f"{report['scene']} at {report['time_s']:.1f} s, the tumour has moved by {report['moved_mm']:.2f} mm. "

@@ -1,4 +1,4 @@
-"""`sulcus calibrate`: a camera by the board, a tool's tip by pivoting, or how two tracked bodies lie together."""
+"""`sulcus calibrate`: camera by the board, tool tip by pivoting, or transform between two tracked bodies."""
 
 import argparse
 import warnings
@@ -136,7 +136,7 @@ def _parse_image_size(text: str) -> tuple[int, int]:
 
 
 def _calibrate_tip(args: argparse.Namespace) -> int:
-    """Return a tool's tip, from its poses while it pivots."""
+    """Calibrate a tool's tip from poses while the tool pivots about the tip."""
     from ar.tracking.tracker_calibration import calibrate_pivot
 
     from ..tracked.pose_file import read_poses
@@ -167,7 +167,7 @@ def _format_values(values: np.ndarray, deviations: np.ndarray) -> str:
 
 
 def _fit_poses(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray], rows: np.ndarray) -> Found:
-    """Calibration by `fit` from poses of files; InputError if it fails, or if its residuals exceed its limits."""
+    """Fit a calibration to poses of files by `fit`; InputError if this fails, or if residuals exceed their limits."""
     from ar.tracking.rigid import read_conventions
 
     names = " and ".join(map(str, files))

@@ -1,4 +1,4 @@
-"""`sulcus check`: play the built-in scenes blank and hold their figures to their bounds."""
+"""`sulcus check`: play the built-in scenes without a display, and compare their metrics with limits."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=10, help="check every Nth frame")
     add_theatre(parser)
     add_camera(parser)
-    add_style(parser, without=("none",))  # there is an outline to be found
+    add_style(parser, without=("none",))  # the check needs an outline in the image
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check scene by scene. 1: a bound was not kept."""
+    """Check each scene; return 1 if a metric exceeds its limit."""
     from tqdm import tqdm
 
     from ..play.checks import list_objections, measure

@@ -1,4 +1,4 @@
-"""`sulcus collect`: a scene as one episode in HDF5."""
+"""`sulcus collect`: record a scene as one episode in HDF5."""
 
 import argparse
 import json
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play and write."""
+    """Play the scene and write its episode."""
     from tqdm import tqdm
 
     from ..episodes.episode import collect
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     out = check_output_path(args.out, ".h5", args.force, [args.anatomy, args.camera])
     theatre = build_requested_theatre(args, args.scene)
     scene = apply_camera_options(args, build_requested_scene(args, args.scene, theatre))
-    scene = replace(scene, look=replace(scene.look, natural=False))  # depths are those of the FEM surface
+    scene = replace(scene, look=replace(scene.look, natural=False))  # depth images show the FEM surface
     name = choose_deformer(args, theatre, scene)
     player = replace(theatre.build_player(name, scene), style=args.style)
     total = len(scene.times)

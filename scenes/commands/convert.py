@@ -1,4 +1,4 @@
-"""`sulcus convert`: episodes in the formats of others, and the card of a data set."""
+"""`sulcus convert`: convert episodes to other data formats, or write the card of a data set."""
 
 import argparse
 import sys
@@ -31,12 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, and write whole.
+    """Read the episodes, and write them in the requested format, atomically.
 
     Raises
     ------
     InputError
-        Episodes that are not there or not whole, or that do not go into one set; an output that cannot be written.
+        Missing or incomplete episodes, or episodes that cannot be in one set; an output that cannot be written.
     """
     from tqdm import tqdm
 
@@ -56,12 +56,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def build_episode_writer(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
-    """Return the function that writes episodes in the requested format; its output path is free.
+    """Return the function that writes episodes in the requested format, after a check of its output path.
 
     Raises
     ------
     InputError
-        An output that is missing, or taken; a package that is missing.
+        A missing or existing output; a missing package.
     """
     if args.to == "card":
         from ..episodes.exports.card import write_card

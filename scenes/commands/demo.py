@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until the time is over, Ctrl-C (exit code 0) or SIGTERM (143)."""
+    """Serve the page until the time is over, Ctrl-C (exit code 0) or SIGTERM (143)."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitStack) -> int:
-    """Open the page, and play when `kernels` has loaded those of the first image; `closing` closes the page."""
+    """Open the page, and play once `kernels` has loaded the first image's kernels; `closing` closes the page."""
     from ar.page.access_guard import UnguardedError
 
     from ..page.demo import Demo

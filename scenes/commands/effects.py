@@ -1,4 +1,4 @@
-"""`sulcus effects`: what each effect of a scene costs and changes."""
+"""`sulcus effects`: computing time and influence of each effect of a scene."""
 
 import argparse
 import sys

@@ -1,4 +1,4 @@
-"""`sulcus episodes`: thousands of scripted surgeries by many processes, each in a file of its own."""
+"""`sulcus episodes`: thousands of scripted episodes by many processes, one file per episode."""
 
 from __future__ import annotations
 
@@ -81,19 +81,19 @@ def _parse_natural(text: str) -> int:
     return _parse_integer(text, 0)
 
 
-def _plan(args: argparse.Namespace) -> str:
-    """Return the path of the plan that is valid from any folder."""
+def _get_plan_path(args: argparse.Namespace) -> str:
+    """Return the plan's name, or a path that is valid from any folder."""
     return str(Path(args.plan).absolute()) if args.plan.endswith(".toml") else args.plan
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make what is missing; 1 if an episode failed."""
+    """Make the missing episodes; return 1 if one failed."""
     out = check_output_folder(args.out, "episodes").absolute()
     if args.slurm:
         return _print_script(args, out)
     from ..episodes.plan import load_plan
 
-    plan = load_plan(_plan(args))  # its bodies may be next to it, and workers elsewhere
+    plan = load_plan(_get_plan_path(args))  # bodies may be files next to the plan, and workers run elsewhere
     if args.estimate:
         return _print_estimate(args, plan, out)
     try:
@@ -139,7 +139,7 @@ def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_
 
 
 def _update_card(out: Path, numbers: Set[int], changed: bool) -> str | None:
-    """Keep the data sheet up to date; why it is not, in words."""
+    """Update the card of the data set; return the reason if this fails."""
     from tqdm import tqdm
 
     from ..episodes.exports.card import keep_card
@@ -251,7 +251,7 @@ def _print_estimate(args: argparse.Namespace, plan: EpisodePlan, out: Path) -> i
     found = read_run(out)
     if found is not None and found.digest != plan.digest:
         raise InputError(f"{out}: holds episodes of another plan, {found.plan}: choose another folder.")
-    bodies = min(args.count, plan.contents.bodies.count)  # to draw a million would take minutes
+    bodies = min(args.count, plan.contents.bodies.count)  # sampling a million would take minutes
     estimate = compute_estimate(read_rates(out), args.count, bodies)
     if args.json:
         from dataclasses import asdict
@@ -270,6 +270,6 @@ def _print_script(args: argparse.Namespace, out: Path) -> int:
     if args.workers or args.scheduler:
         raise InputError("--slurm gives each machine its workers: leave --workers and --scheduler out.")
     words = ["--count", args.count, "--seed", args.seed, "--first", args.first, "--out", out, "--device", args.device]
-    command = [sys.executable, "-m", "scenes.cli", "episodes", _plan(args), *map(str, words)]
+    command = [sys.executable, "-m", "scenes.cli", "episodes", _get_plan_path(args), *map(str, words)]
     print(write_sbatch_script(command, args.slurm, args.device, f"sulcus-{Path(args.plan).stem}"), end="")
     return 0

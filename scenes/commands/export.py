@@ -48,12 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0 when the file is written.
+    """Export the model to a file; return 0.
 
     Raises
     ------
     InputError
-        A model or a mesh that is not there, or a learner that is not in the file; what `write_onnx` and `write_html`
+        A missing model or mesh, or a learner that is not in the file; input that `write_onnx` and `write_html`
         reject.
     """
     if (args.to or Path(args.out).suffix[1:]) == HTML:

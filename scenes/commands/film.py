@@ -1,4 +1,4 @@
-"""`sulcus film`: a scene as a tracked camera records it, with printed targets in view, and its ground truth."""
+"""`sulcus film`: video of a scene by a tracked camera, with printed targets in view and ground truth."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_trouble(text: str) -> tuple[str, float, float]:
-    """KIND:FROM-TO as a name and two times [s], for argparse."""
+    """Parse KIND:FROM-TO into a name and two times [s], for argparse."""
     found = re.fullmatch(r"(\w+):([\d.]+)-([\d.]+)", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form KIND:FROM-TO, such as tool:1.0-1.5")

@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit the tissue. 0: done."""
+    """Fit the tissue; return 0."""
     from tqdm import tqdm
 
     from sim.bodies.meshfile import read_anatomy
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     find_device(args.device, "float32")
     frames = _read_frames(args)
     anatomy = read_anatomy(args.anatomy)
-    check_frames(anatomy, frames)  # bad frames need not wait for a locator
+    check_frames(anatomy, frames)  # reject invalid frames before a locator is built
     if TUMOUR_LABEL in parse_region_tissues(args.region, BRAIN, anatomy.mesh):
         raise InputError("--region tumour: its stiffness is what `sulcus fit` finds. Give other regions alone.")
     locator = find_locator(args, anatomy, small=True)

@@ -29,7 +29,7 @@ class InspectionLimits:
     max_brain_ml: float = 2000.0
     # Largest volume of a tumour relative to the brain: labels of another convention are often larger.
     max_tumour_share: float = 0.25
-    # Distance from the craniotomy to the tumour above which pressing the cortex moves nothing there [m].
+    # Distance from the craniotomy to the tumour above which a press on the cortex does not move it [m].
     max_tumour_distance: float = 0.040
     # Ratio of the longest to the shortest edge of a voxel above which surfaces show steps along one axis.
     max_voxel_ratio: float = 2.5
@@ -86,7 +86,7 @@ class Inspection:
     warnings: tuple[str, ...]
 
     def format_lines(self) -> list[str]:
-        """Return the same in a few lines of text."""
+        """Format the result as a few lines of text."""
         error = max(self.voxel)
         pieces = [
             f"  piece {number}: {volume:.2f} ml, {place}" for number, (volume, place) in enumerate(self.pieces, 1)
@@ -169,7 +169,7 @@ def _describe_tissue(label: int, regions: Mapping[int, Tissue]) -> str:
 
 
 def describe_axes(affine: np.ndarray) -> str:
-    """Three letters for where a volume's axes point, by its affine (4, 4) to RAS."""
+    """Return three letters for the directions of a volume's axes, from its affine (4, 4) to RAS."""
     letters, taken = [], set()
     for column in affine[:3, :3].T / np.linalg.norm(affine[:3, :3], axis=0)[:, None]:
         axis = next(axis for axis in np.argsort(-np.abs(column)) if axis not in taken)

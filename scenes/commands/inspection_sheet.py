@@ -73,12 +73,12 @@ class InspectionView:
     reach: float
 
     def compute_points(self) -> np.ndarray:
-        """Places (SIDE, SIDE, 3) [m] of the pixels."""
+        """Compute the positions (SIDE, SIDE, 3) [m] of the pixels."""
         steps = self.reach * ((2.0 * np.arange(SIDE) + 1.0) / SIDE - 1.0)
         return self.middle + steps[:, None, None] * self.down + steps[None, :, None] * self.right
 
     def find_letters(self) -> dict[str, str]:
-        """Return the patient's sides at the left, right, upper and lower edge, by the axis that lies most along it."""
+        """Return the letters of the patient's sides at the left, right, upper and lower edge of the image."""
         found = {}
         for edge, direction in (
             ("left", -self.right),
@@ -92,7 +92,7 @@ class InspectionView:
 
 
 def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
-    """Return the sheet (H, W, 3) uint8.
+    """Draw the sheet as an image (H, W, 3) uint8.
 
     `opened` (n,) bool says which points of the subject's cortex are in the opening.
     """
@@ -112,12 +112,12 @@ def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject,
     picture = Image.new("RGB", (2 * SIDE + COLUMN_WIDTH, 2 * SIDE), GROUND_COLOUR)
     for number, panel in enumerate(panels):
         picture.paste(Image.fromarray(panel), (SIDE * (number % 2), SIDE * (number // 2)))
-    _write(ImageDraw.Draw(picture), found, [name for name in COLOURS if name in drawn])
+    _write_text(ImageDraw.Draw(picture), found, [name for name in COLOURS if name in drawn])
     return np.asarray(picture)
 
 
 def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> tuple[np.ndarray, set[str]]:
-    """Labels in colours, over the scan where there is one, and the opened cortex; and the names of what is drawn."""
+    """Render a slice: coloured labels over the scan, if any, and the opened cortex. Also return the drawn labels."""
     points = view.compute_points().reshape(-1, 3)
     inverse = np.linalg.inv(masks.affine)
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3]).astype(int)
@@ -158,15 +158,15 @@ def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.
 
 
 def _blend_colour(ground: np.ndarray, colour: Colour, share: float) -> np.ndarray:
-    """Colours (..., 3) with a share of another one."""
+    """Blend colours (..., 3) with a share of another colour."""
     return (1.0 - share) * ground + share * np.array(colour)
 
 
 def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
-    """Return the cortex as seen along the opening's middle, with the tumour's shadow under it."""
+    """Render the cortex seen along the normal of the opening, with the silhouette of the tumour below."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     inward = 0.5 * (low + high) - subject.site
-    if opened.sum() > 3:  # across the plane of the opening
+    if opened.sum() > 3:  # normal to the plane of the opening
         normal = np.linalg.svd(subject.cortex[opened] - subject.cortex[opened].mean(axis=0), full_matrices=False)[2][2]
         inward = normal if normal @ inward > 0.0 else -normal
     inward = inward / np.linalg.norm(inward)
@@ -193,10 +193,10 @@ def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.n
 
 
 def _rasterise_points(view: InspectionView, points: np.ndarray, inward: np.ndarray, cell: float) -> np.ndarray:
-    """(SIDE, SIDE): the number of the point (n, 3) that each pixel shows, or -1; points are squares of `cell` [m]."""
+    """Return the number (SIDE, SIDE) of the point (n, 3) in each pixel, or -1; points are squares of `cell` [m]."""
     off, scale = points - view.middle, 0.5 * SIDE / view.reach
     half = int(np.ceil(0.5 * cell * scale))
-    order = np.argsort(-(off @ inward), kind="stable")  # the nearest is painted last
+    order = np.argsort(-(off @ inward), kind="stable")  # the nearest point is painted last
     at = np.rint(np.stack([off @ view.down, off @ view.right], axis=1)[order] * scale + 0.5 * SIDE).astype(int)
     square = np.stack(np.meshgrid(*[np.arange(-half, half + 1)] * 2), axis=-1).reshape(1, -1, 2)
     index = (at[:, None] + square).reshape(-1, 2)
@@ -235,7 +235,7 @@ def _draw_frame(colour: np.ndarray, view: InspectionView) -> np.ndarray:
     return np.asarray(picture)
 
 
-def _write(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
+def _write_text(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
     """Draw numbers, warnings and colours in the right column."""
     left, top = 2 * SIDE + PAD, PAD
     rows: list[tuple[str, Colour]] = [("Model to be built", TEXT_COLOUR)]

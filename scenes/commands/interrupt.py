@@ -1,4 +1,4 @@
-"""A command that serves ends when it is asked to, whatever it computes just then."""
+"""Termination of commands by Ctrl-C or SIGTERM, even during a long computation."""
 
 import os
 import signal
@@ -21,7 +21,7 @@ POLL_INTERVAL = 0.1
 
 
 class Ended(BaseException):
-    """The main thread's word that a signal came."""
+    """Exception that a signal raises in the main thread, with the exit code."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -102,7 +102,7 @@ def interrupt_on_termination() -> Iterator[Callable[[], None]]:
 
 
 def _is_finalising(frame: FrameType | None) -> bool:
-    """Return True if a frame runs within a finaliser, or within what a garbage collection calls."""
+    """Return True if a frame runs within a finaliser, or within a callback of the garbage collector."""
     while frame is not None:
         if frame.f_code.co_name in ("__del__", "_gc_callback") or frame.f_code.co_filename == weakref.__file__:
             return True
@@ -111,12 +111,12 @@ def _is_finalising(frame: FrameType | None) -> bool:
 
 
 def leave(number: int, frame: FrameType | None) -> None:
-    """Wake the main thread, at a signal."""
+    """Handle a signal: raise `Ended` in the main thread."""
     raise Ended(number)
 
 
 def fulfil_work(result: Future[int], work: Callable[[ExitStack], int], closing: ExitStack) -> None:
-    """Do the work, close, and note what came of it."""
+    """Run `work`, clean up, and store the return value or the exception in `result`."""
     try:
         with closing:
             code = work(closing)

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0: what the figures are is for the reader to judge.
+    """Evaluate the models; return 0 for any errors and coverage.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _get_physics(stated: Mapping[str, str]) -> dict[str, object]:
-    """Return the properties that two bodies must share to be compared: tissue, with that of regions, and element."""
+    """Return the properties that two bodies must share to be compared: tissue, tissue of regions, and element."""
     from surrogate.data.solution_rows import TISSUE_KEY, read_tissue_statement
 
     return {"tissue": read_tissue_statement(stated) if TISSUE_KEY in stated else None, "element": stated.get("element")}

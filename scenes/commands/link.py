@@ -1,4 +1,4 @@
-"""`sulcus link`: poses in and the tumour out by OpenIGTLink, live."""
+"""`sulcus link`: receive poses and send the tumour position by OpenIGTLink, live."""
 
 from __future__ import annotations
 
@@ -129,19 +129,19 @@ def run(args: argparse.Namespace) -> int:
 
 
 def parse_names(args: argparse.Namespace) -> TransformNames:
-    """Names of the transforms that are received."""
+    """Parse the names of the received transforms."""
     from ..link.received_transforms import TransformNames
 
     return TransformNames(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Host and port of `HOST[:PORT]`, `[IPv6]:PORT` or an IPv6 address alone.
+    """Parse host and port of `HOST[:PORT]`, `[IPv6]:PORT` or an IPv6 address alone.
 
     Raises
     ------
     InputError
-        A text that is none.
+        Text that is not an address.
     """
     whole = f"[{text}]" if is_ipv6(text) else text
     found = re.fullmatch(r"(\[[^\[\]]+\]|[^:\[\]]+)(?::([0-9]*))?", whole)
@@ -272,7 +272,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
 
 
 def _choose_tool(theatre: PatientSetup, path: Path) -> TrackedTool:
-    """Return the tool that the best model of poses knows, at its tip as PLUS has it: z points away from the shaft."""
+    """Return the tool of the best pose model, with its origin at the tip as in PLUS: z points away from the shaft."""
     from ..tracked.tracked_tool import TrackedTool
 
     posed = [(model.bound, model.tool) for model in theatre.models.values() if model.tool is not None]

@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Locate the tumour. 0: done; what fits no cause is bad input."""
+    """Locate the tumour; return 0. Observations that no cause explains are invalid input."""
     from sim.bodies.meshfile import read_anatomy, write_mesh
     from sim.runtime.device import find_device
     from surrogate.locating.observation import to_evidence
@@ -117,7 +117,7 @@ def _summarise_result(found: Location, points: int, regions: tuple[Region, ...],
 
 
 def _format_result(found: Location, out: Path | None) -> str:
-    x, y, z = (round(value, 1) + 0.0 for value in 1e3 * found.centroid)  # a zero has no sign
+    x, y, z = (round(value, 1) + 0.0 for value in 1e3 * found.centroid)  # + 0.0 turns -0.0 into 0.0
     sure = "With a probability of 95 %" if found.calibrated else "As a rough estimate"
     lines = [
         f"The centre of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",

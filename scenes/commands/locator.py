@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the locator. 0: done."""
+    """Build the locator; return 0."""
     from sim.bodies.meshfile import read_anatomy
     from sim.runtime.device import find_device
     from surrogate.locating.locator_store import save_locator, to_locator_path
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def make_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Region, ...]) -> Locator:
-    """Make a locator, with a bar of progress; parts that an interrupted run left next to `path` are reused."""
+    """Build a locator with a progress bar; parts that an interrupted run left next to `path` are reused."""
     from tqdm import tqdm
 
     from surrogate.locating.causes import Causes
@@ -88,7 +88,7 @@ def make_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, reg
 
 
 def find_locator(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
-    """Load the locator next to the anatomy, or build one; it covers every vertex, unless it may be `small`.
+    """Load the locator next to the anatomy, or build one; a locator covers every vertex, unless it may be `small`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""`sulcus markers`: the pages to print for tracking, and the list of what is on them."""
+"""`sulcus markers`: pages with tracking targets to print, and a list of the targets."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0 when all files are written.
+    """Write the pages and the list of targets; return 0.
 
     Raises
     ------

@@ -106,7 +106,7 @@ class Parts:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw the overlay; return 0, or 1 if the tumour position is reliable in no frame.
+    """Draw the overlay; return 0, or 1 if no frame has a reliable tumour position.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def _build_page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name
 def _print_summary(
     args: argparse.Namespace, report: dict[str, object], shown: list[Shown], out: Path | None, table: Path | None
 ) -> int:
-    """Print the summary of a run; return 1 if the tumour position is reliable in no frame."""
+    """Print the summary of a run; return 1 if no frame has a reliable tumour position."""
     report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
     print(to_json_line(report) if args.json else _format_report(report))
     return 0 if any(each.known.relied for each in shown) else 1
@@ -216,7 +216,7 @@ def _check_video_path(path: Path, force: bool, inputs: list[str | Path | None]) 
 
 
 def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
-    """Read the inputs of a run; those that are read quickly come first."""
+    """Read the inputs of a run, starting with those that take little time."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
@@ -260,7 +260,7 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
 
 
 def _draw_video(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
-    """Draw all frames, into a video if requested; return them without their colours."""
+    """Draw the overlay on all frames, and write a video if requested; return the results without images."""
     from ar.screen import write_film
     from ar.tracking.image_sequences import read_frame_rate, read_video
 
@@ -305,7 +305,7 @@ def _report(shown: list[Shown], who: str) -> dict[str, object]:
 
 
 def _format_report(report: dict) -> str:
-    """Return the same for people."""
+    """Format the summary of a run as text."""
     count, latency = report["pictures"], report["latency"]
     lines = [f"{count} images; motion by {report['motion_by']}"]
     lines += [f"  {100.0 * number / count:5.1f} %  {state}" for state, number in report["states"].items()]

@@ -1,4 +1,4 @@
-"""`sulcus patient`: from a label volume to a brain that the scenes can play, in one go."""
+"""`sulcus patient`: anatomy, training data and models from a label volume, by one command."""
 
 import argparse
 import json
@@ -185,7 +185,7 @@ def _list_inputs(args: argparse.Namespace) -> list[Path]:
 
 
 def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tissue]) -> int:
-    """Print what would be made, and draw it."""
+    """Print and draw the anatomy that would be made."""
     from ar.screen import write_png
 
     from .inspection import inspect_subject
@@ -193,7 +193,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
 
     began = time.perf_counter()
     picture = args.out.with_suffix(".inspect.png")
-    check_output_path(picture, ".png", True, _list_inputs(args))  # a preview, which is drawn until it looks right
+    check_output_path(picture, ".png", True, _list_inputs(args))  # an earlier preview is replaced
     if args.sample:
         _write_sample(args)
     masks = read_head_masks(parse_sources(args))

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0 when the registration is written.
+    """Register the scan, and write the registration; return 0.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def _build_nearest(anatomy: Anatomy) -> Nearest:
 
 
 def _compute_tumour_error(found: Registration, anatomy: Anatomy) -> tuple[np.ndarray, float]:
-    """Deviations (3,) [mm] along the reference's axes at the tumour's middle, and the radius [m] that 95 % stay in."""
+    """Compute the error at the tumour's centre: deviations (3,) [mm] by axis of the reference, and 95 % radius [m]."""
     from surrogate.locating.locator import compute_radius
 
     if not len(anatomy.tumour_nodes):

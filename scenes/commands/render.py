@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render frame by frame; return 1 if a frame is unreliable."""
+    """Render all frames; return 1 if a frame is unreliable."""
     from tqdm import tqdm
 
     from ..play.scene_costs import add_cost_label

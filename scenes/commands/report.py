@@ -1,4 +1,4 @@
-"""`sulcus report`: what accuracy costs in time, for every deformer there is, as a page, plots and tables."""
+"""`sulcus report`: accuracy and computing time of every deformer, as a page, plots and tables."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if a row could not be measured."""
+    """Measure all rows; return 1 if a row could not be measured."""
     try:
         sections = _measure_seed_sections(args) if args.seed_protocol else _measure_sections(args)
     except KeyboardInterrupt:
@@ -194,7 +194,7 @@ def _tabulate(study: ReportStudy, bar: tqdm) -> None:
 
 
 def _simulate_data(path: Path, args: argparse.Namespace, count: int) -> None:
-    """Make a data set, or go on with it."""
+    """Simulate a data set, or resume it."""
     from . import simulate
 
     parser = argparse.ArgumentParser()

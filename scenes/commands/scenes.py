@@ -1,4 +1,4 @@
-"""`sulcus scenes`: the built-in scenes, their effects, who can play them, and what they look like."""
+"""`sulcus scenes`: the built-in scenes, their effects, the deformers that support them, and images."""
 
 import argparse
 import json
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List them."""
+    """List the scenes."""
     from tqdm import tqdm
 
     from ar.screen import write_png

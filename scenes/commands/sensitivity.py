@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Column titles of the table.
 COLUMN_TITLES = ("factor", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
 COLUMN_WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
-"""Widths of the table's columns [characters]: a line fits into 120."""
+"""Widths of the table's columns [characters]: a line has at most 120."""
 # Explanation under the table.
 NOTE = """
 One factor is changed at a time. F: tools of prescribed force. M: the same tools with the motion of the default under
@@ -116,12 +116,12 @@ def run(args: argparse.Namespace) -> int:
         whole = {"machine": where, **stated, "failed": failed, "surrogate": surrogate, "rows": table}
         print(to_json_line(whole))
     else:
-        print("\n".join([*_bound(model), NOTE, *_list_remarks(study, args.compare, model, failed)]))
+        print("\n".join([*_format_surrogate_row(model), NOTE, *_list_remarks(study, args.compare, model, failed)]))
     return 1 if failed else 0
 
 
 def _run_factorial(args: argparse.Namespace) -> int:
-    """Every combination: which factors decide, alone and together; 1 if a solve did not converge."""
+    """Solve every combination of factors, and print shares of variance; return 1 if a solve did not converge."""
     from math import prod
 
     from ar.screen import write_png
@@ -164,8 +164,8 @@ def _describe_study(study: SensitivityStudy, preset: str) -> str:
     )
 
 
-def _bound(model: Learned | None) -> list[str]:
-    """Return the surrogate's line of the table, if there is one."""
+def _format_surrogate_row(model: Learned | None) -> list[str]:
+    """Format the table row of the surrogate's error bound; empty without a bound."""
     if model is None or not np.isfinite(model.bound):
         return []
     bound = ("", f"{1e3 * model.bound:.3f}", "", "")
@@ -188,7 +188,7 @@ def _list_remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned
     remarks = []
     if failed:
         remarks.append(f"{failed} solves did not converge: they and their comparisons are excluded.")
-    if model is not None and _bound(model):
+    if model is not None and _format_surrogate_row(model):
         stated = _get_reported_error(model)
         remarks.append(
             f"Surrogate error: reported bound on held-out {stated['preset']} loads relative to its own "

@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0: the file is complete, whether or not every case converged; it says which did."""
+    """Simulate the loads; return 0 even if a load did not converge: the data set records which did."""
     out = check_output_path(args.out, ".h5", args.force, resumed="anatomy" in read_statements(Path(args.out)))
     with time_stage("draw"):
         anatomy = read_anatomy(get_template_path() if args.anatomy is None else args.anatomy)
@@ -148,7 +148,7 @@ def run(args: argparse.Namespace) -> int:
         try:
             solved = simulate(out, solver.deformer, loads, provenance, solver.batch, progress)
         except KeyboardInterrupt:
-            bar.close()  # its line ends
+            bar.close()  # ends the line of the progress bar
             print(f"stopped; run the same command again to resume from {to_unfinished_path(out)}", file=sys.stderr)
             return INTERRUPTED_CODE
     _report(args, solver.description, len(loads), solved)
@@ -167,7 +167,7 @@ def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) ->
     if args.scene is None:
         tool = choose_ball(args.tool_preset) if asked is None else asked
         loads = draw_poses(args.tool_preset, anatomy, args.count, args.seed, tool)
-    else:  # imports that a machine which only trains does without
+    else:  # imports that are not needed for training alone
         from ..script.craniotomy_frame import build_craniotomy_frame
         from ..script.scene import find_scene
         from ..script.scene_poses import draw_scene_poses
@@ -177,12 +177,12 @@ def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) ->
 
 
 def _build_requested_tool(args: argparse.Namespace) -> BuiltIn | None:
-    """Return the tool that the options name, if they name one.
+    """Build the requested tool; None without a request.
 
     Raises
     ------
     InputError
-        A size in millimetres that no such tool has.
+        A size [mm] that is not possible for the tool.
     """
     for name, sizes in (("ball", [args.ball]), ("capsule", args.capsule), ("blade", args.blade)):
         if sizes and sizes[0] is not None and not all(MIN_TOOL_MM <= size <= MAX_TOOL_MM for size in sizes):

@@ -55,9 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve, write the displacement, print one JSON line. 0: converged; 1: not converged.
+    """Solve, write the displacement, and print one JSON line; return 0 if converged, else 1.
 
-    Then the equilibrium under the largest share of the load that has one is written, or the last state where none has.
+    Without convergence, the equilibrium under the largest solved share of the load is written, or else the last state.
     """
     out = check_output_path(args.out, ".vtu", args.force, [args.mesh])
     accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision, limit_strain=not args.any_strain)
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     effects: list[Effect] = [tissue, Held(), NodalForce()]
     if anatomy.slide_normal.any():
         effects.append(SKULLS[args.skull])
-    # The file's own elements: who compares with another program means the same discretisation.
+    # Elements of the file: a comparison with another program needs the same discretisation.
     element = args.element or ("p1" if anatomy.mesh.middles is None else "p2")
     fem = Fem(anatomy, effects, accuracy, args.device, element=element)
     plan = fem.plan.explain() if args.explain else ()
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def start_of(file: MeshFile, name: str, metre: float) -> Deformation | None:
-    """Return the first guess in a file's point data `start`, if there is one. `metre`: the file's unit of length [m].
+    """Return the initial guess in a file's point data `start`, if there is one. `metre`: the file's unit of length [m].
 
     Raises
     ------
@@ -137,7 +137,7 @@ def start_of(file: MeshFile, name: str, metre: float) -> Deformation | None:
 
 
 def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads, list[str]]:
-    """Constraints and loads from a file's point data, and what was changed. `metre`: the file's unit of length in m.
+    """Read constraints and loads of a file's point data, with notes on changes. `metre`: the file's unit of length [m].
 
     Raises
     ------

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Track every frame; return 0, or 1 if the body is certain in none.
+    """Track every frame; return 0, or 1 if no frame has a reliable pose.
 
     Raises
     ------

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0 when the models are written."""
+    """Train, compare and write the models; return 0."""
     out = check_output_path(args.out, ".npz", args.force)
     device = parse_device_names(args.device)[0]
     if args.force:
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     learners = asked or list(list_learners(data))
     for note in list_notes(data, learners):
         print(f"sulcus train: {note}", file=sys.stderr)
-    # Without the time that is left: learners take seconds or minutes, whatever the first of them took.
+    # No estimate of the remaining time: learners differ between seconds and minutes.
     shown = "{l_bar}{bar}| {n_fmt}/{total_fmt} learners [{elapsed}{postfix}]"
     with tqdm(total=len(learners), bar_format=shown, disable=args.json, file=sys.stderr) as bar:
         expansion = Expansion(
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def parse_learners(words: str) -> list[str]:
-    """Return the names in `--learners`, of which none is empty."""
+    """Parse the names in `--learners`; an empty name is an error."""
     names = [name.strip() for name in words.split(",")]
     if not all(names):
         raise InputError(f"--learners {words!r}: name each learner, with one comma between two, or leave it out.")
@@ -132,7 +132,7 @@ def _describe_calibration(trained: Trained) -> str:
 
 
 def _describe_error(model: Learned) -> dict[str, object]:
-    """Describe the model's own reported errors, next to its score."""
+    """Describe the errors that the model reports, next to its score."""
     reported = get_reported_errors(model)
     discs = None if reported.held_out is None else asdict(reported.held_out)
     return {"bound_mm": 1e3 * reported.bound, "discs": discs, "weak": reported.weak}

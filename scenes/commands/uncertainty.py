@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _summarise_scene(theatre: PatientSetup, scene: Scene, found: Uncertainty) -> dict[str, Any]:
-    """Figures of a scene, at the moment when the tumour may be farthest off [mm]."""
+    """Summarise a scene at the time of the largest bound on the tumour's error [mm]."""
     from ..play.frame_text import format_errors
 
     model = theatre.models.get(theatre.select_best(scene))
@@ -144,7 +144,7 @@ def _summarise_scene(theatre: PatientSetup, scene: Scene, found: Uncertainty) ->
 
 
 def _format_lines(row: dict[str, Any]) -> Sequence[str]:
-    """Return the same in lines."""
+    """Format the summary of a scene as lines of text."""
     lines = [f"{row['scene']}:", *(f"  {line}" for line in row["said"])]
     lines.append(
         f"  at {row['time_s']:.1f} s, when it moved {row['moved_mm']:.2f} mm; its middle is within "

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look at each. Returns 1 where one is broken.
+    """Validate each file; return 1 if one has faults.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def list_lost_episodes(folder: Path) -> list[Report]:
-    """Episodes that a folder's card names and that are not there."""
+    """List the missing episodes that a folder's card names."""
     from ..episodes.exports.card import TABLE, list_card_files
     from ..episodes.reading.validation import Report
 

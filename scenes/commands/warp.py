@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def load(text: str) -> tuple[float, float, float, float]:
-    """X,Y,Z,N as four numbers, for argparse."""
+    """Parse X,Y,Z,N into four numbers, for argparse."""
     try:
         x, y, z, newton = (float(part) for part in text.split(","))
     except ValueError:
@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def check_warp_options(args: argparse.Namespace) -> None:
-    """Reject options that conflict or are out of range.
+    """Reject conflicting options and values out of range.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float,
 def select_moments(
     args: argparse.Namespace, theatre: PatientSetup, scene: Scene | None
 ) -> tuple[DeformedAnatomy, list[tuple[float, DeformedAnatomy]]]:
-    """Return the requested moment, and those of a sequence with their times [s]; scene None: read from a file.
+    """Return the requested moment, and those of a sequence with times [s]; without a scene, read it from a file.
 
     Raises
     ------

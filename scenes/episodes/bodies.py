@@ -1,4 +1,4 @@
-"""The bodies that episodes are played on: each is drawn, meshed, and given a trained model, once."""
+"""Bodies of the episodes: each is sampled, meshed, and gets a trained model, once."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -52,7 +52,7 @@ class EpisodeBody:
 
     @property
     def anatomy(self) -> Path:
-        """Path of its anatomy; scan and model are next to it."""
+        """Path of the anatomy; scan and model are next to it."""
         return self.folder / ANATOMY_FILE
 
     @property
@@ -63,7 +63,7 @@ class EpisodeBody:
     def build_effects(self, *more: Effect, lets_go: bool = False) -> tuple[Effect, ...]:
         """Return the effects: constraints, skull and others.
 
-        With `lets_go`, the skull separates whatever was sampled.
+        With `lets_go`, the brain may separate from the skull, regardless of the sampled skull model.
         """
         return (self.tissue, Held(), SKULLS["contact" if lets_go else self.drawn["bodies.tissue.skull"]], *more)
 
@@ -80,7 +80,7 @@ class EpisodeBody:
 
 
 def get_tissue(values: Mapping[str, Any]) -> Elasticity:
-    """Return the tissue of drawn values."""
+    """Return the tissue of sampled values."""
     law, young, poisson = (values[f"bodies.tissue.{name}"] for name in ("law", "young_pa", "poisson"))
     ratio = {name: values.get(_to_ratio_name(name), 1.0) for name in ("tumour", *PART_LABELS)}
     times = {**ratio, "necrosis": ratio["necrosis"] * ratio["tumour"]}
@@ -91,7 +91,7 @@ def get_tissue(values: Mapping[str, Any]) -> Elasticity:
 
 
 def _to_ratio_name(region: str) -> str:
-    """Under which name a region's stiffness is drawn."""
+    """Return the name under which a region's stiffness is sampled."""
     return f"bodies.tissue.{to_ratio_key(region)}"
 
 
@@ -153,7 +153,7 @@ def read_body(folder: Path) -> EpisodeBody:
     Raises
     ------
     InputError
-        A file that is missing, or is none.
+        A missing or invalid file.
     """
     path = folder / BODY_FILE
     try:
@@ -203,7 +203,7 @@ def _can_use_shipped_model(body: EpisodeBody, anatomy: Anatomy) -> bool:
 def _train(
     body: EpisodeBody, anatomy: Anatomy, plan: EpisodePlan, seed: int, number: int, device: str, others: Sequence[Path]
 ) -> bool:
-    """Simulate loads on a body, and train its model on them; the data are not kept. Whether some were there before."""
+    """Train a model on simulated loads of a body, which are then removed; return True if earlier loads were reused."""
     learner = plan.contents.bodies.learner
     effects = (*build_push_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"]), NodalForce())
     fem = Fem(anatomy, effects, TRAIN, device, 64)
@@ -239,7 +239,7 @@ def list_model_errors(folder: Path) -> dict[int, ReportedErrors]:
     """Read the reported errors of the models of a folder's bodies, by number; bodies without a model are excluded."""
     found = {}
     for path in sorted((folder / BODIES).glob("[0-9]*")):
-        with suppress(InputError, ValueError):  # bodies without a readable model play nothing
+        with suppress(InputError, ValueError):  # bodies without a readable model are skipped
             found[int(path.name)] = min(
                 read_reported_errors(to_model_path(path / ANATOMY_FILE)).values(), key=lambda one: one.bound
             )
@@ -247,7 +247,7 @@ def list_model_errors(folder: Path) -> dict[int, ReportedErrors]:
 
 
 def find_weak(models: Mapping[int, ReportedErrors]) -> dict[int, ReportedErrors]:
-    """Those that are weak, the worst first."""
+    """Select the weak models, the largest error bound first."""
     return dict(sorted(((number, one) for number, one in models.items() if one.weak), key=lambda each: -each[1].bound))
 
 
@@ -265,7 +265,7 @@ def describe_weak(models: Mapping[int, ReportedErrors]) -> list[str]:
 
 
 def to_weak_json(models: Mapping[int, ReportedErrors]) -> list[dict[str, float | int | None]]:
-    """Return the weak ones as numbers."""
+    """Convert the weak models to JSON."""
     return [
         {
             "body": number,

@@ -12,7 +12,7 @@ ARRAYS_ATTRIBUTE = "arrays"
 
 
 def compute_digest(data: h5py.Dataset) -> str:
-    """Hexadecimal digits of a data set's kind, shape and content."""
+    """Compute the hexadecimal digest of a data set's kind, shape and content."""
     found = sha256(f"{data.shape} {data.dtype.str if data.dtype.kind != 'O' else 'objects'}".encode())
     values = np.asarray(data[()])
     if values.dtype.kind != "O":
@@ -25,7 +25,7 @@ def compute_digest(data: h5py.Dataset) -> str:
 
 
 def list_datasets(file: h5py.File) -> list[h5py.Dataset]:
-    """All data sets of a file, in the order of their names."""
+    """List all data sets of a file, in the order of their names."""
     found: dict[str, h5py.Dataset] = {}
     file.visititems(lambda name, item: found.update({name: item}) if isinstance(item, h5py.Dataset) else None)
     return [found[name] for name in sorted(found)]
@@ -45,7 +45,7 @@ def compute_file_digest(file: h5py.File) -> str:
 
 
 def write_checksums(file: h5py.File) -> None:
-    """State the names of all data sets, the checksum of each, and that of the file."""
+    """Write the names of all data sets, the checksum of each, and that of the file."""
     for data in list_datasets(file):
         data.attrs[CHECKSUM_ATTRIBUTE] = compute_digest(data)
     file.attrs[ARRAYS_ATTRIBUTE] = " ".join(_list_names(file))

@@ -1,4 +1,4 @@
-"""Numbers and words that a plan leaves to chance, and how each is drawn from a seed."""
+"""Random numbers and words of a plan, and their sampling from a seed."""
 
 from dataclasses import dataclass
 from zlib import crc32
@@ -19,7 +19,7 @@ class Distribution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     normal
         Mean and standard deviation; cut off at three deviations.
     choice, weights
-        Values of which one is taken, and how often each, in any unit (default: all alike).
+        Values of which one is sampled, and their relative frequencies (default: equal).
     """
 
     uniform: tuple[float, float] | None = None
@@ -30,9 +30,9 @@ class Distribution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 Number = float | tuple[float, float] | Distribution
-"""In a plan: a number; its least and greatest, with evenly spread values between; or a `Distribution`."""
+"""Number of a plan: a fixed value; limits of a uniform distribution; or a `Distribution`."""
 Word = str | list[str] | Distribution
-"""In a plan: a word; words of which each is as probable; or a `Distribution`."""
+"""Word of a plan: a fixed word; equally probable words; or a `Distribution`."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class ValueLimits:
     unit: str = "1"
 
     def __str__(self) -> str:
-        """In words."""
+        """Describe the limits."""
         return f"{self.low:,g} to {self.high:,g}" + (f" {self.unit}" if self.unit != "1" else "")
 
 
 def build_generator(seed: int, number: int, name: str) -> np.random.Generator:
-    """Random numbers for one name of one episode: no other name, and no other episode, changes them."""
+    """Build the random generator of one name of one episode, independent of other names and episodes."""
     return np.random.default_rng([seed, number, crc32(name.encode())])
 
 
@@ -63,7 +63,7 @@ def spread_of(value: object) -> Distribution:
 
 
 def sample_value(value: object, random: np.random.Generator) -> float | str | bool:
-    """One value of a plan's `Number` or `Word`."""
+    """Sample a value of a plan's `Number` or `Word`."""
     spread = spread_of(value)
     if spread.uniform is not None:
         return float(random.uniform(*spread.uniform))

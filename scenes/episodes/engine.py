@@ -1,4 +1,4 @@
-"""Episodes made by many workers: each that is not there is handed out, in any order, until all are there or failed."""
+"""Scheduling of episodes on many workers: missing ones are assigned in any order, until all exist or have failed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ProgressListener(Protocol):
     """Callback for each finished task, with the number of workers; `outcome` is None if no task finished."""
 
     def __call__(self, kind: str, outcome: TaskOutcome | None, workers: int) -> object:
-        """Take note."""
+        """Receive the outcome of a task."""
         ...
 
 
@@ -47,7 +47,7 @@ class ProgressListener(Protocol):
 class RunStatistics:
     """Statistics of a run: episodes made now, present before, failed permanently, lost for now.
 
-    Frames and bytes made.
+    `frames` and `bytes` are those of the episodes made now.
     """
 
     made: int = 0
@@ -58,7 +58,7 @@ class RunStatistics:
     bytes: int = 0
 
     def add(self, outcome: TaskOutcome) -> RunStatistics:
-        """With one more episode."""
+        """Return the statistics with one more episode."""
         if outcome.failed:
             return replace(self, lost=self.lost + 1) if outcome.lost else replace(self, failed=self.failed + 1)
         if outcome.skipped:
@@ -100,7 +100,7 @@ def make_all(
     heard: ProgressListener,
     before: RunStatistics,
 ) -> RunStatistics:
-    """Make episodes that are missing, each after its body; failures are noted in the folder. Returns the totals.
+    """Make the missing episodes, each after its body; failures are recorded in the folder. Returns the totals.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def make_all(
 
 
 def _collect_ended(ended: SimpleQueue[Future]) -> list[Future]:
-    """All that have ended, after a while at the latest."""
+    """Return the ended futures, after at most `POLL_INTERVAL` without one."""
     found = []
     try:
         found.append(ended.get(timeout=POLL_INTERVAL))

@@ -1,8 +1,8 @@
 """A scene as one episode in HDF5: camera images, tool poses and forces, and the tumour's motion.
 
 Patient space is RAS [m]; the camera frame is OpenCV's (x right, y down, z forward). Read an image with
-`cv2.imdecode(file["pictures/colour"][i], cv2.IMREAD_COLOR)`. Attributes say what each data set is, what solved it, and
-with which tissue, element and tool: `finite_elements` gives them in words, `tissue` and `element` for a program.
+`cv2.imdecode(file["pictures/colour"][i], cv2.IMREAD_COLOR)`. Attributes describe each data set, its solver, and
+tissue, element and tool: `finite_elements` as text, `tissue` and `element` for a program.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -147,7 +147,7 @@ def collect(
     solved: Callable[[int], object] = lambda more: None,
     recording: EpisodeRecording = FULL_RECORDING,
 ) -> dict[str, object]:
-    """Play a scene and write its episode, whole or not at all; return its contents.
+    """Play a scene and write its episode, atomically; return its contents.
 
     `progress` passes the frames on as they are drawn; `solved` receives the number of newly solved frames.
 
@@ -168,7 +168,7 @@ def collect(
                 if name not in stores:
                     stores[name] = pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
                 stores[name][frame.number] = code
-            if stream.failure is not None:  # no frame after it would be kept
+            if stream.failure is not None:  # no frame after the failure would be kept
                 raise stream.failure
             rows.append(collect_numbers_of_frame(frame, player, recording.dated))
             loads.append(frame.loads)
@@ -240,7 +240,7 @@ def collect_numbers_of_frame(frame: Frame, player: Player, dated: bool = True) -
 
 
 def find_cortex_vertices(player: Player) -> np.ndarray:
-    """Mesh vertices (c,) of the open cortex."""
+    """Return the mesh vertices (c,) of the open cortex."""
     return np.unique(player.site.anatomy.open_surface)
 
 
@@ -262,7 +262,7 @@ def collect_reactions(result: Deformation) -> dict[str, np.ndarray]:
 
 
 def to_number(value: float | None) -> float:
-    """NaN in place of None."""
+    """Convert None to NaN."""
     return np.nan if value is None else value
 
 
@@ -278,7 +278,7 @@ def collect_causes(loads: Loads) -> dict[str, np.ndarray]:
             case Posture() | Resected() | Retracted():
                 found |= {name: array[0] for name, array in vars(cause).items()}
             case Touching():
-                pass  # T_world_tool says it
+                pass  # recorded as T_world_tool
             case _:
                 raise InputError(f"episodes hold no {type(cause).__name__}: collect a scene without it.")
     return found
@@ -294,7 +294,7 @@ def write_motion(
 ) -> dict[str, int]:
     """Write all values except images, one row per frame, and the FEM solutions; return their outcomes.
 
-    `truth` has one row for each frame in `numbers` (F,); None: the rows themselves are the finite elements'.
+    `truth` has one row for each frame in `numbers` (F,); None: FEM computed the rows themselves.
     """
     nodes, cortex = player.site.anatomy.tumour_nodes, find_cortex_vertices(player)
     rest = player.site.anatomy.mesh.nodes
@@ -326,7 +326,7 @@ def write_motion(
 def describe(
     file: h5py.File, theatre: PatientSetup, player: Player, deformer: str, recording: EpisodeRecording
 ) -> None:
-    """Units, frames and provenance as attributes."""
+    """Write units, coordinate systems and provenance as attributes."""
     scene, camera, model = player.scene, player.camera, find_model(player.deformer)
     file.create_dataset("K", data=camera.K)
     if camera.lens is not None:
@@ -369,7 +369,7 @@ def describe(
 
 @lru_cache(maxsize=4)
 def compute_model_digest(model: Learned) -> str:
-    """Sixteen hexadecimal digits of what a model's parts hold and of what it says of its training."""
+    """Compute sixteen hexadecimal digits from a model's parts and its training metadata."""
     found = sha256(repr(sorted(model.training.items())).encode())
     for part in model.parts:
         for array in (part.basis.nodes, part.basis.modes, *part.regressor.state().values()):

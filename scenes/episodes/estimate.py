@@ -1,4 +1,4 @@
-"""A run planned on paper: time, disk and processes of many episodes, from those that were made."""
+"""Estimate of a run: time, disk space and processes of many episodes, from measured ones."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from .tasks import FIRST, FIRST_OF_BODY, FIRST_OF_PROCESS, NOT_FIRST
 
 DAY = 86400.0  # One day [s].
 UNITS = (DAY, "days"), (3600.0, "h"), (60.0, "min")
-"""Units of printed times [s], the longest first; a unit is used from twice its length."""
+"""Units of printed times [s], the longest first; a unit is used for times of at least twice its length."""
 PROCESS_COUNTS = (1, 8, 64, 512)
 """Numbers of processes for which the time is printed."""
 
 
 @dataclass(frozen=True)
 class Amount:
-    """A sum that is expected, and its standard error; the latter NaN where one was measured and no more."""
+    """Expected total and its standard error, which is NaN if only one value was measured."""
 
     mean: float
     error: float
@@ -83,7 +83,7 @@ def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEs
 
     def amount(what: str, those: Mapping[str, Sequence[Rate]]) -> Amount:
         return _add_amounts(
-            [_sum([getattr(one, what) for one in those[kind]], counts[kind]) for kind in those if those[kind]]
+            [_compute_total([getattr(one, what) for one in those[kind]], counts[kind]) for kind in those if those[kind]]
         )
 
     return RunEstimate(
@@ -112,8 +112,8 @@ def _compute_mean(values: Sequence[float]) -> Amount:
     return Amount(float(np.mean(values)), error)
 
 
-def _sum(values: Sequence[float], count: int) -> Amount:
-    """Return the total of `count` such values with the standard error of their mean; exact if all were measured."""
+def _compute_total(values: Sequence[float], count: int) -> Amount:
+    """Return the total of `count` values with the standard error of their mean; exact if all were measured."""
     mean = _compute_mean(values)
     return Amount(count * mean.mean, 0.0 if len(values) >= count else count * mean.error)
 
@@ -124,7 +124,7 @@ def _add_amounts(amounts: Sequence[Amount]) -> Amount:
 
 
 def format_estimate(estimate: RunEstimate) -> list[str]:
-    """Return a table of it."""
+    """Format the estimate as a table."""
     found = estimate
     rows = [
         ("disk", _format_amount(found.bytes, 1e9, "GB")),

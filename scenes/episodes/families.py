@@ -1,4 +1,4 @@
-"""Families of motions: what hands do in the episodes of a data set, each with numbers that are left to chance."""
+"""Families of tool motions in the episodes of a data set, with random parameters."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ class FamilyMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pushing(FamilyMotion, frozen=True):
-    """Push of a ball with a force; `spread` is its distance from the centre relative to that of the bone."""
+    """Push of a ball with a force; `spread`: distance from the craniotomy's centre, relative to the reach."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.35)
     radius_mm: Annotated[Number, ValueLimits(1, 15, "mm")] = (5.0, 7.5)
@@ -49,7 +49,7 @@ class SlideMotion(Pushing, frozen=True):
 
 
 class DrawMotion(Pushing, frozen=True):
-    """Lay on, and draw the tissue aside."""
+    """Press, and draw the tissue aside."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.25)
     tilt_deg: Annotated[Number, ValueLimits(0, 45, "°")] = (20.0, 40.0)
@@ -68,7 +68,7 @@ class Walk(Pushing, frozen=True):
 
 
 class Palpate(FamilyMotion, frozen=True):
-    """A ball is moved by its pose, and slides through the tissue; finite elements play."""
+    """A ball is moved by its pose, and slides through the tissue; solved by FEM."""
 
     depth_mm: Annotated[Number, ValueLimits(0.5, 10, "mm")] = (1.0, 4.0)
     radius_mm: Annotated[Number, ValueLimits(3, 15, "mm")] = 7.0
@@ -76,7 +76,7 @@ class Palpate(FamilyMotion, frozen=True):
 
 
 class Retract(FamilyMotion, frozen=True):
-    """A spatula draws the cortex aside while the tissue relaxes; finite elements play."""
+    """A spatula draws the cortex aside while the tissue relaxes; solved by FEM."""
 
     depth_mm: Annotated[Number, ValueLimits(0.5, 12, "mm")] = (3.0, 8.0)
     tilt_deg: Annotated[Number, ValueLimits(0, 40, "°")] = (10.0, 30.0)
@@ -84,21 +84,21 @@ class Retract(FamilyMotion, frozen=True):
 
 
 class Drain(FamilyMotion, frozen=True):
-    """Fluid drains to a share of its height, and the head is turned; the skull lets go; finite elements play."""
+    """Fluid drains to a share of its height and the head turns; the skull may separate; solved by FEM."""
 
     fluid: Annotated[Number, ValueLimits(0, 1)] = (0.0, 0.7)
     turn_deg: Annotated[Number, ValueLimits(-60, 60, "°")] = (-30.0, 30.0)
 
 
 class Debulk(FamilyMotion, frozen=True):
-    """Fluid has partly drained, and the tumour is cut out in shares; finite elements play."""
+    """Fluid has partly drained, and the tumour is cut out in shares; solved by FEM."""
 
     fluid: Annotated[Number, ValueLimits(0, 1)] = (0.2, 0.7)
     steps: Annotated[Number, ValueLimits(2, 8)] = (3.0, 5.0)
 
 
 class FamilyMotions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The families of a plan; those that are not named are not played."""
+    """Families of a plan; None: the family is not played."""
 
     press: Press | None = None
     slide: SlideMotion | None = None
@@ -112,7 +112,7 @@ class FamilyMotions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def named(self) -> dict[str, FamilyMotion]:
-        """Those that the plan has, by name."""
+        """Families that the plan names."""
         found = {name: getattr(self, name) for name in self.__struct_fields__}
         return {name: motion for name, motion in found.items() if motion is not None}
 
@@ -146,7 +146,7 @@ class Scenario:
 class ScenarioInputs:
     """Inputs of a scenario: sampled values, random numbers, duration [s], reach [m].
 
-    `sample_reach_scenario` is the largest distance of a tool of a radius [m] from the centre of the open cortex.
+    `reach` returns the largest distance of a tool of a radius [m] from the centre of the open cortex.
     """
 
     values: Mapping[str, Any]
@@ -155,19 +155,19 @@ class ScenarioInputs:
     reach: Callable[[float], float]
 
     def place(self, radius: float) -> tuple[float, float]:
-        """Return a place for a tool of this radius [m], in the plane of the open cortex [m]."""
+        """Sample a position [m] of a tool of this radius [m] in the tangent plane of the open cortex."""
         far = self.values["spread"] * self.reach(radius)
         angle = self.random.uniform(0.0, 2.0 * np.pi)
         return far * float(np.cos(angle)), far * float(np.sin(angle))
 
     @property
     def probe(self) -> Probe:
-        """The ball."""
+        """Ball of the sampled radius."""
         return Probe(radius=1e-3 * self.values["radius_mm"])
 
 
 def sample_press_scenario(chance: ScenarioInputs) -> Scenario:
-    """Return the act of `Press`."""
+    """Scenario of `Press`."""
     probe = chance.probe
     at = chance.place(probe.radius)
     tilt, angle = np.radians(chance.values["tilt_deg"]), chance.random.uniform(0.0, 2.0 * np.pi)
@@ -181,7 +181,7 @@ def sample_press_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_slide_scenario(chance: ScenarioInputs) -> Scenario:
-    """Return the act of `SlideMotion`."""
+    """Scenario of `SlideMotion`."""
     probe = chance.probe
     start, end = chance.place(probe.radius), chance.place(probe.radius)
     rise = 0.12 * chance.seconds
@@ -189,7 +189,7 @@ def sample_slide_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_draw_scenario(chance: ScenarioInputs) -> Scenario:
-    """Return the act of `DrawMotion`."""
+    """Scenario of `DrawMotion`."""
     probe, rise = chance.probe, 0.25 * chance.seconds
     tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(probe.radius)
     way = draw(chance.values["force_n"], tilt, rise, 0.2 * chance.seconds, at)
@@ -203,7 +203,7 @@ def sample_draw_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_reach_scenario(chance: ScenarioInputs) -> Scenario:
-    """Return the act of `Reach`."""
+    """Scenario of `Reach`."""
     probe, count = chance.probe, round(chance.values["places"])
     places = np.array([chance.place(probe.radius) for _ in range(count)])
     forces = chance.values["force_n"] * chance.random.uniform(0.5, 1.0, count)
@@ -212,7 +212,7 @@ def sample_reach_scenario(chance: ScenarioInputs) -> Scenario:
     def path(time: float) -> Touch:
         number = min(int(time / takes), count - 1)
         share = time / takes - number
-        # On to the next place in the last part, lifted; down and up again before it.
+        # In the last part the tool moves to the next place, lifted; before, it presses and releases.
         on = smooth((share - (1.0 - REST_SHARE)) / REST_SHARE)
         x, y = (1.0 - on) * places[number] + on * places[min(number + 1, count - 1)]
         half = 0.5 * (1.0 - REST_SHARE)
@@ -222,7 +222,7 @@ def sample_reach_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def walk(chance: ScenarioInputs) -> Scenario:
-    """Return the act of `Walk`."""
+    """Scenario of `Walk`."""
     probe, seed = chance.probe, int(chance.random.integers(2**31))
     far, force = 0.5 * chance.values["spread"] * chance.reach(probe.radius), chance.values["force_n"]
 
@@ -235,7 +235,7 @@ def walk(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_palpate_scenario(chance: ScenarioInputs) -> Scenario:
-    """Return the act of `Palpate`."""
+    """Scenario of `Palpate`."""
     probe, rise = chance.probe, 0.2 * chance.seconds
     start, end = chance.place(probe.radius), chance.place(probe.radius)
     way = palpate(1e-3 * chance.values["depth_mm"], start, end, chance.seconds - 2.0 * rise, rise)
@@ -243,7 +243,7 @@ def sample_palpate_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_retract_scenario(chance: ScenarioInputs) -> Scenario:
-    """Return the act of `Retract`."""
+    """Scenario of `Retract`."""
     blade = Blade()
     tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(blade.radius)
     way = lay(1e-3 * chance.values["depth_mm"], tilt, 0.4 * chance.seconds, at)
@@ -251,14 +251,14 @@ def sample_retract_scenario(chance: ScenarioInputs) -> Scenario:
 
 
 def sample_drain_scenario(chance: ScenarioInputs) -> Scenario:
-    """Return the act of `Drain`."""
+    """Scenario of `Drain`."""
     turn, fluid = float(np.radians(chance.values["turn_deg"])), chance.values["fluid"]
     lie = build_drained_turn(0.5 * chance.seconds, 0.1 * chance.seconds, 0.3 * chance.seconds, turn, fluid)
     return Scenario(effects=(Gravity(),), lying=lie, lets_go=True)
 
 
 def sample_debulk_scenario(chance: ScenarioInputs) -> Scenario:
-    """Return the act of `Debulk`."""
+    """Scenario of `Debulk`."""
     count, fluid = round(chance.values["steps"]), chance.values["fluid"]
     lie = build_drained_turn(0.3 * chance.seconds, 0.0, 1.0, 0.0, fluid)
     times = tuple((chance.seconds * np.linspace(0.4, 0.9, count)).tolist())

@@ -67,14 +67,14 @@ def is_begun(folder: Path) -> bool:
 
 
 def clear_folder(folder: Path) -> None:
-    """Make a folder, or empty it of all but what was solved for a body."""
+    """Create a folder, or remove all its files except solved loads of a body."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in set(folder.iterdir()) - set(_list_files(folder / DATA)):
         path.unlink()
 
 
 def forget(data: Path) -> None:
-    """Remove a data set, or what there is of it, and its table."""
+    """Remove a data set, complete or unfinished, and its table."""
     for path in _list_files(data):
         path.unlink(missing_ok=True)
 

@@ -1,4 +1,4 @@
-"""One episode, or one body, of a data set: made in a folder, and only if it is not there."""
+"""Creation of one episode or one body of a data set in a folder, unless it exists."""
 
 import json
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ QUANTILES = ndtri((np.arange(256) + 0.5) / 256)
 def add_noise(colour: np.ndarray, deviation: float, random: np.random.Generator) -> np.ndarray:
     """Return an image (H, W, 3) uint8 with Gaussian noise [grey levels], independent of pixel and colour.
 
-    The noise has 256 values, each as probable: quantiles of the normal law. They are much faster to sample, and fit
+    The noise has 256 values, equally probable: quantiles of the normal distribution. They are fast to sample, and fit
     into a byte up to a standard deviation of 40.
     """
     if deviation == 0.0:
@@ -49,7 +49,7 @@ def add_noise(colour: np.ndarray, deviation: float, random: np.random.Generator)
 
 
 def add_jitter(poses: np.ndarray, metres: float, radians: float, random: np.random.Generator) -> np.ndarray:
-    """Poses (n, 4, 4) as a tracker has them: each apart is off along and about its own axes by such deviations."""
+    """Add tracking errors to poses (n, 4, 4): Gaussian, along and about the axes of each pose's own frame."""
     off = np.tile(np.eye(4), (len(poses), 1, 1))
     off[:, :3, 3] = metres * random.standard_normal((len(poses), 3))
     off[:, :3, :3] = Rotation.from_rotvec(radians * random.standard_normal((len(poses), 3))).as_matrix()
@@ -103,7 +103,7 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
     path = to_body_path(folder, number)
     if (path / BODY_FILE).is_file():
         return Made(path, skipped=True)
-    if path.exists() and not (path / BODY_FILE).is_file():  # asked again, as another may have made it meanwhile
+    if path.exists() and not (path / BODY_FILE).is_file():  # checked again: another process may have made it meanwhile
         return Made(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
     resumed = False
     try:
@@ -124,7 +124,7 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
 def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> Made:
     """Make an episode, unless it exists; its body must exist. A failure is reported in `Made.failed`.
 
-    Loads without equilibrium fail no episode: their frames say so in `outcome_predicted` and `outcome_fem`.
+    Loads without equilibrium do not fail an episode: `outcome_predicted` and `outcome_fem` record them by frame.
     """
     path = to_episode_path(folder, number)
     if path.is_file():
@@ -142,14 +142,14 @@ def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device
 
 @dataclass(frozen=True, eq=False)
 class Opened:
-    """A body whose files were read, and the finite elements that were made for it, by the effects that they solve."""
+    """Body whose files were read, and its FEM solvers by the effects that they solve."""
 
     body: EpisodeBody
     theatre: PatientSetup
     made: dict[str, Fem | OperatedFem] = field(default_factory=dict)
 
     def get_fem(self, scene: Scene) -> Fem | OperatedFem:
-        """Those of a scene; the last few are kept, for to make them takes as long as some frames."""
+        """Return the FEM solver of a scene; a few are cached, because building one takes as long as some frames."""
         asked = repr(scene.get_effects_on(self.theatre.anatomy))
         if asked not in self.made:
             if len(self.made) >= MAX_CACHE_SIZE:
@@ -160,7 +160,7 @@ class Opened:
 
 @lru_cache(maxsize=MAX_CACHE_SIZE)
 def open_body(place: Path, device: str) -> Opened:
-    """Return a body that was made, read once for many episodes; InputError as `read_body`."""
+    """Return an existing body, read once for many episodes; InputError as `read_body`."""
     body = read_body(place)
     return Opened(body, body.open_theatre(device))
 

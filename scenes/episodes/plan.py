@@ -27,7 +27,7 @@ TYPE_NAMES = {
     "object": "a table", "array": "a list", "str": "text in quotation marks", "float": "a number",
     "int": "a whole number", "bool": "true or false", "null": "nothing",
 }  # fmt: skip
-"""Kinds of values, by the names that msgspec has for them."""
+"""Descriptions of types, by their names in msgspec."""
 SHIPPED_PLANS = Path(__file__).parent.parent / "data" / "plans"
 """Folder of the shipped plans."""
 NO_LEARNER = "none"
@@ -71,7 +71,7 @@ def _format_types(words: str) -> str:
 
 
 class TumourPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The template's tumour and opening, for anatomies that are drawn; as the options of `sulcus anatomy`."""
+    """Tumour and opening of synthetic anatomies, as the options of `sulcus anatomy`."""
 
     radius_mm: Annotated[Number, ValueLimits(3, 35, "mm")] = (9.0, 16.0)
     cover_mm: Annotated[Number, ValueLimits(1, 60, "mm")] = (3.0, 12.0)
@@ -95,7 +95,7 @@ class TissuePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LearnerPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Training of a body's model: learner and number of loads. `name` "none": FEM plays."""
+    """Training of a body's model: learner and number of loads. `name` "none": FEM is used."""
 
     name: Annotated[str, (NO_LEARNER, *LEARNERS)] = "series-gp"
     loads: Annotated[int, ValueLimits(40, 100_000)] = 200
@@ -152,7 +152,7 @@ class HandTremor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlanContents(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole of a plan's file."""
+    """Contents of a plan's file."""
 
     title: str
     motion: FamilyMotions
@@ -193,12 +193,12 @@ class EpisodePlan:
 
     @property
     def digest(self) -> str:
-        """Sixteen hexadecimal digits of the text, and of the own anatomies if there are any."""
+        """Sixteen hexadecimal digits of the text, and of the custom anatomies if there are any."""
         return sha256("".join((self.text, *self.own.values())).encode()).hexdigest()[:16]
 
 
 def list_shipped() -> list[str]:
-    """Names of the plans that ship."""
+    """List the names of the shipped plans."""
     return sorted(path.stem for path in SHIPPED_PLANS.glob("*.toml"))
 
 
@@ -225,12 +225,12 @@ def load_plan(name: str) -> EpisodePlan:
 
 
 def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
-    """Sixteen hexadecimal digits of an own anatomy's file and of its scan, as they are now.
+    """Compute sixteen hexadecimal digits from the current files of a custom anatomy and its scan.
 
     Raises
     ------
     InputError
-        A file that is not there, or cannot be read.
+        A missing or unreadable file.
     """
     found, path = sha256(), plan.folder / anatomy
     with read_as(path, "an anatomy", "Put it next to the plan."):
@@ -240,7 +240,7 @@ def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
 
 
 def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
-    """Return the plan that a TOML text holds.
+    """Parse the plan in a TOML text.
 
     Raises
     ------
@@ -261,7 +261,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
 
 
 def list_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | None, tuple[str, ...]]]:
-    """List every field that may be sampled: name, value, limits of a number, and known words."""
+    """List every field that may be sampled: name, value, limits of a number, and allowed words."""
     found = []
     for name, (kind, about) in _list_field_types(type(table)).items():
         if kind in (Number, Word):

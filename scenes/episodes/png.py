@@ -29,7 +29,7 @@ def encode_png(picture: np.ndarray) -> np.ndarray:
 
 
 def _filter_rows(picture: np.ndarray) -> np.ndarray:
-    """Return the rows' bytes, each less that of the sample to its left, and before them the filter's number."""
+    """Apply the filter: each byte of a row minus the byte of the sample to its left, after the filter's number."""
     height, width = picture.shape
     size = picture.itemsize
     samples = picture.astype(picture.dtype.newbyteorder(">"), order="C").view(np.uint8).reshape(height, size * width)

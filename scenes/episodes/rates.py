@@ -1,4 +1,4 @@
-"""Duration of tasks: stored next to the episodes and never in them, whose bytes do not depend on the machine."""
+"""Durations of tasks, stored next to the episodes: the bytes of episodes do not depend on the machine."""
 
 import os
 import platform
@@ -39,7 +39,7 @@ def write_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
     Raises
     ------
     InputError
-        A file that cannot be made.
+        A file that cannot be written.
     """
     now = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
     path = folder / RATES / f"{now}-{platform.node()}-{os.getpid()}.csv"
@@ -60,7 +60,7 @@ def write_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
 
 
 def read_rates(folder: Path) -> list[Rate]:
-    """All that was written down; a line that was torn by a kill is passed over."""
+    """Read the recorded rates; a line left incomplete by a killed process is skipped."""
     found = []
     for path in sorted((folder / RATES).glob("*.csv")):
         for line in path.read_text(errors="replace").splitlines(keepends=True):

@@ -49,7 +49,7 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class Failure:
-    """An episode that could not be made, and why; `lost` if it is tried again by the next run."""
+    """Failed episode and the reason; `lost` if the next run tries again."""
 
     number: int
     reason: str
@@ -112,7 +112,7 @@ def read_run(folder: Path) -> RunSettings | None:
     Raises
     ------
     InputError
-        A file of the name that no run wrote.
+        A file of this name that no run wrote.
     """
     path = folder / RUN
     try:
@@ -129,29 +129,29 @@ def read_run(folder: Path) -> RunSettings | None:
 
 
 def list_finished(folder: Path) -> set[int]:
-    """Numbers of the finished episodes."""
+    """List the numbers of the finished episodes."""
     return {number for number, ending in _find_episodes(folder) if ending == ".h5"}
 
 
 def list_failures(folder: Path) -> dict[int, Failure]:
-    """Return the episodes that could not be made, by number."""
+    """Return the failed episodes, by number."""
     return {number: one for number in list_failed(folder) if (one := read_failure(folder, number)) is not None}
 
 
 def list_failed(folder: Path) -> set[int]:
-    """Numbers of the episodes that could not be made; no file is read."""
+    """List the numbers of the failed episodes; no file is read."""
     return {number for number, _ in _find_episodes(folder / FAILED)}
 
 
 def read_failure(folder: Path, number: int) -> Failure | None:
-    """Read the reason why an episode failed; None if it exists by now, or if the reason cannot be read."""
+    """Read the reason why an episode failed; None if the episode exists, or if the reason cannot be read."""
     with suppress(OSError, ValueError, TypeError):  # another client is removing it
         return Failure(**json.loads(_to_failed_path(folder, number).read_text()))
     return None
 
 
 def mark_failed(folder: Path, failure: Failure) -> None:
-    """Note that an episode could not be made."""
+    """Record the failure of an episode."""
     _write_json(_to_failed_path(folder, failure.number), asdict(failure))
 
 
@@ -165,7 +165,7 @@ def _to_failed_path(folder: Path, number: int) -> Path:
 
 
 def _find_episodes(folder: Path) -> Iterator[tuple[int, str]]:
-    """Numbers and endings of a folder's episodes: by name alone, as there may be a million."""
+    """Find numbers and endings of a folder's episodes, from file names alone: there may be a million."""
     with suppress(FileNotFoundError), os.scandir(folder) as entries:
         for entry in entries:
             found = EPISODE.fullmatch(entry.name)
@@ -211,6 +211,6 @@ def _check_same_run(folder: Path, found: RunSettings, run: RunSettings, force: b
 
 
 def describe_versions(others: Mapping[str, str], ours: Mapping[str, str]) -> str:
-    """Return the packages of other versions in words; none if all are alike."""
+    """Describe the packages of other versions; empty if there are none."""
     names = [name for name in sorted({*others, *ours}) if others.get(name) != ours.get(name)]
     return ", ".join(f"{name} {others.get(name, 'none')} and not {ours.get(name, 'none')}" for name in names)

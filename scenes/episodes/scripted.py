@@ -55,7 +55,7 @@ def sample_body_number(contents: PlanContents, seed: int, number: int) -> int:
 
 
 def sample_episode(contents: PlanContents, seed: int, number: int) -> EpisodeSample:
-    """Sample the values of an episode from the seed and its number alone, each by its own name."""
+    """Sample the values of an episode from seed and episode number alone; each name has its own random numbers."""
     named = contents.motion.named
     weights = np.array([motion.weight for motion in named.values()])
     family = list(named)[int(build_generator(seed, number, "family").choice(len(named), p=weights / weights.sum()))]
@@ -96,12 +96,12 @@ def build_scene(
     return Scene(
         asked.family, title, path, seconds, effects, act.tool, act.lying, act.surgery,
         viewpoint=_build_viewpoint(contents, asked.group("look"), seed, number),
-        look=_look(asked.group("look"), site, seed, number), frames_per_second=contents.frames_per_second,
+        look=_build_appearance(asked.group("look"), site, seed, number), frames_per_second=contents.frames_per_second,
     )  # fmt: skip
 
 
 def make_relaxing(tissue: Elasticity) -> Elasticity:
-    """Return the same tissues, relaxing."""
+    """Return the tissues with viscoelastic relaxation."""
 
     def relaxed(each: object) -> Any:
         return replace(cast(Any, each), prony=PRONY)
@@ -134,8 +134,8 @@ def _build_viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int,
         raise InputError(f"look.bent {look['bent']:g}: {error}") from error
 
 
-def _look(look: Mapping[str, Any], site: CraniotomyFrame, seed: int, number: int) -> Appearance:
-    """Light, colour and covers of an episode."""
+def _build_appearance(look: Mapping[str, Any], site: CraniotomyFrame, seed: int, number: int) -> Appearance:
+    """Return light, colour and occluders of an episode."""
     random = build_generator(seed, number, "look.covers")
     vessels = int(random.integers(2**31)) if random.random() < look["vessels"] else None
     tint = 1.0 - look["tint"] * MAX_TINTS * random.random(3)

@@ -15,9 +15,9 @@ from sim.runtime.threads import limit_to_one_thread
 from .run_folder import RunSettings, describe_versions, get_versions, read_run
 
 DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
-"""Errors that every other episode would meet too."""
+"""Errors that would occur in every other episode, too."""
 FIRST = FIRST_OF_PROCESS, FIRST_OF_BODY, NOT_FIRST = "process", "body", "no"
-"""The first of its kind by a process; the first on its body by that process; neither."""
+"""Values of `first`: first task of its kind by a process; first on its body by a process; neither."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class _Process:
 def try_task(
     make: Callable[[int], Made], number: int, folder: Path, run: RunSettings, body: TaskOutcome | None = None
 ) -> TaskOutcome:
-    """Make item `number`, if the worker can access the run's folder and has its versions.
+    """Make item `number`, if the worker can access the run's folder and has the run's versions.
 
     Raises
     ------

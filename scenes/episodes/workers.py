@@ -30,8 +30,8 @@ MAX_WORKER_DEATHS = 20
 """Number of lost workers after which a task is given up: machines may be taken back at any time."""
 SETTINGS = {  # Settings of Dask.
     "distributed.scheduler.allowed-failures": MAX_WORKER_DEATHS,
-    "distributed.scheduler.worker-ttl": None,  # clocks jump, as after sleep; who ends is seen by its process
-    "distributed.scheduler.http.routes": [],  # their services need no keys
+    "distributed.scheduler.worker-ttl": None,  # clocks jump, as after sleep; ended processes are detected
+    "distributed.scheduler.http.routes": [],  # HTTP services need no keys
 }
 SCHEDULER_TIMEOUT = 10.0
 """Time-out of a scheduler [s]."""
@@ -40,7 +40,7 @@ SCHEDULER_TIMEOUT = 10.0
 @dataclass(frozen=True, eq=False)
 class _Started:
     process: BaseProcess
-    said: Any  # a pipe, whose class is another on Windows: something comes once it is connected
+    said: Any  # pipe, of another class on Windows: a message once it is connected
     times: int
 
 
@@ -55,7 +55,7 @@ def start_processes(
     Raises
     ------
     InputError
-        When they are tended: one that has ended `starts` times in a row without having been connected.
+        In the restart function: a process ended `starts` times in a row without a connection.
     """
     crew = [_start(address, security, device, 1) for device in devices]
 
@@ -113,13 +113,13 @@ def _close(one: _Started) -> None:
 
 def _serve(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
     silence_dask()
-    # A profile holds on to what a task has closed, and what is served by HTTP asks for no keys.
+    # Profiles keep references to closed files, and HTTP services need no keys.
     with config.set({"distributed.worker.profile.enabled": False, "distributed.worker.http.routes": []}):
         asyncio.run(_work(address, security, resources, connected))
 
 
 async def _work(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
-    # Without a limit: a worker that is paused near its share of memory never resumes, as its memory is not Dask's.
+    # No memory limit: a worker paused near its limit never resumes, because Dask does not manage its memory.
     settings = {"nthreads": 1, "host": LOCAL_HOST, "memory_limit": 0, "resources": resources, "dashboard": False}
     async with Worker(address, security=security, **settings) as worker:
         connected.send_bytes(b"yes")
@@ -137,9 +137,9 @@ class Workers:
     device
         "cpu" or "cuda".
     where
-        They are, in words.
+        Description of the machines.
     tend
-        Starts those again that ended.
+        Function that restarts ended processes.
     """
 
     client: Client

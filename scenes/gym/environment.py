@@ -1,4 +1,4 @@
-"""A task as a `gymnasium.Env`."""
+"""Environments of a task for Gymnasium: single and vectorised."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -182,7 +182,7 @@ class Operations(VectorEnv):
     def reset(
         self, *, seed: int | np.integer | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin all episodes; a seed s is s, s + 1, ... of the environments. `options` are none.
+        """Begin all episodes; environment i has seed s + i for a seed s. No `options` are supported.
 
         Raises
         ------
@@ -244,7 +244,7 @@ class Operations(VectorEnv):
         return {"rgb": colour, "depth": depth, "states": states}
 
     def _stack_infos(self, steps: Sequence[EpisodeStep]) -> dict[str, Any]:
-        """Return the truth as arrays with a row for each environment, and Gymnasium's masks of who has it: all."""
+        """Return the ground truth as arrays, a row per environment, with Gymnasium's masks: True for all."""
         infos = {name: np.stack([step.info[name] for step in steps]) for name in steps[0].info}
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 

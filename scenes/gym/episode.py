@@ -46,7 +46,7 @@ class EpisodeScore:
     away
         Distance of the tool from its place [m].
     off
-        Relative difference between the reached and the requested amount.
+        Difference between the reached and the requested amount, relative to the latter.
     cut
         Shares of the tumour that are cut.
     load
@@ -66,7 +66,7 @@ class EpisodeScore:
 
 
 def compute_reward(before: EpisodeScore, now: EpisodeScore, success: bool, ended: bool) -> float:
-    """Return the reward of a step from one state to the next; `ended`: at a limit, without success."""
+    """Return the reward of a step from one state to the next; `ended`: True if the episode ends at a limit."""
     reward = now.potential - before.potential - REWARD.step_penalty
     if now.load > 1.0:
         reward -= REWARD.limit_penalty
@@ -94,7 +94,7 @@ class ResetSample:
 
 
 def draw(setting: TaskSetting, random: np.random.Generator) -> ResetSample:
-    """Draw an episode."""
+    """Sample the random values of an episode."""
     goal, site, tool = setting.sample_goal(random), setting.site, setting.task.tool
     high, far, angle, size = random.random(4)
     aside = START_OFFSETS[0] + far * (START_OFFSETS[1] - START_OFFSETS[0])
@@ -106,7 +106,7 @@ def draw(setting: TaskSetting, random: np.random.Generator) -> ResetSample:
 
 
 class Episode:
-    """The episodes of an environment, one after the other: `begin` comes first, then `ask`; `take` after each.
+    """Successive episodes of an environment: call `begin` first, then `ask` for each step, and `take` after each call.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class Episode:
         return self._build_request(self.drawn)
 
     def ask(self, action: np.ndarray) -> TissueRequest:
-        """Move the tool; what is asked of the tissue then.
+        """Move the tool; return the next request to the tissue model.
 
         Raises
         ------
@@ -156,7 +156,7 @@ class Episode:
 
     @property
     def done(self) -> int:
-        """Steps of the resection that are done: the corridor is cut before an episode begins."""
+        """Number of completed resection steps: the corridor is cut before an episode begins."""
         return self.cut + 1 if self.setting.task.cuts else 0
 
     @property
@@ -194,18 +194,18 @@ class Episode:
         )
 
     def _compute_target(self, touched: Touched) -> np.ndarray:
-        """Target position of the tool (3,) [m]: above the goal, or at the next share where it is now."""
+        """Compute the target position of the tool (3,) [m]: the goal, or the deformed position of the next share."""
         planned = self._compute_planned_target()
         return planned if self.share is None else planned + touched.motion[self.share].mean(axis=0)
 
     @property
     def share(self) -> np.ndarray | None:
-        """Vertices of the share of the tumour that is cut next, or was the last; None where none is cut."""
+        """Vertices of the next share of the tumour to be cut, or of the last share; None if the task cuts nothing."""
         shares = self.setting.shares
         return shares[min(self.cut, len(shares) - 1)] if shares else None
 
     def _compute_planned_target(self) -> np.ndarray:
-        """Target position of the tool in the scan (3,) [m]."""
+        """Compute the target position of the tool in the scan (3,) [m]."""
         assert self.drawn is not None
         nodes = self.setting.site.anatomy.mesh.nodes
         return self.drawn.goal.place if self.share is None else nodes[self.share].mean(axis=0)
@@ -246,7 +246,7 @@ class Episode:
         return compute_states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
 
     def _collect_truth(self, touched: Touched, target: np.ndarray, success: bool) -> dict[str, Any]:
-        """Return ground truth that no robot has (see the docs). Arrays are new in each step."""
+        """Return ground truth that is not observed (see the docs). Arrays are new in each step."""
         assert self.judged is not None and self.drawn is not None
         setting = self.setting
         tumour = setting.site.anatomy.tumour_nodes

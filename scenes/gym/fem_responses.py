@@ -77,7 +77,7 @@ MAX_SURFACE_DISTANCE = 0.03  # Distance from the corridor and the tumour within 
 
 
 class HealthySurface(NamedTuple):
-    """The surface (S, 3) of the healthy tissue that is left near the tumour; outward normals (V, 3) at rest."""
+    """Surface (S, 3) of the remaining healthy tissue near the tumour; undeformed outward normals (V, 3)."""
 
     triangles: np.ndarray
     normals: np.ndarray
@@ -106,7 +106,7 @@ class CutElements:
     _surfaces: dict[int, HealthySurface] = field(default_factory=dict)
 
     def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
-        """Solve as `TissueModel.compute_responses`; independent of earlier requests, as levels have one order."""
+        """Solve as `TissueModel.compute_responses`; independent of earlier requests: levels have a fixed order."""
         return [self._solve_touch(each) for each in asked]
 
     def _solve_touch(self, asked: TissueRequest) -> Touched:
@@ -124,7 +124,7 @@ class CutElements:
     def _solve_level(self, level: int, done: int) -> Deformation:
         """Return the solution at a fluid level, started from the level above.
 
-        After more steps, from that after fewer.
+        After several resection steps, it starts from the solution with one step less.
         """
         key = level, done
         if key not in self._solved:
@@ -138,7 +138,7 @@ class CutElements:
         return self._solved[key]
 
     def _compute_force(self, pose: np.ndarray, done: int, motion: np.ndarray) -> np.ndarray:
-        """Force (3,) [N] of the ball on healthy tissue."""
+        """Compute the force (3,) [N] of the ball on healthy tissue."""
         healthy, nodes = self._get_healthy(done), self.site.anatomy.mesh.nodes
         radius = self.ball.radius
         middle = pose[:3, 3] + radius * pose[:3, 2]

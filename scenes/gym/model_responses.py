@@ -50,7 +50,7 @@ class Hertz:
         return 4.0 / 3.0 * self.modulus * np.sqrt(self.radius) * np.maximum(depth, 0.0) ** 1.5
 
     def compute_contact_radius(self, force: np.ndarray) -> np.ndarray:
-        """Radii of contact [m] under forces [N]: a^3 = 3 F r / (4 E')."""
+        """Return the radii of contact [m] under forces [N]: a^3 = 3 F r / (4 E')."""
         return np.cbrt(0.75 * force * self.radius / self.modulus)
 
     def compute_pressure(self, force: float) -> float:
@@ -122,7 +122,7 @@ class PressedModel:
         return answers
 
     def _build_loads(self, point: np.ndarray, inward: np.ndarray, size: np.ndarray) -> Loads:
-        """Pushes of sizes (k,) [N], each on a footprint of its contact radius, clipped to the training range."""
+        """Build pushes of sizes (k,) [N], each on a footprint of its contact radius, clipped to the training range."""
         return Loads((Pushed(point, size[:, None] * inward, self._compute_footprint(size)),))
 
     def _compute_footprint(self, size: np.ndarray) -> np.ndarray:
@@ -148,7 +148,7 @@ class PressedModel:
             if near.all():
                 break
             slope = np.where(near, np.inf, now - short) / np.where(near | (size == before), 1.0, size - before)
-            # Converged entries stay: others in the batch have no influence.
+            # Converged entries keep their force, so that others in the batch have no influence.
             before, short, size = size, now, np.where(near, size, np.clip(size - now / slope, 0.0, most))
         return size, np.abs(off(size)) < DEPTH_TOLERANCE
 

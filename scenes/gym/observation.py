@@ -16,7 +16,7 @@ POSITION_NOISE = 1e-4  # Standard deviation of a tracked position [m].
 FORCE_NOISE = 2e-3  # Standard deviation of a component of the measured force [N].
 MOTION_NOISE = 2e-4  # Standard deviation of an observed motion of the cortex [m].
 STATE_BOUND = 10.0
-"""Bound of all numbers of an observation, which are clipped to it."""
+"""Limit to which the absolute values of an observation are clipped."""
 STATE_SIZE = 24
 """Number of components of a state."""
 MAX_DEPTH = 2.0
@@ -47,7 +47,7 @@ def compute_states(
     task: GymTask, goal: Goal, hand: RobotTool, sensed: np.ndarray, time: float, done: float, frame: np.ndarray,
     origin: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """State vector (24,) float32, in the axes (3, 3) of twists, relative to the open cortex's centre (3,) [m].
+    """Compute the state (24,) float32, in the axes (3, 3) of twists, relative to the open cortex's centre (3,) [m].
 
     Parameters
     ----------

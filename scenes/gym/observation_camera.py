@@ -24,11 +24,11 @@ class ObservationCamera:
 
     @cached_property
     def camera(self) -> Camera:
-        """It stays where it is."""
+        """Static camera of the setting."""
         return self.setting.scene.viewpoint.build_camera(self.setting.site)
 
     def render(self, seen: Sequence[Seen]) -> tuple[np.ndarray, np.ndarray]:
-        """Colours (B, H, W, 3) uint8 and depths (B, H, W) float32 [m], 0 where nothing is."""
+        """Render colours (B, H, W, 3) uint8 and depths (B, H, W) float32 [m], 0 in the background."""
         shape = len(seen), self.camera.height, self.camera.width
         colour, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
         for done in sorted({each[2] for each in seen}):

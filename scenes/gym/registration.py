@@ -1,4 +1,4 @@
-"""The names by which `gymnasium.make` finds the environments."""
+"""Registration of the environments for `gymnasium.make`."""
 
 from sim.runtime.optional_packages import require_extra
 
@@ -9,7 +9,7 @@ MAX_STEPS = 200
 
 
 def register_environments() -> None:
-    """Register the environments, unless they are: importing `scenes.gym` does it.
+    """Register the environments once; the import of `scenes.gym` calls this function.
 
     Raises
     ------

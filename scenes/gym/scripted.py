@@ -27,7 +27,7 @@ def compute_scripted_actions(task: str, states: np.ndarray, settings: PolicySett
     Raises
     ------
     InputError
-        There is no such task.
+        No task has this name.
     """
     known = find_task(task)
     states = np.asarray(states, np.float64)

@@ -80,7 +80,7 @@ class TaskSetting:
 
     @cached_property
     def middle(self) -> np.ndarray:
-        """The tumour's in the scan (3,) [m]."""
+        """Mean position of the tumour's vertices in the scan (3,) [m]."""
         return self.site.anatomy.mesh.nodes[self.site.anatomy.tumour_nodes].mean(axis=0)
 
     @cached_property
@@ -93,12 +93,12 @@ class TaskSetting:
         return tuple(mesh.tets[list(step)].ravel() for step in surgery.build_resection(self.site.anatomy).steps[1:])
 
     def find_near(self, place: np.ndarray) -> np.ndarray:
-        """Vertices (n,) of the open cortex within `PATCH_RADIUS` of a place (3,) [m], or the nearest one."""
+        """Find the vertices (n,) of the open cortex within `PATCH_RADIUS` of a place (3,) [m], or the nearest one."""
         away = np.linalg.norm(self.site.anatomy.mesh.nodes[self.cortex] - place, axis=1)
         return self.cortex[away <= max(PATCH_RADIUS, away.min())]
 
     def sample_goal(self, random: np.random.Generator) -> Goal:
-        """Draw a goal; every task takes as many numbers."""
+        """Sample a goal; every task takes the same number of random values."""
         far, angle, turn, amount, more = random.random(5)
         task, site = self.task, self.site
         arm = self.middle - site.origin
@@ -179,7 +179,7 @@ def open_setting(
 def _find_touched_tissue(task: GymTask, scene: Scene, site: CraniotomyFrame) -> Tissue:
     """Return the tissue that a ball presses: the one with the largest volume within its radius of the goals' centre.
 
-    Where tissue is cut away, it is the brain's.
+    For a task that cuts tissue, it is the tissue of the brain.
     """
     mesh, elasticity = site.anatomy.mesh, scene.elasticity
     arm = mesh.nodes[site.anatomy.tumour_nodes].mean(axis=0) - site.origin

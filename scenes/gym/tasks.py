@@ -92,7 +92,7 @@ class GymTask:
 
     @property
     def surgery(self) -> Debulking | None:
-        """Return the resection: the corridor, then share after share; the last remains."""
+        """Return the resection: the corridor, then share after share; the last share remains."""
         return Debulking(tuple(float(each) for each in range(int(self.amount[1]) + 1))) if self.cuts else None
 
     def build_scene(self, size: tuple[int, int]) -> Scene:
@@ -110,7 +110,7 @@ class GymTask:
 
 @dataclass(frozen=True)
 class Aspirator(Probe):
-    """The tip of an ultrasonic aspirator: a small ball on a straight, thin shaft."""
+    """Tip of an ultrasonic aspirator: a small ball on a straight, thin shaft."""
 
     radius: float = 2e-3
     shaft: float = 1e-3
@@ -142,7 +142,7 @@ def find_task(name: object) -> GymTask:
     Raises
     ------
     InputError
-        There is none of that name.
+        No task has this name.
     """
     if isinstance(name, str) and name in TASKS:
         return TASKS[name]

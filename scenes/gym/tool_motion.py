@@ -13,7 +13,7 @@ MAX_HEIGHT = 0.02  # Largest height of a tool above the centre of the open corte
 
 @dataclass(frozen=True, eq=False)
 class RobotTool:
-    """A tool in a robot's hand.
+    """Tool held by a robot.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class RobotTool:
     turned: np.ndarray
 
     def compute_pose(self, tool: Instrument) -> np.ndarray:
-        """T_world_tool (4, 4)."""
+        """Compute the pose T_world_tool (4, 4)."""
         T = np.eye(4)
         T[:3, :3] = self.turned
         T[:3, 3] = self.place - compute_lever(tool) * self.turned[:, 2]
@@ -45,7 +45,7 @@ def build_tool_frame(site: CraniotomyFrame) -> np.ndarray:
 
 
 def lay_tool(site: CraniotomyFrame, tool: Instrument, tip: np.ndarray) -> RobotTool:
-    """Return a tool in its first posture, its lowest point at `tip` (3,) [m]."""
+    """Return a tool in its initial orientation, with its lowest point at `tip` (3,) [m]."""
     turned = tool.pose(tip, site.axis, site.right)[:3, :3]
     return RobotTool(tip - compute_lever(tool) * site.axis, turned)
 
@@ -53,7 +53,7 @@ def lay_tool(site: CraniotomyFrame, tool: Instrument, tip: np.ndarray) -> RobotT
 def move_tool(
     hand: RobotTool, site: CraniotomyFrame, tool: Instrument, twist: np.ndarray, tilt: float, deepest: float
 ) -> RobotTool:
-    """Return a tool after a twist (6,) [m, rad], in the frame of `build_tool_frame`, about its own point.
+    """Return a tool after a twist (6,) [m, rad], in the frame of `build_tool_frame`, about the pivot point.
 
     The bone limits its position at the opening's edge. Its depth below the open cortex's centre is at most `deepest`
     [m]. Its tilt from the first orientation is at most `tilt` [rad]: rotations beyond that are ignored.
@@ -70,5 +70,5 @@ def move_tool(
 
 
 def shift_pose(hand: RobotTool, offset: np.ndarray) -> RobotTool:
-    """Return the pose shifted by (3,) [m]."""
+    """Return a pose shifted by (3,) [m]."""
     return replace(hand, place=hand.place + offset)

@@ -1,4 +1,4 @@
-"""One HTML file of a scene: the tool is dragged over the cortex, and a fast model moves the tumour in the browser."""
+"""HTML file of a scene: the user drags the tool over the cortex, and a fast model moves the tumour in the browser."""
 
 import base64
 import hashlib
@@ -43,7 +43,7 @@ SCRIPTS = ("graph.js", "contact.js", "model.js", "outline.js", "draw.js", "page.
 
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
-    """Fast model that a page evaluates: its name, the model, its graph, and whether that moves the cortex too."""
+    """Fast model that a page evaluates: its name, the model, its graph, and True if the model also moves the cortex."""
 
     name: str
     model: Learned
@@ -84,7 +84,7 @@ def write_html(path: str | Path, theatre: PatientSetup, scene: Scene, learner: s
 
 
 def choose_model(theatre: PatientSetup, learner: str | None = None) -> ExportedModel:
-    """Trace the model of that name, or the one with the fewest numbers.
+    """Trace the named model, or the model with the fewest parameters.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def _count_bytes(sheet: Sheet) -> int:
 
 
 def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> str:
-    """Build the text of the page, with all that it needs: model, surfaces, scripts and style."""
+    """Build the text of the page with model, surfaces, scripts and style."""
     stage, model = theatre.build_stage(scene).plain, exported.model
     nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
     table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})
@@ -158,7 +158,7 @@ def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> 
 
 
 def _describe_errors(theatre: PatientSetup, scene: Scene) -> dict[str, Any]:
-    """Return the error of the tumour position in proportion to its motion, and the words of the page."""
+    """Return the error of the tumour position in proportion to its motion, and its description for the page."""
     error, registration = theatre.estimate_motion_error(scene), scene.registration
     known = None if error is None else {"rest": error.rest[registration], "surface": error.surface}
     words = {
@@ -209,7 +209,7 @@ def _read(name: str) -> str:
 
 
 def _digest(text: str) -> str:
-    """Digest by which the page's policy allows an inline script or style, and no other."""
+    """Compute the digest by which the page's security policy allows one inline script or style."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 

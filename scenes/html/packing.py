@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-# Types of the page's arrays, by NumPy kind and size; others are converted to the next that holds them.
+# Types of the page's arrays, by NumPy kind and size; other types are converted to the next that holds their values.
 STORED = {"f4": "f4", "f8": "f8", "i8": "i4", "i4": "i4", "i2": "i4", "u1": "u1", "u2": "u2", "b1": "u1"}
 
 

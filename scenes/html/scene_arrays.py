@@ -1,4 +1,4 @@
-"""Surfaces, colours, light and camera of a scene, as its page draws them."""
+"""Surfaces, colours, light and camera of a scene, as arrays for its page."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -121,7 +121,7 @@ def describe_stage(stage: Stage, camera: Camera) -> dict[str, Any]:
 
 
 def _describe_layers(stage: Stage, pose: np.ndarray) -> Mapping[str, Any]:
-    """Colour, highlight, and relief of the layers that the page draws, with the tool at a pose (4, 4)."""
+    """Describe colour, highlight and relief of the layers that the page draws, with the tool at a pose (4, 4)."""
     looks = {}
     for layer in stage.build_layers(stage.anatomy.mesh.nodes, pose):
         looks[layer.name] = {

@@ -1,4 +1,4 @@
-"""Connections of many OpenIGTLink clients: input is checked, each is sent the newest, and none blocks another."""
+"""Connections of many OpenIGTLink clients: input is checked, and no client blocks another."""
 
 import asyncio
 import socket
@@ -42,9 +42,9 @@ CLIENT_LIMITS = ClientLimits()
 REQUESTS, QUERIES = ("GET_", "STT_", "STP_"), ("GET_", "STP_")
 
 Receive = Callable[[int, Header, bytes], None]
-"""Takes a client's number, a message's header and its content; raises `BadMessageError`."""
+"""Function of a client's number, a message's header and its content; raises `BadMessageError`."""
 Longest = Callable[[str], int]
-"""The size in bytes up to which messages of a type are wanted; 0: none."""
+"""Function that returns the maximum size [bytes] of messages of a type; 0: not wanted."""
 
 
 @dataclass(eq=False)
@@ -60,12 +60,12 @@ class Client:
     leaving: bool = False
 
     def offer(self, key: str, messages: tuple[bytes, ...]) -> None:
-        """Have messages sent when the connection is free; older ones of the same key are dropped."""
+        """Queue messages for sending; older ones of the same key are dropped."""
         self.waiting[key] = messages
         self.news.set()
 
     def leave(self) -> None:
-        """End, once what waits is sent."""
+        """End the connection once the queued messages are sent."""
         self.leaving = True
         self.news.set()
 
@@ -103,15 +103,15 @@ class LinkClients:
         return len(self._clients)
 
     def publish(self, key: str, messages: Iterable[bytes]) -> None:
-        """Send messages to all clients, together; they take the place of those of the same key that still wait."""
+        """Send messages to all clients, together; they replace queued messages of the same key."""
         self._newest[key] = tuple(messages)
         for client in self._clients.values():
             if not client.asks:
                 client.offer(key, self._newest[key])
 
     def reject(self, number: int, code: Code, why: str, text: str) -> None:
-        """Count a rejected message, and send a STATUS to one client; of many at once it gets the newest."""
-        self._count(why, text)
+        """Count a rejected message, and send a STATUS to one client; a newer STATUS replaces a queued one."""
+        self._count_rejection(why, text)
         client = self._clients.get(number)
         if client is not None and not client.asks:
             client.offer(REJECTED_DEVICE, (pack_message("STATUS", REJECTED_DEVICE, encode_status(code, text), 0),))
@@ -122,17 +122,17 @@ class LinkClients:
         assert task is not None
         self._attending.add(task)
         task.add_done_callback(self._attending.discard)
-        _hold_little(writer)
+        _limit_send_buffer(writer)
         if len(self._clients) < self._most:
-            await self._noted(Client(next(self._numbers), writer), reader)
+            await self._serve_client(Client(next(self._numbers), writer), reader)
             return
-        self._count("too many clients")
+        self._count_rejection("too many clients")
         text = f"{self._most} clients are connected, and no more are taken: end one of them"
         writer.write(pack_message("STATUS", REJECTED_DEVICE, encode_status(Code.BUSY, text), 0))
         await _close(writer)
 
     async def close(self) -> None:
-        """Send what waits, for a moment, and end all connections."""
+        """Send the queued messages within a time limit, and end all connections."""
         for client in self._clients.values():
             client.leave()
         for patience in (CLIENT_LIMITS.last_message_time, CLIENT_LIMITS.farewell_time):
@@ -142,10 +142,10 @@ class LinkClients:
                 client.writer.transport.abort()
 
     async def listen(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Hear a server that was connected to, until it ends, and send nothing."""
+        """Receive the messages of a server until the connection ends, and send nothing."""
         await self._attend(Client(next(self._numbers), writer, asks=True), reader)
 
-    async def _noted(self, client: Client, reader: asyncio.StreamReader) -> None:
+    async def _serve_client(self, client: Client, reader: asyncio.StreamReader) -> None:
         peer = client.writer.get_extra_info("peername")
         name = f"client {peer[0]}:{peer[1]}" if peer else "a client"
         self._note(f"{name} comes; clients: {len(self) + 1}")
@@ -171,7 +171,7 @@ class LinkClients:
             await _close(client.writer)
 
     async def _send(self, client: Client) -> None:
-        """Send what waits, as fast as the client reads it."""
+        """Send the queued messages, as fast as the client reads them."""
         try:
             async with asyncio.timeout(CLIENT_LIMITS.greeting_time):
                 await client.spoke.wait()
@@ -190,10 +190,10 @@ class LinkClients:
                     async with asyncio.timeout(CLIENT_LIMITS.timeout):
                         await client.writer.drain()
         except TimeoutError:
-            self._count("client that does not read")
+            self._count_rejection("client that does not read")
             client.writer.transport.abort()
         except OSError:
-            self._count("client that vanished")
+            self._count_rejection("client that vanished")
 
     async def _read(self, client: Client, reader: asyncio.StreamReader) -> None:
         """Receive messages of a client until it closes, or sends an invalid message."""
@@ -206,28 +206,28 @@ class LinkClients:
                         f"{_format_name(header)} announces {header.size} bytes; {MAX_BODY_BYTES} are the most"
                     )
                 async with asyncio.timeout(CLIENT_LIMITS.timeout):
-                    await self._hear(client, reader, header)
-                await asyncio.sleep(0)  # a client that sends without pause blocks no other
+                    await self._receive_body(client, reader, header)
+                await asyncio.sleep(0)  # lets other tasks run if a client sends without pause
         except TimeoutError:
             self.reject(client.number, Code.TIMEOUT, "message that does not end", "a message did not end: reconnect")
         except BadMessageError as error:
             self.reject(client.number, Code.OVERFLOW, "no message", f"{error}: reconnect")
         except asyncio.IncompleteReadError as error:
             if error.partial:
-                self._count("message that breaks off")
+                self._count_rejection("message that breaks off")
         except OSError:
-            self._count("client that vanished")
+            self._count_rejection("client that vanished")
 
-    async def _hear(self, client: Client, reader: asyncio.StreamReader, header: Header) -> None:
+    async def _receive_body(self, client: Client, reader: asyncio.StreamReader, header: Header) -> None:
         """Receive one message's body, and reply."""
         if header.kind[:4] in REQUESTS:
-            await _pass_over(reader, header.size)
-            self._ask(client, header)
+            await _skip_bytes(reader, header.size)
+            self._handle_request(client, header)
             return
         client.spoke.set()
         longest = self._longest(header.kind)
         if header.size > longest:
-            await _pass_over(reader, header.size)
+            await _skip_bytes(reader, header.size)
             why, code = ("too long", Code.OVERFLOW) if longest else ("type not used", Code.UNKNOWN_INSTRUCTION)
             self.reject(client.number, code, why, f"{_format_name(header)} is passed over: {why}")
             return
@@ -240,8 +240,8 @@ class LinkClients:
             why = str(error).partition(":")[0]  # The text after a colon differs from message to message.
             self.reject(client.number, code, why, f"{_format_name(header)} is rejected: {error}")
 
-    def _ask(self, client: Client, header: Header) -> None:
-        """Send a client without stream its requested messages only."""
+    def _handle_request(self, client: Client, header: Header) -> None:
+        """Handle a request: send one message (GET), or stop (STP) or start the stream of messages."""
         client.asks = header.kind.startswith(QUERIES)
         client.spoke.set()
         if header.kind.startswith("STP_"):
@@ -256,15 +256,15 @@ class LinkClients:
             client.waiting = dict(self._newest)
             client.news.set()
 
-    def _count(self, why: str, text: str = "") -> None:
-        """Count a rejected message, and note the first for each reason."""
+    def _count_rejection(self, why: str, text: str = "") -> None:
+        """Count a rejected message, and report the first one of each reason."""
         self.refused[why] += 1
         if self.refused[why] == 1:
             self._note(f"rejected: {text or why}")
 
 
 def _find_message(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
-    """Return a message of a type: that of a name if there is one, else the first of those with the last time stamp."""
+    """Return the message of a type with a name if there is one, else the message with the latest time stamp."""
     every = [(read_header(each[: HEADER.size]), each) for messages in newest.values() for each in messages]
     alike = [(header, each) for header, each in every if header.kind == kind]
     named = (each for header, each in alike if header.name == name)
@@ -275,13 +275,13 @@ def _format_name(header: Header) -> str:
     return f"{header.kind} {header.name}".strip()
 
 
-async def _pass_over(reader: asyncio.StreamReader, size: int) -> None:
+async def _skip_bytes(reader: asyncio.StreamReader, size: int) -> None:
     """Read `size` bytes, and discard them."""
     while size:
         size -= len(await reader.readexactly(min(size, CLIENT_LIMITS.chunk_bytes)))
 
 
-def _hold_little(writer: asyncio.StreamWriter) -> None:
+def _limit_send_buffer(writer: asyncio.StreamWriter) -> None:
     """Limit the system's send buffer for unread bytes, and enable keep-alive to detect lost clients."""
     writer.transport.set_write_buffer_limits(high=0)
     own = writer.get_extra_info("socket")

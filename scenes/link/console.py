@@ -1,4 +1,4 @@
-"""Lines on a console: of many at once a few, and how many others there were."""
+"""Console output with a limited rate of lines, and the number of suppressed lines."""
 
 import sys
 import time
@@ -36,5 +36,5 @@ def limit_rate(write: Callable[[str], None], clock: Callable[[], float] = time.m
 
 
 def format_address(host: str, port: int) -> str:
-    """HOST:PORT, as people write it: an IPv6 address stands in brackets."""
+    """Format HOST:PORT, with an IPv6 address in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

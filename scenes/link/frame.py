@@ -1,4 +1,4 @@
-"""The frame round every OpenIGTLink message: its header of 58 bytes, its checksum and its time stamp."""
+"""Frame of an OpenIGTLink message: header of 58 bytes, checksum and time stamp."""
 
 import struct
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ WRONG_CHECKSUM = "wrong checksum"  # Error message.
 
 
 class BadMessageError(ValueError):
-    """Bytes that are no message, or one whose content is wrong; in words that a sender can act on."""
+    """Bytes that are no message, or invalid content; the text gives the sender the reason."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Header:
 
 
 def read_header(raw: bytes) -> Header:
-    """Return the header in 58 bytes.
+    """Decode the header in 58 bytes.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def read_content(header: Header, body: bytes) -> bytes:
 
 
 def read_metadata(header: Header, body: bytes) -> dict[str, str]:
-    """Metadata of a message whose content was read, by key; those of version 1 have none.
+    """Read the metadata of a message by key, after its content; empty for version 1.
 
     Raises
     ------

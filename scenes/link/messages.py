@@ -1,4 +1,4 @@
-"""The contents of OpenIGTLink messages: TRANSFORM, POSITION, POINT and IMAGE to read, and what is sent.
+"""Contents of OpenIGTLink messages: decoding of TRANSFORM, POSITION, POINT and IMAGE, and encoding for sending.
 
 Lengths are millimetres here, as in the protocol. Layouts: openigtlink.org/protocols, version 2.
 """
@@ -53,7 +53,7 @@ class SentMesh:
 
     @staticmethod
     def from_triangles(triangles: np.ndarray) -> SentMesh:
-        """From vertex numbers (m, 3)."""
+        """Encode triangles, given as vertex numbers (m, 3)."""
         rows = np.full((len(triangles), 4), 3, INTEGER_TYPE)
         rows[:, 1:] = triangles
         return SentMesh(len(triangles), rows.tobytes())
@@ -64,13 +64,13 @@ EMPTY_MESH = SentMesh(0, b"")
 
 
 def encode_polydata(points: np.ndarray, mesh: SentMesh) -> bytes:
-    """POLYDATA: points (n, 3) [mm] and the triangles between them."""
+    """Encode points (n, 3) [mm] and the triangles between them as POLYDATA."""
     head = struct.pack(">10I", len(points), 0, 0, 0, 0, mesh.count, len(mesh.cells), 0, 0, 0)
     return head + np.ascontiguousarray(points, FLOAT_TYPE).tobytes() + mesh.cells
 
 
 def transform(T: np.ndarray) -> bytes:
-    """TRANSFORM: a rigid motion (4, 4) [mm], column by column."""
+    """Encode a rigid motion (4, 4) [mm] as TRANSFORM, column by column."""
     return np.ascontiguousarray(T[:3].T, FLOAT_TYPE).tobytes()
 
 
@@ -88,7 +88,7 @@ def read_transform(content: bytes) -> np.ndarray:
 
 
 def read_position(content: bytes) -> np.ndarray:
-    """Return the matrix (4, 4) [mm] of a POSITION: a place, and a unit quaternion, the real part last.
+    """Return the matrix (4, 4) [mm] of a POSITION: a translation, and a unit quaternion with the real part last.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _read_floats(content: bytes, count: int) -> np.ndarray:
 
 
 def encode_points(names: list[str], places: np.ndarray) -> bytes:
-    """POINT: places (n, 3) [mm], with a name each."""
+    """Encode named points (n, 3) [mm] as POINT."""
     rows = zip(names, places.tolist(), strict=True)
     return b"".join(
         POINT.pack(name.encode("ascii", "replace")[:64], b"", 255, 255, 0, 255, *place, 0.0, b"")
@@ -119,7 +119,7 @@ def encode_points(names: list[str], places: np.ndarray) -> bytes:
 
 
 def read_points(content: bytes) -> tuple[list[str], np.ndarray]:
-    """Names and places (n, 3) [mm] of a POINT.
+    """Decode the names and positions (n, 3) [mm] of a POINT.
 
     Raises
     ------
@@ -165,12 +165,12 @@ def read_image(content: bytes) -> np.ndarray:
 
 
 def encode_string(text: str) -> bytes:
-    """Return STRING: a text of ASCII characters."""
+    """Encode a text of ASCII characters as STRING."""
     raw = text.encode("ascii", "replace")[:MAX_TEXT_BYTES]
     return struct.pack(">HH", ASCII, len(raw)) + raw
 
 
 def encode_status(code: Code, text: str) -> bytes:
-    """STATUS: a code, its name, and a sentence."""
+    """Encode a code, its name, and a sentence as STATUS."""
     name = "" if code is Code.OK else code.name
     return STATUS.pack(code, 0, name.encode()) + text.encode("ascii", "replace") + b"\0"

@@ -87,7 +87,7 @@ class Outgoing:
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * at, mesh), stamp)
 
     def build_messages(self, result: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
-        """Build all messages of a result, with its stamp: unknown surfaces are sent without points."""
+        """Build all messages of a result, with the result's stamp; unknown surfaces are sent without points."""
         known, stamp = result.known, result.stamp
         none = encode_polydata(np.empty((0, 3)), EMPTY_MESH)
         out = []
@@ -167,18 +167,18 @@ class Outgoing:
         if gauge is None:
             return f"not known: {known.words}"
         inside = "inside the tumour, its edge " if gauge.inside else ""
-        return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._of}){_format_doubt(known)}"
+        return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._source}){_format_doubt(known)}"
 
     def _format_motion(self, known: TrackingResult) -> str:
         """Describe the tumour's displacement, with its error and sources; or why it is unknown."""
         if known.band is None:
             return f"not known: {known.words}"
         moved = format_millimetres(known.motion.moved, known.motion.error)
-        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._of}){_format_doubt(known)}"
+        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._source}){_format_doubt(known)}"
 
     @property
-    def _of(self) -> str:
-        """Sources included in an error, and those that are unknown."""
+    def _source(self) -> str:
+        """Description of the sources included in an error, and of the unknown ones."""
         if self.registered:
             return "of tracking, registration and model; not known of tissue and segmentation"
         return "of tracking and model; not known of registration, tissue and segmentation"
@@ -190,7 +190,7 @@ def _format_doubt(known: TrackingResult) -> str:
 
 
 def _format_names(names: list[str]) -> str:
-    """Return some of many, and how many others there are."""
+    """Format the first names, and the number of the others."""
     others = len(names) - MAX_NAMED_POINTS
     return ", ".join(names[:MAX_NAMED_POINTS]) + (f" and {others} others" if others > 0 else "")
 
@@ -202,7 +202,7 @@ def _is_motion_known(known: TrackingResult, vertices: np.ndarray) -> bool:
 
 
 def fit_rigid(rest: np.ndarray, now: np.ndarray) -> np.ndarray:
-    """Return the rigid motion (4, 4) that takes points (n, 3) nearest to where they are now (n, 3), in their unit."""
+    """Fit the rigid motion (4, 4) that maps points (n, 3) to their current positions (n, 3), in their unit."""
     middle, there = rest.mean(axis=0), now.mean(axis=0)
     T = np.eye(4)
     T[:3, :3] = Rotation.align_vectors(now - there, rest - middle)[0].as_matrix()

@@ -186,7 +186,7 @@ class PoseResponder:
         return Registration(np.linalg.inv(sent.T), np.zeros((6, 6)), np.zeros(3), 0.0, 0)
 
     def _describe_doubts(self, known: TrackingResult, before: TrackingResult | None) -> dict[str, object]:
-        """Return state, text and `near` of an unreliable result; only `near` of a reliable one."""
+        """Return state, text and `near` of an unreliable result; only `near` of a reliable result."""
         near = before is not None and before.near
         assert known.T_scan_tool is not None
         doubt, near = describe_misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, OWNER_QUESTION)
@@ -209,7 +209,7 @@ class PoseResponder:
         return add_bound(known, band, parts)
 
     def _build_unknown(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
-        """Nothing is known now, and why."""
+        """Build the result without a known position, with the reason."""
         tool_time = None if before is None else before.tool_time
         near = before is not None and before.near
         state = TumourState.NO_TOOL if tool_time is None else TumourState.STALE

@@ -21,10 +21,10 @@ MAX_KEPT_TRANSFORMS = 32
 
 @dataclass(frozen=True)
 class TransformNames:
-    """Device names of the transforms that are listened to, each AToB: it takes places in A's frame to B's.
+    """Device names of the received transforms, each AToB: it maps coordinates in frame A to frame B.
 
-    Where tool or camera end in another frame than the patient's reference, they end in that of the tracker, as
-    `reference` does. A name of another form is taken for one that ends in the reference's frame.
+    If a tool or camera transform has the same frame B as `reference`, its B is the tracker; otherwise it is the
+    patient's reference, also for names of another form.
     """
 
     tool: str = "StylusTipToReference"
@@ -34,7 +34,7 @@ class TransformNames:
 
     @cached_property
     def by_wire(self) -> dict[str, str]:
-        """Every one, by the bytes of it that a message carries."""
+        """Names by the bytes of each that fit into a message."""
         return {name[:NAME_BYTES].strip(): name for name in (self.tool, self.reference, self.camera, self.registration)}
 
     def is_tracker_transform(self, name: str) -> bool:
@@ -141,7 +141,7 @@ def check_status(metadata: Mapping[str, str]) -> None:
 
 
 def to_rigid(matrix: np.ndarray) -> np.ndarray:
-    """Return the rigid motion (4, 4) [m] of a matrix (4, 4) [mm], rid of single precision's rounding.
+    """Return the rigid motion (4, 4) [m] of a matrix (4, 4) [mm], without the rounding of single precision.
 
     Raises
     ------

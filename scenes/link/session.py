@@ -108,7 +108,7 @@ class OverlayCamera:
 class LinkSession:
     """Live link that receives poses, computes results, and publishes them.
 
-    All but `_compute_messages` and the drawing belongs to the event loop's thread.
+    All methods except `_compute_messages` and drawing run in the event loop's thread.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ class LinkSession:
         self._ended = asyncio.Event()
 
     def end(self) -> None:
-        """Say to all clients that it is over, and end `serve`; from any thread."""
+        """Notify all clients of the end, and end `serve`; callable from any thread."""
         with suppress(RuntimeError):  # the loop is closed: it has ended
             self._loop.call_soon_threadsafe(self._ended.set)
 
@@ -157,12 +157,12 @@ class LinkSession:
     ) -> None:
         """Serve clients for `seconds`; `ready` is given the port.
 
-        Poses may also come from a server, the `source`: it is sent nothing, and the connection is retried.
+        Poses may also come from a server, `source`, to which nothing is sent; a lost connection is retried.
 
         Raises
         ------
         OSError
-            An address that cannot be served on.
+            An address on which no server can be opened.
         """
         server = await asyncio.start_server(self.clients.converse, host, port, limit=READ_AHEAD_BYTES)
         ready.set_result(server.sockets[0].getsockname()[1])
@@ -195,8 +195,8 @@ class LinkSession:
         self.clients.publish("scan", (self._speaks.build_scan(0),))
         self._show(self._solved, self._speaks.build_messages(self._solved))
         with ThreadPoolExecutor(1, "answer") as answering, ThreadPoolExecutor(1, "draw") as drawing:
-            work = [self._reporting(), self._answering(answering)]
-            work += [] if self._eye is None else [self._drawing(self._eye, drawing)]
+            work = [self._keep_reporting(), self._keep_solving(answering)]
+            work += [] if self._eye is None else [self._keep_drawing(self._eye, drawing)]
             tasks = [asyncio.create_task(each) for each in work]
             ended = asyncio.create_task(self._ended.wait())
             limit = seconds if np.isfinite(seconds) else None
@@ -211,8 +211,8 @@ class LinkSession:
             for task in done:
                 task.result()  # raises the exception of the task
 
-    async def _answering(self, thread: ThreadPoolExecutor) -> None:
-        """Compute the solution of the newest pose, again and again."""
+    async def _keep_solving(self, thread: ThreadPoolExecutor) -> None:
+        """Compute the solution of the newest pose, repeatedly."""
         while True:
             await self._posed.wait()
             self._posed.clear()
@@ -227,8 +227,8 @@ class LinkSession:
             # A pose may have grown old while its solution was computed.
             self._show(current, messages if current is result else self._speaks.build_messages(current, places))
 
-    async def _reporting(self) -> None:
-        """Publish, every tick and whatever the solver does, that a pose or its solution is too old, and a STATUS."""
+    async def _keep_reporting(self) -> None:
+        """Publish at each check, independent of the solver, that a pose or its solution is too old, and a STATUS."""
         said: object = None
         beat = 0.0
         while True:
@@ -236,7 +236,7 @@ class LinkSession:
             if (result := self._get_current_result(now)) is not self._shown:
                 self._show(result, self._speaks.build_messages(result, self._places))
             known = result.known
-            # A number that grows is no news.
+            # A growing number alone is not reported again.
             saying = known.state, re.sub(r"[\d.]+", "", known.words), kinds, tuple(self._others)
             if saying != said or now - beat >= STATUS_INTERVAL:
                 said, beat = saying, now
@@ -244,7 +244,7 @@ class LinkSession:
             await asyncio.sleep(CHECK_INTERVAL)
 
     def _get_current_result(self, now: float) -> PoseResult:
-        """Return the last solution, or the reason why none holds at a time [s]; the solver is not called."""
+        """Return the last solution, or the reason why it is not valid at a time [s]; the solver is not called."""
         if isinstance(self._heard.find_relative(self._heard.names.tool, now), str):
             return self._answers.compute_result(self._heard, now, clock.time(), self._shown.known)
         result, waited = add_lateness(self._solved, now - self._arrived, self._heard.stale), now - self._begun
@@ -278,7 +278,7 @@ class LinkSession:
             words += f"; other transforms received: {', '.join(self._others)}"
         return words
 
-    async def _drawing(self, eye: OverlayCamera, thread: ThreadPoolExecutor) -> None:
+    async def _keep_drawing(self, eye: OverlayCamera, thread: ThreadPoolExecutor) -> None:
         """Draw into the newest image, repeatedly."""
         while True:
             await self._pictured.wait()
@@ -299,7 +299,7 @@ class LinkSession:
         return MAX_SHORT_BYTES if kind in ("TRANSFORM", "POSITION", *UNANSWERED) else 0
 
     def _receive(self, number: int, header: Header, content: bytes) -> None:
-        """Hear a message; raises `BadMessageError`."""
+        """Process a message; raises `BadMessageError`."""
         match header.kind:
             case "TRANSFORM" | "POSITION":
                 self._receive_transform(number, header, content)

@@ -1,1 +1,1 @@
-"""Options that several commands declare, and the objects that they ask for."""
+"""Options that several commands declare, and construction of the requested objects."""

@@ -45,7 +45,7 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """WxH as two numbers, for argparse."""
+    """Parse WxH into two numbers, for argparse."""
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 640x480 [pixel]")
@@ -98,9 +98,9 @@ def add_targets(args: argparse.Namespace, scene: Scene) -> Scene:
     InputError
         See `apply_camera_options`; a camera that zooms.
     """
-    from ..tracked.filming import VIEW, from_where_it_sees_all
+    from ..tracked.filming import VIEW, scale_distance
 
     if args.path == "microscope":
         raise InputError("--path microscope zooms, and a tracked camera has one calibration: choose another path.")
     scene = apply_camera_options(args, replace(scene, viewpoint=VIEW))
-    return scene if args.distance is not None else replace(scene, viewpoint=from_where_it_sees_all(scene.viewpoint))
+    return scene if args.distance is not None else replace(scene, viewpoint=scale_distance(scene.viewpoint))

@@ -1,4 +1,4 @@
-"""Checks of output files before the work, for all commands; files that were made of a mesh are next to it.
+"""Checks of output files before the work, for all commands; files derived from a mesh are next to the mesh.
 
 An existing file is replaced only with --force. Commands that resume or extend their own output need no --force.
 """
@@ -65,7 +65,7 @@ def check_output_folder(folder: Path, content: str) -> Path:
 
 
 def check_output_frames(folder: Path, force: bool) -> list[Path]:
-    """Frames that are in a folder, which `force` allows to remove; other files are left alone.
+    """List the frames in a folder, which `force` allows to remove; other files are kept.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def find_foreign_files(mesh: Path, digest: str) -> list[Path]:
 
 
 def check_no_foreign_files(mesh: Path, digest: str, force: bool) -> list[Path]:
-    """Those `find_foreign_files`, which `force` accepts.
+    """Return the files of `find_foreign_files`, which only `force` accepts.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def check_no_foreign_files(mesh: Path, digest: str, force: bool) -> list[Path]:
 
 
 def remove_data(path: Path, wanted: Mapping[str, str]) -> None:
-    """Remove a data set, and an unfinished one of its name, that cannot go on as what is `wanted`; keep others."""
+    """Remove a data set, complete or unfinished, whose attributes differ from `wanted`; keep others."""
     for each in (path, to_unfinished_path(path)):
         found = read_statements(each)
         if any(found.get(name) != wanted.get(name) for name in UNCHANGED_ATTRIBUTES):

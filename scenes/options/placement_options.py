@@ -40,7 +40,7 @@ def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def point(text: str) -> Point:
-    """X,Y,Z as three numbers, for argparse."""
+    """Parse X,Y,Z into three numbers, for argparse."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
@@ -49,17 +49,17 @@ def point(text: str) -> Point:
 
 
 def point_or_file(text: str) -> Point | Path:
-    """X,Y,Z or a file of markups, for argparse."""
+    """Parse X,Y,Z or the name of a markups file, for argparse."""
     return Path(text) if text.lower().endswith((".json", ".fcsv")) else point(text)
 
 
 def parse_opening(text: str) -> int | Point | Path:
-    """Return a piece's number, X,Y,Z or a file of markups, for argparse."""
+    """Parse a piece's number, X,Y,Z or the name of a markups file, for argparse."""
     return int(text) if text.isdecimal() else point_or_file(text)
 
 
 def to_opening_options(args: argparse.Namespace) -> list[str]:
-    """Return the options as words for another command."""
+    """Return the options as arguments of another command."""
     given = {name: getattr(args, name) for name in ("nodes", "craniotomy", "opening_at", "opening_over")}
     texts = {
         name.replace("_", "-"): ",".join(map(repr, value)) if isinstance(value, tuple) else str(value)
@@ -70,7 +70,7 @@ def to_opening_options(args: argparse.Namespace) -> list[str]:
 
 
 def get_trajectory_option(args: argparse.Namespace) -> Path | None:
-    """Return the file of the trajectory that the options name, if they name one."""
+    """Return the file of the requested trajectory; None without a request."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     return given if isinstance(given, Path) and read_markup(given).kind == "Line" else None
 

@@ -1,4 +1,4 @@
-"""Poses of another tracker on the command line: its files, its clock, and where it has the camera."""
+"""Command-line options for an external tracker: pose files, clock, and pose of the camera."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def check_pose_options(args: argparse.Namespace) -> None:
     Raises
     ------
     InputError
-        Options without --poses, poses without a tool, or a clock that is none.
+        Options without --poses, poses without a tool, or an invalid clock.
     """
     if args.poses is None:
         if args.clock != ["0"] or args.hand_eye is not None or args.camera_poses is not None:
@@ -64,7 +64,7 @@ def check_pose_options(args: argparse.Namespace) -> None:
 
 
 def _parse_clock(words: list[str]) -> tuple[float, float]:
-    """Return an offset, and by how much it is off [s]."""
+    """Return a clock offset and its error [s]."""
     try:
         offset, error = float(words[0]), float(words[1]) if len(words) > 1 else 0.0
     except ValueError:
@@ -75,7 +75,7 @@ def _parse_clock(words: list[str]) -> tuple[float, float]:
 
 
 def open_external_tracker(args: argparse.Namespace, calibration: Calibration) -> ExternalTracker | None:
-    """Return the other tracker's poses; None where none are asked for.
+    """Return the external tracker's poses; None without a request.
 
     Raises
     ------

@@ -24,14 +24,14 @@ def add_anatomy(parser: argparse.ArgumentParser) -> None:
 
 
 def add_device(parser: argparse.ArgumentParser, purpose: str = "") -> None:
-    """Declare `--device` of one device; `purpose` is what works there, where that is not all of the command."""
+    """Declare `--device` of one device; `purpose` describes the work on it, if that is not all of the command."""
     parser.add_argument(
         "--device", default="auto", help=f"compute device{purpose and f' for {purpose}'}: auto, cpu, cuda or cuda:1"
     )
 
 
 def add_devices(parser: argparse.ArgumentParser, meant: str = "") -> None:
-    """Declare `--device` of several devices; `meant` says how they share the work."""
+    """Declare `--device` of several devices; `meant` describes how they share the work."""
     parser.add_argument(
         "--device", default="auto", metavar="DEVICES",
         help=f"compute devices: auto, cpu, cuda, all, or a list such as cuda:0,cuda:1 with one process each{meant}",
@@ -51,7 +51,7 @@ def add_json(parser: argparse.ArgumentParser, meaning: str = "print one JSON lin
 
 
 def to_json_line(value: Any) -> str:
-    """One line of JSON: null stands for numbers that are not finite, which JSON does not have."""
+    """Format one line of JSON; null stands for numbers that are not finite, which JSON does not have."""
     return json.dumps(_replace_non_finite(value), allow_nan=False)
 
 
@@ -64,7 +64,7 @@ def _replace_non_finite(value: Any) -> Any:
 
 
 def add_style(parser: argparse.ArgumentParser, without: tuple[Style, ...] = ()) -> None:
-    """Declare the overlay's style: shared by every command that draws a scene; some are of no use to some commands."""
+    """Declare the overlay's style: shared by every command that draws a scene; `without` excludes styles."""
     from ar.overlay.styles import STYLES
 
     styles: list[Style] = [style for style in STYLES if style not in without]
@@ -82,12 +82,12 @@ def add_address(parser: argparse.ArgumentParser) -> None:
 
 
 def list_addresses(args: argparse.Namespace) -> tuple[str, ...]:
-    """Addresses as browsers write them.
+    """Return the addresses of --address in the form that browsers send.
 
     Raises
     ------
     InputError
-        A text that is no such address.
+        Text that is not an address.
     """
     from ar.page.access_guard import format_origin
 
@@ -98,7 +98,7 @@ def list_addresses(args: argparse.Namespace) -> tuple[str, ...]:
 
 
 def print_addresses(browser: Browser) -> None:
-    """Print where else the page is, if a token is needed there."""
+    """Print further addresses of the page, and the use of its token."""
     for address in browser.addresses:
         print(f"sulcus: behind the proxy or the forwarded port, open {address}", flush=True)
     if browser.token is not None and not browser.addresses:

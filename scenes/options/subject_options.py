@@ -19,7 +19,7 @@ from .placement_options import point
 
 
 def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None:
-    """Declare --brain, --tumour, --mask, --tumour-in, and by these `names` the convention that labels follow."""
+    """Declare --brain, --tumour, --mask, --tumour-in, and the option `names` for the label convention."""
     parser.add_argument("--brain", type=parse_labels, metavar="1,2", help="labels of brain, by number or segment name")
     parser.add_argument(
         "--tumour", type=parse_labels, metavar="3,4", help="labels of tumour, by number or segment name"
@@ -61,7 +61,7 @@ def add_axes(parser: argparse._ActionsContainer) -> None:
 
 
 def parse_labels(text: str) -> tuple[Label, ...]:
-    """Numbers and names with commas between them, for argparse."""
+    """Parse numbers and names between commas, for argparse."""
     found = tuple(int(part) if part.strip().isdecimal() else part.strip() for part in text.split(","))
     if "" in found:
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of labels such as 1,2 or Brain,Tumour")
@@ -69,7 +69,7 @@ def parse_labels(text: str) -> tuple[Label, ...]:
 
 
 def parse_sources(args: argparse.Namespace) -> Sources:
-    """Return the files and labels that the options name."""
+    """Return the files and labels named by the options."""
     return Sources(
         args.labels,
         args.brain or (),
@@ -98,7 +98,7 @@ def list_label_options(args: argparse.Namespace) -> list[str]:
 
 
 def label_words(args: argparse.Namespace) -> list[str]:
-    """Return the options as words for `sulcus anatomy`."""
+    """Return the options as arguments of `sulcus anatomy`."""
     given = {
         "--labels": args.labels,
         "--brain": args.brain and ",".join(map(str, args.brain)),
@@ -120,7 +120,7 @@ MAX_BRAIN_ML = 5000.0  # Largest accepted volume of a brain [ml].
 
 
 def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare which healthy head is taken and where its tumour is drawn."""
+    """Declare the options of a healthy head and of the synthetic tumour in it."""
     drawn = parser.add_argument_group("synthetic tumour in a healthy head, without --labels")
     drawn.add_argument(
         "--head", choices=("template", "fsaverage"),

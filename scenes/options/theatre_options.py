@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def add_bodies(parser: argparse.ArgumentParser) -> None:
-    """Declare which anatomy and models there are."""
+    """Declare the options of anatomy and models."""
     add_anatomy(parser)
     parser.add_argument(
         "--model", type=Path,
@@ -41,7 +41,7 @@ def add_trajectory(parser: argparse.ArgumentParser) -> None:
 
 
 def add_theatre(parser: argparse.ArgumentParser) -> None:
-    """Declare who plays, on which anatomy: shared by every command that plays a scene."""
+    """Declare deformer, anatomy and models: shared by every command that plays a scene."""
     add_bodies(parser)
     parser.add_argument(
         "--deformer",
@@ -107,7 +107,7 @@ def build_requested_scene(args: argparse.Namespace, name: str, theatre: PatientS
 
 
 def _follow_trajectory(args: argparse.Namespace, scene: Scene, site: CraniotomyFrame) -> Scene:
-    """Let the scene's tool follow the trajectory; a notice names what keeps it from that."""
+    """Let the scene's tool follow the trajectory; a notice reports if the bone's edge stops the tool."""
     from sim.bodies.markups import read_markup
 
     from ..script.approach import approach_of
@@ -124,7 +124,7 @@ def _follow_trajectory(args: argparse.Namespace, scene: Scene, site: CraniotomyF
 
 
 def list_playable(args: argparse.Namespace, theatre: PatientSetup, scenes: Sequence[Scene]) -> list[Scene]:
-    """Return the named scenes; by default all that the anatomy has a locator for, with a notice about the others."""
+    """Return the named scenes; by default all except those without a required locator, with a notice."""
     left = [] if args.scenes else [scene for scene in scenes if theatre.is_without_locator(scene)]
     if left:
         names = ", ".join(scene.name for scene in left)

@@ -166,14 +166,14 @@ def parse_elasticity(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
 
 
 def parse_optional_tissue(args: argparse.Namespace) -> Tissue | None:
-    """Return the tissue asked for, or None where no option of it is given."""
+    """Return the requested tissue; None without a request."""
     constants = (args.young, args.poisson, args.ogden, args.bulk, args.prony)
     given = args.material != "default" or any(value is not None for value in constants)
     return parse_tissue(args) if given else None
 
 
 def reject_option(given: Mapping[str, object], material: str, owner: str) -> None:
-    """Raise InputError for an option that is given but that only `owner` has."""
+    """Raise InputError if an option is given that only `owner` supports."""
     for name, value in given.items():
         if value is not None:
             raise InputError(
@@ -253,7 +253,7 @@ def parse_region_label(text: str) -> int:
     Raises
     ------
     ValueError
-        Neither.
+        Neither a label nor the name of a region.
     """
     return REGION_NAMES[text] if text in NON_BRAIN_REGIONS else int(text)
 
@@ -264,7 +264,7 @@ def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
     Raises
     ------
     InputError
-        Text of another form, or constants that no tissue has.
+        Text of another form, or invalid constants.
     """
     ogden = isinstance(tissue, Ogden)
     try:
@@ -287,7 +287,7 @@ def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
 
 
 def parse_terms(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
-    """Pairs of numbers from texts "A,B", as Ogden's (c [Pa], m).
+    """Parse pairs of numbers from texts "A,B", as Ogden's (c [Pa], m).
 
     Raises
     ------

@@ -18,10 +18,10 @@ from .requests import Requests
 
 
 class BackgroundStudy:
-    """Computation in a thread, again at each start; `show` receives what `work` yields, or its failure (HTML)."""
+    """Computation in a thread, repeated at each start; `show` receives results or the failure of `work` (HTML)."""
 
     def __init__(self, work: Callable[[], Iterator[Any]], lock: threading.Lock, show: Callable[[Any], None]) -> None:
-        """Prepare the study; it holds `lock`, so that no other solver is built meanwhile."""
+        """Prepare the study, which holds `lock` while it runs: no other solver is built at that time."""
         self.work, self.lock, self.show = work, lock, show
         self.closed, self.thread = threading.Event(), threading.Thread()
 

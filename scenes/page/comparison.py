@@ -1,4 +1,4 @@
-"""Comparison of a page's deformers with the finite elements: of what is shown, and of time against accuracy."""
+"""Comparison of a page's deformers with FEM: the shown solution, and a table of time and accuracy."""
 
 import time as clock
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ def compute_distances(truth: FemResult, player: Player, shown: Deformation) -> n
 
 
 def format_comparison(comparison: Comparison | None, stale: bool, waiting_text: str, fem_text: str = FEM_SHOWN) -> str:
-    """Format the comparison; that of a previous load is greyed and marked, with the state of the FEM solver.
+    """Format the comparison; a comparison of a previous load is grey and marked, with the state of the FEM solver.
 
     `fem_text` is the text for a solution by FEM itself.
     """
@@ -87,7 +87,7 @@ def format_comparison(comparison: Comparison | None, stale: bool, waiting_text: 
 
 
 def describe_change(truth: FemResult, player: Player, shown: Deformation, disabled: Sequence[str]) -> str:
-    """Describe the tumour's distance from its position under all effects, for a solution without some."""
+    """Describe the tumour's distance from its position under all effects, for a solution with some effects disabled."""
     mean = 1e3 * float(compute_distances(truth, player, shown).mean())
     return f"<p>without {escape(', '.join(disabled))} the tumour position differs by {mean:.2f} mm</p>"
 
@@ -122,7 +122,7 @@ class PageState:
     max_render_time: float = 0.015
 
     def choose_resolution(self) -> bool:
-        """Return whether the next image, drawn now, is coarse."""
+        """Return True if the next image is to be coarse."""
         time = clock.perf_counter()
         self.coarse = self.render_time > self.max_render_time and time < self.still_at
         self.still_at = time + self.still_time
@@ -145,7 +145,7 @@ MAX_RECENT_LOADS = 120  # Number of last loads that are kept for each deformer.
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """A deformer's medians over `loads` loads; `best` where no other equals or beats it in both. None: no ranking."""
+    """A deformer's medians over `loads` loads; `best`: True on the Pareto front of both, None without ranking."""
 
     name: str
     milliseconds: float
@@ -173,7 +173,7 @@ class AccuracyTimeTable:
     def rows(self) -> list[ComparisonRow]:
         """Rows of the deformers with a time and an error, fastest first.
 
-        If all of them were shown some of the same loads, only those count, and the rows are ranked. Otherwise each row
+        If there are loads that all deformers were shown, only these count, and the rows are ranked. Otherwise each row
         uses its own loads, without ranking: medians over different loads are not comparable.
         """
         loads_of = {name: self._times.get(name, {}).keys() & missed.keys() for name, missed in self._errors.items()}

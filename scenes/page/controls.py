@@ -117,7 +117,7 @@ def build_slice_control(current: str, choose: Callable[[str], None]) -> Dropdown
 
 
 def build_camera_sliders(scene: Scene, site: CraniotomyFrame, requests: Requests) -> tuple[Slider, Slider]:
-    """Build the sliders of the camera's tilt and distance, at the scene's own."""
+    """Build the sliders of the camera's tilt and distance, with the scene's values."""
     camera = scene.viewpoint.build_camera(site)
     offset = camera.centre - scene.viewpoint.find_target(site)
     distance = float(np.linalg.norm(offset))
@@ -175,7 +175,7 @@ def build_tool_controls(
 
 
 def to_slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
-    """Values of the tool's sliders at a touch, by their labels."""
+    """Convert a touch to the values of the tool's sliders, by label."""
     strength = {"depth [mm]": 1e3 * touch.depth} if scene.posed else {"force [N]": touch.force}
     positions = {"place right [mm]": 1e3 * touch.x, "place up [mm]": 1e3 * touch.y}
     tilts = {f"direction {key} [deg]": np.degrees(tilt) for key, tilt in zip(("right", "up"), touch.tilt, strict=True)}

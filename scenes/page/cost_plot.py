@@ -22,8 +22,8 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
         load_text = f"the same {_format_load_count(rows[0].loads)}; bold: no other is both faster and more accurate"
     else:
         load_text = "the loads up to now" if len(rows) == 1 else "different loads: not comparable"
-    xs, x_ticks = _scale([row.milliseconds for row in rows], LEFT, WIDTH - RIGHT)
-    ys, y_ticks = _scale([max(row.millimetres, MIN_ERROR) for row in rows], HEIGHT - BOTTOM, TOP)
+    xs, x_ticks = _scale_axis([row.milliseconds for row in rows], LEFT, WIDTH - RIGHT)
+    ys, y_ticks = _scale_axis([max(row.millimetres, MIN_ERROR) for row in rows], HEIGHT - BOTTOM, TOP)
     anchors = {x_ticks[-1][0]: "end"}  # the last label stays inside
     parts = [_draw_text(x, HEIGHT - BOTTOM + 12, f"{value:g}", anchors.get(value, "middle")) for value, x in x_ticks]
     parts += [_draw_text(LEFT - 5, at + 4, f"{value:g}", "end") for value, at in y_ticks]
@@ -60,8 +60,8 @@ def _format_name(row: ComparisonRow) -> str:
     return "FEM (reference)" if row.name == "fem" else row.name
 
 
-def _scale(values: Sequence[float], start: float, end: float) -> tuple[list[float], list[tuple[float, float]]]:
-    """Return the places of values between two ends, and those of the powers of ten round them."""
+def _scale_axis(values: Sequence[float], start: float, end: float) -> tuple[list[float], list[tuple[float, float]]]:
+    """Return the positions of values on a logarithmic axis between two ends, and those of the powers of ten."""
     low, high = np.floor(np.log10(min(values))), np.ceil(np.log10(max(values)))
     span = max(high - low, 1.0)
 
@@ -72,7 +72,7 @@ def _scale(values: Sequence[float], start: float, end: float) -> tuple[list[floa
 
 
 def _draw_text(x: float, y: float, text: str, anchor: str) -> str:
-    """Return a text of the plot."""
+    """Return a text element of the SVG."""
     return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}">{escape(text)}</text>'
 
 

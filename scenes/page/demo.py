@@ -1,4 +1,4 @@
-"""The page comes alive: a scripted or hand-set tool, any deformer, and the finite elements checking it behind."""
+"""Main loop of the page: a scripted or manual tool, any deformer, and comparison with FEM in the background."""
 
 import sys
 import threading
@@ -59,7 +59,7 @@ MESSAGE_TIME = 2.0  # Time for which a playing page shows why a frame is skipped
 
 
 class Demo:
-    """A scene on a page, for as long as `run` is let run; visitors change it for another built-in one."""
+    """Scene on a page, played by `run`; users can change to another built-in scene."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class Demo:
         style: Style = "window",
         origins: tuple[str, ...] = (),
     ) -> None:
-        """Open the page; `anatomy` is whose brain, in words, and `find` makes the scenes that visitors choose."""
+        """Open the page; `anatomy` describes the brain, and `find` builds the scenes that users choose, by name."""
         self.theatre, self.anatomy, self.first, self.find = theatre, anatomy, scene, find
         self.build_lock = threading.Lock()
         self._set_scene(scene, deformer)
@@ -107,7 +107,7 @@ class Demo:
         return self.drawn
 
     def _report_skipped_frame(self, error: Exception, end: float) -> None:
-        """Say why a frame is not shown, until there is time to read it or a visitor asks for another; then go on."""
+        """Show why a frame is skipped, for `MESSAGE_TIME` or until a user requests another frame; then resume."""
         self.busy.end_work()
         message = str(error)
         if not isinstance(error, InputError):
@@ -141,12 +141,12 @@ class Demo:
             clock.sleep(max(MIN_REST, pause))
 
     def _show_tool_holder(self) -> None:
-        """Tell each visitor who has the tool, and who leads."""
+        """Show each user who controls the tool."""
         tool, holder, connected = self.stage.scene.tool, self.wish.holder, self.browser.here
         self.browser.show_line(lambda client: "" if tool is None else describe_holder(client, holder, connected))
 
     def close(self) -> None:
-        """Stop the page and the finite elements."""
+        """Stop the page and the FEM threads."""
         self.busy.close()
         for study in self.studies:
             study.close()
@@ -161,20 +161,20 @@ class Demo:
 
     @property
     def referee(self) -> FemWorker:
-        """The finite elements under all effects, which judge the models."""
+        """FEM worker with all effects: the reference for the models."""
         return self.cast.get_worker()
 
     def _set_scene(self, scene: Scene, deformer: str) -> None:
-        """Have a deformer play a scene."""
+        """Set the scene and the deformer, with new solvers, requests and readings."""
         self.cast, self.tally = SceneSolvers(self.theatre, scene, deformer, self.build_lock), AccuracyTimeTable()
         self.history = History(list_lines(scene))
-        # The frame that is shown.
+        # Number of the shown frame.
         self.reached: int | None = None
         self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=is_animated(scene, self.theatre.site))
         self.studies = build_studies(self.theatre, scene, self.wish, self.build_lock, lambda: self.browser)  # not open
 
     def _change_scene(self, name: str) -> None:
-        """Play another scene; where this body has none of that name, stay, and say why."""
+        """Play another scene; if this anatomy does not support it, keep the scene and show the reason."""
         previous = self.cast, self.tally, self.wish, self.history, self.studies
         self.busy.begin_work(f"preparing the scene {name}")
         try:
@@ -220,7 +220,7 @@ class Demo:
         """Return the solution of the request, or of a frame on the way to it; None until there is one."""
         number, name, touch, disabled = self.asked
         request, scene = (number, touch), self.stage.scene
-        if name != "fem" and not disabled:  # no model was trained without
+        if name != "fem" and not disabled:  # no model was trained with effects disabled
             self.busy.begin_work(describe_work(scene, name, *request))
             return self.cast.predict(name, request)
         if (solution := self.cast.solve(disabled, request, state.shown, 0.0)) is not None:
@@ -236,9 +236,9 @@ class Demo:
         return self.cast.solve(disabled, request, state.shown, 1.0 / scene.frames_per_second)
 
     def _show_undeformed(self, state: PageState) -> None:
-        """Show the body at rest while nothing else can be shown."""
+        """Show the undeformed body while no solution is available."""
         number, _, touch, _ = self.asked
-        stage = replace(self.stage, observer=None)  # there is no truth yet to be seen
+        stage = replace(self.stage, observer=None)  # no ground truth is available yet
         player = Player(stage, AtRest(stage.site.anatomy), self.wish.style)
         frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.get_touch(number))
         move_bodies(self.browser, frame, player)
@@ -247,7 +247,7 @@ class Demo:
         state.shows_undeformed = True
 
     def _draw(self, state: PageState, solution: FemResult) -> None:
-        """Draw a solution, and have it compared with FEM unless it is by FEM."""
+        """Draw a solution, and request its comparison with FEM unless FEM computed it."""
         number, name, touch, disabled = self.asked
         look = self.wish.look
         player = replace(self._get_player(self.asked, look), coarse=state.choose_resolution())
@@ -274,13 +274,13 @@ class Demo:
             self._show_touch(tool_touch, lambda: self.wish.tool == SCRIPT)
 
     def _show_touch(self, touch: Touch, condition: Callable[[], bool]) -> None:
-        """Set the tool's sliders to a touch, so that a hand that takes the tool starts there."""
+        """Set the tool's sliders to a touch, at which manual control would start."""
         if self.stage.scene.tool is not None:
             for label, value in to_slider_values(self.stage.scene, touch).items():
                 self.browser.put(label, value, condition)
 
     def _draw_in_style(self, state: PageState) -> None:
-        """Render the same solution in another style."""
+        """Render the shown solution in another style."""
         assert state.frame is not None and state.asked is not None
         frame, state.look, state.coarse = state.frame, self.wish.look, False
         player, seconds = self._get_player(state.asked, state.look), frame.seconds["deform"]
@@ -362,7 +362,7 @@ class Demo:
         )
 
     def _play(self, plays: bool) -> None:
-        """Handle the play button: in a static scene the script takes the tool. A pause stops on the way."""
+        """Handle the play button: in a static scene the script takes the tool. A pause keeps the reached frame."""
         self.wish.play(plays)
         if not plays and self.reached is not None:
             self.wish.set(number=self.reached)

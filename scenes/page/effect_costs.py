@@ -1,4 +1,4 @@
-"""Switches of a scene's effects, with the time that each costs and how far it moves the tumour."""
+"""Switches of a scene's effects, with the time that each effect costs and the tumour motion that it causes."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -46,7 +46,7 @@ def build_effect_fold(theatre: PatientSetup, scene: Scene, requests: Requests, m
 
 
 def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[dict[str, str]]:
-    """Yield the words of an effect's switch and of the note (HTML), by label, whenever an effect is measured.
+    """Yield the text of an effect's switch and of the note (HTML), by label, whenever an effect is measured.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[dict[str, str
 
 
 def format_switch(name: str, figures: Figures) -> str:
-    """Return the words of an effect's switch: its name, the time that it adds and the motion that it causes."""
+    """Return the text of an effect's switch: its name, the time that it adds and the motion that it causes."""
     milliseconds, motion = figures.get(name, (None, None))
     if milliseconds is None or motion is None:
         return f"{describe_effect(name)}: {'cannot be disabled' if name in figures else 'not measured'}"

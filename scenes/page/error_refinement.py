@@ -1,4 +1,4 @@
-"""Refinement of the error of the load that a page shows, by an ensemble of that load."""
+"""Refinement of the error of the load on a page, by an ensemble for this load."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,7 +10,7 @@ from ..script.scene import Scene
 from ..script.tool_paths import Touch
 from .text import format_tumour_trust, format_unbroken
 
-DRAWS = 16  # Number of sampled patients: two for each number that is fitted to them.
+DRAWS = 16  # Number of sampled patients: two for each fitted parameter.
 
 
 def refine_error(theatre: PatientSetup, scene: Scene, touch: Touch, time: float, count: int = DRAWS) -> Iterator[str]:

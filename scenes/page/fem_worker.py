@@ -16,12 +16,12 @@ from ..script.scene import Scene
 from ..script.tool_paths import Touch
 
 FrameRequest = tuple[int, Touch | None]
-"""A frame's number, and the hand's touch if it has the tool."""
+"""Number of a frame, and the touch under manual control, else None."""
 
 
 @dataclass(frozen=True, eq=False)
 class FemResult:
-    """Solution of one frame: its number, the deformation, the loads, and seconds; the request.
+    """Solution of one frame: frame number, loads, deformation, duration [s], and the request.
 
     The frame may be one on the way to the requested one.
     """
@@ -34,9 +34,9 @@ class FemResult:
 
 
 class FemWorker:
-    """Thread that solves the newest frame by FEM; older requests that it did not reach are dropped.
+    """Thread that solves the newest frame by FEM; older pending requests are dropped.
 
-    It pauses while an image is drawn.
+    The thread pauses while an image is drawn.
     It is prepared at the first request. Frames on the way to the requested one are solved too. If FEM fails, `failure`
     is the reason, and no further frames are solved; if loads are rejected, only that frame is skipped, and `refused` is
     its request. After the setup, `player` has the solver, and `plan` lists its solvers as sentences.
@@ -75,7 +75,7 @@ class FemWorker:
             self.newest = None
 
     def wait_newer(self, request: FrameRequest, previous: FemResult | None, seconds: float) -> FemResult | None:
-        """Wait up to `seconds` for a solution of a request or on the way to it, not `previous`; None after that."""
+        """Wait up to `seconds` for another solution than `previous` for a request; None after that time."""
 
         def find_newer() -> FemResult | None:
             result = self.truth
@@ -85,13 +85,13 @@ class FemWorker:
             return self.wake.wait_for(find_newer, seconds)
 
     def stop_soon(self) -> None:
-        """Ask for no more after the solve in hand, and do not wait for it."""
+        """Request the end of the thread after the current solve, without waiting."""
         with self.wake:
             self.closed.set()
             self.wake.notify_all()
 
     def close(self) -> None:
-        """Stop after the solve in hand."""
+        """Stop after the current solve, and wait for the thread's end."""
         self.stop_soon()
         self.thread.join()
 
@@ -99,7 +99,7 @@ class FemWorker:
         enter_background()
         try:
             self._solve_requests(theatre, scene)
-        except Exception as error:  # the page says it; the thread's own report goes to the terminal
+        except Exception as error:  # shown on the page; a traceback goes to the terminal
             self.failure = error
             if not isinstance(error, InputError):
                 raise
@@ -130,7 +130,7 @@ class FemWorker:
             return None if self.closed.is_set() else self.newest
 
     def _prepare_session(self, theatre: PatientSetup, scene: Scene) -> ReplaySession | None:
-        """Return the finite elements; None where they are not wanted any more when it is their turn."""
+        """Build the FEM session; None if the request was withdrawn while this thread waited for the lock."""
         with self.build_lock:
             if self.closed.is_set() or self.newest is None:
                 return None

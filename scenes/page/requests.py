@@ -1,4 +1,4 @@
-"""Requests of a page's visitors, and the line that says who of them has the tool."""
+"""Requests of a page's users, and the line that describes who controls the tool."""
 
 import threading
 from collections.abc import Collection
@@ -51,13 +51,13 @@ class Requests:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def set(self, **values: object) -> None:
-        """Change some wishes at once."""
+        """Change several requests at once."""
         with self.lock:
             for name, value in values.items():
                 setattr(self, name, value)
 
     def take_over(self, right: float | None = None, up: float | None = None, **values: float) -> None:
-        """Take the tool over with some numbers of its touch changed; `right` and `up` tilt its force [rad]."""
+        """Switch to manual control with some values of the touch changed; `right` and `up` tilt the force [rad]."""
         with self.lock:
             tilt = self.touch.tilt[0] if right is None else right, self.touch.tilt[1] if up is None else up
             self.touch, self.tool = replace(self.touch, tilt=tilt, **values), HAND
@@ -82,12 +82,12 @@ class Requests:
             return Look(self.style, self.path, self.through, self.tilt, self.distance, self.registration)
 
     def read_current(self) -> tuple[int, str, Touch | None, frozenset[str]]:
-        """Frame number, deformer, hand-set touch (None: the script's) and effects that are off."""
+        """Return frame number, deformer, manual touch (None: the script's) and disabled effects."""
         with self.lock:
             return self.number, self.deformer, self.touch if self.tool == HAND else None, self.off
 
     def go_on(self, number: int, frames: int) -> None:
-        """Advance playback after a frame was shown, unless a user has sought another one meanwhile."""
+        """Advance playback after a frame was shown, unless a user has requested another one meanwhile."""
         with self.lock:
             if self.plays and self.number == number:
                 self.number = (number + 1) % frames

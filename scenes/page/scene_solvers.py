@@ -52,7 +52,7 @@ class SceneSolvers:
             self.get_player(deformer)
 
     def get_stage(self, disabled: frozenset[str] = ALL_ACTIVE) -> Stage:
-        """Return the stage of the scene without some effects, of the tissue that it has with them."""
+        """Return the stage of the scene without some effects, with unchanged tissue."""
         if disabled not in self.stages:
             scene = self.stages[ALL_ACTIVE].scene
             for effect in scene.get_effects_on(self.theatre.anatomy):
@@ -61,7 +61,7 @@ class SceneSolvers:
         return self.stages[disabled]
 
     def get_worker(self, disabled: frozenset[str] = ALL_ACTIVE) -> FemWorker:
-        """Return the finite elements of the scene without some effects."""
+        """Return the FEM worker of the scene without some effects."""
         if disabled not in self.solvers:
             self.solvers[disabled] = FemWorker(self.theatre, self.get_stage(disabled).scene, self.build_lock)
         return self.solvers[disabled]
@@ -80,7 +80,7 @@ class SceneSolvers:
         return self.players[name, disabled]
 
     def get_player_with_camera(self, name: str, disabled: frozenset[str], look: Look) -> Player:
-        """Return the same, with the camera and the registration of a display style."""
+        """Return the player with the camera and the registration of a display style."""
         player = self.get_player(name, disabled)
         key = disabled, look.path, look.tilt, look.distance, look.registration
         if key[1:] == ("", None, None, None):
@@ -95,7 +95,7 @@ class SceneSolvers:
             if look.distance is not None:
                 viewpoint = replace(viewpoint, distance=look.distance)
             scene = replace(scene, viewpoint=viewpoint, registration=look.registration or scene.registration)
-            # Only the newest is kept: a slider passes through many.
+            # Only the newest stage is kept: a moving slider requests many.
             self.camera_stages = {key: replace(player.stage, scene=scene)}
         return replace(player, stage=self.camera_stages[key])
 
@@ -169,13 +169,13 @@ class SceneSolvers:
         worker.ask(*request)
 
     def stop_all(self) -> None:
-        """Nothing more is wanted: what is under way ends with the step in hand."""
+        """Withdraw the pending request: the worker stops after the current step."""
         if self.pending is not None:
             self.pending[0].drop()
             self.pending = None
 
     def stop_soon(self) -> list[FemWorker]:
-        """Stop the finite elements, without waiting for the steps in hand; returns those that have one."""
+        """Stop the FEM workers without waiting for their current steps; return those that are still running."""
         for worker in self.solvers.values():
             worker.stop_soon()
         return [worker for worker in self.solvers.values() if worker.thread.is_alive()]

@@ -43,7 +43,7 @@ def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
 
 
 def get_tool_force(loads: Loads, deformation: Deformation) -> tuple[float | None, float | None]:
-    """Return the tool force and its error [N]: a prescribed force has none; None: not known."""
+    """Return the tool force and its error [N]: a prescribed force has no error. None: not available."""
     pushed = loads.get_all(Pushed)
     if pushed:
         return float(np.linalg.norm(pushed[0].force[0])), 0.0
@@ -55,7 +55,7 @@ def get_tool_force(loads: Loads, deformation: Deformation) -> tuple[float | None
 
 
 def render_slices(frame: Frame, player: Player, through: str) -> np.ndarray:
-    """Three slices (h, 3 h, 3) uint8 through the tumour's middle, or through the tool's tip where there is one."""
+    """Render three slices (h, 3 h, 3) uint8 through the tumour's centre, or through the tool's tip if there is one."""
     stage, positions = player.stage.select_stage(frame.loads), player.estimate_positions(frame)
     other_layers, tool = [], player.scene.tool
     if tool is not None and frame.pose is not None:
@@ -69,7 +69,7 @@ def render_slices(frame: Frame, player: Player, through: str) -> np.ndarray:
 
 
 def draw_slices_through(stage: Stage, cut: Cut, through: str) -> np.ndarray:
-    """Three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above; of no tip, the middle's."""
+    """Draw three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above (no tip: the centre)."""
     tumour = cut.now if len(cut.now.vertices) else stage.tumour_at_rest
     centre = 0.5 * (tumour.vertices.min(axis=0) + tumour.vertices.max(axis=0))
     return draw_slices(stage.anatomical_scan, cut.tip if through == TIP and cut.tip is not None else centre, cut)

@@ -88,7 +88,7 @@ def format_page_legend(scene: Scene) -> str:
 
 
 def format_legend(keys: Sequence[tuple[str, str]]) -> str:
-    """Return a legend: each line's attributes as SVG has them, and what it means."""
+    """Return a legend of lines, given the SVG attributes and the meaning of each."""
     samples = (
         f'<span><svg width="26" height="8"><line x1="1" y1="4" x2="25" y2="4" {attributes}/></svg>{text}</span>'
         for attributes, text in keys
@@ -97,18 +97,18 @@ def format_legend(keys: Sequence[tuple[str, str]]) -> str:
 
 
 def to_stroke(colour: Sequence[float]) -> str:
-    """Return a colour, sRGB in [0, 1], as a line has it in HTML."""
+    """Format a colour, sRGB in [0, 1], as the stroke attribute of an SVG line."""
     return 'stroke="#' + "".join(f"{round(255.0 * channel):02x}" for channel in colour) + '"'
 
 
 def describe_scene(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
-    """Describe the anatomy, the side, and the tissue of the FEM model."""
+    """Describe the anatomy, the size of its mesh, and the FEM model."""
     mesh = theatre.anatomy.mesh
     return f"Brain: {anatomy}; {len(mesh.nodes)} mesh points. FEM: {describe_fem(theatre, scene)}."
 
 
 def describe_fem(theatre: PatientSetup, scene: Scene) -> str:
-    """Element and tissue that the theatre's finite elements have in a scene."""
+    """Describe element and tissue of the FEM model of a scene."""
     element, elasticity = theatre.choose_element(scene), scene.elasticity
     regions = (f"; the {name_region(key)} of {describe_tissue(tissue)}" for key, tissue in elasticity.regions.items())
     return f"{ELEMENTS.get(element, element)}, {describe_tissue(elasticity.default)}{''.join(regions)}"
@@ -177,7 +177,7 @@ def format_trust(deformation: Deformation, name: str) -> str:
 
 
 def _describe_guarded(outcome: Outcome) -> str:
-    """Describe which of the two computed the solution of a guarded model."""
+    """Describe whether the model or FEM computed the solution of a guarded model."""
     by_model = outcome in (Outcome.PREDICTED, Outcome.EXTRAPOLATED)
     return "fast model" if by_model else "FEM, because the error bound of the fast model is too large"
 
@@ -277,6 +277,6 @@ def format_tip_distance(distance: float, error: float | None, inside: bool) -> s
 
 
 def format_unbroken(length: float, error: float | None = None) -> str:
-    """Return a length and its error [m] in millimetres, whose unit no new line parts from them."""
+    """Format a length and its error [m] in millimetres, without line breaks."""
     text = hud.format_millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
     return text.replace(" ", "&nbsp;")

@@ -17,7 +17,7 @@ from .fem_worker import FemResult
 
 FEM_COLOUR = TRUTH_COLOUR  # Colour of the FEM tumour.
 STALE_COLOUR = (0.45, 0.45, 0.45)
-"""Colour of the FEM tumour while it belongs to another load than the one shown."""
+"""Colour of the FEM tumour while its load differs from the shown one."""
 BRAIN_COLOUR = (0.50, 0.38, 0.36)  # Colour of the inside of the brain's far side: its near side would hide the rest.
 CORTEX_COLOURS = {"cortex": (0.80, 0.53, 0.47), "sulci": (0.45, 0.15, 0.16)}  # Colours of crowns and sulci.
 EDGE_COLOUR, EDGE_WIDTH = (0.93, 0.86, 0.72), 2.5e-3
@@ -28,7 +28,7 @@ LETTER_DISTANCE = 12e-3  # Distance of the orientation letters from the brain [m
 
 
 def build_page_bodies(stage: Stage) -> list[SceneSurface]:
-    """Brain, open cortex, tumour, the finite elements' tumour, an estimate's ellipsoid and the tool, at rest."""
+    """Build the undeformed bodies: brain, open cortex, tumour, FEM tumour, ellipsoid of an estimate, and tool."""
     tool, site, tumour = stage.scene.tool, stage.site, stage.build_tumour(stage.site.anatomy.mesh.nodes)
     wire = SceneSurface("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True)
     bodies = [*build_brain(stage), wire]
@@ -45,7 +45,7 @@ def build_page_bodies(stage: Stage) -> list[SceneSurface]:
 
 
 def build_brain(stage: Stage) -> list[SceneSurface]:
-    """Brain, open cortex and tumour, at rest."""
+    """Build the undeformed brain, open cortex and tumour."""
     brain, scan, cortex = stage.brain, stage.tumour_at_rest, split_cortex(stage, stage.site.anatomy.mesh.nodes)
     return [
         SceneSurface("brain", brain.vertices, brain.triangles, BRAIN_COLOUR, side="back"),
@@ -75,7 +75,7 @@ def build_edge(stage: Stage) -> SceneSurface:
 
 
 def build_surroundings(stage: Stage) -> list[Sign | ScenePicture]:
-    """Build what stays in place: orientation letters round the brain, and planes of the scan behind the tumour."""
+    """Build the static bodies: orientation letters round the brain, and planes of the scan behind the tumour."""
     surroundings: list[Sign | ScenePicture] = [*list_orientation_labels(stage.site)]
     scan, centre = stage.anatomical_scan, stage.tumour_at_rest.vertices.mean(axis=0)
     for plane in PLANES if scan is not None else ():
@@ -89,7 +89,7 @@ def build_surroundings(stage: Stage) -> list[Sign | ScenePicture]:
 
 
 def list_orientation_labels(site: CraniotomyFrame) -> list[Sign]:
-    """Return the patient's sides round the brain."""
+    """Return the labels of the patient's sides around the brain."""
     nodes = site.anatomy.mesh.nodes
     centre, half_size = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + LETTER_DISTANCE
     offsets = np.kron(np.diag(half_size), [[1.0], [-1.0]])
@@ -97,13 +97,13 @@ def list_orientation_labels(site: CraniotomyFrame) -> list[Sign]:
 
 
 def choose_viewpoint(site: CraniotomyFrame) -> SceneViewpoint:
-    """Obliquely onto the open cortex."""
+    """Return an oblique viewpoint towards the open cortex."""
     eye = site.origin - 0.10 * site.axis + 0.13 * site.right + 0.05 * site.up
     return SceneViewpoint(eye, site.origin + 0.02 * site.axis - 0.01 * site.right, site.up, fov=np.radians(38.0))
 
 
 def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
-    """Put the bodies of the 3-D view where a frame has them."""
+    """Move the bodies of the 3-D view to their positions in a frame."""
     positions, tool = player.estimate_positions(frame), player.scene.tool
     stage = player.stage.select_stage(frame.loads)
     tumour = stage.build_tumour(positions)
@@ -117,7 +117,7 @@ def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
 
 
 def move_wire(browser: Browser, stage: Stage, result: FemResult, player: Player) -> None:
-    """Show where the finite elements, under all effects, have the tumour."""
+    """Show the tumour position that FEM computes with all effects."""
     tumour = stage.select_stage(result.loads).build_tumour(player.compute_positions(result.deformation))
     browser.move("finite elements", tumour.vertices, tumour.triangles)
 

@@ -57,7 +57,7 @@ class SceneFigures:
         True if every number and image is finite and the visible cortex moves as the FEM surface; true if every
         solution, drawn or by FEM, has a good outcome.
     doubt
-        The first solution that has not: frame, source and outcome; number of others.
+        First solution with a bad outcome: frame, source and outcome; number of others.
     in_step
         True if every image shows the solution at its own time.
     leaked
@@ -90,7 +90,7 @@ class SceneFigures:
     doubt: str = ""
 
     def find_violations(self, bounds: Bounds) -> list[str]:
-        """Return a sentence for each bound that is not kept."""
+        """Return a sentence for each metric that exceeds its limit."""
         rules = {
             f"overlap {self.overlap:.4f} is below {bounds.overlap}": self.overlap >= bounds.overlap,
             f"error {self.error_mm:.4f} mm is above {1e3 * bounds.error:g} mm": self.error_mm <= 1e3 * bounds.error,
@@ -133,7 +133,7 @@ def measure(
         ).mean()
         for row, frame in enumerate(frames)
     ]
-    finite = [_is_finite(frame) and _is_carried(player, frame) for frame in frames]
+    finite = [_is_finite(frame) and _is_cortex_embedded(player, frame) for frame in frames]
     misses = [
         _measure_miss(player, camera_at(frame.time), frame, truth, row) if finite[row] else WORST_MISS
         for row, frame in enumerate(frames)
@@ -182,7 +182,7 @@ def is_within_surface(closed: Layer, point: np.ndarray) -> bool:
 
 
 def _compute_removed_share(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
-    """Share of the tumour's motion, summed over its vertices and the frames, that estimates remove."""
+    """Compute the share of the tumour's motion, summed over its vertices and the frames, that estimates remove."""
     if not any(frame.estimate for frame in frames):
         return np.nan
     nodes, rest = player.site.anatomy.tumour_nodes, player.site.anatomy.mesh.nodes
@@ -204,8 +204,8 @@ def _list_unreliable(frames: Sequence[Frame], truth: Deformation) -> list[str]:
 def list_objections(frames: Sequence[Frame]) -> list[str]:
     """List warnings about the estimates of a scene with an observation model, or about its frames.
 
-    Number of frames that the locator rejects or doubts, with the first reason. A tumour that is still in most frames:
-    the removed share is then mostly rigid error. They explain limits that are exceeded, and are not limits themselves.
+    Frames that the locator rejects or doubts are counted, with the first reason. If the tumour is still in most frames,
+    the removed share is mostly rigid error. These warnings explain exceeded limits, and are not limits themselves.
     """
     estimates = [frame.estimate for frame in frames if frame.estimate is not None]
     refused = [estimate.refusal for estimate in estimates if estimate.location is None]
@@ -229,7 +229,7 @@ def _is_finite(frame: Frame) -> bool:
     return bool(np.isfinite(frame.picture.depth).all() and np.isfinite(frame.deformation.displacement).all())
 
 
-def _is_carried(player: Player, frame: Frame) -> bool:
+def _is_cortex_embedded(player: Player, frame: Frame) -> bool:
     """Return True if the visible cortex moves as the FEM surface in which it is embedded."""
     stage = player.stage.select_stage(frame.loads)
     if not stage.scene.look.natural:
@@ -264,6 +264,6 @@ def _measure_miss(player: Player, camera: Camera, frame: Frame, truth: Deformati
     drawn = measure_outline_error(frame, mask)
     if frame.estimate is not None:  # both are in the image
         drawn = max(drawn, measure_truth_error(frame, render_silhouette(camera, true)))
-    # Not a number: behind the camera.
+    # NaN: a point is behind the camera.
     pixels = np.inf if np.isnan(pixels) else float(pixels)
     return overlap, mean, pixels, drawn, visible, is_hidden_part_marked(frame, mask)

@@ -47,9 +47,9 @@ VESSELS = VesselSettings()
 def add_vessels(
     intensity: Intensity | None, site: CraniotomyFrame, seed: int, dark: tuple[float, float, float], relief: float
 ) -> Solid:
-    """Return the scan round an opening as a solid texture with vessels upon it, which the seed draws.
+    """Return the scan around an opening as a solid texture with random vessels, which the seed determines.
 
-    They go with the tissue, and have no height. Without a scan, tissue is evenly bright. `dark` and `relief` as of
+    Vessels move with the tissue, and have no height. Without a scan, brightness is uniform. `dark` and `relief` as of
     `Solid`.
     """
     half = site.radius + VESSELS.margin
@@ -69,7 +69,7 @@ def add_vessels(
 def compute_vessel_absorption(
     across: np.ndarray, random: np.random.Generator, settings: VesselSettings = VESSELS
 ) -> np.ndarray:
-    """Share of the light that vessels take, (n, n), at places `across` (n,) [m] from the middle, both ways."""
+    """Compute the share of light (n, n) that vessels absorb, on a grid of coordinates `across` (n,) [m]."""
     points, widths = sample_vessel_paths(float(np.abs(across).max()), random, settings)
     here = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1)
     away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * settings.max_width)
@@ -82,7 +82,7 @@ def compute_vessel_absorption(
 def sample_vessel_paths(
     half: float, random: np.random.Generator, settings: VesselSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (k, 2) [m] of vessels that come in at the border of a square, wander and branch; their widths (k,) [m]."""
+    """Sample vessels that enter at the border of a square and branch: points (k, 2) [m] and widths (k,) [m]."""
     count = settings.trunk_count
     angles = 2.0 * np.pi * (np.arange(count) + random.uniform(0.0, 0.7, count)) / count
     rim = half * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -123,7 +123,7 @@ class FingerSettings:
 
 @dataclass(frozen=True, eq=False)
 class Squares:
-    """Squares of cotton as places of the cortex: vertices and weights (n, 3), and triangles (m, 3) of the places."""
+    """Squares of cotton as points of the cortex: vertices and weights (n, 3), and triangles (m, 3) of the points."""
 
     vertices: np.ndarray
     weights: np.ndarray

@@ -59,8 +59,8 @@ TRUTH_TEXT = "what an estimate is held against is the truth, as finite elements 
 class PatientSetup:
     """Anatomy, its T1 scan if there is one, models by name, uncertainties and costs of effects by scene.
 
-    `locator_file` is the locator of its tumour, for scenes with an observation model. `limit` [m] is that of a guarded
-    model; None: the limit derived from its own errors on held-out cortex. `families`: those that were built.
+    `locator_file` has the locator of the tumour, for scenes with an observation model. `limit` [m] is that of a guarded
+    model; None: the limit derived from its own errors on held-out cortex. `families`: available families.
     """
 
     anatomy: Anatomy
@@ -113,7 +113,7 @@ class PatientSetup:
         return scene.observation_model is not None and (self.locator_file is None or not self.locator_file.is_file())
 
     def build_stage(self, scene: Scene) -> Stage:
-        """Build a scene's stage on this anatomy, rendered on this theatre's device.
+        """Build a scene's stage on this anatomy, rendered on the device of this setup.
 
         Raises
         ------
@@ -141,8 +141,8 @@ class PatientSetup:
     def list_rejections(self, scene: Scene) -> dict[str, str | None]:
         """Find the reason why each trained model does not support a scene, by name; None if it does.
 
-        A model supports only the effects, the tissue and the element that it was trained on. None is the reference with
-        which an estimate is compared.
+        A model supports only the effects, the tissue and the element that it was trained on. No model is the
+        reference of an estimate.
         """
         if scene.observation_model is not None:
             return dict.fromkeys(self.models, TRUTH_TEXT)
@@ -254,18 +254,18 @@ class PatientSetup:
         Raises
         ------
         InputError
-            See `deformer`; an anatomy without open cortex.
+            See `build_deformer`; an anatomy without open cortex.
         """
         return self.build_player_of(self.build_stage(scene), self.build_deformer(name, scene), name)
 
     def build_player_of(self, stage: Stage, deformer: Deformer, name: str) -> Player:
-        """Return a player of a stage and a deformer of that name, with its errors on this anatomy."""
+        """Return a player of a stage and the deformer `name`, with the deformer's errors on this anatomy."""
         ensemble, motion_error = self.estimate_uncertainty(stage.scene), self.estimate_motion_error(stage.scene)
         recorded = self.select_recorded(stage.scene).get(name)
         return Player(stage, deformer, uncertainty=ensemble, motion_error=motion_error, recorded=recorded)
 
     def estimate_uncertainty(self, scene: Scene) -> Uncertainty | None:
-        """Return the expected error of the tumour position in a scene; None without an ensemble of exactly it."""
+        """Return the expected error of the tumour position in a scene; None without an ensemble of this scene."""
         found = self.uncertainties.get(scene.name)
         return found if found and found.mark == self.compute_mark(scene) else None
 
@@ -275,7 +275,7 @@ class PatientSetup:
         return found if found and found.mark == self.compute_mark(scene) else None
 
     def select_recorded(self, scene: Scene) -> dict[str, FamilyFigures]:
-        """Select the families with figures that hold in a scene: of a tool's force on this tissue, fixed to bone."""
+        """Select the families with figures that apply to a scene: a tool's force on this tissue, fixed to bone."""
         kinds = {type(effect): str(effect) for effect in scene.get_effects_on(self.anatomy)}
         pushed = {*kinds, Bonded} == {Elasticity, Held, Bonded, ToolForce}
         return {name: one for name, one in self.family_figures.items() if pushed and one.tissue == kinds[Elasticity]}
@@ -303,19 +303,19 @@ class PatientSetup:
 
 @dataclass(frozen=True, eq=False)
 class AtRest:
-    """A Deformer that solves nothing: the body stays where the scan has it."""
+    """Deformer without motion: the body stays undeformed, as in the scan."""
 
     anatomy: Anatomy
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Return a guess that nothing moves, whatever acts."""
+        """Return zero displacement under any loads, as `guess` marks it."""
         rest = guess(np.zeros((len(loads), *self.anatomy.mesh.nodes.shape)))
         return rest if at is None else rest.restrict(at)
 
 
 @lru_cache(1)
 def read_template_uncertainties() -> Mapping[str, Uncertainty]:
-    """Return the uncertainties that ship with the template, by scene."""
+    """Return the shipped uncertainties of the template, by scene."""
     return read_uncertainties(to_uncertainty_path(get_template_path()))
 
 
@@ -325,12 +325,12 @@ def plan_of(deformer: Deformer) -> tuple[str, ...]:
 
 
 def to_model_path(anatomy: Path, kind: str = "model") -> Path:
-    """Return the path of models next to MESH.vtu: MESH.model.npz by default, MESH.SCENE.npz for those of one scene."""
+    """Return the path of models next to MESH.vtu: MESH.model.npz by default, MESH.SCENE.npz for models of one scene."""
     return anatomy.with_suffix(f".{kind}.npz")
 
 
 def load_models(path: Path, anatomy: Anatomy) -> dict[str, Learned]:
-    """Load the models next to an anatomy, by name; those of one scene are called NAME-SCENE.
+    """Load the models next to an anatomy, by name; models for one scene are called NAME-SCENE.
 
     Raises
     ------
@@ -367,7 +367,7 @@ def open_theatre(
     """
     for name in scenes:
         check_scene_exists(name)
-    # # Trained models alone would not detect this, and the FEM fallback would fail too late.
+    # Trained models alone would not detect this, and the FEM fallback would fail too late.
     find_device(device, LIVE.precision)
     path = get_template_path() if anatomy is None else Path(anatomy)
     body = read_anatomy(path)

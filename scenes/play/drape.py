@@ -18,7 +18,7 @@ CLOTH_EDGE = 0.8e-3  # Largest edge of a triangle of cloth near the hole [m].
 CLOTH_GROWTH = 0.35  # Growth of the largest edge with the distance from the hole, beyond `CLOTH_WIDTH`.
 CLOTH_WIDTH = 30e-3  # Width of the ring of cloth round the hole with the smallest edges [m].
 SMOOTHING_STEPS = 20  # Number of smoothing steps of the drape.
-FOLD_COUNTS = (9, 14)  # Numbers of folds round the hole of two sets, of which the higher is seen.
+FOLD_COUNTS = (9, 14)  # Numbers of folds around the hole in two sets; the visible height is the larger of both.
 FOLD_HEIGHT = 4.5e-3  # Height of the folds [m].
 FOLD_START = 9e-3  # Distance from the hole at which the folds have their height [m].
 
@@ -44,7 +44,7 @@ def build_drape(site: CraniotomyFrame, number: int, folded: bool) -> Layer:
 
 
 def cut_hole(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the surface lifted off the brain, with a round hole over the open cortex, as of `clip_surface`."""
+    """Return the surface lifted off the brain, with a round hole over the open cortex; see `clip_surface`."""
     mesh = site.anatomy.mesh
     lifted = mesh.nodes + DRAPE_HEIGHT * compute_vertex_normals(mesh.nodes, mesh.surface)
     # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
@@ -77,7 +77,7 @@ def fold_cloth(
 
 
 def list_border(triangles: np.ndarray) -> np.ndarray:
-    """List the edges (k, 2) of one triangle only."""
+    """List the edges (k, 2) that belong to one triangle only."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
     return edges[trimesh.grouping.group_rows(edges, require_count=1)]
 
@@ -106,7 +106,7 @@ def clip_surface(
     added, pieces, rim = [], [], []
     for corners in mixed:
         inside = value[corners] > 0.0
-        # Turn the triangle so that the lone corner comes first.
+        # Permute the corners so that the corner alone on its side comes first.
         lone = int(np.argmax(inside) if inside.sum() == 1 else np.argmin(inside))
         a, b, c = np.roll(corners, -lone)
         cuts = []

@@ -80,7 +80,7 @@ def measure_effects(
     Raises
     ------
     InputError
-        A scene that cannot be solved, or not to the end.
+        A scene that cannot be solved to the end.
     """
     whole = run(theatre, scene, every)
     nowhere = replace(whole, displacement=np.zeros_like(whole.displacement), milliseconds=0.0, held=0)
@@ -123,7 +123,7 @@ def run(theatre: PatientSetup, scene: Scene, every: int) -> AblationRun:
     InputError
         A body without fixed nodes, or a frame that is not in equilibrium. Unphysical equilibria are counted.
     """
-    before = list_device_arrays()  # freed meanwhile or not, they are not the scene's
+    before = list_device_arrays()  # arrays that existed before do not belong to the scene
     fem = theatre.build_fem(scene, scene.accuracy, live=True)
     times = scene.times[::every].tolist()
     found, seconds, unphysical = _solve_frames(fem, scene, theatre.site, times)
@@ -137,7 +137,7 @@ def run(theatre: PatientSetup, scene: Scene, every: int) -> AblationRun:
 def _solve_frames(
     fem: Deformer, scene: Scene, site: CraniotomyFrame, times: list[float]
 ) -> tuple[list[np.ndarray], list[float], int]:
-    """Displacements (V, 3) [m], NaN of what was cut out, and seconds of each frame; number of unphysical frames."""
+    """Solve the frames: displacements (V, 3) [m], NaN where resected, and seconds; number of unphysical frames."""
     last, found, seconds, unphysical, stage = None, [], [], 0, Stage(scene, site)
     for time in times:
         loads = scene.build_loads(site, scene.path(time), time)
@@ -153,7 +153,7 @@ def _solve_frames(
 
 
 def list_device_arrays() -> list[wp.array]:
-    """All Warp arrays that live and own their memory."""
+    """List all live Warp arrays that own their memory."""
     gc.collect()
     return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]
 

@@ -23,7 +23,7 @@ class EffectRecord:
     """Measured effects of one scene on one anatomy, of which a number of `frames` was solved.
 
     `mark`: fingerprint of the scene, see `scenes.script.uncertainty.mark_of`; `day`: ISO 8601; `machine` in words.
-    `effects`, by class name: FEM time per frame that an effect adds [ms], and how far it moves the tumour [mm]; None:
+    `effects`, by class name: FEM time per frame that an effect adds [ms], and tumour motion that it causes [mm]; None:
     not solvable without it, `refused` has the reason. `all`: time and motion of the whole scene. `unphysical`: number
     of frames with inverted or overstrained tetrahedra, in the solutions with and without each effect.
     """
@@ -45,12 +45,12 @@ def format_unphysical(count: int) -> str:
 
 
 def read_effect_records(path: Path) -> dict[str, EffectRecord]:
-    """Read the records of a file, by scene; none where there is no file.
+    """Read the records of a file, by scene; empty without a file.
 
     Raises
     ------
     InputError
-        A file that cannot be read as such.
+        An invalid or unreadable file.
     """
     if not path.is_file():
         return {}

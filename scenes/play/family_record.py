@@ -35,12 +35,12 @@ class FamilyFigures(msgspec.Struct, array_like=True, frozen=True):
 
 
 def read_family_figures(mesh: Path, digest: str) -> dict[str, FamilyFigures]:
-    """Read the figures of families in MESH.report.json, of the anatomy with this digest; none without such a file.
+    """Read the figures of families in MESH.report.json, of the anatomy with this digest; empty without a file.
 
     Raises
     ------
     InputError
-        A file that cannot be read as such.
+        An invalid or unreadable file.
     """
     if not (path := mesh.with_suffix(".report.json")).is_file():
         return {}

@@ -30,7 +30,7 @@ class FineCortex:
 def build_fine_cortex(
     site: CraniotomyFrame, mesh: TetMesh, surface: np.ndarray, intensity: Intensity | None, edge: float = EDGE_LENGTH
 ) -> FineCortex:
-    """Build the fine cortex upon triangles (S, 3) of the surface of a mesh, of which tissue may have been resected.
+    """Build the fine cortex on surface triangles (S, 3) of a mesh, from which tissue may have been resected.
 
     `edge`: largest edge of a triangle in the craniotomy [m].
     """

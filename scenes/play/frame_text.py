@@ -81,7 +81,7 @@ def _describe_fluid(cause: Posture, nodes: np.ndarray) -> str:
 
 
 def shorten_source(source: str) -> str:
-    """Shorten `Deformation.source`: regions with a tissue of their own are given by name only."""
+    """Shorten `Deformation.source`: regions with another tissue are given by name only."""
     return OWN_TISSUES_PATTERN.sub(lambda found: f"; own tissue: {', '.join(REGION_PATTERN.findall(found[0]))}", source)
 
 
@@ -146,7 +146,7 @@ def format_tumour_error(error: TumourError, brief: bool = False) -> str:
 
 
 def find_worst(errors: Sequence[TumourError]) -> TumourError:
-    """Return the largest of several frames' errors; not known where one is not."""
+    """Return the largest error of several frames; not available if it is not available for one frame."""
     known = [error for error in errors if error.bound is not None]
     if len(known) < len(errors) or not known:
         return TumourError(None)
@@ -161,5 +161,5 @@ def annotate(over: Overlaid, number: int, remark: str) -> None:
 
 
 def label_frame(number: int) -> list[str]:
-    """Return the lines that label an image: its frame number, and that it is simulated."""
+    """Return the lines that label an image: its frame number, and a note that the image is simulated."""
     return [f"frame {number}", "simulation"]

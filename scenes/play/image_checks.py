@@ -46,7 +46,7 @@ def render_silhouette(camera: Camera, layer: Layer) -> np.ndarray:
 
 
 def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
-    """Compute the distance between the outline in a frame's image and that of a silhouette (H, W) bool [pixel].
+    """Compute the distance between the outline in a frame's image and the outline of a silhouette (H, W) bool [pixel].
 
     Outlines drawn broken, because they are occluded or unreliable, may have gaps.
     """
@@ -68,19 +68,19 @@ def measure_truth_error(frame: Frame, mask: np.ndarray) -> float:
 
 
 def _mask_foreground(frame: Frame) -> np.ndarray:
-    """(H, W) bool: words and tools."""
+    """Return the mask (H, W) bool of text and tools."""
     return find_ink(frame.shown, WHITE, 0) | (frame.picture.segmentation == TOOL)
 
 
 def find_closed_ground(frame: Frame) -> np.ndarray:
-    """(H, W) bool: ground that the tumour is not seen through, and no tool."""
+    """Return the mask (H, W) bool of pixels that show neither a tool nor cortex through which the tumour is seen."""
     return ~np.isin(frame.picture.segmentation, (*OPENING.ids, TOOL))
 
 
 def is_hidden_part_marked(frame: Frame, mask: np.ndarray) -> bool:
     """Return True if the image marks the occluded part of a silhouette (H, W) bool, if there is one.
 
-    There the outline must be broken, without shading, and the image must name the occluder.
+    In this part the outline must be broken, without shading, and the image must name the occluder.
     """
     ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), find_closed_ground(frame)
     least, most = BROKEN_SHARES
@@ -107,7 +107,7 @@ def _is_ground_labelled(frame: Frame, mask: np.ndarray) -> bool:
 def has_printed_numbers(player: Player, frame: Frame) -> bool:
     """Return True if the image shows the frame number, the distance from tip to tumour, and the estimate."""
     labelled = all(has_text(frame.shown, line, TEXT_SCALE) for line in label_frame(frame.number))
-    if not labelled or not _estimate_printed(player, frame):
+    if not labelled or not _has_printed_estimate(player, frame):
         return False
     return frame.tip is None or _find_number(player, frame, frame.tip) is not None
 
@@ -139,7 +139,7 @@ def _find_number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, in
     return None
 
 
-def _estimate_printed(player: Player, frame: Frame) -> bool:
+def _has_printed_estimate(player: Player, frame: Frame) -> bool:
     """Return True if the image shows the estimated tumour motion and its error as computed here."""
     found = frame.estimate
     if found is None or found.location is None:
@@ -160,7 +160,7 @@ def _estimate_printed(player: Player, frame: Frame) -> bool:
 
 
 def _get_corners(player: Player, frame: Frame) -> np.ndarray:
-    """Corners (S, 3, 3) [m] of the tumour's triangles as they are drawn."""
+    """Return the corners (S, 3, 3) [m] of the tumour's triangles as they are drawn."""
     return player.estimate_positions(frame)[player.stage.select_stage(frame.loads).anatomy.tumour_surface]
 
 

@@ -102,7 +102,7 @@ def has_instrument(tool: object) -> TypeGuard[Probe | Blade]:
 
 @lru_cache(maxsize=8)
 def build_instrument(tool: Probe | Blade, kind: BallInstrument, number: int) -> tuple[Layer, ...]:
-    """Build the layers of a brain spatula, or of an instrument of a kind for a ball, in the tool's frame."""
+    """Build the layers of a brain spatula, or of an instrument with a ball, in the tool's frame."""
     if isinstance(tool, Blade):
         return (build_metal([build_spatula(tool)], [STEEL], number, BLADE_LIGHT),)
     lift = np.array([0.0, 0.0, 1e3 * tool.radius, 0.0, 0.0])
@@ -130,7 +130,7 @@ def build_metal(
 
 
 def build_spatula(blade: Blade) -> trimesh.Trimesh:
-    """Build a brain spatula: the lower half of a blade, from whose end a thinner strip goes up and away."""
+    """Build a brain spatula: the lower half of a blade, with a thinner strip that leads up and away from its end."""
     edge, half = blade.edge, 0.5 * blade.length
     rounded = edge * np.sin(np.linspace(-0.48 * np.pi, 0.0, 9))
     y = np.append(rounded + edge - half, np.linspace(edge - half, half - SPATULA_BEND, 12)[1:])

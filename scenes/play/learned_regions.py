@@ -33,5 +33,5 @@ def _scale_tissue(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
 
 
 def _remove_relaxation(tissue: Tissue) -> Tissue:
-    """Return a tissue as if it did not relax."""
+    """Return a tissue without its relaxation."""
     return replace(tissue, prony=()) if isinstance(tissue, Material | Ogden) else tissue

@@ -52,7 +52,7 @@ class TumourEstimate:
     location
         Result of the locator; None if it rejects the observation.
     refusal
-        Reason of the rejection, in its words; else empty.
+        Reason of the rejection in the locator's words; else empty.
     middle, true
         (3,) [m]: centroid of the tumour in the scan, and its true displacement.
     seconds
@@ -74,7 +74,7 @@ class TumourEstimate:
 
     @property
     def moved(self) -> float:
-        """Its length [m]."""
+        """Length [m] of `motion`."""
         return float(np.linalg.norm(self.motion))
 
     @property
@@ -120,7 +120,7 @@ class TumourEstimate:
 
     @property
     def source(self) -> str:
-        """Description of the observation; or the reason why it was rejected."""
+        """Description of the observation, or the reason of its rejection."""
         if self.location is None:
             return f"rejected, {self.refusal}"
         tip = ", and where the tool touches" if len(self.observation.tips) else ""
@@ -156,7 +156,7 @@ class Sees(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Observer:
-    """Observer that samples the points of a `PointObservation`, with its errors, and calls a locator without loads."""
+    """Observer that samples the points and errors of a `PointObservation`, and calls a locator without loads."""
 
     site: CraniotomyFrame
     locator: Locator
@@ -173,7 +173,7 @@ class Observer:
         )
 
     def observe(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
-        """Sample the observation of a frame; arguments as of `estimate`."""
+        """Sample the observation of a frame; for the arguments see `estimate`."""
         model, random = self.observation_model, np.random.default_rng([self.observation_model.seed, 1 + number])
         now = self._interpolate_points(positions)
         off = self._smooth + model.white * random.standard_normal(now.shape)
@@ -181,9 +181,9 @@ class Observer:
         if tool is not None:
             shown = KDTree(tool).query(now)[0] > HIDING_DISTANCE
             tips = find_touched(self.site.anatomy, positions, tool)
-            tips = self._as_a_whole(tips + model.white * random.standard_normal(tips.shape))
+            tips = self._move_rigid(tips + model.white * random.standard_normal(tips.shape))
         sigma = np.full(shown.sum(), np.hypot(model.white, model.smooth))
-        return Observation(self._as_a_whole(now + off)[shown], self._interpolate_points(self._rest)[shown], sigma, tips)
+        return Observation(self._move_rigid(now + off)[shown], self._interpolate_points(self._rest)[shown], sigma, tips)
 
     @property
     def _rest(self) -> np.ndarray:
@@ -194,13 +194,13 @@ class Observer:
         vertices, weights = self._places
         return np.einsum("nc,nci->ni", weights, positions[vertices])
 
-    def _as_a_whole(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) [m] with the rigid error."""
+    def _move_rigid(self, points: np.ndarray) -> np.ndarray:
+        """Add the rigid error to points (n, 3) [m]."""
         return self._rigid.apply(points, self._interpolate_points(self._rest).mean(axis=0))
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
-        """The points: vertices (n, 3) of the mesh, and weights (n, 3)."""
+        """Observed points: vertices (n, 3) of the mesh, and weights (n, 3)."""
         site, random = self.site, np.random.default_rng([self.observation_model.seed, 0])
         triangles = site.anatomy.open_surface
         corners = self._rest[triangles]
@@ -241,9 +241,9 @@ def sample_rigid_error(model: PointObservation | StereoObservation, number: int)
 
 
 def find_touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
-    """Return the place of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches.
+    """Find the point of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches.
 
-    (0, 3) where it is in the air.
+    Empty, (0, 3), if the tool is in the air.
     """
     triangles = anatomy.open_surface
     near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:SEARCHED_CORNERS]]

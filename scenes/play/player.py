@@ -1,4 +1,4 @@
-"""The loop: a scripted tool, a deformer and a camera make one frame after the other."""
+"""Loop that plays a scene: tool input, deformation and rendering of each frame."""
 
 import time as clock
 from collections.abc import Iterator, Mapping
@@ -56,7 +56,7 @@ STAGES = ("deform", "render", "overlay")
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Frame of a scene.
+    """Rendered frame of a scene, with its solution, distances and errors.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class Frame:
     remark
         Further text in the image, for example that the bone stops the tool; usually empty.
     seconds
-        Wall time by stage, see `STAGES`; that of an estimate as "locate".
+        Wall time by stage, see `STAGES`; "locate" is the time of an estimate.
     estimate
         Estimated tumour position, in a scene with an observation model: it is drawn, and `deformation` is the truth.
     """
@@ -176,16 +176,16 @@ class Player:
 
     @property
     def site(self) -> CraniotomyFrame:
-        """The open cortex that it is played on."""
+        """Open cortex of the scene's anatomy."""
         return self.stage.site
 
     @property
     def camera(self) -> Camera:
-        """The scene's camera as it starts."""
+        """Initial camera of the scene."""
         return self.stage.camera
 
     def get_camera(self, time: float) -> Camera:
-        """Return the scene's camera at a time [s]: one that stays is the same, whose backdrop is kept."""
+        """Return the scene's camera at a time [s]; a static camera is one object, whose backdrop is cached."""
         return self.camera if self.scene.viewpoint.path is None else self.scene.viewpoint.build_camera(self.site, time)
 
     @cached_property
@@ -208,7 +208,7 @@ class Player:
         return self.scene.build_loads(self.site, touch or self.get_touch(number), float(self.scene.times[number]))
 
     def compute_deformation(self, loads: Loads, last: Deformation | None = None) -> Deformation:
-        """Compute the deformation from the last one; a trained model or a table returns the drawn vertices only."""
+        """Compute the deformation, starting from the last; a trained model or a table returns drawn vertices only."""
         if isinstance(self.deformer, Learned | LinearModel):
             return self.deformer.deform(loads, start=last if self.follows else None, at=self.stage.nodes)
         return self.deformer.deform(loads, start=last)
@@ -315,9 +315,9 @@ class Player:
         return replace(error, observed=worst, registration=deviation)
 
     def play_frames(self, every: int = 1, together: int = 1) -> Iterator[Frame]:
-        """Yield the frames of the scene, or each `every`-th.
+        """Yield every frame of the scene, or each `every`-th frame.
 
-        A model whose solutions are independent computes `together` frames in one batch. It takes a quarter of the time,
+        A model whose solutions are independent computes `together` frames together. This takes a quarter of the time,
         and the first frame waits for the last solution.
         """
         numbers = range(0, len(self.scene.times), every)
@@ -395,6 +395,6 @@ def get_legend_names(estimate: TumourEstimate | None) -> LegendNames:
 
 
 def measure_gauge(tip: np.ndarray, hidden: Layer) -> Gauge:
-    """From a tip (3,) [m] to the nearest point of a hidden surface, and whether it is inside."""
+    """Measure from a tip (3,) [m] to the nearest point of a hidden surface, and whether the tip is inside."""
     corners = hidden.vertices[hidden.triangles]
     return Gauge(tip, find_closest_points(tip[None], corners).point[0], inside=is_enclosing(corners, tip))

@@ -29,7 +29,7 @@ def build_reference_fem(theatre: PatientSetup, scene: Scene) -> Fem | OperatedFe
 def is_history_dependent(fem: Deformer) -> bool:
     """Return True if FEM must solve a frame after the previous ones.
 
-    Not needed if only forces act on an elastic intact body. A deformer that is not FEM needs no history.
+    No history is needed if only forces act on an elastic intact body. A deformer that is not FEM needs no history.
     """
     return isinstance(fem, OperatedFem) or (isinstance(fem, Fem) and not fem.problem.plain)
 
@@ -41,10 +41,10 @@ def solve_reference_frames(
     progress: Callable[[int], object] = lambda more: None,
     fem: Fem | OperatedFem | None = None,
 ) -> Deformation:
-    """One row per frame's loads, every vertex, at training accuracy; one after the other where the past matters.
+    """Solve the loads of each frame for all vertices at training accuracy; in sequence if solutions depend on the past.
 
-    `progress` hears how many more frames are solved, whenever some are. `fem` are finite elements that are at hand, as
-    `build_reference_fem` makes them.
+    `progress` receives the number of newly solved frames. `fem` is an existing solver, as
+    `build_reference_fem` builds it.
     """
     fem = fem or theatre.build_fem(scene, TRAIN, BATCH_FRAMES)
     apart = not is_history_dependent(fem) and not (isinstance(fem, Fem) and fem.batch == 1)

@@ -1,4 +1,4 @@
-"""Frames asked for in any order, of a run in which each is found from another one near it."""
+"""Frames of a run in any requested order, each computed from another frame near it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ MAX_TIME_STEP = 0.2
 
 @dataclass(frozen=True)
 class ReplayOrder:
-    """Order in which frames are reached from others.
+    """Order in which frames are computed from other frames.
 
     Parameters
     ----------
@@ -62,19 +62,19 @@ class FrameCache(Generic[T]):
         self._last: dict[int, T] = {}
 
     def approach_frame(self, number: int) -> tuple[int, T]:
-        """Return the frame, or one nearer to it, and its number: a call takes one step at most."""
+        """Take at most one step towards a frame; return the number and the frame that is reached."""
         computed = self.kept | self._last
         starts = computed if self._course.back else [other for other in computed if other <= number]
         reached = min(starts, key=lambda other: abs(number - other), default=-1)
         if reached != number:
-            before, reached = computed.get(reached), self._stop(reached, number)
+            before, reached = computed.get(reached), self._find_step_end(reached, number)
             computed = {reached: self._step(reached, before)}
             if reached % self._every == 0:
                 self.kept |= computed
         self._last = {reached: computed[reached]}
         return reached, computed[reached]
 
-    def _stop(self, start: int, number: int) -> int:
+    def _find_step_end(self, start: int, number: int) -> int:
         """Return the frame at which a step from `start` towards a frame ends."""
         leap = self._course.leap
         if start < number:
@@ -122,5 +122,5 @@ def plan_replay_order(player: Player) -> ReplayOrder | None:
         return IN_ORDER
     if not any(isinstance(effect, SkullContact) for effect in scene.get_effects_on(player.site.anatomy)):
         return None
-    # # Only displacements of such a state are stored, a third of a megabyte each.
+    # Only displacements of states with skull contact are stored, a third of a megabyte each.
     return ReplayOrder(max(1, round(MAX_TIME_STEP * scene.frames_per_second)), back=True, kept=64)

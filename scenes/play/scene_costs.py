@@ -35,14 +35,14 @@ def label_lines(frame: Frame, name: str) -> list[str]:
 
 
 def _format_length(length: float, error: float | None) -> str:
-    """Format a length and the tumour's error of it [m] in millimetres; an unknown error is given at the image's top."""
+    """Format a length and its error [m] in millimetres; an unknown error is given at the image's top."""
     return f"{1e3 * length:.2f} {'mm' if error is None else f'+- {bound_words(error, 1)}'}"
 
 
 def add_cost_label(frame: Frame, name: str) -> np.ndarray:
     """Draw a panel on the shown image (H, W, 3): deformer, loads, and milliseconds by stage; also of an estimate."""
     seen = frame.picture.segmentation
-    # It hides cortex where it must, but no tool, no line and no word.
+    # The panel may hide cortex, but no tool, line or text.
     hides = (frame.taken > 0) | (seen != DRAPE), (frame.taken > 0) | (seen == TOOL)
     sights = [each.view(np.uint8) for each in hides]
     return draw_text_panel(
@@ -65,7 +65,7 @@ class Thumbnail:
 
 
 def render_thumbnail(player: Player, name: str) -> Thumbnail:
-    """Return the frame of a deformer `name` in which the tumour has moved most, of those after the last cut, small."""
+    """Render a small image of the frame after the last cut in which the tumour has moved most, by deformer `name`."""
     every = max(1, (len(player.scene.times) - 1) // (RENDERED_FRAMES - 1))
     frames = list(player.play_frames(every))
     best = max(frames, key=lambda frame: (_count_cuts(player, frame), frame.moved))

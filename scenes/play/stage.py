@@ -39,7 +39,7 @@ NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", COTTON: "cotton", GLOVE
 
 CORTEX_COLOUR = (0.86, 0.60, 0.54)  # Colour of the cortex (RGB, 0 to 1).
 TOOL_COLOUR = (0.78, 0.80, 0.83)  # Colour of the tool (RGB, 0 to 1).
-# Lines that eyes without red or green tell apart, and see on cortex and drape: tests/test_scenes_checks.py.
+# Line colours that colour-blind users can distinguish, on cortex and drape: tests/test_scenes_checks.py.
 TUMOUR_COLOUR = (0.20, 0.94, 0.42)
 TRUTH_COLOUR = (0.90, 0.35, 0.78)
 """Colour of the tumour surface computed by FEM."""
@@ -58,8 +58,8 @@ ESTIMATED_LINES = LegendNames(
 READING_DEPTH = 2.0e-3
 # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
 RIM_DISTANCE = 10e-3
-TUMOUR_DEPTH = 0.03e-3  # Depth of that outline below the rounded facets [m]: it cuts corners of the mesh off.
-TUMOUR_HEIGHT = 0.06e-3  # Largest height of that outline above the facets [m]: coarse meshes stay visible as such.
+TUMOUR_DEPTH = 0.03e-3  # Depth of the tumour's outline below rounded facets [m]: it cuts off mesh corners.
+TUMOUR_HEIGHT = 0.06e-3  # Largest height of the outline above the facets [m]: coarse meshes stay recognisable.
 DARK_SHARE = 0.6  # Brightness of a sulcus as a share of the brightest crown.
 RELIEF_EDGE = 1.0e-3  # Largest edge of the cortex of `relief` [m].
 TUMOUR_EDGE = 1.8e-3  # Largest edge of the tumour's surface where its outline is drawn [m].
@@ -68,7 +68,7 @@ DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of th
 
 @dataclass(frozen=True, eq=False)
 class Cortex:
-    """Part of the surface: mesh vertices (n,), triangles (m, 3) of them; the scan, and where it is read (n, 3) [m]."""
+    """Part of the surface: mesh vertices (n,), their triangles (m, 3), the scan, and its sampling points (n, 3) [m]."""
 
     vertices: np.ndarray
     triangles: np.ndarray
@@ -110,7 +110,7 @@ class Stage:
 
     @cached_property
     def _after(self) -> tuple[Stage, ...]:
-        """The stage after 0, 1, ... steps."""
+        """Stages after 0, 1, ... resection steps."""
         whole = self.site.anatomy
         return tuple(
             replace(self, left=left) for left in list_remaining_bodies(whole, self.scene.get_effects_on(whole))
@@ -129,12 +129,12 @@ class Stage:
 
     @cached_property
     def camera(self) -> Camera:
-        """The scene's camera as it starts. One that stays is always this object: a `Renderer` keeps its backdrop."""
+        """Initial camera of the scene. A static camera is always this object: a `Renderer` caches its backdrop."""
         return self.scene.viewpoint.build_camera(self.site)
 
     @cached_property
     def lamp(self) -> Lamp:
-        """A lamp over the surgeon's shoulder."""
+        """Lamp over the surgeon's shoulder."""
         site, look = self.site, self.scene.look
         lamp = build_lamp(self.camera, site.origin, radius=1.6 * site.radius)
         turned = Rotation.from_rotvec(look.turn * site.axis).apply(lamp.position - site.origin)
@@ -177,13 +177,13 @@ class Stage:
 
     @cached_property
     def brain(self) -> Layer:
-        """The closed part of the brain's surface, at rest."""
+        """Undeformed surface of the brain without the open cortex."""
         mesh, craniotomy = self.anatomy.mesh, self.anatomy.craniotomy
         vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
         return Layer("brain", CORTEX, mesh.nodes[vertices], triangles, CORTEX_COLOUR)
 
     def build_layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
-        """Cortex at `positions` (V, 3) [m], drape, and the tool at T_world_tool `pose` (4, 4) if there is one."""
+        """Build cortex at `positions` (V, 3) [m], drape, and a tool, if any, at T_world_tool `pose` (4, 4)."""
         tool, look = self.scene.tool, self.scene.look
         if pose is None or not look.natural or not has_instrument(tool):
             return self._list_layers(positions, self.compute_corners(pose))
@@ -192,7 +192,7 @@ class Stage:
         return [*self._list_layers(positions, None), *placed]
 
     def compute_corners(self, pose: np.ndarray | None) -> np.ndarray | None:
-        """Corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
+        """Compute the corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
         if self.scene.tool is None or pose is None:
             return None
         return np.asarray(self.scene.tool.mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
@@ -254,7 +254,7 @@ class Stage:
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
     def smooth_tumour(self, tumour: Layer) -> Layer:
-        """Return a layer of the tumour's surface with rounded facets: for its outline, not for numbers."""
+        """Return a layer of the tumour's surface with rounded facets: for its outline, not for measurements."""
         surface = self.round_tumour
         return replace(
             tumour, vertices=surface.place(tumour.vertices), triangles=surface.triangles, colour=tumour.colour[0]
@@ -290,7 +290,7 @@ class Stage:
 
     @cached_property
     def round_tumour(self) -> EmbeddedSurface:
-        """Fine surface with rounded facets upon the tumour's surface."""
+        """Fine surface with rounded facets on the tumour's surface."""
         at, triangles = self.site.anatomy.mesh.nodes[self._tumour[0]], self._tumour[1]
         fine = build_embedded_surface(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
         return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, highest=TUMOUR_HEIGHT)
@@ -313,7 +313,7 @@ class Stage:
 
     @cached_property
     def scan(self) -> Solid | None:
-        """The scan as a solid texture, with vessels where the scene has some; None where there is neither."""
+        """The scan as a solid texture, with the vessels of the scene; None without scan and vessels."""
         model, seed = self.scene.observation_model, self.scene.look.vessels
         if isinstance(model, StereoObservation) and model.vessels:
             seed = model.seed

@@ -19,7 +19,7 @@ from .stereo_update import First, StereoPair, observe_first, observe_point_cloud
 
 @dataclass(frozen=True, eq=False)
 class StereoObserver:
-    """Observer that renders both eyes' images, with camera noise, and locates from them. Loads are not used.
+    """Observer that renders both eyes' images, with camera noise, and locates the tumour from both. Loads are not used.
 
     `stage` is the rendered stage.
     """
@@ -29,10 +29,10 @@ class StereoObserver:
     observation_model: StereoObservation
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
-        """Estimate the tumour in a frame; arguments as of `Observer.estimate`. Rendering time is not counted."""
+        """Estimate the tumour in a frame; arguments: see `Observer.estimate`. Rendering time is not counted."""
         shot, anatomy = self.render_pair(number, positions, tool), self.stage.site.anatomy
         tips = NO_POINTS.now if tool is None else find_touched(anatomy, positions, tool)
-        _ = self._first_shot  # to draw it takes long
+        _ = self._first_shot  # rendered here, so that its time is not counted
         begun = clock.perf_counter()
         return locate_tumour(anatomy, self.locator, lambda: self.observe(shot, tips), positions, begun)
 
@@ -68,7 +68,7 @@ class StereoObserver:
 
     @cached_property
     def first(self) -> First:
-        """First image pair: of the brain in the scan's configuration.
+        """First image pair, of the brain as in the scan.
 
         Raises
         ------

@@ -45,7 +45,7 @@ LARGE_MOTION_HINT = (
 )
 """Reasons why points of the first pair may not be found again."""
 Rigid = Callable[[np.ndarray], np.ndarray]
-"""Takes places (n, 3) [m] to where a tracked microscope has them."""
+"""Function that adds the error of a tracked microscope to positions (n, 3) [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class StereoPair:
     tool: tuple[np.ndarray, np.ndarray] | None = None
 
     def rectify(self, site: CraniotomyFrame) -> StereoView:
-        """Return the windows about an opening.
+        """Rectify the pair to windows centred on an opening.
 
         Raises
         ------
@@ -109,7 +109,7 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
     Raises
     ------
     InputError
-        See `StereoPair.rectify`; too few points; points off the scan's cortex.
+        See `StereoPair.rectify`; too few points; points too far from the scan's cortex.
     """
     view = shot.rectify(site)
     pixels = build_pixel_grid(site, view, count)
@@ -130,7 +130,7 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
 def observe_points(
     site: CraniotomyFrame, first: First, shot: StereoPair, rigid: Rigid, tips: np.ndarray
 ) -> Observation:
-    """Track points of the first pair in a later pair; `tips` (k, 3) [m] are contact points of a tool.
+    """Track the points of the first pair in a later pair; `tips` (k, 3) [m] are contact points of a tool.
 
     Raises
     ------
@@ -158,7 +158,7 @@ def observe_point_cloud(
 ) -> Observation:
     """Return `count` cortex points without correspondences, from one pair.
 
-    Arguments and errors as of `observe_points`.
+    For arguments and errors see `observe_points`.
     """
     view = shot.rectify(site)
     pixels = build_pixel_grid(site, view, count)
@@ -182,7 +182,7 @@ def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.
 
 
 def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> Cloud:
-    """Select the pixels (n, 2) with a depth inside the drape's hole.
+    """Triangulate pixels (n, 2), and keep the points inside the drape's hole.
 
     Raises
     ------

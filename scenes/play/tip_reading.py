@@ -23,7 +23,7 @@ class TipDistance:
     distance
         [m].
     bound
-        95 % bound on the difference from the FEM distance [m]; None if there is none.
+        95 % bound on the difference from the FEM distance [m]; None if not available.
     """
 
     distance: float
@@ -81,6 +81,6 @@ def measure_tip_distance(
 
 
 def _get_ball(loads: Loads, tool: Instrument | None) -> Probe | None:
-    """Return the tool where it is the only thing that pushes or is moved, and a ball; else None."""
+    """Return the tool if it is a ball and the only tool that pushes or is moved; else None."""
     alone = len(loads.get_all(Pushed)) + len(loads.get_all(Touching)) == 1
     return tool if alone and isinstance(tool, Probe) else None

@@ -39,7 +39,7 @@ def debulk_tumour(anatomy: Anatomy) -> Anatomy:
 
 
 def build_debulked_study(study: ReportStudy) -> ReportStudy:
-    """Return the same study of the debulked body, once `simulate_debulked` has made its data."""
+    """Return the study of the debulked body, after `simulate_debulked` has made its data."""
     return replace(study, data=_to_answers_path(study))
 
 
@@ -66,7 +66,7 @@ def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> 
 
 
 def read_simulation_seconds(study: ReportStudy) -> float | None:
-    """Read the seconds of `simulate_debulked`; None if it was not run, or not in one run."""
+    """Read the seconds of `simulate_debulked`; None if there was no run, or an interrupted one."""
     return read_noted_seconds(_to_answers_path(study))
 
 

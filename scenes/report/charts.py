@@ -19,9 +19,9 @@ Place = tuple[float, float]
 
 
 def find_front(rows: Sequence[ReportRow]) -> frozenset[str]:
-    """Names of the rows that no other equals or beats in both milliseconds and mean distance from the reference.
+    """Return the names of the rows on the Pareto front of milliseconds and mean distance from the reference.
 
-    Only errors count: another law is none, and the reference's own elements have none of their mesh.
+    Rows of another law, and of the reference's own elements, are excluded: their distance is no model error.
     """
     return find_pareto_front({row.name: place for row in rows if row.against == ERROR and (place := _place_time(row))})
 
@@ -31,7 +31,7 @@ def _place_time(row: ReportRow) -> Place | None:
 
 
 def _place(x: float | None, figures: ErrorFigures | None) -> Place | None:
-    """Return x and the mean distance [mm], if both can stand on logarithmic axes."""
+    """Return x and the mean distance [mm], if both are positive, as logarithmic axes require; else None."""
     return None if not x or figures is None or not figures.mm.mean > 0.0 else (x, figures.mm.mean)
 
 
@@ -50,7 +50,7 @@ def build_batch_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
 
 
 def build_effects_chart(records: Sequence[EffectRecord]) -> ChartPanel | None:
-    """Build the chart of what each effect of a scene costs and changes; None without records."""
+    """Build the chart of cost and influence of each effect of a scene; None without records."""
     dots = tuple(
         Dot(f"{name}, {record.scene}", name, ms, mm, hint=f"{record.scene}, {record.day}, {record.machine}")
         for record in records
@@ -70,7 +70,7 @@ def build_preparation_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
 
 
 def build_adaptation_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
-    """Build the chart of error against the time until a model knows a resection; None without rows."""
+    """Build the chart of error against the time until a model includes a resection; None without rows."""
     title = "How long until a model knows that tissue was removed?"
     return _scatter(rows, title, "seconds until the first load", lambda row: _place(row.adapt, row.reference))
 
@@ -134,7 +134,7 @@ def _scatter(
 
 
 def _find_central_range(load_mm: Sequence[float]) -> tuple[float, float] | None:
-    """Return the range of the central 95 % of loads, if it can stand on a logarithmic axis."""
+    """Return the range of the central 95 % of loads, if a logarithmic axis can show it."""
     low, high = np.percentile(load_mm, [2.5, 97.5]).tolist() if load_mm else (0.0, 0.0)
     return (low, high) if low > 0.0 else None
 
@@ -164,7 +164,7 @@ CHARTS = {
 
 
 def format_number(value: float | None) -> str:
-    """Three digits, as people write them."""
+    """Format a number with three digits."""
     if value is None:
         return ""
     return "< 0.0001" if 0.0 < value < 1e-4 else f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"

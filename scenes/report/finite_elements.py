@@ -71,7 +71,7 @@ class FemVariant:
 
 @dataclass(frozen=True)
 class FamilySpec:
-    """One of `FAMILIES`, on the mesh of the data set."""
+    """Family of `FAMILIES`, on the mesh of the data set."""
 
     name: str
 
@@ -149,7 +149,7 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
 
 
 def _build_fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
-    """Set up for single loads."""
+    """Build FEM for single loads."""
     effects = build_push_effects(body, change_law(study.get_tissue_on(body), spec.law))
     return Fem(
         body, effects, spec.accuracy, spec.device or study.device, None, spec.element or study.element, live=True
@@ -165,7 +165,7 @@ def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
 
 
 def find_body(study: ReportStudy, mesh: str) -> Anatomy:
-    """Return the body on a mesh by name; meshes of the template are made once and kept."""
+    """Return the body on a mesh by name; meshes of the template are built once and cached."""
     if mesh == OWN_MESH:
         return study.anatomy
     if mesh == HALVED_MESH:
@@ -174,7 +174,7 @@ def find_body(study: ReportStudy, mesh: str) -> Anatomy:
 
 
 def build_template_mesh(folder: Path, size: int) -> Path:
-    """Return the template's brain of about `size` nodes; made if it is not there."""
+    """Return the template's brain of about `size` nodes; build the mesh if it does not exist."""
     path = folder / f"template_{size}.vtu"
     if not path.exists():
         write_anatomy(path, make_anatomy(build_template_subject(Tumour()), MeshPlan(size)))
@@ -187,7 +187,7 @@ def get_law_name(tissue: Elasticity) -> str | None:
 
 
 def change_law(tissue: Elasticity, law: str | None) -> Elasticity:
-    """Return the tissue, in all regions, with another law of the same constants.
+    """Return the tissue with another law and unchanged constants, in all regions.
 
     Raises
     ------
@@ -207,7 +207,7 @@ def change_law(tissue: Elasticity, law: str | None) -> Elasticity:
 
 
 def move_pushes_onto(body: Anatomy, loads: Loads) -> Loads:
-    """Return the same pushes at the nearest points of another mesh's open cortex."""
+    """Return the pushes moved to the nearest points of another mesh's open cortex."""
     (pushed,) = loads.get_all(Pushed)
     corners = body.mesh.nodes[body.open_surface]
     return Loads(

@@ -1,4 +1,4 @@
-"""A row of a learner: trained without the discs, without the sectors, and with ever fewer loads."""
+"""Row of a learner: trained without the discs, without the sectors, and with decreasing numbers of loads."""
 
 from dataclasses import dataclass, replace
 
@@ -22,7 +22,7 @@ MIN_LOADS = 64  # Smallest number of training loads of a learning curve.
 
 @dataclass(frozen=True)
 class LearnerSpec:
-    """One of `train.LEARNERS`."""
+    """Learner of `train.LEARNERS`."""
 
     name: str
 
@@ -88,7 +88,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
 
 
 def list_counts(most: int) -> list[int]:
-    """64, 128, 256, ... below `most`."""
+    """List the counts 64, 128, 256, ... below `most`."""
     return [MIN_LOADS << k for k in range(20) if MIN_LOADS << k < most]
 
 
@@ -105,7 +105,7 @@ def compute_coverage_beyond(
 
 
 def _measure_adaptation(study: ReportStudy, spec: LearnerSpec) -> tuple[float | None, ErrorFigures | None]:
-    """Seconds of simulating and learning the debulked body, and figures there; nothing where it was not simulated."""
+    """Return the seconds of simulation and training on the debulked body, and errors there; None without simulation."""
     seconds = read_simulation_seconds(study)
     if seconds is None:
         return None, None
@@ -119,7 +119,7 @@ def _measure_adaptation(study: ReportStudy, spec: LearnerSpec) -> tuple[float | 
 
 
 def _train_model(study: ReportStudy, spec: LearnerSpec, split: DiscSplit) -> tuple[Deformer, SolveCounts]:
-    """Train a model on the training loads of a split; with the solves that it took."""
+    """Train a model on the training loads of a split; also return the numbers of solves used."""
     trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
     solves = trained.scores[0].solves
     assert solves is not None
@@ -129,7 +129,7 @@ def _train_model(study: ReportStudy, spec: LearnerSpec, split: DiscSplit) -> tup
 def _compute_errors(
     model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray
 ) -> tuple[ErrorFigures | None, float]:
-    """Figures against `truth` (B, k, 3) [m], and the share of the loads that the model calls extrapolated."""
+    """Compute errors against `truth` (B, k, 3) [m], and the share of loads that the model marks as extrapolated."""
     result = model.deform(loads, at=nodes)
     flagged = [outcome is Outcome.EXTRAPOLATED for outcome in result.outcome]
     return compute_figures(result.displacement, truth, loads), float(np.mean(flagged)) if flagged else 0.0

@@ -66,7 +66,7 @@ class Section:
 
 
 def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> None:
-    """Write `index.html`, `report.json`, and for each section `NAME.csv` and its plots, each whole."""
+    """Write `index.html`, `report.json`, and for each section `NAME.csv` and its plots, each atomically."""
     bodies = []
     for section in sections:
         plots = []
@@ -155,7 +155,7 @@ def _spread(figures: ErrorFigures) -> tuple[str, ...]:
 
 
 def _format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """Lines of a class and cells."""
+    """Format a table from lines, each with a class and cells."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(
         f'<tr class="{kind}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>' for kind, cells in lines
@@ -164,7 +164,7 @@ def _format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]
 
 
 def _flatten(value: Any, name: str = "") -> Iterable[tuple[str, Any]]:
-    """Numbers and texts; one inside others is named by the way to it, as in reference.mm.mean."""
+    """Flatten nested numbers and texts to dotted names, as in reference.mm.mean."""
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else None
     if inside is None:
         yield name, value

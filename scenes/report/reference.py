@@ -26,7 +26,7 @@ BATCH_LOADS = 16  # Number of loads solved together where a batch is faster: an 
 class ReferenceSolutions:
     """Solutions of n loads: displacement (n, k, 3) [m]; good (n,) bool, which converged.
 
-    Seconds (n,) that each took.
+    `seconds` (n,): duration of each solve [s].
     """
 
     displacement: np.ndarray

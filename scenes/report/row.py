@@ -21,7 +21,7 @@ MIN_LOADS_FOR_P99 = 1000  # Minimum number of loads for a 99th percentile.
 
 @dataclass(frozen=True)
 class ErrorSpread:
-    """Mean, 95 and 99.9 percentile, and maximum of distances over load x vertex; no 99.9 percentile of few loads."""
+    """Mean, 95 and 99.9 percentile, and maximum of distances over load x vertex; no 99.9 percentile for few loads."""
 
     mean: float
     p95: float
@@ -57,7 +57,7 @@ class ErrorFigures:
 
 
 def compute_distance_figures(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> ErrorFigures | None:
-    """Figures of distances (B, n) [m] from `truth` (B, n, 3) [m] under forces (B,) [N]; None of no load.
+    """Compute the errors from distances (B, n) [m] to `truth` (B, n, 3) [m] under forces (B,) [N]; None without loads.
 
     A load's motion is the mean displacement of its n vertices in `truth`.
     """
@@ -82,7 +82,7 @@ def compute_distance_figures(distance: np.ndarray, truth: np.ndarray, force: np.
 
 
 def compute_figures(result: np.ndarray, truth: np.ndarray, loads: Loads) -> ErrorFigures | None:
-    """Figures of `result` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
+    """Compute the errors of `result` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
     (pushed,) = loads.get_all(Pushed)
     return compute_distance_figures(np.linalg.norm(result - truth, axis=2), truth, split_forces(pushed)[0])
 

@@ -74,7 +74,7 @@ def measure_row(study: ReportStudy, spec: Spec) -> ReportRow:
 
 
 def _measure_on_one_core(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
-    """Products this small take longer on several, and say less."""
+    """Measure a learner on one core: small products take longer, and times vary more, on several."""
     with limit_to_one_thread():
         return measure_learner(study, spec)
 
@@ -87,7 +87,7 @@ CORES = 4  # Number of CPU cores per measured learner, which uses one; the other
 
 
 def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
-    """Return the data's own finite elements, and others that differ from them in one thing; in the mesh if `remesh`.
+    """List the FEM variant of the data set, and variants that differ in one factor; also in the mesh if `remesh`.
 
     The reference itself is left out: it would show only its tolerance.
     """
@@ -109,7 +109,7 @@ def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[F
 
 
 def list_all_combinations(study: ReportStudy) -> tuple[FemVariant, ...]:
-    """All of the star's laws, elements, meshes, tolerances and precisions with each other."""
+    """List all combinations of the compared laws, elements, meshes, tolerances and precisions."""
     meshes = {OWN_MESH: OWN_MESH, **(MESHES if study.is_shipped else {"halved edges": HALVED_MESH})}
     precisions: tuple[Precision, ...] = ("float32", "float64")
     return tuple(
@@ -122,19 +122,19 @@ def list_all_combinations(study: ReportStudy) -> tuple[FemVariant, ...]:
 
 
 def list_family_specs() -> tuple[FamilySpec, ...]:
-    """One for each of `FAMILIES`."""
+    """List a specification for each of `FAMILIES`."""
     return tuple(FamilySpec(name) for name in FAMILIES)
 
 
 def list_learner_specs() -> tuple[LearnerSpec, ...]:
-    """One for each learner of `surrogate`."""
+    """List a specification for each learner of `surrogate`."""
     return tuple(LearnerSpec(name) for name in LEARNERS)
 
 
 def measure_in_process(turn: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
-    """Measured in a process of its own, which starts at once and measures in its `turn`."""
+    """Measure a row in its own process, which starts immediately and measures once it enters `turn`."""
     try:
-        # Data that the study has already read stay here.
+        # Data that the study has already read are not copied to the process.
         with process_pool(["cpu"], prepare_rows, replace(study)) as children, turn:
             return run_on_each(children, measure_row, [spec])[0]
     except LostError:
@@ -206,7 +206,7 @@ def _get_row(study: ReportStudy, run: Run, spec: Spec) -> ReportRow:
 
 
 def _format_power(tolerance: float) -> str:
-    """0.01 as 1e-2."""
+    """Format a tolerance, for example 0.01 as 1e-2."""
     return f"{tolerance:.0e}".replace("e-0", "e-")
 
 
@@ -220,7 +220,7 @@ FORMER_NAMES = {"teacher": "own_fem", "taught": "loads"}
 
 
 def _read_kept_row(path: Path, digest: str) -> ReportRow | None:
-    """Return the row in a file, if it is there, whole, and of the same inputs."""
+    """Read the row in a file; None if it is missing, incomplete, or of other inputs."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
         row = {FORMER_NAMES.get(name, name): value for name, value in stored["row"].items()}

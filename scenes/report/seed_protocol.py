@@ -36,7 +36,7 @@ MAX_TRAINING = 2000  # Largest number of training loads of a model.
 SCORED = 100  # Largest number of left-out loads on which `train` scores a model.
 WARM_UP, TIMED = 10, 100  # Numbers of predictions of a learner before the timed ones, and of these.
 PUBLISHED_LIMITS = {"published-ann": 0.3, "published-svr": 0.2}
-"""Mean errors that the authors report their models to be below [mm]."""
+"""Upper limits of the mean errors that the authors report for their models [mm]."""
 Predict = Callable[[Loads], np.ndarray]
 
 
@@ -110,7 +110,7 @@ def simulate_seed(study: SeedStudy, body: Anatomy, loads: Loads, progress: Calla
 
 
 def list_seed_specs() -> tuple[Spec, ...]:
-    """Return the published learners, those of this project, elements and other families."""
+    """List the published learners, the learners of this project, elements and other families."""
     return (
         *(LearnerSpec(name) for name in (*PUBLISHED, "linear", *LEARNED_MODELS)),
         *(FemVariant(f"FEM {element}", element=element) for element in ("p1", "smoothed", "p2")),

@@ -65,17 +65,17 @@ class ReportStudy:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The data."""
+        """Opened data set."""
         return read_dataset(self.data)
 
     @cached_property
     def expansion(self) -> Expansion:
-        """The series of its finite elements, which every training on the data shares."""
+        """Power series of the FEM model, shared by all training on the data."""
         return Expansion(self.dataset, self.device, kept=self.folder / "answers" / f"series-{self.digest}.npz")
 
     @property
     def anatomy(self) -> Anatomy:
-        """The body."""
+        """Anatomy of the data set."""
         return self.dataset.anatomy
 
     @cached_property
@@ -85,17 +85,17 @@ class ReportStudy:
 
     @cached_property
     def tissue(self) -> Elasticity:
-        """The tissue that the data was made with, and that of regions."""
+        """Tissue of the data set, with that of regions."""
         stated = self.dataset.provenance
         return read_tissue_statement(stated) if TISSUE_KEY in stated else Elasticity()
 
     def get_tissue_on(self, body: Anatomy) -> Elasticity:
-        """Return the same for a body that may lack some of the regions."""
+        """Return the tissue for a body that may lack some of the regions."""
         return self.tissue.restrict(np.unique(body.mesh.region).tolist())
 
     @property
     def element(self) -> str:
-        """The element that the data was made with."""
+        """Element of the data set."""
         return self.dataset.provenance.get("element", "p1")
 
     @cached_property
@@ -110,7 +110,7 @@ class ReportStudy:
 
     @cached_property
     def converged(self) -> Loads:
-        """The loads of the data that converged; a split has a row for each."""
+        """Converged loads of the data set; a split has a row for each."""
         return self.dataset.loads.select(np.flatnonzero(self.dataset.good))
 
     @property
@@ -169,7 +169,7 @@ KINDS = ("stronger", "more oblique", "nearer to the rim")  # Kinds of loads beyo
 
 
 def draw_loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) -> Loads:
-    """`count` loads, every third of one of `KINDS`, otherwise as those of `like` are; always the same ones."""
+    """Draw `count` loads, a third of each of `KINDS`, otherwise distributed as `like`; deterministic."""
     random = np.random.default_rng(0)
     rows = random.integers(len(like.point), size=count)
     kind = np.arange(count) % len(KINDS)
@@ -185,7 +185,7 @@ def draw_loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) 
 
 
 def _compute_max_angle(patch: Patch, pushed: Pushed) -> float:
-    """Greatest angle between force and inward normal [rad]."""
+    """Compute the largest angle between force and inward normal [rad]."""
     cosine = np.einsum("bi,bi->b", split_forces(pushed)[1], patch.find_normals(pushed.point))
     return float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
 
@@ -201,7 +201,7 @@ def _turn_from_normal(direction: np.ndarray, normal: np.ndarray, angle: float, m
 
 
 def _sample_near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Points (B, 3) [m] whose footprints (B,) [m] hang over the rim by a tenth to half of their radius."""
+    """Sample points (B, 3) [m] whose footprints (B,) [m] extend beyond the rim by a tenth to half of their radius."""
     points = patch.place(random.random((4096, 3)))[0]
     ratio = patch.compute_edge_distance(points)[None] / footprint[:, None]
     wanted = random.uniform(*EDGE_DISTANCES, len(footprint))[:, None]

@@ -31,7 +31,7 @@ class Approach:
     line: bool = False
 
     def follow(self, path: Path) -> Path:
-        """Return the same tool path, starting at the entry instead of the centre, and along the trajectory."""
+        """Return the tool path shifted from the centre to the entry, and along the trajectory."""
 
         def along(time: float) -> Touch:
             touch = path(time)
@@ -70,7 +70,7 @@ def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
                 f"{1e3 * MAX_CORTEX_DISTANCE:g} mm is the most. "
                 "Open the skull there (--opening-at), or mark another entry."
             )
-        return _approach(site, entry, site.axis)
+        return _compute_approach(site, entry, site.axis)
     if markup.kind != "Line" or len(points) != 2 or not np.ptp(points, axis=0).any():
         raise InputError(f"{path}: is no trajectory. Save a line of two points, or one point, from 3D Slicer.")
     outer, deep = sorted(points, key=lambda point: float((point - site.origin) @ site.axis))
@@ -98,10 +98,10 @@ def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
             f"{1e3 * MAX_CORTEX_DISTANCE:g} mm is "
             "the most that a line is drawn out by. See that it is of this opening, and draw it through the cortex."
         )
-    return replace(_approach(site, entry, way), line=True)
+    return replace(_compute_approach(site, entry, way), line=True)
 
 
-def _approach(site: CraniotomyFrame, entry: np.ndarray, way: np.ndarray) -> Approach:
+def _compute_approach(site: CraniotomyFrame, entry: np.ndarray, way: np.ndarray) -> Approach:
     """Return the approach at a point (3,) [m] of the cortex, in a direction (3,)."""
     axes = np.stack([site.right, site.up])
     place = axes @ (entry - site.origin)
@@ -112,7 +112,7 @@ def _approach(site: CraniotomyFrame, entry: np.ndarray, way: np.ndarray) -> Appr
 
 
 def _find_entry(corners: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarray | None:
-    """Compute the first intersection of a line with triangles (S, 3, 3) from outside (3,) [m]; None if it misses.
+    """Compute the first intersection of a line with triangles (S, 3, 3) from outside (3,) [m]; None if the line misses.
 
     Möller, Trumbore 1997, J. Graphics Tools 2:21-28.
     """

@@ -26,10 +26,10 @@ class HandSettings:
 
 
 class CameraPath(Protocol):
-    """A pure function of the camera as it starts, the point that it looks at (3,) [m], and a time [s]."""
+    """Camera path: a pure function of the initial camera, its target point (3,) [m], and a time [s]."""
 
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
-        """Return the camera at that time."""
+        """Return the camera at a time [s]."""
         ...
 
 
@@ -92,7 +92,7 @@ class Orbit:
         """Return the camera at a time [s]."""
         degrees = np.degrees(self.reach * np.sin(2.0 * np.pi * time / self.period))
         to_target = camera.to_camera_frame(np.asarray(target))
-        # About the target in place of the camera's own centre.
+        # Rotate about the target instead of the camera's centre.
         return camera.move(to_target).perturb(degrees).move(-to_target)
 
 
@@ -151,7 +151,7 @@ class Microscope:
 
 @lru_cache(maxsize=16)
 def sample_waves(seed: int, settings: HandSettings = HandSettings()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frequencies [Hz], phases [rad] and amplitudes of a hand's motion, each (6, n), for 3 shifts and 3 turns."""
+    """Sample frequencies [Hz], phases [rad] and amplitudes (6, n) of a hand's motion, for 3 shifts and 3 turns."""
     random = np.random.default_rng(seed)
     count, frequencies = settings.wave_count, (settings.drift_frequencies, settings.tremor_frequencies)
     bands = [random.uniform(*band, (6, count)) for band in frequencies]
@@ -160,7 +160,7 @@ def sample_waves(seed: int, settings: HandSettings = HandSettings()) -> tuple[np
 
 
 def sample_wandering(seed: int, time: float, settings: HandSettings = HandSettings()) -> np.ndarray:
-    """Six numbers (6,) that wander with time [s] about 0, with a standard deviation of 1."""
+    """Return six numbers (6,) that vary smoothly with time [s] about 0, with a standard deviation of 1."""
     frequencies, phases, sizes = sample_waves(seed, settings)
     return (sizes * np.sin(2.0 * np.pi * frequencies * time + phases)).sum(axis=1)
 

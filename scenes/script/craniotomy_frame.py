@@ -1,4 +1,4 @@
-"""The open cortex as a place to work at: where a hand touches it, and which way it goes."""
+"""Open cortex with a coordinate frame: contact points and directions of tools."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ HOLE_RATIO = 0.98
 
 @dataclass(frozen=True, eq=False)
 class CraniotomyFrame(OpenCortex):
-    """The open cortex, and what a hand asks of it."""
+    """Open cortex with a coordinate frame, contact points and directions of tools."""
 
     def compute_reach(self, radius: float) -> float:
         """Return the maximum distance [m] of a tool of this `radius` from the axis, as limited by the bone."""
@@ -31,12 +31,12 @@ class CraniotomyFrame(OpenCortex):
     def find_contact(self, x: float, y: float, radius: float) -> Place:
         """Return the material point of the open cortex nearest to the place (x, y) [m] of its tangent plane.
 
-        A tool of this `radius` [m] stays inside the opening: the place is brought back to where the bone stops it.
+        A tool of this `radius` [m] stays inside the opening: a place beyond is moved to where the bone stops the tool.
         """
         return self.find_nearest(self.clip_to_opening(self.origin + x * self.right + y * self.up, radius))
 
     def compute_direction(self, touch: Touch) -> np.ndarray:
-        """Return unit direction (3,) of a touch's force: inwards, tilted."""
+        """Compute the unit direction (3,) of a touch's force: inwards, with the touch's tilt."""
         along = self.axis + np.tan(touch.tilt[0]) * self.right + np.tan(touch.tilt[1]) * self.up
         return along / np.linalg.norm(along)
 

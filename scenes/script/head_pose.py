@@ -29,7 +29,7 @@ class HeadPose:
     fluid: float = 1.0
 
     def build_posture(self, nodes: np.ndarray) -> Posture:
-        """One load case for a body of these nodes (V, 3) [m]."""
+        """Build the load case of a body with nodes (V, 3) [m]."""
         down = np.array(self.direction) / np.linalg.norm(self.direction)
         return Posture(down[None], np.array([compute_fluid_level(nodes, down, self.fluid)]), np.ones(1))
 
@@ -37,7 +37,7 @@ class HeadPose:
 
 
 Lie = Callable[[float], HeadPose]
-"""Time [s] -> Lying."""
+"""Function of time [s] that returns a head pose."""
 
 
 def get_supine_pose(time: float) -> HeadPose:
@@ -51,7 +51,7 @@ def build_drainage(seconds: float, to: float = 0.0) -> Lie:
 
 
 def build_drained_turn(drain: float, pause: float, turn: float, angle: float, to: float = 0.0) -> Lie:
-    """On the back while the fluid falls to a share within `drain` [s]; `pause` [s]; then a turn by `angle` [rad].
+    """Build a pose: supine while fluid falls to a share in `drain` [s]; `pause` [s]; then a turn by `angle` [rad].
 
     A positive angle brings the left side down; the turn takes `turn` [s].
     """

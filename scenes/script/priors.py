@@ -154,7 +154,7 @@ def sample_priors(count: int, seed: int = 0) -> list[PatientSample]:
 def sample_from_fit(
     tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0, ratio: float = 1.0
 ) -> list[PatientSample]:
-    """Draw `count` samples whose tissue and skull are from a fit; all else as in `sample_priors`.
+    """Draw `count` samples whose tissue and skull are from a fit; the other parameters as in `sample_priors`.
 
     `young` [Pa] is the scene's own modulus, `ratio` its tumour's relative stiffness, and `skulls` the skulls that it
     may have. Parameters that were not fitted keep their prior.
@@ -181,12 +181,12 @@ def sample_from_fit(
 
 
 def sample_rigid_errors(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of registration (count, 3) and of segmentation (count,) [m]."""
+    """Sample errors of registration (count, 3) and of segmentation (count,) [m]."""
     random = np.random.default_rng([seed, 1])
     shift = REGISTRATION_PRIOR.range[1] * random.standard_normal((count, 3))
     return shift, SEGMENTATION_PRIOR.range[1] * random.standard_normal(count)
 
 
 def choose_name(share: float, names: Sequence[str]) -> str:
-    """Return the name that a share in [0, 1) chooses, each as probable."""
+    """Return the name that a share in [0, 1) selects, all with equal probability."""
     return names[min(int(share * len(names)), len(names) - 1)]

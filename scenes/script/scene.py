@@ -225,7 +225,7 @@ class Scene:
         return f"the bone's edge stops the tool {1e3 * beyond:.1f} mm short" if beyond > STOP_TOLERANCE else ""
 
     def compute_pose(self, site: CraniotomyFrame, touch: Touch) -> np.ndarray:
-        """T_world_tool (4, 4) of a tool that is moved; it faces the tissue whichever way it is moved."""
+        """Compute T_world_tool (4, 4) of a moved tool, which faces the tissue in every direction of motion."""
         assert self.tool is not None
         return self.tool.pose(self.compute_tip(site, touch), site.axis, site.right)
 
@@ -264,7 +264,7 @@ class Scene:
 
 @lru_cache(8)
 def _build_resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
-    """Each frame asks for it."""
+    """Build a resection, cached because every frame needs it."""
     return surgery.build_resection(anatomy)
 
 
@@ -272,18 +272,18 @@ SCENES = (
     "spatula", "press", "slide", "draw", "palpate", "retract", "brain_shift", "resection", "pulsation", "sag",
     "lost_force", "microscope",
 )  # fmt: skip
-"""The built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
+"""Names of the built-in scenes, each a module of `scenes.builtin` that exports SCENE."""
 
 
 def find_scene(name: str) -> Scene:
     """Return a built-in scene by name, or the SCENE of a user's own file by its path, which ends in .py.
 
-    The file is run as any Python file is: with all the rights of who runs it.
+    The file is executed as Python code, with all rights of the user.
 
     Raises
     ------
     InputError
-        There is no scene of that name. Or the file is missing, does not run or has no SCENE. Or the scene's path gives
+        No scene has this name. Or the file is missing, does not run or has no SCENE. Or the scene's path gives
         no Touch, or its tissue fails `sim.check_tissue`.
 
     Examples
@@ -300,7 +300,7 @@ def find_scene(name: str) -> Scene:
 
 
 def check_scene_exists(name: str) -> None:
-    """Raise InputError where no scene is called so and it is no file of a user's. Nothing is run or read."""
+    """Raise InputError if a name is neither a built-in scene nor an existing file. No file is executed or read."""
     if name not in SCENES and not name.endswith(".py"):
         raise InputError(
             f"no scene is called {name!r}: choose one of {', '.join(SCENES)}, or name a file of your own, MY_SCENE.py."
@@ -326,7 +326,7 @@ def _read_own_scene(path: str) -> Scene:
     for effect in found.effects:
         if isinstance(effect, Elasticity):
             for tissue in (effect.default, *effect.regions.values()):
-                if tissue is not None and type(tissue) is not Material:  # ours are tested
+                if tissue is not None and type(tissue) is not Material:  # our own law is tested
                     try:
                         check_tissue(tissue)
                     except InputError as error:

@@ -1,4 +1,4 @@
-"""Sampling of a scene's tool poses, as a hand sets them on the page: place on the cortex, and depth."""
+"""Sampling of a scene's tool poses, as a user sets them on the page: position on the cortex, and depth."""
 
 import numpy as np
 from scipy.stats import qmc

@@ -10,5 +10,5 @@ def get_template_path() -> Path:
 
 
 def get_gym_model_path() -> Path:
-    """Return a model of the gym's blade on the template, by its pose, in tissue that does not relax."""
+    """Return the path of the model of the gym's blade poses on the template, for tissue without relaxation."""
     return get_template_path().with_suffix(".gym.npz")

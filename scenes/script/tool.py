@@ -1,4 +1,4 @@
-"""Tools: how one looks, and where it is."""
+"""Tools: shape, rendering and pose."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,7 +26,7 @@ def build_capsule(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def add_shaft(shape: BuiltIn, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a tool of which the shape alone is known, on a straight shaft to `top` (3,) [m].
+    """Return the surface of a tool with a known shape only, on a straight shaft to `top` (3,) [m].
 
     Vertices (n, 3) [m] in the tool's own frame, and triangles (m, 3).
     """
@@ -60,7 +60,7 @@ class Instrument(Protocol):
         ...
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
-        """T_world_tool (4, 4) as it touches `tip` (3,) [m] from outside; inward, aside: unit vectors (3,)."""
+        """Return T_world_tool (4, 4) of a tool at `tip` (3,) [m], from outside; inward, aside: unit vectors (3,)."""
         ...
 
 
@@ -85,7 +85,7 @@ class Probe:
     shaft: float = 1.8e-3
     length: float = 0.14
     lean: float = 0.75
-    turn: float = field(default=0.0, repr=False)  # stored uncertainties go by the text of a tool
+    turn: float = field(default=0.0, repr=False)  # fingerprints use the repr of a tool
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
@@ -127,7 +127,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class Blade:
-    """Brain spatula: a flat blade with a round edge, on an arm that goes up from one end.
+    """Brain spatula: a flat blade with a round edge, on an arm that leads up from one end.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ class Touch:
 
 
 Path = Callable[[float], Touch]
-"""Time [s] -> Touch."""
+"""Function of time [s] that returns a touch."""
 
 IDLE_HEIGHT = 4e-3  # Height of an idle tool above the tissue [m].
 
@@ -131,9 +131,9 @@ def _interpolate_depth(share: float, depth: float) -> float:
 
 
 def stroke_cortex(force: float, radius: float, speed: float) -> Path:
-    """Straight strokes without a pause at `speed` [m/s] from point to point of a circle of `radius` [m].
+    """Stroke without a pause at `speed` [m/s] in straight lines between points of a circle of `radius` [m].
 
-    Each point is the golden angle on from the last: no stroke repeats another, and they cover the circle evenly.
+    Successive points differ by the golden angle: no stroke is repeated, and strokes cover the circle evenly.
     """
     turn = np.pi * (3.0 - np.sqrt(5.0))
     stroke = 2.0 * radius * np.sin(turn / 2.0)

@@ -58,7 +58,7 @@ class TumourError:
 
     @property
     def registration_words(self) -> str:
-        """The registration's standard deviation along each axis, or nothing: bounds of scenes differ by it."""
+        """Description of the registration's standard deviation along each axis; empty if not available."""
         if self.registration is None or self.bound is None:
             return ""
         return describe_registration(self.registration)
@@ -148,7 +148,7 @@ class Uncertainty:
         return TumourError(worst, largest, moved=moved, guess=self.guess, registration=deviation)
 
     def read(self, values: tuple[float, ...], time: float) -> float:
-        """One of the lists at a time [s], between its entries in proportion."""
+        """Interpolate one of the lists linearly at a time [s]."""
         return float(np.interp(time, self.times, values))
 
 
@@ -190,7 +190,7 @@ def fit_motion_error(found: Uncertainty) -> MotionError | None:
 def mark_of(scene: Scene, site: CraniotomyFrame, element: str) -> str:
     """Compute the fingerprint of a scene: 16 hexadecimal digits of its loads, its anatomy and the priors."""
     times = np.linspace(0.0, scene.duration, 25).tolist()
-    # Rounded, for sines differ from machine to machine in the last digit.
+    # Rounded, because sines differ between machines in the last digit.
     acts = [np.round(_list_parameters(scene, time), 6).tolist() for time in times]
     priors = [(prior.law, prior.range) for prior in PRIORS]
     whole = (scene.effects, scene.surgery, scene.tool, scene.duration, element, acts, priors, site.anatomy.digest)
@@ -209,12 +209,12 @@ def to_uncertainty_path(anatomy: Path) -> Path:
 
 
 def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
-    """Those of a file, by scene; none where there is no file.
+    """Read the uncertainties of a file, by scene; empty without a file.
 
     Raises
     ------
     InputError
-        A file that cannot be read as such.
+        An invalid or unreadable file.
     """
     if not path.is_file():
         return {}
@@ -223,7 +223,7 @@ def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
 
 
 def _read(row: dict) -> Uncertainty:
-    """One scene's; every list is as long as the times, and of finite numbers.
+    """Read one scene's uncertainty; every list is as long as the times, and has finite numbers.
 
     Files without `registered` and `motion` get an upper estimate from the parts.
     """
@@ -256,7 +256,7 @@ def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
 
 
 def _round_numbers(value: object) -> object:
-    """Numbers to a micrometre: more digits promise more than an ensemble knows."""
+    """Round numbers to a micrometre, because the sampling error of an ensemble is larger."""
     match value:
         case dict():
             return {name: _round_numbers(one) for name, one in value.items()}

@@ -199,4 +199,4 @@ class Viewpoint:
 USUAL_VIEWPOINT = Viewpoint()
 """Default viewpoint of scenes."""
 OBLIQUE_VIEWPOINT = Viewpoint(distance=0.20, tilt=-0.8, fov=float(np.radians(16.0)))
-"""The same oblique view of every anatomy: for data sets, and for tracked cameras, which must see their targets."""
+"""Oblique view, equal for every anatomy: for data sets, and for tracked cameras, which must see their targets."""

@@ -17,11 +17,11 @@ class BoardDetections:
     Parameters
     ----------
     views
-        Views of the images that show it.
+        Views of the board, from the images that show it.
     width, height
         Size of all images [pixel].
     looked_at
-        Number of images.
+        Number of examined images.
     """
 
     views: tuple[BoardView, ...]

@@ -81,7 +81,7 @@ def build_intrinsics_header(calibration: Calibration, covariance: np.ndarray) ->
 
 
 def write_exactly_known(path: str | Path, calibration: Calibration) -> None:
-    """Write the K.json of a camera that is exactly known, as that of a rendered video; the write is atomic.
+    """Write, atomically, the K.json of an exactly known camera, for example of a rendered video.
 
     Raises
     ------
@@ -93,12 +93,12 @@ def write_exactly_known(path: str | Path, calibration: Calibration) -> None:
 
 
 def write_calibration(path: str | Path, calibration: Calibration, form: Literal["opencv", "ros"] = "opencv") -> None:
-    """Write a calibration as OpenCV's YAML or ROS's, .yaml or .yml; it appears whole or not at all.
+    """Write a calibration as OpenCV's YAML or ROS's, .yaml or .yml, atomically.
 
     Raises
     ------
     InputError
-        An unknown form, a name of another ending, or a file that cannot be written.
+        An unknown format, a wrong file ending, or a file that cannot be written.
     """
     path = to_path(path)
     if form not in FORMATS:

@@ -78,7 +78,7 @@ def _set_stamped_time(picture: Named) -> Named:
 
 
 def _select_pose(state: TrackedTargets, wanted: list[str]) -> tuple[Verdict, Pose | None, str]:
-    """Return the pose of the first target, relative to the second if given; else the verdict of the missing one."""
+    """Return the pose of the first target, relative to the second if given; else the verdict on the missing target."""
     for name in wanted:
         if name not in state.poses:
             return state.verdicts[name], None, name
@@ -134,7 +134,7 @@ class ExternalTracker:
 
     @property
     def swapped(self) -> ExternalTracker:
-        """The same poses with the tool's taken for the reference's."""
+        """External tracker with the poses of tool and reference exchanged."""
         return replace(self, tool=self.patient, patient=self.tool)
 
     def compare_targets(self, time: float, seen: Mapping[str, Pose], before: Agreement) -> Agreement:
@@ -157,7 +157,7 @@ class ExternalTracker:
 
     @property
     def streams(self) -> dict[str, PoseStream]:
-        """All poses, by whose they are."""
+        """Streams of poses by body: tool, patient, and a tracked camera."""
         camera = {} if self.eye is None or self.eye.body is None else {"camera": self.eye.body}
         return {"tool": self.tool, "patient": self.patient, **camera}
 

@@ -50,8 +50,8 @@ KINDS = {
 """Disturbances of a video, with their description."""
 
 
-def from_where_it_sees_all(view: Viewpoint) -> Viewpoint:
-    """Return the same camera, at a distance from which its image shows as much as that of `VIEW`."""
+def scale_distance(view: Viewpoint) -> Viewpoint:
+    """Return the camera at the distance at which its image shows as much as that of `VIEW`."""
     assert view.calibration is not None
     longer = (view.calibration.focal[1] / view.height) / (USUAL_CALIBRATION.focal[1] / USUAL_CALIBRATION.height)
     return replace(view, distance=longer * VIEW.distance)
@@ -71,7 +71,7 @@ def place_reference(site: CraniotomyFrame, camera: Camera) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Trouble:
-    """Something that goes wrong from one time to another [s].
+    """Disturbance of the images from one time to another [s].
 
     Raises
     ------
@@ -154,7 +154,7 @@ def mount_targets(player: Player) -> Mounted:
     T_tool_cube = np.eye(4)
     T_tool_cube[2, 3] = CUBE_DISTANCE
     towards = pose[:3, :3].T @ (camera.centre - pose[:3, :3] @ T_tool_cube[:3, 3] - pose[:3, 3])
-    turn = np.arctan2(towards[1], towards[0]) - 0.25 * np.pi  # the edge between the cube's sides comes to the front
+    turn = np.arctan2(towards[1], towards[0]) - 0.25 * np.pi  # the edge between two sides of the cube faces the camera
     T_tool_cube[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
     return Mounted(TrackedTool(shape, np.linalg.inv(T_tool_cube)), place_reference(site, camera))
 

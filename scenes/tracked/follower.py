@@ -72,7 +72,7 @@ class TrackingResult:
     time
         Time of the image [s].
     state, words
-        State, and the reason for users why it is limited or unreliable; empty if it is reliable.
+        State of the tumour, and the reason why it is limited or unreliable, for users; empty if it is reliable.
     tracked
         Detected targets.
     motion
@@ -135,7 +135,7 @@ class Follower:
     motion
         Model of the brain's motion under the tool.
     elsewhere
-        Poses of an external tracker, which replace the cube's; with a tracked camera, the reference's, too.
+        Poses of an external tracker, which replace those of the cube; with a tracked camera, also of the reference.
     intrinsic
         Covariance (9, 9) of the camera's calibration, of `ar.tracking.intrinsics.PARAMETERS`; None: not available.
     settings
@@ -289,7 +289,7 @@ class Follower:
         return None if cube is None else cube.transform_to(reference)
 
     def _describe_age(self, time: float) -> str:
-        """Describe the age of an external tracker's poses, if they are missing; else empty."""
+        """Describe the age of an external tracker's last poses if current ones are missing; else empty."""
         age = None if self.elsewhere is None else self.elsewhere.compute_age(time)
         if self.elsewhere is None or age is None:
             return ""

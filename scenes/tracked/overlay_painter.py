@@ -23,7 +23,7 @@ from .tracked_tool import TrackedTool
 
 NO_CONTACT_TEXT = "the tool does not touch: as in the scan"  # Text in the image.
 SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
-"""The opening is visible within the drape's hole; all else may be bone."""
+"""Layer through which the tumour is seen: the drape's hole; everything else may be bone."""
 GREY_STATES = (TumourState.NO_TOOL, TumourState.STALE, TumourState.NO_REFERENCE)
 """States in which the tumour is drawn in grey, and dotted."""
 
@@ -98,7 +98,7 @@ class Painter:
         return Layer("tool", TOOL, *self.tool.build_surface(pose, cubed), TOOL_COLOUR)
 
     def measure_tip(self, known: TrackingResult, tumour: Layer) -> Gauge | None:
-        """From the tool's tip to the tumour, with the error of both; None where one is not known."""
+        """Measure from the tool's tip to the tumour, with the error of both; None if a position is unknown."""
         if known.T_scan_tool is None or known.tip_covariance is None or known.band is None:
             return None
         gauge = measure_gauge(known.T_scan_tool[:3, 3], tumour)
@@ -107,7 +107,7 @@ class Painter:
         return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, known.motion.error)))
 
     def _draw_grey(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None) -> Overlaid:
-        """Return the outline in grey, if it has a place, and why."""
+        """Draw the outline in grey at the last position, if there is one, with the reason."""
         over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
         if known.camera is not None and self.style != "none":
             self._draw_dotted(over, known.camera, self.stage.build_tumour(known.motion.positions))

@@ -32,9 +32,9 @@ def sample_of(known: TrackingResult, gauge: Gauge | None, tooled: bool, now: flo
 
 
 def render_slices(known: TrackingResult, painter: Painter, through: str) -> np.ndarray:
-    """Three slices (h, 3 h, 3) uint8 of the scan, through one of the places of `scenes.page.side_panels`.
+    """Render three slices (h, 3 h, 3) uint8 of the scan, through one of the places of `scenes.page.side_panels`.
 
-    Their band is the error of the motion, for tracking and registration do not move the tumour in the scan.
+    The error band is that of the motion: tracking and registration do not move the tumour in the scan.
     """
     stage, tool = painter.stage, painter.build_tool_layer(known, cubed=False)
     tip = None if known.T_scan_tool is None else known.T_scan_tool[:3, 3]

@@ -65,28 +65,28 @@ class OverlayPage:
     busy: Busy = field(init=False)
     history: History = field(init=False)
     shown: deque[Shown] = field(default_factory=lambda: deque(maxlen=MAX_KEPT_RESULTS), init=False)
-    # # Requests of users, written by the page's threads.
+    # Requests of users, written by the page's threads.
     plays: bool = field(default=True, init=False)
     style: Style = field(init=False)
     through: str = field(default="", init=False)
     sought: deque[int] = field(default_factory=lambda: deque(maxlen=1), init=False)
-    # # Displayed state: the original image, its overlay, and its style.
+    # Displayed state: the original image, its overlay, and its style.
     taken: Timed | None = field(default=None, init=False)
     newest: Shown | None = field(default=None, init=False)
     number: int = field(default=-1, init=False)
-    # # Shortest interval between two images up to now [s].
+    # Shortest interval between two images up to now [s].
     interval: float = field(default=MAX_INTERVAL, init=False)
     place: str = field(default="", init=False)
     drawn: tuple[str, ...] = field(default=(), init=False)
     tints: dict[str, tuple[float, float, float]] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        """Open the page; errors as of `ar.page.browser.Browser`."""
+        """Open the page; for errors see `ar.page.browser.Browser`."""
         stage, tool, calibration = self.painter.stage, self.painter.tool, self.follower.calibration
         self.style, self.history = self.painter.style, History(list_lines(self.tooled))
         bodies = build_brain(stage)
         if tool is not None:
-            # # Empty until the tool is seen.
+            # Empty until the tool is visible.
             away = np.tile(stage.site.origin, (len(tool.bare[0]), 1))
             bodies.append(SceneSurface("tool", away, tool.bare[1], TOOL_COLOUR))
         self.browser = Browser(
@@ -203,7 +203,7 @@ class OverlayPage:
 
     @contextmanager
     def _show_failure(self, end: float) -> Iterator[None]:
-        """Say on the page, for a while, why it cannot go on."""
+        """Show the reason of a failure on the page for some time, then raise the error again."""
         try:
             yield
         except ValueError as error:
@@ -228,13 +228,13 @@ class OverlayPage:
         self._draw(one)
 
     def _measure_gauge(self, known: TrackingResult) -> Gauge | None:
-        """From tip to tumour, where both are known."""
+        """Measure from tip to tumour; None if the tumour is drawn in grey or not at all."""
         if known.state in GREY_STATES:
             return None
         return self.painter.measure_tip(known, self.painter.stage.build_tumour(known.motion.positions))
 
     def _draw(self, one: Shown) -> None:
-        """Put an image, its text, bodies, slices and chart on the page."""
+        """Show an image, its text, bodies, slices and chart on the page."""
         known, look, painter = one.known, self.through, self.painter
         self.drawn = self.style, self.through
         said = report(one, self._measure_gauge(known), self.tooled, self.place)
@@ -255,7 +255,7 @@ class OverlayPage:
             self.browser.tint(name, colour)
 
     def _draw_in_style(self) -> None:
-        """Draw the same image in another style, if requested."""
+        """Draw the newest image in another style, if requested."""
         if self.newest is None or self.taken is None or self.drawn == (self.style, self.through):
             return
         assert self.taken.picture.colour is not None

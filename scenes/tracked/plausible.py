@@ -29,7 +29,7 @@ def describe_implausible(registration: Registration, stage: Stage, camera: Camer
     return ""
 
 
-def from_head(tip: np.ndarray, stage: Stage) -> float:
+def measure_head_distance(tip: np.ndarray, stage: Stage) -> float:
     """Compute the distance [m] of a tool's tip (3,) [m] from the bounding box of the head's mesh."""
     nodes = stage.anatomy.mesh.nodes
     return float(np.linalg.norm(tip - np.clip(tip, nodes.min(axis=0), nodes.max(axis=0))))
@@ -54,7 +54,7 @@ def describe_misplaced_tool(
 
     `near`: True if it was near before; `theirs`: question about the possible cause.
     """
-    away = from_head(T_scan_tool[:3, 3], stage)
+    away = measure_head_distance(T_scan_tool[:3, 3], stage)
     near = near or away <= NEAR_DISTANCE
     if not near:
         never = f"the tool is {1e3 * away:.0f} mm from the head, and was never nearer than {1e3 * NEAR_DISTANCE:.0f}"

@@ -1,4 +1,4 @@
-"""Poses of a tracked body as a CSV file: seconds, millimetres and unit quaternions. Rows where it is lost are blank."""
+"""Poses of a tracked body as a CSV file: seconds, millimetres and unit quaternions. Rows without a pose are blank."""
 
 import csv
 import warnings
@@ -42,14 +42,14 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Returns the numbers (n,) of the rows in the file, times (n,) [s] and poses (n, 4, 4) [m].
 
-    A pose leads from the body to the tracker: x_tracker = T x_body. Rows without a pose are passed over. So
+    A pose maps the body's frame to the tracker's: x_tracker = T x_body. Rows without a pose are skipped, and so
     are rows in which the tracker did not see the body, with a warning: a status that is not OK, zeros or the identity.
     Other columns are ignored.
 
     Raises
     ------
     InputError
-        A file that is missing or no such table, times that do not ascend, quaternions that are not of length 1, or
+        A missing file or one without these columns, times that do not ascend, quaternions that are not of length 1, or
         places farther than 100 m.
     """
     times, poses, _ = _read(path)
@@ -88,7 +88,7 @@ def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     columns = read_columns(path, {with_errors[:8], with_errors}, with_errors[1:], partial(_is_unseen, unseen=unseen))
     pose = np.column_stack([columns[name] for name in (*PLACE, *TURN)])
     zeros, same = ((np.abs(pose) == each).all(axis=1) for each in (np.zeros(7), np.eye(7)[6]))
-    # A body that is the identity in every row is the frame of the other one.
+    # A body whose pose is the identity in every row defines the frame of the other one.
     for rows, what in ((zeros, "zeros"), (same & ~same[~np.isnan(pose[:, 0])].all(), "the identity")):
         unseen.update({what: np.count_nonzero(rows)})
         for name in with_errors[1:8]:
@@ -135,7 +135,7 @@ def _is_unseen(cells: Mapping[str, str], unseen: Counter[str]) -> bool:
 
 
 def _read_covariances(columns: dict[str, np.ndarray], count: int) -> np.ndarray:
-    """Covariances (n, 6, 6) [m], [rad], of `write_poses`'s columns, or the usual one."""
+    """Covariances (n, 6, 6) [m], [rad], of `write_poses`'s columns, or the default one."""
     if COVARIANCE[0] not in columns:
         return np.tile(np.diag(np.repeat(np.square(USUAL_DEVIATIONS), 3)), (count, 1, 1))
     upper = np.zeros((count, 6, 6))

@@ -17,7 +17,7 @@ FORMAT = "sulcus registration 1"  # Name and version of the file format.
 REMEDY = "Make one by `sulcus register`."  # Remedy in error messages.
 MAX_FILE_BYTES = 1 << 16  # Maximum size of a valid file [bytes].
 ROTATION_TOLERANCE = 1e-4  # Tolerance of a rotation's columns from length 1 and right angles.
-# Share of its largest eigenvalue by which a covariance's smallest may be below 0, by rounding.
+# Rounding tolerance of a covariance's smallest eigenvalue below 0, relative to its largest eigenvalue.
 EIGENVALUE_TOLERANCE = 1e-9
 SCAN_TOLERANCE = 5e-3  # Largest difference of bounds and tumour between two meshes of one scan [m].
 _UNITS = np.repeat([1e3, 1.0], 3)  # Conversion of the covariance from metres and radians to millimetres and radians.
@@ -26,13 +26,13 @@ _UNITS = np.repeat([1e3, 1.0], 3)  # Conversion of the covariance from metres an
 def read_registration(path: str | Path) -> Registration:
     """Return the registration in a file of `sulcus register`.
 
-    `T_patient_scan_mm` (4 x 4) takes a place in the scan, RAS, to the frame of the patient's reference. `covariance`
-    (6 x 6) is of a shift [mm] in that frame, and of a small turn [rad] about `centre_mm`, a place in the scan.
+    `T_patient_scan_mm` (4 x 4) maps a point of the scan, RAS, to the frame of the patient's reference. `covariance`
+    (6 x 6): translation [mm] in the reference's frame, and small rotation [rad] about `centre_mm` in the scan.
 
     Raises
     ------
     InputError
-        No such file, another format, a transform that is not rigid, or a covariance that is none.
+        No such file, another format, a transform that is not rigid, or an invalid covariance.
     """
     path = to_path(path)
     if not path.is_file():
@@ -137,12 +137,12 @@ def as_stored(registration: Registration) -> dict[str, object]:
 
 
 def write_registration(path: str | Path, registration: Registration) -> None:
-    """Write a registration, .json; it appears whole or not at all.
+    """Write a registration, .json, atomically.
 
     Raises
     ------
     InputError
-        A file that cannot be written, or a name of another ending.
+        A file that cannot be written, or a wrong file ending.
     """
     with write_atomically(to_path(path), ".json") as partial:
         partial.write_text(json.dumps(as_stored(registration), indent=1) + "\n", encoding="utf-8")

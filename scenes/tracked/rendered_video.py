@@ -26,9 +26,9 @@ from .filming import (
     Taking,
     Trouble,
     VideoFrame,
-    from_where_it_sees_all,
     mount_targets,
     render_shots,
+    scale_distance,
 )
 
 SCENE = "palpate"
@@ -45,13 +45,13 @@ TISSUE_SPREAD = 25e-3  # Standard deviation of the tissue displacement around a 
 
 @dataclass(frozen=True, eq=False)
 class Dent:
-    """A Deformer that solves nothing: tissue goes with the tool's tip, the less the farther it is from it."""
+    """Deformer by a formula: tissue moves with the tool's tip, with a weight that decreases with distance."""
 
     anatomy: Anatomy
     site: CraniotomyFrame
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Compute the deformation under posed tools: the tissue is as deep as their tip is under the open cortex."""
+        """Compute the deformation under posed tools: tissue at a tip moves by the tip's depth below the open cortex."""
         nodes = self.anatomy.mesh.nodes
         cause = loads.get(Touching)
         assert cause is not None
@@ -90,7 +90,7 @@ class DrawnFilm:
     taking: Taking
 
     def get_image(self, shot: VideoFrame) -> Named:
-        """Return an image as a video gives it."""
+        """Return an image in the form that a video reader yields."""
         return to_named_image(f"{shot.time:.1f} s", shot.colour, shot.time)
 
 
@@ -105,7 +105,7 @@ def build_synthetic_video(theatre: PatientSetup) -> DrawnFilm:
     view = replace(VIEW.calibrate(CAMERA), path=HandHeld(0))
     whole = find_scene(SCENE)
     scene = replace(
-        whole, path=lambda time: whole.path(time + START_TIME), viewpoint=from_where_it_sees_all(view),
+        whole, path=lambda time: whole.path(time + START_TIME), viewpoint=scale_distance(view),
         frames_per_second=FRAME_RATE, duration=DURATION, look=PLAIN_APPEARANCE,
     )  # fmt: skip
     stage = theatre.build_stage(scene)

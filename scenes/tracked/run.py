@@ -60,18 +60,18 @@ class Shown:
     stamped: bool = False
 
     def drop_image(self) -> Shown:
-        """Return the same without its colours, which take memory."""
+        """Return the result without the image's colours, which take memory."""
         return replace(self, colour=np.empty((0, 0, 3), np.uint8))
 
     def drop_mesh(self) -> Shown:
-        """Return the same without where the brain is, and without its colours."""
+        """Return the result without the brain's vertex positions, and without the image's colours."""
         motion = replace(self.known.motion, positions=np.empty((0, 3)), solution=None)
         return replace(self.drop_image(), known=replace(self.known, motion=motion))
 
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """Image whose time [s] is read from its pixels, if it is written there, and from its source otherwise.
+    """Image with its time [s], read from a stamp in its pixels if there is one, otherwise from the source.
 
     `covered` (H, W) bool is the foreground in front of the brain, such as a hand, if a mask is given.
     """
@@ -82,7 +82,7 @@ class Timed:
 
 
 def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[Timed]:
-    """Yield images with their time stamps, and with their masks: all that is not black is foreground.
+    """Yield images with their time stamps, and with their masks, in which pixels that are not black are foreground.
 
     A 24-hour clock is continued at midnight.
 
@@ -93,7 +93,7 @@ def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> I
     """
     before, days = -np.inf, 0.0
     for number, picture in enumerate(film):
-        covered = None if masks is None else _mask(masks, picture, number)
+        covered = None if masks is None else _get_mask(masks, picture, number)
         stamp = read_stamp(picture.grey)
         time = days + (picture.time if stamp is None else stamp)
         if time < before - 0.5 * DAY_SECONDS:
@@ -104,8 +104,8 @@ def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> I
         raise ValueError("there are more masks than images. Give one for each image, in order.")
 
 
-def _mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
-    """Return the foreground mask of the image of a number."""
+def _get_mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
+    """Return the foreground mask of image `number`."""
     mask = next(masks, None)
     if mask is None:
         raise ValueError(f"{picture.name} has no mask: there are {number}. Give one for each image, in order.")
@@ -115,7 +115,7 @@ def _mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
 
 
 def pace_images(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
-    """Yield images like a live camera: the newest taken at the time of the request, and the moment [s] of its time 0.
+    """Yield images like a live camera: the newest image at each request, and the clock time [s] of image time 0.
 
     Images that arrive between requests are lost.
     """
@@ -150,7 +150,7 @@ def draw_overlays(film: Iterator[Timed], follower: Follower, painter: Painter, l
 def overlay_one(
     taken: Timed, begun: float | None, before: TrackingResult | None, follower: Follower, painter: Painter
 ) -> Shown:
-    """Compute one image with its overlay, from the result `before`.
+    """Compute the overlay of one image, from the result `before`.
 
     `begun` is the clock time [s] of the images' time 0, if they are live: old images are marked stale.
 

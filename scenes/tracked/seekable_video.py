@@ -30,18 +30,18 @@ class SeekableFilm:
     next: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
-        """Open it."""
+        """Open the video."""
         self.count = count_frames(self.path)
-        self.film = self._from(0)
+        self.film = self._read_from(0)
 
-    def _from(self, number: int) -> Iterator[Timed]:
+    def _read_from(self, number: int) -> Iterator[Timed]:
         return read_timed(read_video(self.path, self.rate, colour=True, first=number))
 
     def read_image(self, number: int) -> Timed | None:
-        """Return an image by its number; None if the video ends before it, which `count` then gives."""
+        """Return an image by its number; None if the video ends before this image; `count` is then corrected."""
         if number != self.next:
-            # From its start: a video's own leaps do not land on every frame.
-            self.film = self._from(number)
+            # Read from the start: seeking in a video does not reach every frame.
+            self.film = self._read_from(number)
         found, self.next = next(self.film, None), number + 1
         if found is None:
             self.count, self.next = min(self.count, number), -1

@@ -34,7 +34,7 @@ class BrainMotion:
     model, tool
         95 % bounds on a vertex's error by the model, and by the error of the tool's position [m].
     doubt
-        Reason why it is unreliable, in words for the image; empty if it is reliable.
+        Reason why the motion is unreliable, as text for the image; empty if it is reliable.
     solution
         The solution, from which the next one may start.
     """

@@ -1,4 +1,4 @@
-"""The tool that carries the printed cube: its shape, and where it is on the cube."""
+"""Tool that carries the printed cube: its shape, and its pose relative to the cube."""
 
 import json
 from dataclasses import dataclass, field
@@ -56,7 +56,7 @@ class TrackedTool:
 
     @cached_property
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Surface, as far as known, with its cube: vertices (n, 3) [m] in its own frame, triangles (m, 3).
+        """Surface with the cube, as far as the shape is known: vertices (n, 3) [m] in its own frame, triangles (m, 3).
 
         Only the printed faces are included, with their borders.
         """
@@ -114,7 +114,7 @@ def _check_rigid(T: np.ndarray) -> None:
 
 
 def write_tool(path: Path, tool: TrackedTool) -> None:
-    """Write a tool as JSON, in millimetres; the file appears whole or not at all."""
+    """Write a tool as JSON, in millimetres, atomically."""
     T = tool.T_cube_tool.copy()
     T[:3, 3] *= 1e3
     stored = {

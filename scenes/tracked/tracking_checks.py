@@ -1,4 +1,4 @@
-"""Verification of an overlay by its pixels, when markers are lost and found again, and images are late."""
+"""Verification of an overlay by its pixels, with lost and recovered markers and late images."""
 
 import time as clock
 from collections.abc import Iterator
@@ -49,7 +49,7 @@ class TrackingFigures:
     pictures
         Number of images.
     confident
-        Number of images in which a lost or old position is drawn in the ink of a known one.
+        Number of images in which a lost or old position is drawn in the colour of a known one.
     unsaid
         Number of images with a lost or old position that do not show the reason in their pixels.
     back
@@ -66,7 +66,7 @@ class TrackingFigures:
     off: float
 
     def find_violations(self) -> list[str]:
-        """Return a sentence for each bound that is not kept."""
+        """Return a sentence for each metric that exceeds its limit."""
         back, near = self.back <= CHECK.max_search_images, self.off <= CHECK.max_outline_error
         rules = {
             f"{self.confident} images draw a lost or old position as if it were known": self.confident == 0,
@@ -77,13 +77,13 @@ class TrackingFigures:
         return [sentence for sentence, kept in rules.items() if not kept]
 
     def to_row(self) -> dict[str, float | None]:
-        """For machines: None is a figure that could not be measured."""
+        """Convert to a row of JSON; None: not measured."""
         return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True, eq=False)
 class Event:
-    """Image at its arrival: its age [s], and the required text; empty without a disturbance."""
+    """Image at its arrival, with its age [s] and the required text, which is empty without a disturbance."""
 
     shot: VideoFrame
     late: float = 0.0
@@ -138,7 +138,7 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
 
 
 def _has_warning(colour: np.ndarray, words: str, wanted: str) -> bool:
-    """Return True if text that begins as wanted is found in an image."""
+    """Return True if the image contains text with the wanted beginning."""
     lines = format_warning(words, colour.shape[1])
     return words.startswith(wanted) and all(
         has_text(colour, line, TEXT_SCALE, compute_ink(WARNING_COLOUR)) for line in lines

@@ -24,7 +24,7 @@ FORMAT = "sulcus film 1"  # Name and version of the file format.
 REMEDY = "Give the truth.npz that `sulcus film` wrote."  # Remedy in error messages.
 POSE_ARRAYS = ("T_camera_scan", "T_scan_tool")  # Arrays of poses.
 SPACES = {"scan": "RAS [m]", "camera": "x right, y down, z forward [m]"}  # Axes and unit of the coordinate systems.
-ERROR_TOLERANCE = 1e-3  # Error beyond its bound above which a tumour is wrong [m].
+ERROR_TOLERANCE = 1e-3  # Excess of the error over its bound above which a tumour position counts as wrong [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +50,13 @@ class VideoGroundTruth:
     displacement: np.ndarray
 
     def find_image(self, time: float) -> int | None:
-        """Return the number of the image taken at a time [s], to a millisecond; None: none was."""
+        """Return the number of the image taken at a time [s], to a millisecond; None without such an image."""
         near = int(np.abs(self.times - time).argmin())
         return near if abs(self.times[near] - time) < 1e-3 else None
 
 
 def write_truth(path: Path, truth: VideoGroundTruth) -> None:
-    """Write a truth as .npz; it appears whole or not at all."""
+    """Write the ground truth as .npz, atomically."""
     with write_atomically(path, ".npz") as partial, partial.open("wb") as file:
         np.savez_compressed(
             file,
@@ -69,14 +69,14 @@ def write_truth(path: Path, truth: VideoGroundTruth) -> None:
 
 
 def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = MAX_TRUTH_BYTES) -> VideoGroundTruth:
-    """Return the truth in a file, of a body with this digest and number of `vertices` on its tumour's surface.
+    """Read the ground truth of an anatomy with this digest and number of `vertices` on its tumour's surface.
 
-    Its arrays inflate to at most `largest` bytes.
+    The uncompressed arrays have at most `largest` bytes.
 
     Raises
     ------
     InputError
-        A file that is missing or no such truth, or of another body.
+        A missing or invalid file, or ground truth of another anatomy.
     """
     path = to_path(path)
     with read_as(path, "the ground truth of a video", REMEDY), path.open("rb") as raw:
@@ -98,7 +98,7 @@ def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = MAX
 
 
 def write_table(path: Path, truth: VideoGroundTruth, rest: np.ndarray) -> None:
-    """Write a truth as a readable table, a row for each image; rest (n, 3) [m]: the tumour's surface in the scan.
+    """Write the ground truth as a table, a row for each image; rest (n, 3) [m]: the tumour's surface in the scan.
 
     Poses are rows of 12 numbers, of the matrix from the scan to the camera, and from the tool to the scan [mm].
     """
@@ -159,13 +159,13 @@ def compute_overlay_error(
 
 
 def _compute_lateral_lengths(apart: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Lengths (n,) of vectors (n, 3) across the lines of sight to points (n, 3) of the camera's frame."""
+    """Compute the lengths (n,) of vectors (n, 3) across the lines of sight to points (n, 3) of the camera's frame."""
     rays = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     return np.linalg.norm(apart - np.sum(apart * rays, axis=1, keepdims=True) * rays, axis=1)
 
 
 def _compute_edge_distance(true: np.ndarray, drawn: np.ndarray) -> float:
-    """Mean distance [pixel] of the edge of a mask from that of the true one, and back; infinite without either."""
+    """Compute the mean distance [pixel] between the edges of a mask and the true mask; infinite without one."""
     edges = [mask & (np.asarray(binary_erosion(mask)) == 0) for mask in (true, drawn)]
     if not all(edge.any() for edge in edges):
         return np.inf

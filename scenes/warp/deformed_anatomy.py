@@ -1,4 +1,4 @@
-"""The moment that is exported: how a body is displaced, by what, and how surely."""
+"""Exported deformation: displacement of an anatomy, its cause, and its error bound."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -46,7 +46,7 @@ def play_scene_cause(scene: Scene, number: int) -> Cause:
 
 
 def load_cause(loads: Loads) -> Cause:
-    """Describe the one push of a load case as a cause."""
+    """Describe the single push of a load case as a cause."""
     (pushed,) = loads.get_all(Pushed)
     place, force = 1e3 * pushed.point[0], pushed.force[0]
     newton = float(np.linalg.norm(force))
@@ -126,7 +126,7 @@ class Played:
     def list_moments(
         self, frames: Sequence[int], progress: Callable[[int], object] = lambda more: None
     ) -> list[DeformedAnatomy]:
-        """Return the moments of some frames, in rising order."""
+        """Return the moments of some frames, in ascending order."""
         fem = self.theatre.build_fem(self.scene, TRAIN, 1, live=True)
         needed = range(frames[-1] + 1) if is_history_dependent(fem) else frames
         answers = solve_reference_frames(
@@ -142,7 +142,7 @@ class Played:
     def _build_moment(self, number: int, result: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
         scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
         moved = result.displacement[0]
-        # Nothing is located here, and no locator is asked for.
+        # Nothing is located here, so that no locator is needed.
         stage = Stage(replace(scene, observation_model=None), site)
         player = Player(stage, AtRest(site.anatomy))
         now = site.anatomy.mesh.nodes + moved

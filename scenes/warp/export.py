@@ -123,7 +123,7 @@ def _write_points(place: Path, moment: DeformedAnatomy, marks: Sequence[Landmark
 
 
 def name_points(moment: DeformedAnatomy, marks: Sequence[Landmark]) -> dict[str, np.ndarray]:
-    """Points (3,) [m] by name: of tissue in the scan and now, the tumour's centroid now, and the tool's tip."""
+    """List points (3,) [m] by name: tissue in the scan and deformed, the tumour's deformed centroid, and the tip."""
     points = {}
     for one in marks:
         points |= {f"{one.name}, in the scan": one.rest, f"{one.name}, now": one.now}
@@ -144,7 +144,7 @@ def _write_sequence(path: Path, sequence: Sequence[tuple[float, DeformedAnatomy]
 
 
 def describe_spaces(files: Sequence[str]) -> dict[str, str]:
-    """In which space each file's coordinates are; `cause` is of those in `warp.json`."""
+    """Describe the coordinate system of each file; `cause` has coordinates in `warp.json`."""
     known = {"field_resampling.nii.gz": "RAS, mm", "deformed.glb": "left, head, front, m"}
     endings = {".nii.gz": "that of the image", ".txt": ""}
     found = {name: known.get(name, endings.get(name[name.find(".") :], "LPS, mm")) for name in files}

@@ -1,4 +1,4 @@
-"""A patient's own images and label maps, as they would be now: on their own grids, as NIfTI."""
+"""Deformed images and label maps of a patient, on their original grids, as NIfTI."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,7 +111,7 @@ def _is_label_like(values: np.ndarray) -> bool:
 
 
 def _compute_equal_share(values: np.ndarray) -> float:
-    """Return the share of voxels, but for those that are 0, that have the value of the next along the first axis."""
+    """Return the share of the nonzero voxels that have the value of the next voxel along the first axis."""
     thin = values[:, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE]
     one, two = thin[:-1:SAMPLING_STRIDE], thin[1::SAMPLING_STRIDE]
     full = (one != 0) & (two != 0)
@@ -148,7 +148,7 @@ class PatientImage:
 
 @dataclass(frozen=True)
 class Warped:
-    """Name of a warped image, and its numbers of voxels that moved, came from outside, and were resected."""
+    """Name of a warped image, and numbers of voxels that moved, came from outside, and were resected."""
 
     name: str
     moved: int
@@ -227,9 +227,9 @@ def write_warped(folder: Path, picture: PatientImage, fields: WarpFields, order:
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Count the voxels that moved, came from outside the image, or from resected tissue.
+    """Numbers of voxels that moved, that came from outside the image, and that came from resected tissue.
 
-    Also return the blank ones (I, J, K).
+    `blank` (I, J, K) bool: voxels without a source.
     """
 
     moved: int
@@ -269,14 +269,14 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
             source, np.clip(place, 0, last).T, order=order, mode="nearest", prefilter=False, output=source.dtype
         )
         numbers = np.ravel_multi_index(index[rows].T - np.array([[first], [0], [0]]), (len(slab), *sides))
-        slab.reshape(-1)[numbers] = np.where(off | cut, 0, _as(read, values.dtype))
+        slab.reshape(-1)[numbers] = np.where(off | cut, 0, _cast_values(read, values.dtype))
         blank[first : first + BATCH_SLICES].reshape(-1)[numbers] = off | cut
         outside, resected = outside + int(off.sum()), resected + int(cut.sum())
     return out, Counts(moved, outside, resected, blank)
 
 
 def _find_moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Backward displacements (m, 3) [m] of those rows (m,) of places (n, 3) [m] that have one."""
+    """Find the nonzero backward displacements (m, 3) [m] at points (n, 3) [m], and their rows (m,)."""
     index = fields.grid.index(now)
     held = np.flatnonzero(((index > 0.0) & (index < np.array(fields.grid.shape) - 1)).all(axis=1))
     went = fields.grid.read(fields.backward, now[held])
@@ -284,7 +284,7 @@ def _find_moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.nd
     return went[moves], held[moves]
 
 
-def _as(values: np.ndarray, kind: np.dtype) -> np.ndarray:
+def _cast_values(values: np.ndarray, kind: np.dtype) -> np.ndarray:
     if kind.kind not in "iu":
         return values.astype(kind)
     limits = np.iinfo(kind)

@@ -1,4 +1,4 @@
-"""Named points of a body at rest and now, each a place in tissue that the finite elements carry."""
+"""Named points of tissue with undeformed and deformed positions, interpolated in the FEM mesh."""
 
 from dataclasses import dataclass
 
@@ -34,9 +34,9 @@ class Landmark:
 
 
 def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, ...]:
-    """Points of tissue of the tumour and of the open cortex, where a body has them, as (V, 3) [m] displaces them.
+    """List the landmarks of the tumour and of the open cortex, if present, under displacements (V, 3) [m].
 
-    They move linearly in their tetrahedron or triangle, as the fields do.
+    Landmarks are interpolated linearly in their tetrahedron or triangle, like the fields.
     """
     mesh, found = body.mesh, []
     if body.in_tumour.any():
@@ -56,7 +56,7 @@ def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, .
 
 
 def compute_centroid(body: Anatomy, displacement: np.ndarray) -> np.ndarray | None:
-    """Return the centroid (3,) [m] of the tumour's volume as it is now; None without a tumour."""
+    """Return the centroid (3,) [m] of the tumour's deformed volume; None without a tumour."""
     tumour = body.mesh.tets[body.in_tumour]
     if not len(tumour):
         return None

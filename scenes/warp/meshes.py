@@ -1,4 +1,4 @@
-"""Triangles as VTP, STL and glTF, each with the space that it is in."""
+"""Triangles as VTP, STL and glTF files, each with its coordinate system."""
 
 import base64
 import json
@@ -23,7 +23,7 @@ TO_GLTF = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class NamedSurface:
-    """A named surface: vertices (n, 3) [m, RAS], how far each has moved (n, 3) [m], triangles (m, 3), colour RGBA."""
+    """A named surface: vertices (n, 3) [m, RAS], displacements (n, 3) [m], triangles (m, 3), colour RGBA."""
 
     name: str
     vertices: np.ndarray
@@ -35,13 +35,13 @@ class NamedSurface:
 def build_surface_mesh(
     name: str, triangles: np.ndarray, nodes: np.ndarray, moved: np.ndarray, colour: tuple[float, float, float, float]
 ) -> NamedSurface:
-    """Build the surface of some triangles of nodes (V, 3) [m], displaced by (V, 3) [m], without other vertices."""
+    """Build the surface of some triangles of nodes (V, 3) [m], displaced by (V, 3) [m], without unused vertices."""
     used, numbers = np.unique(triangles, return_inverse=True)
     return NamedSurface(name, nodes[used] + moved[used], moved[used], numbers.reshape(-1, 3), colour)
 
 
 def write_vtp(path: Path, mesh: NamedSurface) -> None:
-    """Write VTK's XML of polygons in millimetres, LPS, which its field SPACE says; `displacement` [mm] at points."""
+    """Write VTK's XML of polygons in millimetres, LPS, as its field SPACE records; `displacement` [mm] at points."""
     points, moved = (1e3 * values * LPS for values in (mesh.vertices, mesh.moved))
     ends = 3 * np.arange(1, len(mesh.triangles) + 1)
     space = " ".join(str(code) for code in (*b"LPS", 0))
@@ -104,7 +104,7 @@ def write_glb(path: Path, meshes: Sequence[NamedSurface]) -> None:
             else:
                 bounds = {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
                 accessors.append({**view, "componentType": FLOAT, "count": len(values), "type": "VEC3", **bounds})
-            data += values.tobytes()  # all of four bytes: no gaps
+            data += values.tobytes()  # all values have four bytes: no padding
         first = len(accessors) - 3
         parts.append({"attributes": {"POSITION": first, "NORMAL": first + 1}, "indices": first + 2})
     said = {

@@ -12,11 +12,11 @@ from sim.fields.grid import Grid, build_grid_around
 from sim.fields.grid_interpolation import interpolate_in_tetrahedra
 
 TYPES = {"f4": "float", "u1": "unsigned char"}  # Names of data types in NRRD.
-LEVEL = 1  # Compression level, the lowest: more hardly reduces floats.
+LEVEL = 1  # Lowest compression level: higher levels hardly reduce floats.
 DIGITS = 4
-"""Decimals of displacements in millimetres: further ones have no meaning, and take half of a file."""
+"""Decimals of displacements [mm]: further decimals have no meaning, and double the file size."""
 TUMOUR, SHELL = 1, 2
-"""Labels of the segments: tumour, what may be tumour."""
+"""Labels of the segments: tumour, and tissue that may be tumour."""
 COLOURS = {TUMOUR: (0.20, 0.94, 0.42), SHELL: (0.95, 0.75, 0.20)}  # Colours (RGB, 0 to 1) of the segments.
 VOXEL = 0.5e-3  # Edge of a voxel [m].
 MARGIN = 2e-3  # Margin round the segments [m].
@@ -91,14 +91,14 @@ def _format_vector(values: np.ndarray) -> str:
 
 
 def _build_displacement_header(direction: str) -> dict[str, str]:
-    # The number of NIfTI's intent: by it Slicer and ITK tell a transform from other vectors.
+    # NIfTI's intent code, by which Slicer and ITK distinguish a transform from other vectors.
     return {"displacement field type": direction, "intent_code": "1006"}
 
 
 def write_segmentation(path: Path, nodes: np.ndarray, tets: np.ndarray, bound: float | None) -> None:
     """Write the tumour of tetrahedra (T, 4) of nodes (V, 3) [m, RAS], and if known the shell within a bound [m].
 
-    The shell is all outside the tumour that is no farther from it: of its surface's place, not of its size.
+    The shell is the tissue outside the tumour within this bound. It bounds the surface's position, not the size.
     """
     grid = build_grid_around(nodes[np.unique(tets)], VOXEL, (bound or 0.0) + MARGIN)
     inside = interpolate_in_tetrahedra(grid, nodes, tets, np.zeros_like(nodes))[1]

@@ -66,7 +66,7 @@ class SamplePlaces:
 
 
 def list_places(moment: DeformedAnatomy) -> SamplePlaces:
-    """Vertices of what is left of a body, four places in each tetrahedron, three on each open triangle, landmarks."""
+    """List the vertices of the remaining body, four points per tetrahedron, three per open triangle, and landmarks."""
     body, mesh = moment.left, moment.left.mesh
     used, marks = np.unique(mesh.tets), list_landmarks(body, moment.displacement)
     within, on = len(INNER_WEIGHTS) * len(mesh.tets), len(FACE_WEIGHTS) * len(body.open_surface)
@@ -160,7 +160,7 @@ def compute_fields(
 def find_finer_spacing(
     moment: DeformedAnatomy, fields: WarpFields, settings: SpacingSettings = SpacingSettings()
 ) -> float | None:
-    """Return a spacing [m] at which both are exact enough, or as near as size allows; None where no finer one helps."""
+    """Return a finer spacing [m] that meets the tolerance, or is as near as size allows; None if none is needed."""
     now = fields.grid.spacing
     places = list_places(moment)
     worst = float(places.compute_errors(fields)[places.tumour | places.landmarks].max(initial=0.0))

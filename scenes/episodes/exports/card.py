@@ -1,4 +1,4 @@
-"""The card of a data set, written into its folder: table of episodes, Croissant, data sheet and licence."""
+"""Card of a data set, written into its folder: table of episodes, Croissant, data sheet and licence."""
 
 import csv
 import io
@@ -128,7 +128,7 @@ def _is_outdated(folder: Path, names: set[str]) -> bool:
 
 
 def list_card_files(folder: Path) -> dict[str, int]:
-    """Names and sizes of the episodes that a folder's card lists; none where there is no such table."""
+    """Read names and sizes of the episodes that a folder's card lists; empty without such a table."""
     try:
         with (folder / TABLE).open(newline="", encoding="utf-8") as file:
             return {row["file"]: int(row["bytes"]) for row in csv.DictReader(file)}

@@ -29,7 +29,7 @@ HELD_OUT_STRIDE = 10  # One in this many bodies (or episodes, if there are fewer
 
 
 def describe_task(contents: EpisodeContents) -> str:
-    """Return the sentence for an episode's family; of one that has none, its scene's name."""
+    """Return the sentence for an episode's family; without a family, the name of its scene."""
     return TASKS.get(contents.family, f"Play the scene {contents.family}.")
 
 
@@ -79,7 +79,7 @@ def list_shared_images(episodes: Sequence[EpisodeContents], wanted: Sequence[str
 
 
 def list_shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
-    """Those `NUMBERS` that every episode has in the same shape: two bodies' tumours have not."""
+    """List the `NUMBERS` that every episode has in the same shape; tumours of two bodies differ in shape."""
     first = episodes[0].shapes
     return tuple(
         name
@@ -90,7 +90,7 @@ def list_shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
 
 
 def compute_frame_rate(contents: EpisodeContents, time: np.ndarray) -> float:
-    """Frames a second.
+    """Compute the frame rate [1/s].
 
     Raises
     ------
@@ -104,7 +104,7 @@ def compute_frame_rate(contents: EpisodeContents, time: np.ndarray) -> float:
 
 
 def collect_numbers(file: h5py.File, contents: EpisodeContents, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """`state` (T, 7), `action` (T, 6) and the named arrays, as float32; `time` as it is stored.
+    """Collect `state` (T, 7), `action` (T, 6) and the named arrays as float32; `time` keeps its stored type.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def collect_numbers(file: h5py.File, contents: EpisodeContents, names: Sequence[
 
 
 def read_per_frame(file: h5py.File, contents: EpisodeContents, name: str) -> np.ndarray:
-    """Rows (T, ...) of a named array; of `K` (T, 3, 3) that of each frame, which changes where the camera zooms."""
+    """Read the rows (T, ...) of a named array; `K` (T, 3, 3) has a row per frame, because a camera may zoom."""
     if name != "K":
         return read_numbers(file, contents, name)
     if "K_of_frame" in contents.shapes:
@@ -129,24 +129,24 @@ def read_per_frame(file: h5py.File, contents: EpisodeContents, name: str) -> np.
 
 
 def split_into_blocks(frames: int) -> Iterator[range]:
-    """All frames, `BLOCK_FRAMES` at a time."""
+    """Split the frames into blocks of `BLOCK_FRAMES`."""
     return (range(start, min(start + BLOCK_FRAMES, frames)) for start in range(0, frames, BLOCK_FRAMES))
 
 
 def name_axes(name: str) -> list[str] | None:
-    """Names of a vector's components, where they have some."""
+    """Return the names of a vector's components; None if they have no names."""
     return {"state": list(STATE), "action": list(ACTION), "distance": ["m"]}.get(
         name, list("xyz") if name in ("force", "force_read", "tip", "contact") else None
     )
 
 
 def measure_stored_size(episodes: Sequence[EpisodeContents]) -> int:
-    """Bytes of all their files."""
+    """Return the total size of the episodes' files [bytes]."""
     return sum(one.path.stat().st_size for one in episodes)
 
 
 def name_files(episodes: Sequence[EpisodeContents]) -> Mapping[EpisodeContents, str]:
-    """Return a name for each, its file's; where two have the same, with a number."""
+    """Return a unique name of each episode: its file's name, numbered if two files have the same name."""
     taken: set[str] = set()
     found = {}
     for one in episodes:
@@ -157,7 +157,7 @@ def name_files(episodes: Sequence[EpisodeContents]) -> Mapping[EpisodeContents, 
 
 
 def build_states(poses: np.ndarray) -> np.ndarray:
-    """(T, 7) float32 of `T_world_tool` (T, 4, 4): origin [m], and quaternion x, y, z, w that does not jump in sign."""
+    """Build (T, 7) float32 from `T_world_tool` (T, 4, 4): origin [m], and quaternion x, y, z, w without sign jumps."""
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     flips = np.sign(np.einsum("ij,ij->i", turns[1:], turns[:-1]))
     turns[1:] *= np.cumprod(np.where(flips < 0.0, -1.0, 1.0))[:, None]
@@ -165,9 +165,9 @@ def build_states(poses: np.ndarray) -> np.ndarray:
 
 
 def build_twists(poses: np.ndarray) -> np.ndarray:
-    """(T, 6) float32: shift of the tool's origin [m] and its turn [rad], both in world axes, to the next frame.
+    """Build (T, 6) float32: the tool's translation [m] and rotation [rad] to the next frame, in world axes.
 
-    The last is zero.
+    The last row is zero.
     """
     shifts = np.diff(poses[:, :3, 3], axis=0)
     turns = Rotation.from_matrix(poses[1:, :3, :3]) * Rotation.from_matrix(poses[:-1, :3, :3]).inv()
@@ -176,9 +176,9 @@ def build_twists(poses: np.ndarray) -> np.ndarray:
 
 
 def collect_texts(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
-    """Return the texts by the names that they go by; those of several folders are numbered.
+    """Return data sheets and licences by file name; names are numbered if there are several folders.
 
-    None where there are none.
+    Empty if there are no such files.
     """
     homes = dict.fromkeys(find_dataset_folder(one.path.resolve().parent) for one in episodes)
     found = {}
@@ -191,11 +191,11 @@ def collect_texts(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
 
 
 def write_along(episodes: Sequence[EpisodeContents], folder: Path) -> None:
-    """Write the texts into a folder."""
+    """Write the data sheets and licences of the episodes into a folder."""
     for name, text in collect_texts(episodes).items():
         (folder / name).write_text(text, encoding="utf-8")
 
 
 def find_dataset_folder(folder: Path) -> Path:
-    """Return the data set's folder, of that which its episodes lie in."""
+    """Return the data set's folder, given the folder of its episodes."""
     return folder.parent if folder.name == "episodes" and not (folder / LICENCE).exists() else folder

@@ -31,7 +31,7 @@ CONTEXT: Mapping[str, Any] = {
     "name": {"@container": "@language"},
     **{name: f"cr:{name}" for name in UNTYPED_TERMS},
 }
-"""The specification's own context."""
+"""JSON-LD context of the specification."""
 COLUMNS: Mapping[str, tuple[str, str]] = {
     "file": ("sc:Text", "The episode's HDF5 file."),
     "family": ("sc:Text", "Scenario of the episode."),

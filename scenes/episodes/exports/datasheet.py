@@ -1,4 +1,4 @@
-"""The data sheet of a data set, by the questions of Gebru et al. (2021), "Datasheets for Datasets", CACM 64(12)."""
+"""Data sheet of a data set, by the questions of Gebru et al. (2021), "Datasheets for Datasets", CACM 64(12)."""
 
 import json
 from collections import Counter
@@ -50,7 +50,7 @@ def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str
 
 
 def format_range_row(key: str, found: Sequence[Any]) -> str:
-    """Return a row of what varies."""
+    """Format the table row of a varied parameter."""
     if all(is_number(one) for one in found):
         return f"| `{key}` | {format_cell(min(found))} | {format_cell(max(found))} | {len(found)} |"
     often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, found)).most_common(8))
@@ -63,12 +63,12 @@ def is_number(value: Any) -> bool:
 
 
 def format_cell(value: Any) -> str:
-    """Return a value in a table: whole numbers in full, others to four digits."""
+    """Format a value for a table: whole numbers in full, others to four digits."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def list_leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Numbers and texts of nested JSON by their dotted names; lists are numbered."""
+    """List numbers and texts of nested JSON by their dotted names; items of lists are numbered."""
     match value:
         case dict():
             for key, inner in value.items():
@@ -83,12 +83,12 @@ def list_leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 TEMPLATE, DRAWN, UNSTATED = "template", "drawn", ""
 """Origin of an anatomy: the shipped one, the same brain with another tumour, or unknown.
 
-Else the name of an own one.
+Other values: the name of a custom anatomy.
 """
 
 
 def find_origin(contents: EpisodeContents) -> str:
-    """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, the name of an own one, or `UNSTATED`."""
+    """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, the name of a custom one, or `UNSTATED`."""
     stated = read_parameters(contents).get("bodies.anatomies")
     if stated is not None:
         return str(stated)
@@ -237,7 +237,7 @@ def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
 
 
 def format_value(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
-    """Return an attribute of all episodes that have it."""
+    """Format the values of an attribute over all episodes that have it."""
     return [one.said[key] for one in episodes if key in one.said]
 
 

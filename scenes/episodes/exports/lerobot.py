@@ -101,7 +101,7 @@ REQUIRED_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_
 def write_lerobot(
     episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write a data set; the folder appears whole. Returns what it holds. `progress` passes the episodes on.
+    """Write a data set, atomically; return its summary. `progress` wraps the episodes.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def write_lerobot(
 
 
 def to_key(name: str) -> str:
-    """LeRobot's name of an array of ours."""
+    """Return LeRobot's name of an array."""
     return "action" if name == "action" else f"observation.{name}"
 
 
@@ -187,7 +187,7 @@ def build_columns(frames: int, episode: int, first: int, task: int, rate: float)
 
 @dataclass
 class Tables:
-    """The data tables, a new one wherever the last is large enough; frames are written in blocks."""
+    """Writer of data tables of limited size; frames are written in blocks."""
 
     folder: Path
     number: int = -1
@@ -197,7 +197,7 @@ class Tables:
     def write(
         self, file: h5py.File, contents: EpisodeContents, columns: Mapping[str, np.ndarray], pictures: Sequence[str]
     ) -> tuple[int, int]:
-        """Write an episode; returns the numbers of the folder and the file that it is in."""
+        """Write an episode; return the numbers of its folder and its file."""
         if self.writer is not None and self.path.stat().st_size > 1e6 * FILE_MEGABYTES:
             self.close()
         for block in split_into_blocks(len(columns["index"])):
@@ -215,7 +215,7 @@ class Tables:
         return divmod(self.number, FOLDER_FILES)
 
     def close(self) -> None:
-        """End the table that is open."""
+        """Close the current table."""
         if self.writer is not None:
             self.writer.close()
             self.writer = None
@@ -231,7 +231,7 @@ def encode_images(file: h5py.File, contents: EpisodeContents, name: str, frames:
 
 
 def to_arrow_column(array: np.ndarray) -> pa.Array:
-    """Rows (T, ...) as a column: numbers, vectors, or lists of lists."""
+    """Convert rows (T, ...) to a column: numbers, vectors, or lists of lists."""
     if array.ndim == 1:
         return pa.array(array)
     if array.ndim == 2:
@@ -254,7 +254,7 @@ def measure_image_statistics(file: h5py.File, contents: EpisodeContents, name: s
 
 
 def to_lerobot_statistics(name: str, spread: RowStatistics) -> dict[str, list]:
-    """Convert statistics to LeRobot's form: of an image (channels, 1, 1)."""
+    """Convert statistics to LeRobot's form; those of an image have shape (channels, 1, 1)."""
     said = spread.to_lists()
     if not name.startswith("observation.images."):
         return said
@@ -262,7 +262,7 @@ def to_lerobot_statistics(name: str, spread: RowStatistics) -> dict[str, list]:
 
 
 def build_task_table(tasks: Sequence[str]) -> pa.Table:
-    """Tasks with their numbers; the sentence is the index that pandas restores."""
+    """Build the table of tasks and their numbers; pandas restores the sentence as index."""
     index = "__index_level_0__"
     table = pa.table({"task_index": np.arange(len(tasks)), index: list(tasks)})
     kinds = (("task_index", "int64", "int64"), (index, "unicode", "object"))
@@ -281,7 +281,7 @@ def build_task_table(tasks: Sequence[str]) -> pa.Table:
 
 
 def describe_features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
-    """Numbers as `info.json` describes them."""
+    """Describe the numbers for `info.json`."""
     kinds = {name: "float32" if name not in REQUIRED_COLUMNS or name == "timestamp" else "int64" for name in shapes}
     return {
         name: {"dtype": kinds[name], "shape": list(shape) or [1], "names": name_axes(name.rpartition(".")[2])}

@@ -17,13 +17,13 @@ from ..reading.windows import read_image_bytes, read_numbers, read_rows
 from .columns import measure_stored_size, name_files, write_along
 
 SEPARATE_TABLES = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
-"""Arrays with many numbers a frame, each in a table of its own."""
+"""Arrays with many numbers per frame, each in its own table."""
 
 
 def write_folder(
     episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write a folder for each episode; the whole appears at once. Returns what it holds.
+    """Write a folder for each episode, atomically; return a summary.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def write_pictures(place: Path, file: h5py.File, contents: EpisodeContents) -> N
 
 
 def write_tables(place: Path, file: h5py.File, contents: EpisodeContents) -> None:
-    """Write `frames.csv`, a row for each frame, and a table for each array that is wide. NaN is an empty field."""
+    """Write `frames.csv`, a row for each frame, and a table for each array with many columns. NaN is an empty field."""
     columns: dict[str, Sequence[object] | np.ndarray] = {"frame": range(contents.frames)}
     for name in contents.shapes:
         described = ARRAYS.get(name)
@@ -87,7 +87,7 @@ def write_table(path: Path, columns: dict[str, Any]) -> None:
 
 
 def write_description(path: Path, file: h5py.File, contents: EpisodeContents) -> None:
-    """Write the attributes, what each array is, and the arrays that an episode has once."""
+    """Write the attributes, the meaning of each array, and the arrays without frames."""
     arrays = {}
     for name in contents.shapes:
         item = file[f"pictures/{name}" if name in PICTURES else name]

@@ -36,7 +36,7 @@ GYM = 2
 def write_robomimic(
     episodes: Sequence[EpisodeContents], path: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write the file, whole or not at all; return its contents. `progress` wraps the episodes.
+    """Write the file, atomically; return a summary. `progress` wraps the episodes.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def write_robomimic(
 
 
 def write_demo(demo: h5py.Group, obs: h5py.Group, contents: EpisodeContents, numbers: dict[str, np.ndarray]) -> None:
-    """Write all but the images of one episode: a state is the tool's, then the tumour's where all have as many."""
+    """Write one episode without images: a state is that of the tool, then of the tumour if exported."""
     actions, state = numbers.pop("action"), numbers.pop("state")
     tumour = [numbers[name].reshape(contents.frames, -1) for name in ("tumour_predicted",) if name in numbers]
     dones = np.zeros(contents.frames, np.int64)

@@ -1,4 +1,4 @@
-"""The tumour, and the cortex where it is there, over time: XDMF with its numbers in HDF5, for ParaView."""
+"""Tumour and, if recorded, cortex over time: XDMF with arrays in HDF5, for ParaView."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,13 +17,13 @@ from ..reading.windows import read_numbers
 from .columns import SPACE, measure_stored_size, name_files, write_along
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
-"""Contents to write, and the surface of their anatomy."""
+"""Exported surfaces, and the attribute of the anatomy with the triangles of each."""
 
 
 def write_xdmf(
     episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write two files an episode, `.xdmf` to open and `.h5` with its numbers; the folder appears whole.
+    """Write two files per episode, atomically: `.xdmf` to open, and `.h5` with its arrays.
 
     Positions are metres. Further arrays are the displacement from the scan, and the distance to the FEM solution where
     FEM solved the frame. Without the anatomy there are points alone: `points_only` counts such episodes.
@@ -59,7 +59,7 @@ def write_xdmf(
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[h5py.File]:
-    """Yield a new HDF5 file; a full disk ends in a sentence."""
+    """Yield a new HDF5 file; a full disk is reported in a sentence."""
     with write_stream_atomically(path, ".h5") as stream, h5py.File(stream, "w") as file:
         yield file
 
@@ -82,7 +82,7 @@ def write_arrays(
 
 
 def add_series(domain: Element, group: h5py.Group, name: str, times: np.ndarray) -> None:
-    """Describe the frames of one surface: a grid each."""
+    """Describe the frames of one surface, a grid per frame."""
     series = SubElement(
         domain, "Grid", Name=str(group.name).strip("/"), GridType="Collection", CollectionType="Temporal"
     )

@@ -23,12 +23,12 @@ def find_anatomy(contents: EpisodeContents) -> Anatomy | None:
 
 def is_template(digest: str) -> bool:
     """Return True if an anatomy's digest is that of the template."""
-    template = _read(get_template_path())
+    template = _read_anatomy(get_template_path())
     return template is not None and template.digest == digest
 
 
 def find_surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Those triangles (S, 3) of mesh vertices whose corners are all among sorted `nodes` (n,), as numbers of these."""
+    """Select the triangles (S, 3) whose corners are all in sorted `nodes` (n,), as indices into `nodes`."""
     places = np.searchsorted(nodes, surface).clip(max=len(nodes) - 1)
     return places[(nodes[places] == surface).all(axis=1)]
 
@@ -37,15 +37,15 @@ def find_surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
 def _find_anatomy(digest: str, folder: Path) -> Anatomy | None:
     places = [path for above in (folder, folder.parent) for path in sorted(above.glob("bodies/*/anatomy.vtu"))]
     for path in (get_template_path(), *places):
-        anatomy = _read(path)
+        anatomy = _read_anatomy(path)
         if anatomy is not None and anatomy.digest == digest:
             return anatomy
     return None
 
 
 @cache
-def _read(path: Path) -> Anatomy | None:
-    """Return an anatomy that can be read."""
+def _read_anatomy(path: Path) -> Anatomy | None:
+    """Read an anatomy; None if it cannot be read."""
     try:
         return read_anatomy(path)
     except InputError:

@@ -23,7 +23,7 @@ REMEDY = f"{HINT}make it again, or leave it out."  # Remedy in error messages.
 
 
 def open_episode(path: Path) -> h5py.File:
-    """Return an episode's file; InputError where it is not there, or no HDF5."""
+    """Open an episode's file; InputError if it is missing or not HDF5."""
     with read_as(path, "an episode", REMEDY):
         return h5py.File(path, "r")
 
@@ -34,9 +34,9 @@ def format_finding(error: InputError, path: Path) -> str:
 
 
 class OpenFiles:
-    """Files that are opened when they are first read, in the process that reads them; those read least go first.
+    """Cache of open files: each is opened at its first use, and the least recently used one is closed.
 
-    A process that is forked opens its own, and one that gets this by pickling too.
+    Forked processes, and processes that unpickle this object, open their own files.
     """
 
     def __init__(self, most: int = 16) -> None:
@@ -58,7 +58,7 @@ class OpenFiles:
         Raises
         ------
         InputError
-            A file that is not there, or no HDF5.
+            A missing file, or one that is not HDF5.
         """
         if self._process != os.getpid():
             self.close()
@@ -71,7 +71,7 @@ class OpenFiles:
         return self._open[path]
 
     def close(self) -> None:
-        """Close all."""
+        """Close all files."""
         while self._open:
             self._open.popitem()[1].close()
 
@@ -126,7 +126,7 @@ class EpisodeContents:
 
     @property
     def depth_scale(self) -> float:
-        """Metres in one step of its depth."""
+        """Length of one step of the depth images [m]."""
         return float(self.said.get("depth_scale_m", np.nan))
 
 
@@ -167,7 +167,7 @@ def inspect_contents(file: h5py.File, path: Path) -> EpisodeContents:
 
 
 def read_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
-    """Attributes as Python's own texts, numbers, and lists of them.
+    """Read attributes as texts, numbers, and lists of Python.
 
     Raises
     ------
@@ -194,7 +194,7 @@ def get_array(group: h5py.Group, name: str) -> h5py.Dataset:
 
 
 def _find_arrays(file: h5py.Group, inside: str = "", depth: int = 0) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Arrays by their names; InputError where one is not in the file itself."""
+    """Yield the arrays by name; InputError if one is not in the file itself."""
     if len(file) > MAX_NAMES or depth > MAX_DEPTH:
         raise InputError(f"it holds more groups or names than an episode has. {REMEDY}")
     for name in file:
@@ -240,14 +240,14 @@ def _check_shapes(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ..
         array = arrays[name]
         if array.dtype.kind not in wanted.kind or (picture and h5py.check_vlen_dtype(array.dtype) != np.uint8):
             raise InputError(f"{name!r} holds {array.dtype}: another kind is needed. {REMEDY}")
-        _fit(name, array.shape, wanted, sizes)
+        _check_shape(name, array.shape, wanted, sizes)
         shapes[last if picture else name] = array.shape
     if not 0 < sizes[FRAMES] <= MAX_FRAMES:
         raise InputError(f"it has {sizes[FRAMES]} frames: 1 to {MAX_FRAMES} are read. {REMEDY}")
     return shapes
 
 
-def _fit(name: str, shape: tuple[int, ...], wanted: Array, sizes: dict[str, int]) -> None:
+def _check_shape(name: str, shape: tuple[int, ...], wanted: Array, sizes: dict[str, int]) -> None:
     """Reject a shape that contradicts known lengths; record new ones."""
     axes = wanted.axes
     if axes[-1] is None:

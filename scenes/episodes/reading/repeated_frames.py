@@ -1,4 +1,4 @@
-"""Some frames of an episode solved again by finite elements, from its plan and its body alone."""
+"""Repeated FEM solution of some frames of an episode, from its plan and its body alone."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -62,7 +62,7 @@ def _add_skipped(report: Report, words: str) -> Report:
 def _solve_again(
     said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the frames (k,), and the tumour's displacement (k, n, 3) [m] in each."""
+    """Solve frames again: numbers of the frames (k,), and the tumour's displacement (k, n, 3) [m] in each."""
     plan = plan_from(str(said["plan"]), str(said.get("plan_name", "plan")), Path())
     seed, number = int(said["seed"]), int(said["episode"])
     body, theatre = opened.body, opened.theatre
@@ -80,7 +80,7 @@ def validate_files(
 ) -> Iterator[Report]:
     """Yield a report of each file, in order of completion; `workers` processes at a time.
 
-    Files that a lost process had begun are checked again, each on its own.
+    Files of a crashed process are checked again, each in its own process.
     """
     left = list(dict.fromkeys(paths))
     look_at = partial(_run_limited, look)

@@ -12,9 +12,9 @@ from .windows import Episodes, read_episodes
 
 
 class EpisodeDataset(Dataset[dict[str, Any]]):
-    """Windows of `read_episodes` as tensors; the order is the same, and texts stay lists.
+    """Windows of `read_episodes` as tensors, in the order of `read_episodes`; texts stay lists.
 
-    It pickles without its open files: workers open their own, whether they are forked or spawned.
+    Open files are not pickled: forked and spawned workers open their own.
     """
 
     def __init__(

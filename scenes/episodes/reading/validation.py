@@ -67,7 +67,7 @@ def mask_findings(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy |
 
 
 def read_episode_camera(file: h5py.File, contents: EpisodeContents, frame: int) -> Camera:
-    """Return the camera of a frame; ValueError where its numbers are none of a camera."""
+    """Return the camera of a frame; ValueError if its parameters are invalid."""
     moves = "K_of_frame" in contents.shapes
     K = (
         read_numbers(file, contents, "K_of_frame", range(frame, frame + 1))[0]
@@ -114,7 +114,7 @@ class Report:
 
 
 def validate_episode(path: Path) -> Report:
-    """Look at all of one episode."""
+    """Check the arrays, images and attributes of one episode."""
     problems: list[str] = []
     skipped: list[str] = []
     try:
@@ -148,7 +148,7 @@ def check_units(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
 
 
 def check_numbers(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
-    """Numbers that are not finite and must be; infinite ones anywhere; times that do not grow."""
+    """Yield findings on forbidden NaN, infinite values, and times that do not increase."""
     for name in contents.shapes:
         if name in PICTURES or ARRAYS[name].kind != "f":
             continue
@@ -167,7 +167,7 @@ def check_numbers(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
 
 
 def check_poses(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
-    """Poses that are no rotation and translation; a camera matrix that is none."""
+    """Yield findings on poses that are not rigid motions, and on an invalid camera matrix."""
     for name in POSES:
         if name not in contents.shapes:
             continue

@@ -84,7 +84,7 @@ def _read(array: h5py.Dataset, frames: range) -> Rows:
 
 
 def _read_solved_rows(array: h5py.Dataset, contents: EpisodeContents, frames: range) -> Rows:
-    """Rows of an array that has one for each frame that was solved."""
+    """Read rows of an array with one row for each solved frame."""
     if len(contents.fem_frames) == contents.frames:
         return _read(array, frames)
     wanted = np.arange(frames.start, frames.stop, frames.step)
@@ -106,7 +106,7 @@ FEM_KNOWN = "fem_known"
 
 
 def list_episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Files of episodes, in the order of their names: those given, and those in a folder, or in its `episodes`.
+    """List files of episodes, sorted by name: given files, and those in a folder or its subfolder `episodes`.
 
     Raises
     ------
@@ -224,7 +224,7 @@ class Episodes(Sequence[dict[str, Any]]):
         Raises
         ------
         InputError
-            See `at`; a size below 1, or rows of different sizes (for example tumours of two bodies).
+            See `get_window`; a size below 1, or rows of different sizes (for example tumours of two bodies).
         """
         if size < 1:
             raise InputError(f"batches of {size}: give a whole number of windows, 1 or more.")
@@ -244,7 +244,7 @@ def read_episodes(
     stride: int = 1,
     most_open: int = 16,
 ) -> Episodes:
-    """Windows of frames of episodes: a folder, or files.
+    """Read windows of frames of episodes, from a folder or from files.
 
     Parameters
     ----------
