@@ -145,9 +145,8 @@ def compute_lit_share(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.flo
         return 1.0
     if z > wp.max(wp.max(first[1], second[1]), wp.max(third[1], fourth[1])):
         return 0.0
-    # A box 2 HALF_SOFT_WIDTH wide about (u, v): taps at its border are weighted by their part inside, so that no steps
-    # are
-    # visible.
+    # A box 2 HALF_SOFT_WIDTH wide about (u, v). Taps at its border are weighted by their part inside the box.
+    # Without weights, steps are visible.
     reach = wp.float32(HALF_SOFT_WIDTH) + 0.5
     across = Taps()
     for j in range(FILTER_WIDTH):
