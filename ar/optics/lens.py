@@ -87,7 +87,7 @@ class Lens:
         return np.stack(self._apply_distortion(x, y), axis=-1)
 
     def undistort(self, places: np.ndarray) -> np.ndarray:
-        """Undistort positions (..., 2), the inverse of `bent`, by Newton's method; NaN without solution in `reach`."""
+        """Invert `distort` at positions (..., 2) by Newton's method; NaN without a solution within `reach`."""
         places = np.asarray(places, np.float64)
         wanted = places.reshape(-1, 2).T
         _, moved = self._along

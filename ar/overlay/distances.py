@@ -112,12 +112,7 @@ def measure_seen(
                 distance[row, column] = wp.length(point - nearest)
 
 
-RING_DISTANCES = (
-    1e-3,
-    5e-3,
-    10e-3,
-    15e-3,
-)  # Distances of the rings from the surface [m]; the first indicates contact.
+RING_DISTANCES = (1e-3, 5e-3, 10e-3, 15e-3)  # Distances of the rings from the surface [m]; the first indicates contact.
 RING_COLOUR = (232.0, 228.0, 204.0)
 """Colour of rings."""
 MIN_RING_LENGTH = 24  # Smallest length of a drawn ring [pixel].
