@@ -323,7 +323,7 @@ class Strategy:
     def _move_tools(self, cases: Cases, start: wp.array) -> SolverResult:
         """Move the tools from start (3N, b), where they were, in steps of the allowed length.
 
-        An undeformed mesh on which nothing acts where the tools end is the solution, whatever they met on their path.
+        If nothing acts on the undeformed mesh at the end of the path, it is the solution, regardless of contact before.
         """
 
         def moved(part: Cases, share: np.ndarray) -> Cases:
