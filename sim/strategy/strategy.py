@@ -383,7 +383,7 @@ class Strategy:
         return self._finish(cases, aimed, result)
 
     def _finish(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], result: SolverResult) -> SolverResult:
-        """Finish cases after their last step, in place: mark those that tools pierce, and those that fell short."""
+        """Finish cases in place after their last step: mark those pierced by a tool, and those below the whole load."""
         problem, u, outcome, reached = self.problem, result.u, result.outcome, result.reached
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
