@@ -31,7 +31,7 @@ BENCHMARKS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one measurement. Returns what `sulcus` commands return."""
+    """Run one measurement; return an exit code, as `sulcus` commands do."""
     if argv is None:
         limit_threads()
     arguments = join_points(sys.argv[1:] if argv is None else argv)
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make_parser(*asked: str) -> argparse.ArgumentParser:
-    """The parser of all measurements; those asked for know their arguments."""
+    """Build the parser of all measurements; only those in `asked` get their arguments."""
     parser = CommandParser(prog="python -m benchmarks", description=__doc__)
     names = parser.add_subparsers(dest="command", required=True, metavar="NAME")
     for name, text in BENCHMARKS.items():

@@ -1,4 +1,4 @@
-"""`python -m benchmarks elements`: how far each element is from the limit of fine meshes."""
+"""`python -m benchmarks elements`: error of each element relative to the limit of fine meshes."""
 
 import argparse
 import json
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if a solve did not converge."""
+    """Measure, row by row; return 1 if a solve did not converge."""
     from scenes.analysis.measurement import describe_machine
 
     from ..studies.elements import Press, limits, rows

@@ -1,4 +1,4 @@
-"""`python -m benchmarks fit`: what `sulcus fit` says of patients whose tissue is known."""
+"""`python -m benchmarks fit`: errors of `sulcus fit` on synthetic patients of known tissue."""
 
 import argparse
 import json
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure; 1 if of some patient no equilibrium was found."""
+    """Measure; return 1 if some patient has no equilibrium."""
     from scenes.script.shipped_files import get_template_path
     from sim.bodies.meshfile import read_anatomy
 
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _cells(row: dict[str, float | None]) -> list[str]:
-    """What stands in a line of the table."""
+    """Format the cells of a table row."""
 
     def said(name: str, digits: int = 0) -> str:
         value = row[name]

@@ -1,4 +1,4 @@
-"""`python -m benchmarks growth`: what a load takes in seconds and memory as the mesh grows, as a table and a plot."""
+"""`python -m benchmarks growth`: time and memory of a load over mesh size, as a table and a plot."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if a load did not converge."""
+    """Measure, row by row; return 1 if a load did not converge."""
     from ar.screen import write_png
     from scenes.analysis.loglog_chart import draw_panels
     from scenes.analysis.measurement import describe_machine, write_table
@@ -91,6 +91,6 @@ def _print(found: Sequence[Row], table) -> None:
         cells = (
             row.nodes, row.tets, row.preconditioner, f"{row.set_up:.3g}", row.batch, f"{row.load:.3g}",
             f"{row.outer:g}", f"{row.converged} of {row.loads}", f"{row.memory:.3g}",
-            *(f"{number:.3g}" if row.foreseen else "" for number in (row.card, row.foreseen)),  # none without a card
+            *(f"{number:.3g}" if row.foreseen else "" for number in (row.card, row.foreseen)),  # None without a GPU
         )  # fmt: skip
         print(f"| {' | '.join(map(str, cells))} |", file=table)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks gym`: how many steps a second the Gymnasium environments make."""
+"""`python -m benchmarks gym`: steps per second of the Gymnasium environments."""
 
 import argparse
 import sys

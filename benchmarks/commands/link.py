@@ -1,4 +1,4 @@
-"""`python -m benchmarks link`: how long an OpenIGTLink client waits for the answer to a pose."""
+"""`python -m benchmarks link`: latency from a pose to its result at an OpenIGTLink client."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""`python -m benchmarks locate`: the share of a tumour's motion that `sulcus locate` and its rivals find."""
+"""`python -m benchmarks locate`: share of a tumour's motion that `sulcus locate` and baselines estimate."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HEADS = (
     "refused", "in doubt", "warned", "ms",
 )  # fmt: skip
 
-# Farther no registration slips unnoticed [mm].
+# Largest simulated slip of a registration [mm].
 MOST_SLIPPED = 50.0
 
 
@@ -82,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if of some twin no equilibrium was found."""
+    """Measure, row by row; return 1 if some synthetic case has no equilibrium."""
     from scenes.analysis.measurement import describe_machine
     from scenes.script.shipped_files import get_template_path
     from sim.bodies.meshfile import read_anatomy
@@ -117,12 +117,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse, before anything is solved, what would be refused after.
+    """Check the arguments before anything is solved.
 
     Raises
     ------
     InputError
-        Counts, shares or a seed that cannot be; a brain of one's own without its finer mesh.
+        Counts, shares or a seed out of range; a user's brain without its finer mesh.
     """
     check_at_least("--twins", args.twins, 1)
     check_at_least("--seed", args.seed, 0)
@@ -139,13 +139,13 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def check_finer(args: argparse.Namespace) -> None:
-    """Raise InputError for a brain of one's own without its finer mesh."""
+    """Raise InputError for a user's brain without its finer mesh."""
     if args.anatomy is not None and args.finer is None:
         raise InputError("--anatomy needs --finer: a finer mesh of the same brain, by `sulcus anatomy --nodes`.")
 
 
 def finer_of(args: argparse.Namespace) -> Anatomy:
-    """The mesh that the truths are solved on."""
+    """Return the mesh on which the ground truths are solved."""
     from sim.bodies.meshfile import read_anatomy, write_anatomy
     from sim.bodies.subject import MeshPlan, make_anatomy
     from sim.bodies.template import Tumour, build_template_subject
@@ -162,7 +162,7 @@ def finer_of(args: argparse.Namespace) -> Anatomy:
 
 
 def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
-    """Read the locator that is given, or the one that the folder keeps, or make a new one."""
+    """Read the given locator, or the one in the folder, or build a new one."""
     from surrogate.locating.locator_store import load_locator, make_locator, save_locator
 
     path = args.locator or (args.folder and args.folder / f"{body.digest}.locator.npz")
@@ -180,7 +180,7 @@ def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
 
 @contextmanager
 def bar(name: str) -> Iterator[Callable[..., None]]:
-    """A progress bar on the error stream, and what sets it: how many are done, of how many, and of what."""
+    """Show a progress bar on the error stream; yield a function that sets its count, total and stage."""
     from tqdm import tqdm
 
     with tqdm(desc=name, file=sys.stderr) as bar:
@@ -193,7 +193,7 @@ def bar(name: str) -> Iterator[Callable[..., None]]:
 
 
 def _cells(row: Row) -> Iterable[str]:
-    """What stands in a line of the table."""
+    """Format the cells of a table row."""
     held = "" if row.held is None else f"{row.held:.0f} %"
     took = "" if row.milliseconds is None else f"{row.milliseconds:.3g}"
     return (

@@ -1,4 +1,4 @@
-"""`python -m benchmarks microscope`: error of a tumour that is located from pictures of two eyes."""
+"""`python -m benchmarks microscope`: error of a tumour position estimated from stereo images."""
 
 import argparse
 import json

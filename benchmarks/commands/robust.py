@@ -1,4 +1,4 @@
-"""`python -m benchmarks robust`: how many of thousands of random loads converge."""
+"""`python -m benchmarks robust`: share of thousands of random loads that converge."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve them all; 1 if one did not converge."""
+    """Solve all loads; return 1 if one did not converge."""
     from scenes.analysis.measurement import describe_machine, write_table
     from sim.runtime.journal import open_journal
 

@@ -1,4 +1,4 @@
-"""`python -m benchmarks skull`: how far the tumour moves under each skull, on meshes of several sizes."""
+"""`python -m benchmarks skull`: tumour motion with each skull model, on meshes of several sizes."""
 
 import argparse
 import json
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if a solve did not converge."""
+    """Measure, row by row; return 1 if a solve did not converge."""
     from scenes.analysis.measurement import describe_machine
 
     from ..studies.skull_models import rows

@@ -1,4 +1,4 @@
-"""`python -m benchmarks solver`: the first load and a further one on a mesh, beside other finite-element packages."""
+"""`python -m benchmarks solver`: time of the first and of a further load, compared with other FEM packages."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare; 1 if one of our answers is off."""
+    """Compare; return 1 if a solution of sulcus is not within the tolerance."""
     from scenes.analysis.measurement import describe_machine
     from sim.runtime.device import find_device
 

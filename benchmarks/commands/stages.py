@@ -1,4 +1,4 @@
-"""`python -m benchmarks stages`: what each stage costs, as a table."""
+"""`python -m benchmarks stages`: time of each stage, as a table."""
 
 import argparse
 import json

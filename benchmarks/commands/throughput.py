@@ -1,4 +1,4 @@
-"""`python -m benchmarks throughput`: how many loads a second the finite elements solve."""
+"""`python -m benchmarks throughput`: loads per second that FEM solves."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..studies.throughput import Drawn, Row, Together
 
 YOUNG = 3000.0
-# Loads together on the CPU, where more gain nothing; and loads a row there, and on CUDA.
+# Batch size on the CPU, where larger ones gain nothing; number of loads of a row on the CPU, and on CUDA.
 CPU_BATCH, CPU_COUNT, CUDA_COUNT = 64, 64, 4096
 NAMES = (
     "law", "nu", "element", "nodes", "set", "loads", "converged", "steps: median", "p99", "solves/s", "us a load",
@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if a load did not converge."""
+    """Measure, row by row; return 1 if a load did not converge."""
     from scenes.analysis.measurement import describe_machine
     from sim.effects import ToolContact
     from sim.runtime.device import parse_device_names

@@ -1,4 +1,4 @@
-"""`python -m benchmarks track`: error of a tool's tip that a camera sees by its printed cube."""
+"""`python -m benchmarks track`: error of a tool's tip that a camera tracks by its printed cube."""
 
 import argparse
 import json
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure; 1 if a wrong pose was called certain."""
+    """Measure; return 1 if a wrong pose was reported as certain."""
     from ..studies.track_study import studied
 
     check_at_least("--pictures", args.pictures, 2)
