@@ -189,8 +189,8 @@ def main(words: list[str] | None = None) -> int:
     """Print a table; return 2 if the folder does not contain the data."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="data/liver of the repository")
-    parser.add_argument("--mesh", choices=("remeshed", "default"), default="remeshed", help="that forces are found on")
-    parser.add_argument("--sequences", nargs="+", help="such as linear/s1 (default: all that are there)")
+    parser.add_argument("--mesh", choices=("remeshed", "default"), default="remeshed", help="mesh of the estimate")
+    parser.add_argument("--sequences", nargs="+", help="names such as linear/s1 (default: all)")
     args = parser.parse_args(words)
     try:
         names = args.sequences or list_sequences(args.folder)

@@ -30,13 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = f"figures: {', '.join(NAMED)}"
     parser.add_argument(
         "--json", type=Path, metavar="OUT.json",
-        help=f"the record, written after every figure; an unfinished run goes on (default: {OUT})",
+        help=f"record, written after every figure; an unfinished run resumes (default: {OUT})",
     )  # fmt: skip
     parser.add_argument(
         "--only", nargs="+", choices=NAMED, default=list(NAMED), metavar="NAME",
-        help="these figures (default: all; their names stand below)",
+        help="figures to measure (default: all; see the names below)",
     )  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="small counts, no record: shows that all commands run")
+    parser.add_argument("--quick", action="store_true", help="small counts, no record: smoke test of all commands")
     parser.add_argument("--anatomy", type=Path, help="measure on this .vtu instead of the template where a bench can")
     parser.add_argument(
         "--from", dest="source", type=Path, metavar="NEW.json", help="measure nothing: take this record"

@@ -19,11 +19,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "anatomies", nargs="*", type=Path, metavar="ANATOMY.vtu", help="bodies (default: the template that ships)"
     )
     parser.add_argument(
-        "--coarse", action="store_true", help="leave out the same bodies with every edge halved, which take the longest"
+        "--coarse", action="store_true", help="skip the bodies with every edge halved, which take the longest"
     )
     parser.add_argument("--elements", nargs="+", default=list(ELEMENTS), choices=ELEMENTS, help="which (default: all)")
     parser.add_argument("--poisson", nargs="+", type=float, default=[0.30, 0.45, 0.49, 0.495], help="Poisson's ratios")
-    parser.add_argument("--force", type=float, default=0.1, help="of the press, on a 7 mm disc [N]")
+    parser.add_argument("--force", type=float, default=0.1, help="force on a 7 mm disc [N]")
     add_device(parser)
     add_json(parser)
 

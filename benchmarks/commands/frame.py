@@ -18,12 +18,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", nargs="?", default="press", help="a built-in scene")
     add_theatre(parser)
     add_plugin(parser)
-    parser.add_argument("--size", default="640x480", metavar="WxH", help="of the picture [pixel]")
-    parser.add_argument("--frames", type=int, default=120, help="frames that are timed")
+    parser.add_argument("--size", default="640x480", metavar="WxH", help="size of the image [pixel]")
+    parser.add_argument("--frames", type=int, default=120, help="number of timed frames")
     parser.add_argument(
         "--batch",
         type=int,
-        help="pictures that are drawn together, for pictures a second (default: 64 on CUDA, else 4)",
+        help="images rendered in one batch, to measure images per second (default: 64 on CUDA, else 4)",
     )
     add_json(parser)
 

@@ -26,12 +26,12 @@ SIZES = (2000, 5300, 17_000, 50_000, 100_000, 200_000)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES), metavar="N", help="nodes (default: six)")
-    parser.add_argument("--batch", nargs="+", type=int, default=[1, 8], metavar="B", help="loads together (1 8)")
+    parser.add_argument("--batch", nargs="+", type=int, default=[1, 8], metavar="B", help="batch sizes (default: 1 8)")
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element")
     add_device(parser)
     parser.add_argument(
         "--out", type=Path, default=Path("growth.png"), metavar="PLOT.png",
-        help="the plot; rows and meshes are kept beside it, and an unfinished run goes on",
+        help="plot; rows and meshes are stored next to it, and an unfinished run resumes",
     )  # fmt: skip
     add_force(parser)
     add_json(parser)

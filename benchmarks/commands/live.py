@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", type=int, default=1000, help="frames of each tool")
     parser.add_argument(
         "--checked", type=int,
-        help=f"frames held against the converged solution (default: {CHECKED}, or all where there are fewer)",
+        help=f"frames compared with the converged solution (default: {CHECKED}, or all where there are fewer)",
     )  # fmt: skip
     add_tissue_arguments(parser)
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element")

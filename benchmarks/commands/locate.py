@@ -38,21 +38,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_anatomy(parser)
     parser.add_argument(
         "--finer", type=Path, metavar="FINER.vtu",
-        help="a finer mesh of the same brain, of which the truths are (default: the template's, of --nodes)",
+        help="finer mesh of the same brain, for the ground truth (default: the template's, of --nodes)",
     )  # fmt: skip
-    parser.add_argument("--nodes", type=int, default=8000, help="of the template's finer mesh, without --finer")
+    parser.add_argument("--nodes", type=int, default=8000, help="nodes of the template's finer mesh, without --finer")
     parser.add_argument(
         "--element", choices=ELEMENTS, default=RECOMMENDED,
-        help="finite element of the truths (default: %(default)s); p2 takes minutes a twin on a CPU",
+        help="finite element of the ground truth (default: %(default)s); p2 takes minutes per case on a CPU",
     )  # fmt: skip
-    parser.add_argument("--twins", type=int, default=20, help="truths, a quarter by each cause")
-    parser.add_argument("--points", nargs="+", type=int, default=[100], help="points that are seen (default: 100)")
+    parser.add_argument("--twins", type=int, default=20, help="number of test cases, a quarter by each cause")
+    parser.add_argument("--points", nargs="+", type=int, default=[100], help="observed points (default: 100)")
     parser.add_argument(
-        "--cover",
-        nargs="+",
-        type=int,
-        default=[36],
-        help="share of the open cortex that they lie on [%%] (default: 36)",
+        "--cover", nargs="+", type=int, default=[36], help="observed share of the open cortex [%%] (default: 36)"
     )
     parser.add_argument(
         "--noise", nargs="+", type=int, default=[0, 1, 2], choices=(0, 1, 2),
@@ -60,15 +56,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "degree and 1 or 2 mm, whose size `sulcus locate` is given",
     )  # fmt: skip
     parser.add_argument(
-        "--clouds", action="store_true", help="points have no names: where the surface is; rivals need names, and rest"
+        "--clouds", action="store_true", help="observe point clouds, without correspondences; baselines are left out"
     )
     parser.add_argument(
         "--slip", type=float, default=0.0, metavar="MM",
-        help="all points are displaced so far along the open cortex, as by a registration that slipped (default: 0)",
+        help="registration slip: displacement of all points along the open cortex [mm] (default: 0)",
     )  # fmt: skip
     parser.add_argument(
         "--wrong-registration", action="store_true",
-        help="all points are displaced by 2 to 5 mm or rotated by 2 to 4 degrees, in a random direction",
+        help="wrong registration: displace all points by 2 to 5 mm or rotate by 2 to 4 degrees, at random",
     )  # fmt: skip
     parser.add_argument(
         "--locator", type=Path, metavar="FILE.npz", help="locator of the anatomy (default: a new one, kept in --folder)"
@@ -76,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser, "the twins and of what is seen")
     add_device(parser)
     parser.add_argument(
-        "--folder", type=Path, help="keeps meshes, twins and the locator, so that a stopped run goes on (default: none)"
+        "--folder", type=Path, help="folder of meshes, cases and locator, to resume a stopped run (default: none)"
     )
     add_json(parser)
 

@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_anatomy(parser)
-    parser.add_argument("--count", type=int, default=10_000, help="loads, half of them brutal")
+    parser.add_argument("--count", type=int, default=10_000, help="number of loads, half of them brutal")
     add_seed(parser)
     add_tissue_arguments(parser)
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together")
     add_device(parser)
-    parser.add_argument("--out", type=Path, metavar="LOADS.csv", help="a line for each load; an unfinished run goes on")
+    parser.add_argument("--out", type=Path, metavar="LOADS.csv", help="row for each load; an unfinished run resumes")
     add_force(parser)
     add_json(parser)
 

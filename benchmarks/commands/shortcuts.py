@@ -15,7 +15,7 @@ from sim.bodies.meshfile import read_anatomy
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_anatomy(parser)
-    parser.add_argument("--runs", type=int, default=20, help="loads or frames of each row")
+    parser.add_argument("--runs", type=int, default=20, help="number of loads or frames of each row")
     add_device(parser)
     add_json(parser)
 

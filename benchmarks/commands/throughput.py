@@ -44,12 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=PRESETS,
         metavar="SET",
-        help="of loads (default: all, of --poses the round tools)",
+        help="presets of loads (default: all; with --poses the round tools)",
     )
-    parser.add_argument("--poses", action="store_true", help="poses of the ball that stands for each tool, not forces")
+    parser.add_argument("--poses", action="store_true", help="poses of each tool's ball, instead of forces")
     parser.add_argument(
         "--laws", nargs="+", choices=LAWS, default=["stable-neo-hookean", "neo-hookean"], metavar="LAW",
-        help=f"with E = {YOUNG:g} Pa (default: stable-neo-hookean neo-hookean)",
+        help=f"laws with E = {YOUNG:g} Pa (default: stable-neo-hookean neo-hookean)",
     )  # fmt: skip
     parser.add_argument(
         "--poisson", nargs="+", type=float, default=[0.45, 0.49], metavar="NU", help="Poisson's ratios (0.45 0.49)"
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--count", type=int, help=f"loads a row and device (default: {CUDA_COUNT} on CUDA, {CPU_COUNT} on the CPU)"
     )
     parser.add_argument("--batch", type=int, help=f"loads solved together (default: all; {CPU_BATCH} on the CPU)")
-    parser.add_argument("--repeats", type=int, default=3, help="of each row; the median counts")
+    parser.add_argument("--repeats", type=int, default=3, help="repeats of each row; the median is reported")
     add_devices(parser)
     add_json(parser)
 

@@ -17,7 +17,7 @@ HEADS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--pictures", type=int, default=60, help="of each protocol")
+    parser.add_argument("--pictures", type=int, default=60, help="number of images of each protocol")
     add_seed(parser, "poses and noise")
     add_json(parser)
 
