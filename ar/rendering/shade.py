@@ -302,7 +302,7 @@ def shade(
                 corners = corners_of(picture, winner, surfaces, placed)
                 look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
             p = wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
-            if bent:  # tested here, images without a lens take a seventh less time
+            if bent:  # this test saves a seventh of the time for images without a lens
                 p = pixel_at(picture, column, row, pixels)
             point = point_at(p, corners, look, surfaces.texels, eyes[picture])
             if winner >= still:

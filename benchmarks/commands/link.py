@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure. Returns 0."""
+    """Measure the latency in several runs, and print the best and the median run; return 0."""
     from scenes.analysis.measurement import describe_machine
 
     from ..studies.link_latency import CLIENTS, measured

@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--noise", nargs="+", type=int, default=[0, 1, 2], choices=(0, 1, 2),
-        help="levels (default: 0 1 2). 0: none. 1 and 2: white 0.3 mm, smooth 0.5 mm, and a rigid error of half a "
+        help="levels (default: 0 1 2). 0: none. 1, 2: independent 0.3, correlated 0.5 mm, and a rigid error of half a "
         "degree and 1 or 2 mm, whose size `sulcus locate` is given",
     )  # fmt: skip
     parser.add_argument(

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure."""
+    """Measure the errors for each seed, and print the table; return 0."""
     from scenes.script.observation_models import StereoObservation
 
     from ..studies.stereo_study import rows

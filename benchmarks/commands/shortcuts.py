@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row."""
+    """Measure each acceleration, and print the table row by row."""
     from scenes.analysis.measurement import describe_machine
     from scenes.script.craniotomy_frame import build_craniotomy_frame
     from sim.runtime.device import find_device

@@ -232,7 +232,7 @@ class ContactDescent:
         return batch.failed >= 2 * self.limits.max_failures
 
     def _increase_proximal_term(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
-        """Increase the proximal coefficient where no forces were found (b,) bool; return which (b,) fail finally."""
+        """Increase the proximal coefficient of `waiting` cases (b,), without forces; return those (b,) to give up."""
         times = self.limits.max_failures
         batch.waiting = waiting
         batch.failed = np.where(waiting, batch.failed + 1, 0)
