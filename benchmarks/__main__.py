@@ -9,29 +9,29 @@ from scenes.cli import join_points, limit_threads, run_command
 from scenes.options.help import CommandParser
 
 BENCHMARKS = {
-    "stages": "cost of each stage of a frame on this machine",
-    "elements": "error of each element against the limit of fine meshes, and its cost",
-    "contact": "the mesh's share of a contact force: a ball is moved over one cell",
-    "skull": "motion of the tumour under each skull, on meshes of several sizes, and what leaks",
+    "stages": "time of each stage of a frame on this machine",
+    "elements": "error of each element relative to the limit of fine meshes, and its time",
+    "contact": "error of a contact force due to the mesh: a ball moves over one cell",
+    "skull": "motion of the tumour with each skull model, on meshes of several sizes, and leaked volume",
     "robust": "convergence of thousands of random loads",
     "live": "duration and error of a frame of a moving tool, warm-started",
     "frame": "duration of each part of a page's frame: load, deform, render, composite, encode, send",
-    "growth": "time and memory that a load takes on finer and finer meshes, and its preconditioner",
-    "throughput": "loads a second that the finite elements solve: one mesh, thousands of loads",
-    "locate": "share of a tumour's motion that is found from points on the open cortex, by sulcus and by rivals",
-    "microscope": "error and duration of locating the tumour from pictures of two eyes",
-    "gym": "steps a second of the Gymnasium environments, of states and of pictures",
-    "fit": "errors of tissue and skull that are fitted to several frames of known patients",
-    "track": "error of a tool's tip that a camera sees by its printed cube",
-    "link": "time that an OpenIGTLink client waits for the answer to a pose",
-    "shortcuts": "time that each shortcut of the solver saves on typical loads",
+    "growth": "time, memory and preconditioner of a load over mesh size",
+    "throughput": "loads per second that FEM solves: one mesh, thousands of loads",
+    "locate": "share of a tumour's motion that sulcus and baselines estimate from points on the open cortex",
+    "microscope": "error and time of a tumour position estimated from stereo images",
+    "gym": "steps per second of the Gymnasium environments, with states and with images",
+    "fit": "errors of tissue and skull fitted to several frames of synthetic patients",
+    "track": "error of a tool's tip that a camera tracks by its printed cube",
+    "link": "latency from a pose to its result at an OpenIGTLink client",
+    "shortcuts": "speed-up by each acceleration of the solver on typical loads",
     "solver": "time of the first load on a mesh and of a further one, compared with other packages",
-    "all": "every figure of the performance pages in one go: a record, its tables, and what got slower",
+    "all": "all figures of the performance pages: a record, its tables, and numbers that got worse",
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one measurement. Returns what `sulcus` commands return."""
+    """Run one measurement; return an exit code, as `sulcus` commands do."""
     if argv is None:
         limit_threads()
     arguments = join_points(sys.argv[1:] if argv is None else argv)
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def make_parser(*asked: str) -> argparse.ArgumentParser:
-    """The parser of all measurements; those asked for know their arguments."""
+    """Build the parser of all measurements; only those in `asked` get their arguments."""
     parser = CommandParser(prog="python -m benchmarks", description=__doc__)
     names = parser.add_subparsers(dest="command", required=True, metavar="NAME")
     for name, text in BENCHMARKS.items():

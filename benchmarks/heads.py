@@ -1,8 +1,8 @@
-"""How far one force moves one tumour in different heads: the template, fsaverage's inner skull, and a mask of a brain.
+"""Tumour motion by the same force in different heads: the template, fsaverage's inner skull, and a brain mask.
 
     python benchmarks/heads.py [--mask ch2bet.nii.gz] [--cover 3 10 25] [--sites central frontal ...] [--nodes N]
 
-Every brain is scaled to 1,470 ml; the mask's own size is a row of its own. At each site the same ball of 12 mm radius
+Every brain is scaled to 1,470 ml; a separate row has the mask's own size. At each site the same ball of 12 mm radius
 is drawn at the same depth under the cortex, the skull is opened over it, and 0.3 N press the middle of the opening.
 A row has the mean motion of the tumour's vertices [mm], with a bonded and with a sliding skull, as CSV. fsaverage
 needs the extra `anatomies`.
@@ -26,7 +26,7 @@ FORCE, FOOTPRINT = 0.3, 7e-3  # [N], [m]
 
 
 def heads(mask: Path | None) -> dict[str, Callable[[Tumour], Subject]]:
-    """What draws a tumour, by the name of the head."""
+    """Return the functions that build a subject with a tumour, by the name of the head."""
     volume = Head().volume
     found = {"template": build_template_subject, "fsaverage": partial(_drawn, read_fsaverage_head(volume))}
     if mask is not None:
@@ -42,7 +42,7 @@ def _drawn(healthy: HealthyHead, tumour: Tumour) -> Subject:
 
 
 def motions(subject: Subject, nodes: int) -> list[float]:
-    """Mean motion [mm] of the tumour under the force, with a bonded and with a sliding skull."""
+    """Compute the mean motion [mm] of the tumour under the force, with a bonded and with a sliding skull."""
     anatomy = make_anatomy(subject, MeshPlan(nodes))
     place = open_cortex(anatomy).place(right_mm=0, up_mm=0)
     loads = push(place.point, FORCE * place.inward, footprint=FOOTPRINT)
@@ -55,7 +55,7 @@ def motions(subject: Subject, nodes: int) -> list[float]:
 
 
 def main() -> None:
-    """Print a row for each depth, site and head; what a head refuses is its row."""
+    """Print a row for each depth, site and head; a rejected tumour has its reason as the row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mask", type=Path)
     parser.add_argument("--cover", type=float, nargs="+", default=[10.0, 25.0], help="[mm]")

@@ -1,4 +1,4 @@
-"""Forces and positions of a liver from clouds of its surface, on the sequences of another group's repository.
+"""Estimates of forces and positions of a liver from point clouds of its surface, on a public data set.
 
 The data are of gmestdagh/adjoint-elastic-registration (GPL-3; they stay outside this repository): five sequences of
 fifty clouds of a linear liver, and five of a neo-Hookean one, with the true force and the true position of the mesh.
@@ -8,8 +8,8 @@ MICCAI, report 6.5 to 9.4 % of the force on the linear sequences, and 0.8 to 1.2
     python benchmarks/liver_sequences.py PATH/TO/data/liver [--mesh remeshed|default] [--sequences linear/s1 ...]
 
 The method is that of `surrogate.locating`: forces are a Gaussian process on the patch where they may act (the data name
-its vertices), tissue is linear, and each cloud conditions them; the closest points are renewed. Sizes and lengths are
-those of greatest evidence on the first cloud. Neo-Hookean livers are answered by linear tissue too, and it is said.
+its vertices), tissue is linear, and each cloud conditions them; closest points are recomputed. Sizes and lengths are
+those of greatest evidence on the first cloud. Tissue is linear for neo-Hookean livers too; the table notes it.
 """
 
 import argparse
@@ -36,23 +36,23 @@ from surrogate.locating.calibration import RADIUS_SQUARED
 from surrogate.locating.evidence import compute_correlation
 
 PUBLISHED = {"linear": "force 6.5 - 9.4 %, 0.8 - 1.2 s an update", "neohookean": "no figure that we know"}
-# Lengths [m] over which forces are alike, sizes of one vertex's force [N], and errors of points [m], to choose from.
+# Candidate correlation lengths [m] of forces, sizes of one vertex's force [N], and errors of points [m].
 LENGTHS, SIZES, ERRORS = (4e-3, 1e-2, 2.5e-2), (1e-4, 1e-3, 1e-2, 1e-1, 1.0), (1e-5, 5e-5, 2e-4, 6e-4)
 ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Liver:
-    """A mesh, and what a unit force along each axis on each vertex of a patch does to it.
+    """Mesh, and its motion by unit forces along each axis on each vertex of a patch.
 
     Parameters
     ----------
     mesh
         Vertices in metres.
     surface
-        (S, 3) vertices of the triangles that clouds are of.
+        (S, 3) vertices of the triangles that the clouds sample.
     patch
-        (f,) vertices that forces may act on.
+        (f,) vertices on which forces may act.
     motion
         (V, 3, 3 f) [m/N].
     """
@@ -64,12 +64,12 @@ class Liver:
 
 
 def read_liver(folder: Path, mesh: str, sequence: Path) -> Liver:
-    """Read a mesh and the patch of a sequence; solve for the patch's forces.
+    """Read the mesh and the patch of a sequence; solve for the motion by the patch's forces.
 
     Raises
     ------
     InputError
-        A folder that has not the files of the data.
+        A folder without the files of the data.
     """
     base = folder / f"mesh-{mesh}"
     try:
@@ -91,23 +91,23 @@ def read_liver(folder: Path, mesh: str, sequence: Path) -> Liver:
 
 
 @dataclass(frozen=True)
-class Belief:
-    """What is believed of forces and points before a cloud is seen: `LENGTHS`, `SIZES`, `ERRORS`."""
+class Hyperparameters:
+    """Hyperparameters of the prior of forces and of point errors, from `LENGTHS`, `SIZES` and `ERRORS`."""
 
     length: float
     size: float
     error: float
 
     def covariance(self, liver: Liver) -> np.ndarray:
-        """Of the patch's forces (3 f, 3 f) [N^2]."""
+        """Compute the prior covariance of the patch's forces (3 f, 3 f) [N^2]."""
         at = liver.mesh.nodes[liver.patch]
         return np.kron(self.size**2 * compute_correlation(compute_squared_distances(at, at), self.length), np.eye(3))
 
 
-def seen(liver: Liver, cloud: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What a cloud (n, 3) [m] says of forces, where they are believed to be `force` (3 f,) [N].
+def linearise_observation(liver: Liver, cloud: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Linearise the observation of forces by a cloud (n, 3) [m] about an estimate `force` (3 f,) [N].
 
-    Rows (n, 3 f) [m/N] that act on forces, and what they are seen to give (n,) [m]: motion along the surface's normal.
+    Return rows (n, 3 f) [m/N] that map forces to motions along the surface's normal, and the observed motions (n,) [m].
     """
     nodes = liver.mesh.nodes
     corners = (nodes + liver.motion @ force)[liver.surface]
@@ -120,39 +120,39 @@ def seen(liver: Liver, cloud: np.ndarray, force: np.ndarray) -> tuple[np.ndarray
 
 
 def condition_prior(
-    belief: Belief, prior: np.ndarray, rows: np.ndarray, value: np.ndarray
+    settings: Hyperparameters, prior: np.ndarray, rows: np.ndarray, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Mean (3 f,) [N] and covariance of forces, and the logarithm of the evidence (Rasmussen, Williams 2006, 2.30)."""
+    """Return mean (3 f,) [N] and covariance of forces, and the log evidence (Rasmussen, Williams 2006, 2.30)."""
     gain = prior @ rows.T
     whole = rows @ gain
-    whole[np.diag_indices(len(whole))] += belief.error**2
+    whole[np.diag_indices(len(whole))] += settings.error**2
     factor = cholesky(whole, lower=True)
     weight = cho_solve((factor, True), value)
     log = -0.5 * float(value @ weight) - float(np.log(np.diag(factor)).sum())
     return gain @ weight, prior - gain @ cho_solve((factor, True), gain.T), log
 
 
-def chosen(liver: Liver, cloud: np.ndarray) -> Belief:
-    """The belief of greatest evidence on a cloud."""
-    rows, value = seen(liver, cloud, np.zeros(3 * len(liver.patch)))
-    beliefs = [Belief(*each) for each in product(LENGTHS, SIZES, ERRORS)]
-    return max(beliefs, key=lambda belief: condition_prior(belief, belief.covariance(liver), rows, value)[2])
+def choose_hyperparameters(liver: Liver, cloud: np.ndarray) -> Hyperparameters:
+    """Choose the hyperparameters of greatest evidence on a cloud."""
+    rows, value = linearise_observation(liver, cloud, np.zeros(3 * len(liver.patch)))
+    candidates = [Hyperparameters(*each) for each in product(LENGTHS, SIZES, ERRORS)]
+    return max(candidates, key=lambda settings: condition_prior(settings, settings.covariance(liver), rows, value)[2])
 
 
-def estimates(liver: Liver, clouds: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray, float]]:
-    """Forces (3 f,) [N], their covariance, and seconds, cloud by cloud."""
-    belief, force, found = chosen(liver, clouds[0]), np.zeros(3 * len(liver.patch)), []
-    prior = belief.covariance(liver)
+def estimate_forces(liver: Liver, clouds: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """Estimate forces (3 f,) [N], their covariance, and the computing time [s], cloud by cloud."""
+    settings, force, found = choose_hyperparameters(liver, clouds[0]), np.zeros(3 * len(liver.patch)), []
+    prior = settings.covariance(liver)
     for cloud in clouds:
         begun = time.perf_counter()
         for _ in range(ROUNDS):
-            force, covariance, _ = condition_prior(belief, prior, *seen(liver, cloud, force))
+            force, covariance, _ = condition_prior(settings, prior, *linearise_observation(liver, cloud, force))
         found.append((force, covariance, time.perf_counter() - begun))
     return found
 
 
-def measured(folder: Path, mesh: str, name: str) -> str:
-    """A line of the table, of one sequence."""
+def measure_sequence(folder: Path, mesh: str, name: str) -> str:
+    """Estimate one sequence; return its row of the table."""
     sequence = folder / "sequences" / name
     liver = read_liver(folder, mesh, sequence)
     true = np.load(sequence / "true-forces.npy")
@@ -162,8 +162,8 @@ def measured(folder: Path, mesh: str, name: str) -> str:
     places = np.load(sequence / "positions-default.npy").reshape(len(true), -1, 3)
     rest = meshio.read(folder / "mesh-default" / "liver.msh").points
     at, off, position, held, seconds = locate(liver.mesh, rest), [], [], [], []
-    with limit_to_one_thread():  # products are small
-        found = estimates(liver, clouds)
+    with limit_to_one_thread():  # matrix products are small
+        found = estimate_forces(liver, clouds)
     for (force, covariance, took), truth, place in zip(found, true, places, strict=True):
         miss = force.reshape(-1, 3).sum(axis=0) - truth
         spread = covariance.reshape(len(liver.patch), 3, len(liver.patch), 3).sum(axis=(0, 2))
@@ -179,27 +179,27 @@ def measured(folder: Path, mesh: str, name: str) -> str:
     )
 
 
-def sequences_of(folder: Path) -> list[str]:
-    """Names of the sequences that a folder has, in either layout of the data."""
+def list_sequences(folder: Path) -> list[str]:
+    """List the names of the sequences in a folder, in either layout of the data."""
     base = folder / "sequences"
     return sorted(path.parent.relative_to(base).as_posix() for path in base.rglob("true-forces.npy"))
 
 
 def main(words: list[str] | None = None) -> int:
-    """Print a table. 2: the folder is not that of the data."""
+    """Print a table; return 2 if the folder does not contain the data."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="data/liver of the repository")
-    parser.add_argument("--mesh", choices=("remeshed", "default"), default="remeshed", help="that forces are found on")
-    parser.add_argument("--sequences", nargs="+", help="such as linear/s1 (default: all that are there)")
+    parser.add_argument("--mesh", choices=("remeshed", "default"), default="remeshed", help="mesh of the estimate")
+    parser.add_argument("--sequences", nargs="+", help="names such as linear/s1 (default: all)")
     args = parser.parse_args(words)
     try:
-        names = args.sequences or sequences_of(args.folder)
+        names = args.sequences or list_sequences(args.folder)
         if not names:
             raise InputError(f"{args.folder}: holds no sequences. Give the folder data/liver of the repository.")
         print("| sequence | force is off by | in its 95 % ellipsoid | positions: mean, p95 | an update | published |")
         print("|---|---|---|---|---|---|")
         for name in names:
-            print(measured(args.folder, args.mesh, name), flush=True)
+            print(measure_sequence(args.folder, args.mesh, name), flush=True)
     except InputError as error:
         print(f"liver_sequences: {error}", file=sys.stderr)
         return 2

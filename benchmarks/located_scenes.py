@@ -1,11 +1,11 @@
-"""How `locate` fares on motions by causes that it may not know: those of built-in scenes, solved by finite elements.
+"""Errors of `locate` on motions by causes that its ensemble may lack: built-in scenes, solved by FEM.
 
     python benchmarks/located_scenes.py [--anatomy A.vtu] [--scenes retract resection ...] [--sights N]
 
-A locator lies beside the anatomy (`sulcus locator A.vtu --small`). Five moments of each scene are seen by 30, 100 and
+A locator is next to the anatomy (`sulcus locator A.vtu --small`). Five frames of each scene are observed by 30, 100 and
 300 points of the open cortex in turn, without the tool: nearly exact, and with the errors of the scene `sag`. A row
-has how far the tumour's middle moves and how far the answer is off [mm], the mean p95 [mm], the share of answers whose
-95 % ellipsoid holds the truth, and how many are in doubt or refused, as CSV.
+has the motion of the tumour's centroid, the error of the estimate and the mean p95 [mm], the share of estimates whose
+95 % ellipsoid covers the truth, and the numbers of doubtful and of rejected estimates, as CSV.
 """
 
 import argparse
@@ -24,11 +24,11 @@ from scenes.script.shipped_files import get_template_path
 
 MOMENTS, COUNTS = 5, (30, 100, 300)
 ERRORS = {"none": PointObservation(white=2e-5, smooth=2e-5, shift=0.0, turn=0.0), "of sag": PointObservation()}
-"""An error of 0.02 mm is none: an observation cannot state less than it can mean."""
+"""Errors of points: 0.02 mm stands for no error, as an observation requires a positive error."""
 
 
 def estimates(theatre: PatientSetup, name: str, sights: int) -> dict[str, list[TumourEstimate]]:
-    """What is answered of a scene, by the errors of what is seen."""
+    """Compute the estimates of a scene, by the errors of its observations."""
     scene = find_scene(name)
     player, last, found = theatre.build_player("fem", scene), None, {error: [] for error in ERRORS}
     for number in np.linspace(0, len(scene.times), MOMENTS + 1, dtype=int)[1:] - 1:
@@ -42,7 +42,7 @@ def estimates(theatre: PatientSetup, name: str, sights: int) -> dict[str, list[T
 
 
 def row(answers: list[TumourEstimate]) -> list[str]:
-    """Figures of answers to one scene."""
+    """Summarise the estimates of one scene."""
     given = [answer for answer in answers if answer.location is not None]
     moved = 1e3 * np.mean([answer.true_motion for answer in answers])
     doubted = sum(answer.location.slipped for answer in given if answer.location)

@@ -37,9 +37,9 @@ class OperatedFem:
     make
         Function that builds the solver of an anatomy.
     ahead
-        Build all solvers at once and keep them, so that no load waits; else each on first use.
+        True: build all solvers at once and keep them, so that no load waits. False: build each on first use.
     kept
-        Number of the latter that stay in memory.
+        Number of solvers that stay in memory if they are built on first use.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Array functions that NumPy lacks. Other array types, as graphs for export, register their own versions."""
+"""Array functions that NumPy lacks. Other array types, such as `Wire` of ONNX graphs, register their own versions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Rounded:
 
     @classmethod
     def round_table(cls, table: np.ndarray, step: np.ndarray | float) -> Self:
-        """Round a table (n, r) to a step, or steps (r,); to longer ones if int16 would not hold the largest number."""
+        """Round a table (n, r) to a step, or steps (r,); larger ones if the numbers exceed int16."""
         largest = np.abs(table).max(axis=0, initial=0.0) / np.iinfo(np.int16).max
         step = np.maximum(np.broadcast_to(step, largest.shape), largest).astype(np.float32)
         return cls(np.rint(table / step).astype(np.int16, order="F"), step)
@@ -47,7 +47,7 @@ class Rounded:
 def round_to_half(table: np.ndarray) -> np.ndarray:
     """Round numbers of any size to the 11 significant bits of half precision, as float32: a file takes half the bytes.
 
-    They change by 1 in 2,000 at most.
+    The relative change is at most 1 in 2,000.
     """
     share, exponent = np.frexp(table)
     return np.ldexp(np.rint(share * 2048.0) / 2048.0, exponent).astype(np.float32)
@@ -72,7 +72,7 @@ def find_columns_in_use(rows: np.ndarray) -> np.ndarray:
 
 
 def predict_in_chunks(predicted: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, most: int = 64) -> np.ndarray:
-    """Predict rows (B, f) in chunks of at most `most`: limits memory."""
+    """Predict rows (B, f) in chunks of at most `most` rows, to limit memory."""
     if len(rows) <= most:
         return predicted(rows)
     return np.concatenate([predicted(rows[first : first + most]) for first in range(0, len(rows), most)])

@@ -84,7 +84,7 @@ def folder(tmp_path_factory):
 
 
 def test_forces_and_positions_are_estimated_from_point_clouds(script, folder, capsys):
-    assert script.sequences_of(folder) == ["linear/s1"] and script.main([str(folder)]) == 0
+    assert script.list_sequences(folder) == ["linear/s1"] and script.main([str(folder)]) == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("| linear"))
     cells = line.split("|")
     force, position = float(cells[2].split()[0]), float(cells[4].split(",")[0])

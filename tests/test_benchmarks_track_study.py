@@ -13,8 +13,8 @@ from benchmarks.studies.track_study import (
     TURNED,
     Shot,
     between,
+    build_pivot_poses,
     build_row,
-    calibrate_pivot,
     spread,
     trial_camera,
 )
@@ -51,7 +51,7 @@ def test_generated_poses_satisfy_the_protocols():
     np.testing.assert_allclose(middle, [0.0, 0.0, AWAY], atol=0.01)
     pixels = camera.project(np.array([T[:3, 3] for T in evenly]))[0]
     assert (pixels > 0.0).all() and (pixels < [camera.width, camera.height]).all()
-    once, often = (np.array(list(calibrate_pivot(20, 0, point))) for point in (np.zeros(3), None))
+    once, often = (np.array(list(build_pivot_poses(20, 0, point))) for point in (np.zeros(3), None))
     tips = once[:, :3, :3] @ [0.0, 0.0, -TIP_DISTANCE] + once[:, :3, 3]
     np.testing.assert_allclose(tips, tips[:1].repeat(20, axis=0), atol=1e-12)
     assert np.ptp(often[:, :3, :3] @ [0.0, 0.0, -TIP_DISTANCE] + often[:, :3, 3], axis=0).min() > 0.03

@@ -9,7 +9,7 @@ from locators import locator_of
 from sim import fem
 from sim.anatomy import BRAIN_LABEL, PART_LABELS
 from surrogate.locating.causes import OEDEMA, SWELLING, Causes, build_groups, build_swellings
-from surrogate.locating.ensemble import ACCURACY, round_tumour, solve_members
+from surrogate.locating.ensemble import ACCURACY, mark_tumour_surroundings, solve_members
 from surrogate.locating.observation import Observation, to_evidence
 from surrogate.locating.posterior import condition_prior
 
@@ -26,7 +26,7 @@ def test_swelling_near_tumour_includes_marked_oedema(body):
     region = np.where(away > 25e-3, far, body.mesh.region)
     for anatomy, labels in ((body, ()), (replace(body, mesh=replace(body.mesh, region=region)), (far,))):
         for reach in (9e-3, 20e-3):
-            marked, swells = round_tumour(anatomy, reach)
+            marked, swells = mark_tumour_surroundings(anatomy, reach)
             own = np.setdiff1d(swells, labels)
             near = (away < reach) & (anatomy.mesh.region == BRAIN_LABEL)
             assert len(own) == 1 and np.array_equal(marked.mesh.region == own, near) and near.any()
@@ -56,7 +56,7 @@ def test_group_members_share_one_preconditioner(body, monkeypatch):
     monkeypatch.setattr(fem, "choose_preconditioner", lambda *given: made.append(given) or choose(*given))
     motion, kind = solve_members(body, group, 0, "cpu", FEW)
     assert len(made) == 1
-    marked, labels = round_tumour(body, group.reach[0])
+    marked, labels = mark_tumour_surroundings(body, group.reach[0])
     apart = fem.Fem(marked, group.build_effects(FEW.oedema, labels), ACCURACY, "cpu").deform(
         build_swellings(marked, FEW.oedema)
     )

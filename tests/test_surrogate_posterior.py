@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from sim.geometry.locate import Located
 from surrogate.locating.causes import SWELLING, TOOL
 from surrogate.locating.evidence import SHIFT_ERROR, SIGMA, SLIPPED_ERROR, TURN_PER_SHIFT, build_motion_evidence
-from surrogate.locating.observation import Observation, place_again
+from surrogate.locating.observation import Observation, to_moved_evidence
 from surrogate.locating.posterior import POSTERIOR, ObservedPrior, Posterior, build_observed_prior, condition_prior
 from surrogate.locating.prior import CAUSE_SETS, NO_PLACE, OTHER_CAUSES, PLACE_SETS, RIGID_RATIOS, MotionPrior
 from surrogate.locating.whitened import whiten
@@ -79,7 +79,7 @@ def test_point_cloud_is_placed_without_its_rigid_error(prior):
     open_nodes = body.mesh.nodes[np.unique(body.open_surface)]
     rest = open_nodes[np.linalg.norm(open_nodes - open_nodes.mean(axis=0), axis=1) < 10e-3]
     still, number = np.zeros_like(body.mesh.nodes), np.arange(len(rest))
-    found = place_again(body, Observation(rest + shift), number, still, lambda at: np.tile(shift, (len(at), 1)))
+    found = to_moved_evidence(body, Observation(rest + shift), number, still, lambda at: np.tile(shift, (len(at), 1)))
     assert len(rest) > 3 and found.at == pytest.approx(rest, abs=1e-9)
 
 

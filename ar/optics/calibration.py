@@ -83,11 +83,11 @@ class Calibration:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def build_camera(self, T_camera_world: np.ndarray) -> Camera:
-        """Return the camera at a pose, (4, 4) as in `Camera`; errors as there."""
+        """Return the camera at a pose T_camera_world (4, 4) [m]; errors as in `Camera`."""
         return Camera(self.K, T_camera_world, self.width, self.height, self.lens)
 
     def resize_calibration(self, width: int, height: int, scale: bool = False) -> Calibration:
-        """Return the calibration for another image size, if `scale` is set and the aspect ratio is the same.
+        """Return the calibration for an image size; another size needs `scale` and the same aspect ratio.
 
         Raises
         ------
@@ -120,9 +120,9 @@ def to_opencv_text(calibration: Calibration) -> str:
 
 
 def to_ros_text(calibration: Calibration) -> str:
-    """Write a calibration as YAML of ROS's camera_info, of the model plumb_bob, or rational_polynomial if needed.
+    """Write a calibration as YAML of ROS's camera_info; lens model plumb_bob, or rational_polynomial if needed.
 
-    Without rectification; the projection is that of the camera matrix.
+    Images are not rectified: the projection matrix equals the camera matrix.
     """
     coefficients = to_opencv_coefficients(calibration.lens)
     lines = [
@@ -140,7 +140,7 @@ def to_ros_text(calibration: Calibration) -> str:
 
 
 def to_opencv_coefficients(lens: Lens) -> np.ndarray:
-    """Return coefficients (5,) or, of a rational lens, (8,), in OpenCV's order."""
+    """Return the lens coefficients in OpenCV's order: (5,), or (8,) for a rational lens."""
     return lens.coefficients if lens.coefficients[5:].any() else lens.coefficients[:5]
 
 
@@ -182,7 +182,7 @@ def parse_calibration(text: str) -> Calibration:
     Raises
     ------
     ValueError
-        A text that is too long or not such YAML. A part that is missing, is given twice, has another shape or is not
+        A text that is too long or not valid YAML. A part that is missing, is given twice, has another shape or is not
         finite. An unsupported lens or distortion model. Errors of `Calibration`.
     """
     storage = _open_text(text)
@@ -203,7 +203,7 @@ def parse_calibration(text: str) -> Calibration:
         raise ValueError("camera_matrix must be (fx 0 cx; 0 fy cy; 0 0 1): calibrate without skew.")
     for key, shape in (("rectification_matrix", (3, 3)), ("projection_matrix", (3, 4))):
         if key in keys:
-            _read_matrix(root, key, shape)  # for rectified images, which are not used here
+            _read_matrix(root, key, shape)  # checked only: the matrix is for rectified images, which are not used
     (fx, _, cx), (_, fy, cy) = K[:2].tolist()
     width, height = (_read_int(root, key) for key in ("image_width", "image_height"))
     lens, name = _read_lens(root, keys), _name(root, keys)

@@ -124,9 +124,9 @@ class Camera:
         return undistort_pixels(self.lens, tuple(self.K.ravel().tolist()), self.width, self.height)
 
     def perturb(self, degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Camera:
-        """Return the same camera with the world rotated about its centre by an angle [degree].
+        """Return the camera with the world rotated about the camera's centre by an angle [degree].
 
-        Right-handed round `axis` (camera frame): round y, the default, the scene ahead moves to the right.
+        The rotation is right-handed about `axis` (camera frame): about y, the default, the scene moves to the right.
         """
         direction = np.asarray(axis, np.float64) / np.linalg.norm(axis)
         turn = np.eye(4)
@@ -134,13 +134,13 @@ class Camera:
         return replace(self, T_camera_world=turn @ self.T_camera_world)
 
     def move(self, shift: np.ndarray) -> Camera:
-        """Return the same camera moved by `shift` (3,) [m] in its own frame, right, down and forward."""
+        """Return the camera moved by `shift` (3,) [m] in the camera frame: right, down, forward."""
         T = self.T_camera_world.copy()
         T[:3, 3] -= shift
         return replace(self, T_camera_world=T)
 
     def zoom(self, factor: float) -> Camera:
-        """Return the same camera with `factor` times the focal length, about its principal point, with the same lens.
+        """Return the camera with `factor` times the focal length; principal point and lens are unchanged.
 
         Raises
         ------
@@ -154,7 +154,7 @@ class Camera:
         return replace(self, K=K)
 
     def refocus(self, focal_length: float, before: float, now: float) -> Camera:
-        """Return the same camera focused on another distance, which changes its magnification.
+        """Return the camera focused on another distance, which changes the magnification.
 
         A thin lens of focal length f forms the image of an object at d at the distance f d / (d - f) behind it.
 
@@ -178,7 +178,7 @@ class Camera:
         return self.zoom(behind[0] / behind[1])
 
     def scale(self, factor: float) -> Camera:
-        """Return the same view on `factor` times as many pixels along each side."""
+        """Return the camera of the same view with `factor` times as many pixels along each side."""
         width, height = round(self.width * factor), round(self.height * factor)
         resize = np.array(
             [
@@ -190,16 +190,16 @@ class Camera:
         return replace(self, K=resize @ self.K, width=width, height=height)
 
     def crop_to(self, rows: slice, columns: slice) -> Camera:
-        """Return the camera of `picture[rows, columns]`, slices with start and stop."""
+        """Return the camera of the image part `[rows, columns]`, two slices with start and stop."""
         shift = np.zeros((3, 3))
         shift[:2, 2] = columns.start, rows.start
         part = replace(self, K=self.K - shift, width=columns.stop - columns.start, height=rows.stop - rows.start)
-        if self.lens is not None:  # computing it again would take longer
+        if self.lens is not None:  # a copy is faster than computing it again
             part.__dict__["straight"] = self.straight[rows, columns] - shift[:2, 2]
         return part
 
     def pad(self, aspect: float) -> Camera:
-        """Return the camera of the image centred on the smallest canvas of width / height = `aspect` that holds it."""
+        """Return the camera of the smallest canvas of width / height = `aspect` with the image at its centre."""
         width = max(self.width, round(self.height * aspect))
         height = max(self.height, round(self.width / aspect))
         shift = np.zeros((3, 3))
@@ -257,7 +257,7 @@ BASELINE = 24e-3
 def build_stereo_pair(
     camera: Camera, baseline: float = BASELINE, working_distance: float | None = None
 ) -> tuple[Camera, Camera]:
-    """Build the left and the right camera about a central one, `baseline` [m] apart along its rows.
+    """Build the left and right cameras of a central camera, `baseline` [m] apart along its image rows.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ ROW_ITERATIONS = 6  # Number of fixed-point iterations for the row in which a po
 
 
 def compute_row_time(row: np.ndarray | float, height: int, readout: float) -> np.ndarray | float:
-    """Compute the time [s] of a row in an image of `height` rows; rows outside as the first or last one."""
+    """Compute the time [s] of a row in an image of `height` rows; rows outside are clipped to the image."""
     return readout * (np.clip(np.asarray(row) / max(height - 1, 1), 0.0, 1.0) - 0.5)
 
 
@@ -294,7 +294,7 @@ def split_row_bands(
 ) -> list[tuple[slice, Camera]]:
     """Split the rows, from top to bottom, into bands, each with the camera at its time, cropped to these rows.
 
-    There are as many as needed for points (n, 3) [m] to move by at most `MAX_BAND_MOTION` pixels in each.
+    In each band, points (n, 3) [m] move by at most `MAX_BAND_MOTION` pixels.
     """
     middle = camera_at(0.0)
     moments = readout * np.linspace(-0.5, 0.5, MOTION_SAMPLES)
@@ -310,7 +310,7 @@ def split_row_bands(
 
 
 def find_row_time(camera_at: Callable[[float], Camera], readout: float, point: np.ndarray) -> float:
-    """Compute the time [s] of the row in which a point (3,) [m] is seen; 0 if it has no pixel."""
+    """Compute the time [s] of the row in which a point (3,) [m] is visible; 0 if the point has no pixel."""
     time = 0.0
     for _ in range(ROW_ITERATIONS):
         camera = camera_at(time)

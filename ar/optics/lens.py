@@ -14,7 +14,7 @@ DIRECTION_COUNT = 32  # Number of directions round the axis at which the mapping
 MAX_NEWTON_ITERATIONS = 20  # Maximum number of Newton iterations of the inverse mapping.
 # Residual that ends the Newton iterations, in normalised coordinates: 1e-9 pixel at a focal length of 1000 pixels.
 NEWTON_TOLERANCE = 1e-12
-CHUNK_POINTS = 8192  # Chunk size [points]: its arrays fit in the CPU cache. All at once take half as long again.
+CHUNK_POINTS = 8192  # Chunk size [points]: its arrays fit in the CPU cache. Without chunks it takes 1.5 times as long.
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Lens:
         return np.stack(self._apply_distortion(x, y), axis=-1)
 
     def undistort(self, places: np.ndarray) -> np.ndarray:
-        """Undistort positions (..., 2), the inverse of `bent`, by Newton's method; NaN without solution in `reach`."""
+        """Invert `distort` at positions (..., 2) by Newton's method; NaN without a solution within `reach`."""
         places = np.asarray(places, np.float64)
         wanted = places.reshape(-1, 2).T
         _, moved = self._along
@@ -113,7 +113,7 @@ class Lens:
             a, b, c = self._compute_slopes(x, y)
             inverse = 1.0 / (a * c - b * b)
             x, y = x - inverse * (c * off_x - b * off_y), y - inverse * (a * off_y - b * off_x)
-            # Beyond the reach the derivatives are meaningless: a step that leads there ends at its edge.
+            # Derivatives beyond `reach` are meaningless: longer steps end at `reach`.
             back = np.minimum(1.0, self.reach / np.maximum(np.hypot(x, y), self.reach))
             x, y = back * x, back * y
         at = self._apply_distortion(x, y)

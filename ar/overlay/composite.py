@@ -1,4 +1,4 @@
-"""Composition of the hidden surface into the camera image, registered to it, and never over the tool."""
+"""Composition of a hidden surface into the registered camera image, never over the tool."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -56,7 +56,7 @@ MARGIN_STROKES = (12, 7)  # Stroke and gap lengths of a margin [pixel].
 HIDDEN_STROKES = (9, 6)  # Stroke and gap lengths of an outline under closed ground or a tool [pixel].
 HIDDEN_LINE_WIDTH = 2  # Line width of an outline under closed ground or a tool [pixel].
 SILHOUETTE_TEXT_WIDTH = 96  # Width of text lines within the silhouette [pixel].
-MAX_LOWER_ROWS = 2  # Number of text rows by which text at the top may be lower, to leave a line visible.
+MAX_LOWER_ROWS = 2  # Largest downward shift of the text at the top that avoids lines [text rows].
 # Widths of text at the top as shares of the image width; the first that covers no tool is used.
 HEAD_WIDTHS = 0.62, 0.5, 0.4, 0.32, 0.25
 STYLE_TEXT_DISTANCE = 2 * LINE_SPACING  # Distance of a style's text from the number next to the tip [pixel].
@@ -129,7 +129,7 @@ def composite(
     marks: Marks = NO_MARKS,
     words: Words = NO_WORDS,
 ) -> Overlaid:
-    """Return the image with a hidden surface drawn into it. On a GPU, depth is copied back only for a cut.
+    """Draw a hidden surface into an image. On a GPU, depth is copied to the host only for the style "cut".
 
     Parameters
     ----------
@@ -244,12 +244,12 @@ def _describe_motion(hidden: Layer, before: Layer, words: Words) -> str:
 def _write_lines(sketch: Sketch, camera: Camera, words: Words, motion: str) -> Overlaid:
     """Write the lines at the top, the motion and the warning.
 
-    Top and corner come first, so that their text seldom moves; then by importance, for some is left out without space.
+    Text at the top and in the corner is placed first and seldom moves. Then the most important text comes first.
     """
     drawn = Overlaid(sketch.colour, sketch.taken.copy())
     write_head(drawn, words.head)
     if motion:
-        firm = drawn.taken * ~sketch.faint  # it keeps its place, although it is on the margin's line
+        firm = drawn.taken * ~sketch.faint  # without the margin's line, so that the text does not move
         lay(drawn.colour, firm, wrap_line(motion, MAX_BOTTOM_WIDTH * camera.width), (0, camera.height))
         np.bitwise_or(drawn.taken, firm, out=drawn.taken)
     write_doubt(drawn, words.doubt)
@@ -265,7 +265,7 @@ def _write_labels(drawn: Overlaid, sketch: Sketch, measure: Measure, keys: Seque
     if measure.gauge is not None:
         before_it = taken.copy()
         write_gauge(out, taken, measure.camera, measure.gauge, front, sketch.taken, sketch.thin)
-        # The text of the style is not about the number.
+        # Keep the text of the style away from the number: they are unrelated.
         square = np.ones((2 * STYLE_TEXT_DISTANCE + 1,) * 2, np.uint8)
         apart = cv2.dilate(((taken > 0) & (before_it == 0)).view(np.uint8), square)
     ground, around = sketch.ground, sketch.around
@@ -337,7 +337,7 @@ def draw_points(drawn: Overlaid, camera: Camera, points: np.ndarray, where: np.n
     pixels, _ = camera.project(points)
     here = pixels[np.isfinite(pixels).all(axis=1)].round().astype(int)
     here = here[((here >= 0) & (here < (camera.width, camera.height))).all(axis=1)]
-    near = cv2.dilate(drawn.taken, np.ones((7, 7), np.uint8))  # keeps letters of text intact
+    near = cv2.dilate(drawn.taken, np.ones((7, 7), np.uint8))  # no dot on letters
     for column, row in here[where[here[:, 1], here[:, 0]] & (near[here[:, 1], here[:, 0]] == 0)].tolist():
         cv2.circle(drawn.colour, (column, row), 2, BORDER_COLOUR, -1)
         cv2.circle(drawn.colour, (column, row), 1, POINT_COLOUR, -1)
@@ -378,8 +378,8 @@ def write_head(drawn: Overlaid, lines: Sequence[str]) -> None:
     """Draw text lines in the top-left corner, below the orientation letter, in place; may cover other lines."""
     free, middle = drawn.taken.copy(), len(drawn.taken) // 2
     below = HEAD_ROW + LINE_SPACING * (len(lines) + MAX_LOWER_ROWS)
-    free[:HEAD_ROW] = free[middle - HEAD_ROW // 2 : middle + HEAD_ROW // 2] = 1  # for the orientation letters
-    free[below:] = 1  # rather over a line than in the centre of the image
+    free[:HEAD_ROW] = free[middle - HEAD_ROW // 2 : middle + HEAD_ROW // 2] = 1  # kept free for the orientation letters
+    free[below:] = 1  # text may cover a line, but not the centre of the image
     before = free.copy()
     lay(drawn.colour, free, lines, (0, HEAD_ROW), needed=True, below=Below(lines=drawn.taken))
     drawn.taken[free > before] = 1

@@ -56,7 +56,7 @@ class CutPlane:
 
 
 def build_plane(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) -> CutPlane:
-    """Build the plane of a camera's centre, a centre (3,) [m] and a tip (3,) [m], which is on its right in the image.
+    """Build the plane through a camera's centre, a surface's centre (3,) [m] and a tip (3,) [m], right in the inset.
 
     Without a tip, or with one on the line of sight, the plane is horizontal in the image.
     """

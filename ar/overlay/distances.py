@@ -71,7 +71,7 @@ def measure_points(
     # output
     distance: wp.array(dtype=wp.float32),
 ):
-    """Measure a run of points."""
+    """Compute signed distances of a run of points."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         found = wp.mesh_query_point_sign_parity(tree, points[index], reach, RAY_COUNT)
@@ -97,7 +97,7 @@ def measure_seen(
     # output
     distance: wp.array2d(dtype=wp.float32),
 ):
-    """Measure a run of the box's pixels; `rays` reach to where z is 1."""
+    """Compute distances of visible points for a run of the box's pixels; `rays` end at z = 1."""
     start = begin + wp.tid() * run
     for index in range(start, wp.min(start + run, end)):
         row = index / distance.shape[1]
@@ -112,12 +112,7 @@ def measure_seen(
                 distance[row, column] = wp.length(point - nearest)
 
 
-RING_DISTANCES = (
-    1e-3,
-    5e-3,
-    10e-3,
-    15e-3,
-)  # Distances of the rings from the surface [m]; the first stands for contact.
+RING_DISTANCES = (1e-3, 5e-3, 10e-3, 15e-3)  # Distances of the rings from the surface [m]; the first indicates contact.
 RING_COLOUR = (232.0, 228.0, 204.0)
 """Colour of rings."""
 MIN_RING_LENGTH = 24  # Smallest length of a drawn ring [pixel].
@@ -160,7 +155,7 @@ def draw_rings(
     for number, lines in rings.items():
         found = [_write_on(sheet, line, number, taken, written) for line in lines if len(line) >= MIN_NUMBERED_LENGTH]
         if not any(found):
-            # Without free space: first over lines, and then over another number.
+            # Without free space, the number covers lines, or else another number.
             any(
                 _write_on(sheet, line, number, shut, written)
                 for shut in (written, np.zeros_like(written))
@@ -176,9 +171,9 @@ def separate_rings(drawn: np.ndarray) -> np.ndarray:
 
 
 def _write_on(sheet: np.ndarray, line: np.ndarray, text: str, shut: np.ndarray, written: np.ndarray) -> bool:
-    """Write a number on a line (n, 1, 2), as close to its centre as `shut` allows, in place; return True if possible.
+    """Write a number on a line (n, 1, 2), near its centre but not in the mask `shut`; return True if possible.
 
-    Its place is marked in both (h, w) bool.
+    The number's box is marked in both masks (h, w) bool. Arrays change in place.
     """
     (width, height), _ = cv2.getTextSize(text, FONT, TEXT_SCALE, 1)
     middle = len(line) // 2

@@ -96,7 +96,7 @@ def lay(
     needed: bool = False,
     below: Below = COVER_NOTHING,
 ) -> None:
-    """Write lines of ASCII text at the free place closest to a wish, and mark that place; both arrays change in place.
+    """Write lines of ASCII text at the free place closest to `wish`, and mark it in `taken`; arrays change in place.
 
     Write the most important text first: without space nothing is written, unless it is `needed`.
 
@@ -140,7 +140,7 @@ def wrap_line(text: str, room: float, scale: float = TEXT_SCALE) -> list[str]:
     return list(_wrap_line(text, room, scale))
 
 
-@lru_cache(maxsize=256)  # most texts stay from image to image, and this takes 1 ms
+@lru_cache(maxsize=256)  # most texts recur in the next image, and a call takes 1 ms
 def _wrap_line(text: str, room: float, scale: float) -> list[str]:
     if _measure_width(text, scale) <= room:
         return [text] if text else []

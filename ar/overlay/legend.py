@@ -62,7 +62,7 @@ def draw_legend(entries: tuple[Entry, ...]) -> np.ndarray:
         row = LEGEND_LINE_HEIGHT * number + LEGEND_LINE_HEIGHT // 2
         stroke, gap = entry.pattern or (SAMPLE_LENGTH, 0)
         strokes = [(left, min(left + stroke, SAMPLE_LENGTH) - 1) for left in range(2, SAMPLE_LENGTH - 2, stroke + gap)]
-        rim = [(BORDER_COLOUR, entry.width + 2)] if entry.width > 1 else []  # border as in `dash`
+        rim = [(BORDER_COLOUR, entry.width + 2)] if entry.width > 1 else []  # border as in `draw_dashes`
         for ink, width in (*rim, (entry.ink, entry.width)):
             for left, right in strokes:
                 cv2.line(sheet, (left, row), (right, row), (*ink, OPAQUE), width, cv2.LINE_AA)

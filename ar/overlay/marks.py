@@ -42,7 +42,7 @@ class Trace:
 
 
 def draw_before(sheet: np.ndarray, camera: Camera, box: tuple[slice, slice], before: Layer, hidden: Layer) -> None:
-    """Draw the dotted position of the hidden surface before, and an arrow from its centroid there to the present one.
+    """Draw the dotted earlier outline of the hidden surface, and an arrow from its earlier to its present centroid.
 
     In place, on the sheet of the image's rows and columns `box`, which hold both surfaces.
     """
@@ -53,7 +53,7 @@ def draw_before(sheet: np.ndarray, camera: Camera, box: tuple[slice, slice], bef
     middles = np.stack([before.vertices.mean(axis=0), hidden.vertices.mean(axis=0)])
     ends, _ = camera.crop_to(*box).project(middles)
     length = float(np.linalg.norm(ends[1] - ends[0]))
-    if not length >= MIN_ARROW:  # nor where one has no pixel
+    if not length >= MIN_ARROW:  # also true for NaN: an end without a pixel
         return
     start, end = (tuple(each) for each in np.clip(ends, -1e4, 1e4).round().astype(int).tolist())
     for ink, width in ((BORDER_COLOUR, 4), (compute_ink(BEFORE_COLOUR), 2)):

@@ -101,13 +101,13 @@ class Measure:
                     & (line < (part.width - LETTER_EDGE_DISTANCE, part.height - LETTER_EDGE_DISTANCE))
                 ).all(axis=1)
             ]
-            # Letters are outside of tools, where the line is visible.
+            # Place letters where no tool covers the line.
             front = (self.roles.read_roles(self.picture.segmentation, box) == FRONT).astype(np.uint8)
             line = line[
                 cv2.dilate(front, np.ones((2 * LETTER_EDGE_DISTANCE + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] == 0
             ]
             if len(line):
-                # Next to the line: there may be another on it, from the tip.
+                # Place letters next to the line, as the gauge's line from the tip may be on it.
                 along = (line[-1] - line[0]) / max(float(np.linalg.norm(line[-1] - line[0])), 1.0)
                 beside = np.rint(LETTER_LINE_DISTANCE * np.array([along[1], -along[0]])).astype(int)
                 places = np.clip(
@@ -125,7 +125,7 @@ class Measure:
                     write_haloed(above, letter, (column - 4, row + 4), TEXT_SCALE, RING_COLOUR)
 
     def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
-        """Add the explanation of the lines to a composite image, with arguments of `place_sheet`; in place.
+        """Add scale, text or inset of the style to a composite image, in place; arguments as in `place_sheet`.
 
         needed (H, W) uint8: above 0 on objects that must stay visible even without other space.
         """
@@ -134,7 +134,7 @@ class Measure:
             caption = f"{self.name or 'surface'}: mm under\nwhat is seen\n{self.off}"
             scale = draw_depth_scale(to_key(compute_ink(self.hidden.colour)), caption)
             if not place_sheet(colour, taken, scale, sights):
-                # A tint needs its scale: rather over cortex than not at all.
+                # A tint needs a scale, which may cover cortex if there is no free space.
                 wish = colour.shape[1], HEAD_ROW
                 places = (
                     find_free_place(shut, scale.shape[1::-1], wish) for shut in (taken | sights, taken | needed, taken)

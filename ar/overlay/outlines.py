@@ -35,7 +35,7 @@ def join_boxes(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> 
 
 
 def find_pixel_box(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None:
-    """Return rows and columns that hold the pixels of points (V, 3) and `SOFT_EDGE_WIDTH` more.
+    """Return the rows and columns of the box of points' pixels (V, 3), widened by `SOFT_EDGE_WIDTH`.
 
     None if outside the image.
     """
@@ -57,7 +57,7 @@ def find_pixel_box(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | 
 
 
 def find_pixel_corners(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Find corners (n, 2) of the pixels that may be between points (V, 3) in front of a camera with a lens.
+    """Find pixels (n, 2) whose box holds the image of a surface with points (V, 3) in front of a camera with a lens.
 
     A lens bends the lines between points, but not out of the box that holds them in its undistorted image.
     """

@@ -76,7 +76,7 @@ def draw_overlay(
     Parameters
     ----------
     drawn
-        The one image, on its device.
+        Image to draw into, a batch of one, on its device.
     box, camera
         Rows and columns of the image in which to draw, and the camera of that part.
     hidden, seen
@@ -157,7 +157,7 @@ def to_flat_sheet(lines: np.ndarray | None, device: str) -> wp.array:
 def from_edge(seen: RasterisedSurface) -> wp.array:
     """Compute the chamfer distance (h, w) of each pixel from a silhouette's edge [pixel], up to the soft edge's width.
 
-    OpenCV's on the CPU, and the same by kernels on a GPU.
+    OpenCV computes it on the CPU, kernels with the same result on a GPU.
     """
     device, shape = str(seen.nearest.device), seen.nearest.shape[1:]
     beside = wp.empty(shape, dtype=wp.uint8, device=device)

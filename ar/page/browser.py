@@ -1,7 +1,7 @@
 """Browser page: camera image, 3-D view next to it, playback, controls and a report, made with viser.
 
-The overlay is composited into the image before it comes here (`ar.overlay.composite`). The whole image is shown, as one
-element. So no window shape and no client can misalign the two. The 3-D view is updated by sending vertices alone.
+`ar.overlay.composite` has already drawn the overlay into the image. The page shows the whole image, as one
+element, so that image and overlay stay aligned in every window. The 3-D view is updated by sending vertices alone.
 `ar.page.style` holds the layout.
 """
 
@@ -35,7 +35,7 @@ from .recording import Recorder
 from .scene import add_body, set_up_scene
 from .style import PAGE, STATUS, build_style
 
-LAST_ORDER = 1e9  # Sort order of the element after all that are added later.
+LAST_ORDER = 1e9  # Sort order that keeps an element last on the page.
 LOCAL_ADDRESSES = ("127.0.0.1", "0.0.0.0", "::1", "::")  # Addresses that this machine reaches by the name localhost.
 
 
@@ -87,7 +87,7 @@ class Browser:
         gui.add_html(build_style(size[0] / size[1]))
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
         gui.add_html(build_element(PICTURE, ""))
-        # Last: if a low window has no space for them under the image, the controls come before them.
+        # The words come last: in a low window without space under the image, the controls precede them.
         self.words = gui.add_html(build_element(PAGE, keep_together(words)), order=LAST_ORDER)
         self.line = gui.add_html("")
         self.text = gui.add_html(build_element(SAID, ""))
@@ -203,7 +203,7 @@ class Browser:
         if colour is not self.shown[1] or words != self.shown[2]:
             self.put_sight(self.coded, words)
         self.shown = wanted
-        # Only on a change: a client may be moving it.
+        # Set the slider only on a change: a client may be moving it.
         if place != at:
             self.controls.assign(self.frame, place)
 
@@ -216,7 +216,7 @@ class Browser:
     def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
         """Show an image (H, W, 3) uint8 of slices, and charts (HTML) of the last seconds, in tabs next to the 3-D view.
 
-        `drawn` makes them, on the page's own thread, as often as `ConnectionLimits` allow: intermediate ones are
+        The page's thread calls `drawn` for them, as often as `ConnectionLimits` allow: intermediate ones are
         skipped.
         """
         with self.lock:
@@ -274,7 +274,7 @@ class Browser:
             if not self.closed.is_set():
                 self.crowd.read(line)
 
-        # On that thread, no client leaves meanwhile.
+        # While this thread runs `send`, no client leaves.
         self.note("lines", lambda: self.server.get_event_loop().call_soon_threadsafe(send))
 
     def put(self, label: str, value: float | str, wanted: Callable[[], bool] | None = None) -> None:
@@ -289,7 +289,7 @@ class Browser:
         self.note(f"control {label}", lambda: self.controls.assign(control, value, wanted))
 
     def rename(self, label: str, words: str) -> None:
-        """Show other words for a control; an unknown label is ignored, as of a scene shown before."""
+        """Show other words for a control; an unknown label, such as one of the previous scene, is ignored."""
         if (control := self.controls.handles.get(label)) is not None:
             self.note(f"words {label}", lambda: setattr(control, "label", words))
 
@@ -342,7 +342,7 @@ class Browser:
             self.controls.assign(self.frame, number)
 
         self.controls.press(self.button, toggle)
-        # A slider needs a length, so that of a single frame has two positions.
+        # A slider needs two positions, even for a single frame.
         self.controls.receive_input(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
         self.controls.bind_key(PLAY_KEY, toggle)
         if seekable:

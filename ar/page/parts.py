@@ -48,7 +48,7 @@ class Sign:
 
 @dataclass(frozen=True)
 class Slider:
-    """Slider for a number; `changed` receives it, on the page's own thread, and must return at once.
+    """Slider for a number; `changed` receives the number, on the page's own thread, and must return at once.
 
     `label` is its name for `Browser.put`; `words` are shown instead of the name, `hint` as a tooltip.
     """

@@ -24,7 +24,7 @@ RECORD_LABEL, STOP_LABEL, ENCODE_LABEL = "Record", "Stop recording", "Encoding t
 
 @dataclass
 class PageRecording:
-    """Images as encoded by `coded`, each with its arrival time [s]."""
+    """Images encoded by `to_data_url`, each with its arrival time [s]."""
 
     began: float
     taken: list[tuple[float, str]] = field(default_factory=list)
@@ -76,7 +76,7 @@ def replay_images(taken: Sequence[tuple[float, str]], ended: float, rate: float)
 
 
 def decode_recorded(code: str) -> np.ndarray:
-    """Decode an image (H, W, 3) uint8 from an address written by `coded`."""
+    """Decode an image (H, W, 3) uint8 from a data URL of `to_data_url`."""
     written = np.frombuffer(base64.b64decode(code.partition(",")[2]), np.uint8)
     return cv2.cvtColor(cv2.imdecode(written, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)  # type: ignore[arg-type]
 

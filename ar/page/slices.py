@@ -39,7 +39,7 @@ class SliceView:
 
     @property
     def normal(self) -> np.ndarray:
-        """(3,): away from the viewer."""
+        """(3,): viewing direction, away from the viewer."""
         return np.cross(self.right, self.down)
 
     def compute_points(self, middle: np.ndarray, count: int) -> np.ndarray:

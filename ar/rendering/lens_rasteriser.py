@@ -28,7 +28,7 @@ class Unbent:
 
 
 def build_undistortion(cameras: Sequence[Camera], device: str) -> Unbent:
-    """Compute undistorted pixels of cameras of one size; unchanged for one without a lens among others with one."""
+    """Compute undistorted pixels of cameras of one size; for a camera without a lens, the pixels themselves."""
     if all(camera.lens is None for camera in cameras):
         return get_no_undistortion(device)
     return get_undistortion(tuple(cameras), device)

@@ -127,8 +127,8 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
 class Renderer:
     """Layers under a lamp, prepared once and drawn any number of times; from one thread at a time.
 
-    The image of fixed layers is cached for a camera, from its second image on. For a moving camera it would be of no
-    use.
+    The image of fixed layers is cached from a camera's second image on: a camera that moves has no second image,
+    so nothing is cached.
     """
 
     def __init__(self, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> None:
@@ -210,7 +210,7 @@ class Renderer:
         through: Unbent,
         pictures: Pictures,
     ) -> None:
-        """Light the contents of the z-buffers, in the shadow of some triangles, into images that hold all else."""
+        """Shade the pixels of the z-buffers, with shadows of the `casting` triangles, into images with a background."""
         count, height, width = nearest.shape
         shadow = self._draw_shadow(placed, casting)
         inputs = [

@@ -145,9 +145,8 @@ def compute_lit_share(picture: wp.int32, at: wp.vec3f, shadow: Shadow) -> wp.flo
         return 1.0
     if z > wp.max(wp.max(first[1], second[1]), wp.max(third[1], fourth[1])):
         return 0.0
-    # A box 2 HALF_SOFT_WIDTH wide about (u, v): taps at its border are weighted by their part inside, so that no steps
-    # are
-    # visible.
+    # A box 2 HALF_SOFT_WIDTH wide about (u, v). Taps at its border are weighted by their part inside the box.
+    # Without weights, steps are visible.
     reach = wp.float32(HALF_SOFT_WIDTH) + 0.5
     across = Taps()
     for j in range(FILTER_WIDTH):
@@ -303,7 +302,7 @@ def shade(
                 corners = corners_of(picture, winner, surfaces, placed)
                 look = surfaces.looks[wp.int32(surfaces.look_of[winner])]
             p = wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
-            if bent:  # tested here, images without a lens take a seventh less time
+            if bent:  # this test saves a seventh of the time for images without a lens
                 p = pixel_at(picture, column, row, pixels)
             point = point_at(p, corners, look, surfaces.texels, eyes[picture])
             if winner >= still:

@@ -1,4 +1,4 @@
-"""Views of the calibration board, and the intrinsics of a camera that follow from them, with their errors."""
+"""Views of the calibration board, and the intrinsics of a camera computed from them, with their errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ def _compute_sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
 def choose_views(
     views: Sequence[BoardView], face: Face, most: int, settings: IntrinsicsSettings = IntrinsicsSettings()
 ) -> list[BoardView]:
-    """Select at most `most` of the sharp views, each as different from those before it as possible.
+    """Select at most `most` of the sharp views, each as different from the views before it as possible.
 
     Views are compared by the position of the board's outline in the image. Gonzalez (1985), "Clustering to minimize the
     maximum intercluster distance": the farthest view from all chosen ones comes next.
@@ -143,7 +143,7 @@ REMEDY = "Tilt the board by 20 to 45 degrees to all sides, near and far, and als
 def compute_calibration_error(
     camera: Camera, T_camera_target: np.ndarray, corners: np.ndarray, place: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
-    """Compute the covariance (3, 3) [m^2], in the camera's frame, of a target point by that of the calibration.
+    """Propagate a calibration's covariance to a target point: (3, 3) [m^2] in the camera's frame.
 
     The pose absorbs most of a calibration error, as target and point are seen by the same camera. The remainder is
     computed by the derivatives of the projection: as far as it is observable, across the line of sight.

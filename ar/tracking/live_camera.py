@@ -18,11 +18,11 @@ class FrameSource(Protocol):
     """Source of images: `cv2.VideoCapture`, or a replacement."""
 
     def isOpened(self) -> bool:
-        """Return True if it is open."""
+        """Return True if the source is open."""
         ...
 
     def read(self) -> tuple[bool, np.ndarray | None]:
-        """Return whether there was an image, and the image (H, W, 3) uint8 in BGR order."""
+        """Return True if an image arrived, and the image (H, W, 3) uint8 in BGR order."""
         ...
 
     def release(self) -> None:
@@ -67,7 +67,7 @@ def read_camera_images(
 def read_newest(pictures: Generator[Named | None], patience: float) -> Iterator[Named | None]:
     """Yield the newest image at each request; None if none arrived within `patience` [s].
 
-    A separate thread reads the images; those that arrive between requests are dropped. It ends, and closes the
+    A separate thread reads the images; those that arrive between requests are dropped. The thread ends, and closes the
     images, when this iterator ends.
 
     Raises

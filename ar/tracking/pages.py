@@ -85,7 +85,7 @@ def build_printed_pages() -> tuple[Page, ...]:
 
 
 def to_face_name(face: Face) -> str:
-    """Return the axis of the target that a face looks along: "+x", "-z"."""
+    """Return the target's axis along a face's outward normal, such as "+x" or "-z"."""
     outwards = -face.T_target_face[:3, 2]
     axis = int(np.abs(outwards).argmax())
     return f"{'+' if outwards[axis] > 0.0 else '-'}{'xyz'[axis]}"

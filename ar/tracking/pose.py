@@ -1,4 +1,4 @@
-"""Poses of targets from their corners, with a covariance or the reason why none is known; targets that are followed."""
+"""Poses of targets from their corners, with covariances, and tracking of targets from image to image."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def find_pose(
     before: np.ndarray | None = None,
     settings: PoseSettings = PoseSettings(),
 ) -> tuple[Verdict, Pose | None]:
-    """Estimate the pose of a target; none unless it is certain.
+    """Estimate the pose of a target; no pose is returned if it is uncertain or ambiguous.
 
     Every face has two poses that mirror each other (Schweighofer, Pinz 2006, "Robust pose estimation from a planar
     target", IEEE Trans. Pattern Anal. Mach. Intell. 28:2024-2030). Each is fitted to all corners. A pose is returned if
@@ -213,7 +213,7 @@ class TrackedTargets:
     poses
         Poses of the targets that are certain.
     last
-        The last certain pose (4, 4), and its image's number, of all that had one.
+        The last certain pose (4, 4) of each target that had one, and the number of its image.
     """
 
     number: int

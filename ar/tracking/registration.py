@@ -74,9 +74,9 @@ class Registration:
     rms
         Root mean square residual distance [m] of the pairs.
     pairs, surface
-        Numbers of points of each kind.
+        Number of pairs, and number of surface points.
     scanned
-        Scan that it was made for, if known.
+        Scan that the registration was made for, if known.
     """
 
     T_patient_scan: np.ndarray
@@ -258,7 +258,7 @@ def _compute_rms(off: np.ndarray) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-FALSE_ALARM_RATE = 0.05  # False-alarm rate: share of valid sets in which a pair is reported as suspect.
+FALSE_ALARM_RATE = 0.05  # False-alarm rate: share of valid point sets with a pair reported as suspect.
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,7 +272,7 @@ class PairResiduals:
     held_out
         Residual distances (n,) [m] in the registration by the other pairs.
     studentised
-        The latter (n,) divided by its standard deviation as predicted from the others' scatter. NaN for three pairs,
+        `held_out` (n,) divided by its standard deviation as predicted from the others' scatter. NaN for three pairs,
         from which scatter cannot be estimated.
     chance
         Probability that a set without outliers has a residual as large as the largest of these; NaN for three pairs.
@@ -285,7 +285,7 @@ class PairResiduals:
 
     @property
     def worst(self) -> int:
-        """Number, from 0, of the pair that fits the others worst."""
+        """Index of the pair that fits the other pairs worst."""
         return int(np.argmax(self.held_out if np.isnan(self.studentised).any() else self.studentised))
 
     @property

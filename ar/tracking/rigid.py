@@ -17,7 +17,7 @@ def compute_angles(rotations: np.ndarray) -> np.ndarray:
 
 
 def move_about(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Apply a shift [m] and a turn [rad], `step` (6,), about T `centre` (3,) [m], to a rigid motion T (4, 4)."""
+    """Apply `step` (6,), a shift [m] and a rotation [rad] about T `centre` (3,) [m], to a rigid motion T (4, 4)."""
     out = np.eye(4)
     out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
     out[:3, 3] = T[:3, :3] @ centre + T[:3, 3] + step[:3] - out[:3, :3] @ centre
@@ -38,7 +38,7 @@ def turn_vectors(rotations: np.ndarray) -> np.ndarray:
 
 
 def read_conventions(poses: np.ndarray) -> dict[str, np.ndarray]:
-    """Return poses (n, 4, 4), and their reinterpretations under other quaternion conventions, by the convention."""
+    """Return poses (n, 4, 4) by convention: as given, and reinterpreted under other quaternion conventions."""
     read = Rotation.from_matrix(poses[:, :3, :3])
     forms = {"": read, "as w, x, y, z": Rotation.from_quat(np.roll(read.as_quat(), -1, axis=1)), "inverted": read.inv()}
     found = {how: poses.copy() for how in forms}

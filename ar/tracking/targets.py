@@ -1,7 +1,7 @@
 """Printed targets: the tool's cube, the patient's reference, the calibration board; and their corners in an image.
 
-Every face is a ChArUco board of odd by odd squares, whose corners are those of a chessboard. OpenCV finds them to a
-tenth of a pixel. A marker's own corners have an error of a fifth, always inwards.
+Every face is a ChArUco board of odd by odd squares, whose corners are those of a chessboard. OpenCV's error is a
+tenth of a pixel for them, and a fifth for the markers' own corners, which are always detected too far inwards.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class Face:
     columns, rows
         Squares, both odd.
     square
-        Side of one [m].
+        Side of a square [m].
     first
         Number of its first marker in the dictionary; the others follow.
     T_target_face
@@ -56,7 +56,7 @@ class Face:
 
     @cached_property
     def board(self) -> cv2.aruco.CharucoBoard:
-        """Board of OpenCV, in metres."""
+        """ChArUco board as an object of OpenCV, in metres."""
         dictionary = cv2.aruco.getPredefinedDictionary(MARKER_DICTIONARY)
         return cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.square, MARKER_RATIO * self.square, dictionary, self.ids
@@ -96,7 +96,7 @@ class Target:
 
     @property
     def outline(self) -> np.ndarray:
-        """The corners of all faces in the target's frame (n, 3) [m]."""
+        """Corners of all faces in the target's frame (n, 3) [m]."""
         return np.concatenate([face.outline for face in self.faces])
 
 
@@ -161,7 +161,7 @@ class DetectedCorners:
     pixels
         Detected positions (n, 2).
     face
-        Number of the face (n,) of each.
+        Number of the face (n,) of each corner.
     """
 
     points: np.ndarray
@@ -202,7 +202,7 @@ class Detector:
     def detect(self, grey: np.ndarray, names: Sequence[str] = ()) -> dict[str, DetectedCorners]:
         """Detect corners in an image (H, W) uint8, by the target's name; targets without visible corners are left out.
 
-        Only targets of these `names` are detected; without any, all.
+        Only targets of these `names` are detected; without names, all.
         """
         corners, known = _detect_markers(self._thorough, self.targets, np.ascontiguousarray(grey))
         wanted = [target for target in self.targets if not names or target.name in names]

@@ -1,4 +1,4 @@
-"""Calibration of a tracker: the camera on it by hand and eye, and the tip of a tool by pivoting."""
+"""Calibration of a tracker: hand-eye calibration of its camera, and pivot calibration of a tool's tip."""
 
 from dataclasses import dataclass
 

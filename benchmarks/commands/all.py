@@ -1,4 +1,4 @@
-"""`python -m benchmarks all`: every figure of the performance pages in one go, their tables, and what got slower."""
+"""`python -m benchmarks all`: measure all figures of the performance pages, write tables, report what got slower."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = f"figures: {', '.join(NAMED)}"
     parser.add_argument(
         "--json", type=Path, metavar="OUT.json",
-        help=f"the record, written after every figure; an unfinished run goes on (default: {OUT})",
+        help=f"record, written after every figure; an unfinished run resumes (default: {OUT})",
     )  # fmt: skip
     parser.add_argument(
         "--only", nargs="+", choices=NAMED, default=list(NAMED), metavar="NAME",
-        help="these figures (default: all; their names stand below)",
+        help="figures to measure (default: all; see the names below)",
     )  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="small counts, no record: shows that all commands run")
+    parser.add_argument("--quick", action="store_true", help="small counts, no record: smoke test of all commands")
     parser.add_argument("--anatomy", type=Path, help="measure on this .vtu instead of the template where a bench can")
     parser.add_argument(
         "--from", dest="source", type=Path, metavar="NEW.json", help="measure nothing: take this record"
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, write tables, compare; 1 if a figure failed, missed what it was asked, or got worse."""
+    """Measure, write tables, compare; return 1 if a figure failed, missed its target, or got worse."""
     from ..figures.figure_tables import read_page, table, write_page
 
     if args.source and (args.json or args.quick or args.anatomy):
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         code = int(any(entry.state in ("failed", "missed") for entry in record.rows))
     for path in args.tables:
         print(f"{path}: {'written' if write_page(path, record) else 'unchanged'}")
-    if old and set(args.only) < set(NAMED):  # else its figures that are none any more are named
+    if old and set(args.only) < set(NAMED):  # for all figures, the comparison also lists removed ones
         old = _only(old, args.only)
     return max(code, _compared(old, record)) if old else code
 
@@ -88,7 +88,7 @@ def _only(record: Record, names: Sequence[str]) -> Record:
 
 
 def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Record:
-    """The record, with what it lacked of the figures that were asked for."""
+    """Measure the requested figures that the record lacks; return the completed record."""
     from sim.bodies.meshfile import read_anatomy
 
     from ..figures.figure_record import record_of, write_record
@@ -107,7 +107,7 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
             stop_if_asked()
             if line:
                 bar.write(line, file=sys.stderr)
-            elif sys.stderr.isatty():  # the clock goes on
+            elif sys.stderr.isatty():  # updates the elapsed time
                 bar.refresh()
 
         for name in args.only:
@@ -122,7 +122,7 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
 
 
 def _begun(out: Path, force: bool) -> tuple[Entry, ...]:
-    """Rows of the record to go on with; by `force` none of a file that is no record."""
+    """Read the rows of an unfinished record; with `force`, none if the file is not a record."""
     try:
         return read_record(out).rows if out.exists() else ()
     except InputError:
@@ -132,7 +132,7 @@ def _begun(out: Path, force: bool) -> tuple[Entry, ...]:
 
 
 def _compared(old: Record, new: Record) -> int:
-    """Print what changed, and return 1 if something got worse."""
+    """Print the changed numbers; return 1 if one got worse or is no longer measured."""
     from ..figures.figure_comparison import MARGIN, compared
 
     found = compared(old, new)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks contact`: the mesh's share of a contact force."""
+"""`python -m benchmarks contact`: error of a contact force due to the mesh."""
 
 import argparse
 import sys
@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if an answer is not good."""
+    """Measure, row by row; return 1 if a solution is not good."""
     from scenes.analysis.measurement import describe_machine
 
     from ..studies.contact_mesh import rows

@@ -1,4 +1,4 @@
-"""`python -m benchmarks elements`: how far each element is from the limit of fine meshes."""
+"""`python -m benchmarks elements`: error of each element relative to the limit of fine meshes."""
 
 import argparse
 import json
@@ -19,17 +19,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "anatomies", nargs="*", type=Path, metavar="ANATOMY.vtu", help="bodies (default: the template that ships)"
     )
     parser.add_argument(
-        "--coarse", action="store_true", help="leave out the same bodies with every edge halved, which take the longest"
+        "--coarse", action="store_true", help="skip the bodies with every edge halved, which take the longest"
     )
     parser.add_argument("--elements", nargs="+", default=list(ELEMENTS), choices=ELEMENTS, help="which (default: all)")
     parser.add_argument("--poisson", nargs="+", type=float, default=[0.30, 0.45, 0.49, 0.495], help="Poisson's ratios")
-    parser.add_argument("--force", type=float, default=0.1, help="of the press, on a 7 mm disc [N]")
+    parser.add_argument("--force", type=float, default=0.1, help="force on a 7 mm disc [N]")
     add_device(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if a solve did not converge."""
+    """Measure, row by row; return 1 if a solve did not converge."""
     from scenes.analysis.measurement import describe_machine
 
     from ..studies.elements import Press, limits, rows

@@ -1,4 +1,4 @@
-"""`python -m benchmarks fit`: what `sulcus fit` says of patients whose tissue is known."""
+"""`python -m benchmarks fit`: errors of `sulcus fit` on synthetic patients of known tissue."""
 
 import argparse
 import json
@@ -20,26 +20,26 @@ HEADS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_anatomy(parser)
-    parser.add_argument("--finer", type=Path, metavar="FINER.vtu", help="a finer mesh of the same brain, of the truths")
-    parser.add_argument("--nodes", type=int, default=8000, help="of the template's finer mesh")
-    parser.add_argument("--twins", type=int, default=20, help="patients")
-    parser.add_argument("--presses", type=int, default=2, help="frames with a tool")
-    parser.add_argument("--drained", type=int, default=4, help="frames with drained fluid")
-    parser.add_argument("--forces", type=int, default=4, help="patients of whom a force is read")
-    parser.add_argument("--points", type=int, default=100, help="that are seen in a frame")
-    parser.add_argument("--cover", type=int, default=80, help="share of the open cortex [%%]")
+    parser.add_argument("--finer", type=Path, metavar="FINER.vtu", help="finer mesh of the same brain, for the truth")
+    parser.add_argument("--nodes", type=int, default=8000, help="nodes of the template's finer mesh")
+    parser.add_argument("--twins", type=int, default=20, help="number of patients")
+    parser.add_argument("--presses", type=int, default=2, help="number of frames with a tool")
+    parser.add_argument("--drained", type=int, default=4, help="number of frames with drained fluid")
+    parser.add_argument("--forces", type=int, default=4, help="number of patients with a measured force")
+    parser.add_argument("--points", type=int, default=100, help="observed points in a frame")
+    parser.add_argument("--cover", type=int, default=80, help="observed share of the open cortex [%%]")
     parser.add_argument(
-        "--noise", nargs="+", type=int, default=[0, 1, 2], choices=(0, 1, 2), help="levels, as of `benchmarks locate`"
+        "--noise", nargs="+", type=int, default=[0, 1, 2], choices=(0, 1, 2), help="levels, as in `benchmarks locate`"
     )
     add_seed(parser, "the patients")
     add_device(parser)
     parser.add_argument("--locator", type=Path, metavar="FILE.npz", help="locator of the anatomy (default: a new one)")
-    parser.add_argument("--folder", type=Path, help="keeps what was made, so that a stopped run goes on")
+    parser.add_argument("--folder", type=Path, help="folder of results, from which a stopped run resumes")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure; 1 if of some patient no equilibrium was found."""
+    """Measure; return 1 if some patient has no equilibrium."""
     from scenes.script.shipped_files import get_template_path
     from sim.bodies.meshfile import read_anatomy
 
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _cells(row: dict[str, float | None]) -> list[str]:
-    """What stands in a line of the table."""
+    """Format the cells of a table row."""
 
     def said(name: str, digits: int = 0) -> str:
         value = row[name]

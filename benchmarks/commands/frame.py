@@ -1,4 +1,4 @@
-"""`python -m benchmarks frame`: where the time of a page's frame goes."""
+"""`python -m benchmarks frame`: time of each stage of a frame of the page."""
 
 import argparse
 import json
@@ -18,18 +18,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", nargs="?", default="press", help="a built-in scene")
     add_theatre(parser)
     add_plugin(parser)
-    parser.add_argument("--size", default="640x480", metavar="WxH", help="of the picture [pixel]")
-    parser.add_argument("--frames", type=int, default=120, help="frames that are timed")
+    parser.add_argument("--size", default="640x480", metavar="WxH", help="size of the image [pixel]")
+    parser.add_argument("--frames", type=int, default=120, help="number of timed frames")
     parser.add_argument(
         "--batch",
         type=int,
-        help="pictures that are drawn together, for pictures a second (default: 64 on CUDA, else 4)",
+        help="images rendered in one batch, to measure images per second (default: 64 on CUDA, else 4)",
     )
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play the scene to a page that nobody looks at."""
+    """Play the scene on a page without clients, and print the times."""
     from tqdm import tqdm
 
     from scenes.analysis.measurement import describe_machine
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     name = choose_deformer(args, theatre, scene)
     player = theatre.build_player(name, scene)
     where = f"{describe_machine(args.device)}; {scene.name} by {name}, {width} x {height}"
-    with redirect_stdout(sys.stderr):  # viser says there where it serves
+    with redirect_stdout(sys.stderr):  # viser prints its address there
         frames = frames_of(player, args.frames)
         found = table(list(tqdm(frames, "frames", args.frames, unit="frame", file=sys.stderr)))
     count = args.batch or (4 if player.stage.device == "cpu" else 64)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks growth`: what a load takes in seconds and memory as the mesh grows, as a table and a plot."""
+"""`python -m benchmarks growth`: time and memory of a load over mesh size, as a table and a plot."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ SIZES = (2000, 5300, 17_000, 50_000, 100_000, 200_000)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("--sizes", nargs="+", type=int, default=list(SIZES), metavar="N", help="nodes (default: six)")
-    parser.add_argument("--batch", nargs="+", type=int, default=[1, 8], metavar="B", help="loads together (1 8)")
+    parser.add_argument("--batch", nargs="+", type=int, default=[1, 8], metavar="B", help="batch sizes (default: 1 8)")
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element")
     add_device(parser)
     parser.add_argument(
         "--out", type=Path, default=Path("growth.png"), metavar="PLOT.png",
-        help="the plot; rows and meshes are kept beside it, and an unfinished run goes on",
+        help="plot; rows and meshes are stored next to it, and an unfinished run resumes",
     )  # fmt: skip
     add_force(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if a load did not converge."""
+    """Measure, row by row; return 1 if a load did not converge."""
     from ar.screen import write_png
     from scenes.analysis.loglog_chart import draw_panels
     from scenes.analysis.measurement import describe_machine, write_table
@@ -91,6 +91,6 @@ def _print(found: Sequence[Row], table) -> None:
         cells = (
             row.nodes, row.tets, row.preconditioner, f"{row.set_up:.3g}", row.batch, f"{row.load:.3g}",
             f"{row.outer:g}", f"{row.converged} of {row.loads}", f"{row.memory:.3g}",
-            *(f"{number:.3g}" if row.foreseen else "" for number in (row.card, row.foreseen)),  # none without a card
+            *(f"{number:.3g}" if row.foreseen else "" for number in (row.card, row.foreseen)),  # None without a GPU
         )  # fmt: skip
         print(f"| {' | '.join(map(str, cells))} |", file=table)

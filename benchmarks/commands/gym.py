@@ -1,4 +1,4 @@
-"""`python -m benchmarks gym`: how many steps a second the Gymnasium environments make."""
+"""`python -m benchmarks gym`: steps per second of the Gymnasium environments."""
 
 import argparse
 import sys
@@ -16,21 +16,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)} (default: all)")
     parser.add_argument("--envs", type=int, default=64, help="environments, stepped together")
-    parser.add_argument(
-        "--processes", action="store_true", help="every environment in a process of its own, by Gymnasium"
-    )
+    parser.add_argument("--processes", action="store_true", help="one process for each environment, by Gymnasium")
     parser.add_argument(
         "--observation",
         nargs="+",
         choices=OBSERVATIONS,
         default=list(OBSERVATIONS),
-        help="states, or pictures too (default: both)",
+        help="observation: states, or also images (default: both)",
     )
-    parser.add_argument("--size", default="160x120", metavar="WxH", help="of pictures")
-    parser.add_argument("--steps", type=int, default=40, help="of every environment in a repeat")
-    parser.add_argument("--repeats", type=int, default=5, help="of which the median counts")
+    parser.add_argument("--size", default="160x120", metavar="WxH", help="size of images [pixel]")
+    parser.add_argument("--steps", type=int, default=40, help="steps of each environment in a repeat")
+    parser.add_argument("--repeats", type=int, default=5, help="number of repeats; the median is reported")
     parser.add_argument("--anatomy", default="template", help="a .vtu file (default: the template that ships)")
-    parser.add_argument("--model", help="a file of trained models (default: the one beside the anatomy)")
+    parser.add_argument("--model", help="file of trained models (default: that next to the anatomy)")
     parser.add_argument("--physics", default="auto", help="auto, model or fem")
     add_device(parser)
     add_json(parser)

@@ -1,4 +1,4 @@
-"""`python -m benchmarks link`: how long an OpenIGTLink client waits for the answer to a pose."""
+"""`python -m benchmarks link`: latency from a pose to its result at an OpenIGTLink client."""
 
 import argparse
 import json
@@ -14,15 +14,15 @@ from .locate import bar
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--points", type=int, default=5000, help="of the surface that is sent")
-    parser.add_argument("--rate", type=float, default=30.0, help="poses a second")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each run")
-    parser.add_argument("--runs", type=int, default=5, help="how often it is repeated")
+    parser.add_argument("--points", type=int, default=5000, help="number of points of the sent surface")
+    parser.add_argument("--rate", type=float, default=30.0, help="poses per second")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of each run [s]")
+    parser.add_argument("--runs", type=int, default=5, help="number of runs")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure. Returns 0."""
+    """Measure the latency in several runs, and print the best and the median run; return 0."""
     from scenes.analysis.measurement import describe_machine
 
     from ..studies.link_latency import CLIENTS, measured

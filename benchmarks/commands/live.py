@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..studies.live import Tally
 
 CHECKED = 20
-"""Frames that are held against the converged solution, unless another number is given."""
+"""Default number of frames that are compared with the converged solution."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", type=int, default=1000, help="frames of each tool")
     parser.add_argument(
         "--checked", type=int,
-        help=f"frames held against the converged solution (default: {CHECKED}, or all where there are fewer)",
+        help=f"frames compared with the converged solution (default: {CHECKED}, or all where there are fewer)",
     )  # fmt: skip
     add_tissue_arguments(parser)
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element")
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play every tool; 1 if a frame did not converge, or was farther off than promised."""
+    """Play every tool; return 1 if a frame did not converge or its error exceeds the limit."""
     from scenes.analysis.budget import MAX_LIVE_ERROR
     from scenes.analysis.measurement import describe_machine
     from scenes.script.craniotomy_frame import build_craniotomy_frame

@@ -1,4 +1,4 @@
-"""`python -m benchmarks locate`: the share of a tumour's motion that `sulcus locate` and its rivals find."""
+"""`python -m benchmarks locate`: share of a tumour's motion that `sulcus locate` and baselines estimate."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HEADS = (
     "refused", "in doubt", "warned", "ms",
 )  # fmt: skip
 
-# Farther no registration slips unnoticed [mm].
+# Largest simulated slip of a registration [mm].
 MOST_SLIPPED = 50.0
 
 
@@ -38,37 +38,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_anatomy(parser)
     parser.add_argument(
         "--finer", type=Path, metavar="FINER.vtu",
-        help="a finer mesh of the same brain, of which the truths are (default: the template's, of --nodes)",
+        help="finer mesh of the same brain, for the ground truth (default: the template's, of --nodes)",
     )  # fmt: skip
-    parser.add_argument("--nodes", type=int, default=8000, help="of the template's finer mesh, without --finer")
+    parser.add_argument("--nodes", type=int, default=8000, help="nodes of the template's finer mesh, without --finer")
     parser.add_argument(
         "--element", choices=ELEMENTS, default=RECOMMENDED,
-        help="finite element of the truths (default: %(default)s); p2 takes minutes a twin on a CPU",
+        help="finite element of the ground truth (default: %(default)s); p2 takes minutes per case on a CPU",
     )  # fmt: skip
-    parser.add_argument("--twins", type=int, default=20, help="truths, a quarter by each cause")
-    parser.add_argument("--points", nargs="+", type=int, default=[100], help="points that are seen (default: 100)")
+    parser.add_argument("--twins", type=int, default=20, help="number of test cases, a quarter by each cause")
+    parser.add_argument("--points", nargs="+", type=int, default=[100], help="observed points (default: 100)")
     parser.add_argument(
-        "--cover",
-        nargs="+",
-        type=int,
-        default=[36],
-        help="share of the open cortex that they lie on [%%] (default: 36)",
+        "--cover", nargs="+", type=int, default=[36], help="observed share of the open cortex [%%] (default: 36)"
     )
     parser.add_argument(
         "--noise", nargs="+", type=int, default=[0, 1, 2], choices=(0, 1, 2),
-        help="levels (default: 0 1 2). 0: none. 1 and 2: white 0.3 mm, smooth 0.5 mm, and a rigid error of half a "
+        help="levels (default: 0 1 2). 0: none. 1, 2: independent 0.3, correlated 0.5 mm, and a rigid error of half a "
         "degree and 1 or 2 mm, whose size `sulcus locate` is given",
     )  # fmt: skip
     parser.add_argument(
-        "--clouds", action="store_true", help="points have no names: where the surface is; rivals need names, and rest"
+        "--clouds", action="store_true", help="observe point clouds, without correspondences; baselines are left out"
     )
     parser.add_argument(
         "--slip", type=float, default=0.0, metavar="MM",
-        help="all points are displaced so far along the open cortex, as by a registration that slipped (default: 0)",
+        help="registration slip: displacement of all points along the open cortex [mm] (default: 0)",
     )  # fmt: skip
     parser.add_argument(
         "--wrong-registration", action="store_true",
-        help="all points are displaced by 2 to 5 mm or rotated by 2 to 4 degrees, in a random direction",
+        help="wrong registration: displace all points by 2 to 5 mm or rotate by 2 to 4 degrees, at random",
     )  # fmt: skip
     parser.add_argument(
         "--locator", type=Path, metavar="FILE.npz", help="locator of the anatomy (default: a new one, kept in --folder)"
@@ -76,13 +72,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_seed(parser, "the twins and of what is seen")
     add_device(parser)
     parser.add_argument(
-        "--folder", type=Path, help="keeps meshes, twins and the locator, so that a stopped run goes on (default: none)"
+        "--folder", type=Path, help="folder of meshes, cases and locator, to resume a stopped run (default: none)"
     )
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if of some twin no equilibrium was found."""
+    """Measure, row by row; return 1 if some synthetic case has no equilibrium."""
     from scenes.analysis.measurement import describe_machine
     from scenes.script.shipped_files import get_template_path
     from sim.bodies.meshfile import read_anatomy
@@ -117,12 +113,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse, before anything is solved, what would be refused after.
+    """Check the arguments before anything is solved.
 
     Raises
     ------
     InputError
-        Counts, shares or a seed that cannot be; a brain of one's own without its finer mesh.
+        Counts, shares or a seed out of range; a user's brain without its finer mesh.
     """
     check_at_least("--twins", args.twins, 1)
     check_at_least("--seed", args.seed, 0)
@@ -139,13 +135,13 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def check_finer(args: argparse.Namespace) -> None:
-    """Raise InputError for a brain of one's own without its finer mesh."""
+    """Raise InputError for a user's brain without its finer mesh."""
     if args.anatomy is not None and args.finer is None:
         raise InputError("--anatomy needs --finer: a finer mesh of the same brain, by `sulcus anatomy --nodes`.")
 
 
 def finer_of(args: argparse.Namespace) -> Anatomy:
-    """The mesh that the truths are solved on."""
+    """Return the mesh on which the ground truths are solved."""
     from sim.bodies.meshfile import read_anatomy, write_anatomy
     from sim.bodies.subject import MeshPlan, make_anatomy
     from sim.bodies.template import Tumour, build_template_subject
@@ -162,7 +158,7 @@ def finer_of(args: argparse.Namespace) -> Anatomy:
 
 
 def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
-    """Read the locator that is given, or the one that the folder keeps, or make a new one."""
+    """Read the given locator, or the one in the folder, or build a new one."""
     from surrogate.locating.locator_store import load_locator, make_locator, save_locator
 
     path = args.locator or (args.folder and args.folder / f"{body.digest}.locator.npz")
@@ -180,7 +176,7 @@ def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
 
 @contextmanager
 def bar(name: str) -> Iterator[Callable[..., None]]:
-    """A progress bar on the error stream, and what sets it: how many are done, of how many, and of what."""
+    """Show a progress bar on the error stream; yield a function that sets its count, total and stage."""
     from tqdm import tqdm
 
     with tqdm(desc=name, file=sys.stderr) as bar:
@@ -193,7 +189,7 @@ def bar(name: str) -> Iterator[Callable[..., None]]:
 
 
 def _cells(row: Row) -> Iterable[str]:
-    """What stands in a line of the table."""
+    """Format the cells of a table row."""
     held = "" if row.held is None else f"{row.held:.0f} %"
     took = "" if row.milliseconds is None else f"{row.milliseconds:.3g}"
     return (

@@ -1,4 +1,4 @@
-"""`python -m benchmarks microscope`: error of a tumour that is located from pictures of two eyes."""
+"""`python -m benchmarks microscope`: error of a tumour position estimated from stereo images."""
 
 import argparse
 import json
@@ -18,17 +18,17 @@ HEADS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--scene", default="microscope", help="a scene that two eyes see, or MY_SCENE.py")
-    parser.add_argument("--seeds", type=int, default=5, help="how many, from 0")
-    parser.add_argument("--every", type=int, default=10, help="one frame in so many")
-    parser.add_argument("--cloud", action="store_true", help="give points without names, as a cloud of the cortex")
-    parser.add_argument("--plain", action="store_true", help="draw no vessels: the scan's grey alone")
+    parser.add_argument("--scene", default="microscope", help="scene with a stereo camera, or MY_SCENE.py")
+    parser.add_argument("--seeds", type=int, default=5, help="number of seeds, from 0")
+    parser.add_argument("--every", type=int, default=10, help="stride of the used frames")
+    parser.add_argument("--cloud", action="store_true", help="observe a point cloud, without correspondences")
+    parser.add_argument("--plain", action="store_true", help="render without vessels: the scan's grey values alone")
     add_theatre(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure."""
+    """Measure the errors for each seed, and print the table; return 0."""
     from scenes.script.observation_models import StereoObservation
 
     from ..studies.stereo_study import rows

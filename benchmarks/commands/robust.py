@@ -1,4 +1,4 @@
-"""`python -m benchmarks robust`: how many of thousands of random loads converge."""
+"""`python -m benchmarks robust`: share of thousands of random loads that converge."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_anatomy(parser)
-    parser.add_argument("--count", type=int, default=10_000, help="loads, half of them brutal")
+    parser.add_argument("--count", type=int, default=10_000, help="number of loads, half of them brutal")
     add_seed(parser)
     add_tissue_arguments(parser)
     parser.add_argument("--element", choices=ELEMENTS, default=RECOMMENDED, help="finite element")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together")
     add_device(parser)
-    parser.add_argument("--out", type=Path, metavar="LOADS.csv", help="a line for each load; an unfinished run goes on")
+    parser.add_argument("--out", type=Path, metavar="LOADS.csv", help="row for each load; an unfinished run resumes")
     add_force(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve them all; 1 if one did not converge."""
+    """Solve all loads; return 1 if one did not converge."""
     from scenes.analysis.measurement import describe_machine, write_table
     from sim.runtime.journal import open_journal
 

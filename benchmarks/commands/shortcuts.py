@@ -1,4 +1,4 @@
-"""`python -m benchmarks shortcuts`: what each shortcut of the solver is worth on work that users do."""
+"""`python -m benchmarks shortcuts`: speed-up by each acceleration of the solver on typical loads."""
 
 import argparse
 import json
@@ -15,13 +15,13 @@ from sim.bodies.meshfile import read_anatomy
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add_anatomy(parser)
-    parser.add_argument("--runs", type=int, default=20, help="loads or frames of each row")
+    parser.add_argument("--runs", type=int, default=20, help="number of loads or frames of each row")
     add_device(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row."""
+    """Measure each acceleration, and print the table row by row."""
     from scenes.analysis.measurement import describe_machine
     from scenes.script.craniotomy_frame import build_craniotomy_frame
     from sim.runtime.device import find_device

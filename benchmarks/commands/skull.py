@@ -1,4 +1,4 @@
-"""`python -m benchmarks skull`: how far the tumour moves under each skull, on meshes of several sizes."""
+"""`python -m benchmarks skull`: tumour motion with each skull model, on meshes of several sizes."""
 
 import argparse
 import json
@@ -20,10 +20,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "anatomies", nargs="*", type=Path, metavar="ANATOMY.vtu", help="bodies (default: the template of --nodes)"
     )
-    parser.add_argument("--nodes", nargs="+", type=int, default=[5300, 17_000, 40_000], help="of the template's meshes")
+    parser.add_argument("--nodes", nargs="+", type=int, default=[5300, 17_000, 40_000], help="nodes of the template")
     parser.add_argument(
         "--skulls", nargs="+", default=["bonded", "slide"], choices=(*SKULLS, "tearing", "pressing"),
-        help="what the skull does (default: bonded slide). tearing: the bond lets go where it bears too much. "
+        help="skull models (default: bonded slide). tearing: the bond fails above its strength. "
         "pressing: it bears nothing and has no gap",
     )  # fmt: skip
     parser.add_argument("--poisson", nargs="+", type=float, default=[0.45, 0.49], help="Poisson's ratios (0.45 0.49)")
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if a solve did not converge."""
+    """Measure, row by row; return 1 if a solve did not converge."""
     from scenes.analysis.measurement import describe_machine
 
     from ..studies.skull_models import rows

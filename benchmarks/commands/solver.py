@@ -1,4 +1,4 @@
-"""`python -m benchmarks solver`: the first load and a further one on a mesh, beside other finite-element packages."""
+"""`python -m benchmarks solver`: time of the first and of a further load, compared with other FEM packages."""
 
 from __future__ import annotations
 
@@ -38,30 +38,30 @@ COLUMNS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument(
-        "--peers", nargs="*", choices=NAMES, help="these too, or all of them (most want the extra `peers`)"
+        "--peers", nargs="*", choices=NAMES, help="other packages to compare, or all (most need the extra `peers`)"
     )
     parser.add_argument(
         "--tolerance",
         nargs="+",
         type=float,
         default=[1e-6],
-        help="relative residuals that are asked for, each in a run of its own (default: 1e-6)",
+        help="required relative residuals, each in a separate run (default: 1e-6)",
     )
     parser.add_argument(
-        "--device", choices=("cpu", "cuda"), default="cpu", help="of ours and of tled; others have the CPU"
+        "--device", choices=("cpu", "cuda"), default="cpu", help="device of sulcus and of tled; others use the CPU"
     )
     parser.add_argument(
         "--mesh", nargs="+", type=Path, metavar="MESH.vtu", help="made by `sulcus anatomy` (default: the template)"
     )
-    parser.add_argument("--loads", type=int, default=20, help="palpation loads, each from rest")
+    parser.add_argument("--loads", type=int, default=20, help="palpation loads, each undeformed at first")
     add_seed(parser)
-    parser.add_argument("--starts", type=int, default=3, help="first answers of each engine")
-    parser.add_argument("--threads", type=int, default=2, help="of every engine")
+    parser.add_argument("--starts", type=int, default=3, help="number of first results of each package")
+    parser.add_argument("--threads", type=int, default=2, help="threads of each package")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare; 1 if one of our answers is off."""
+    """Compare; return 1 if a solution of sulcus is not within the tolerance."""
     from scenes.analysis.measurement import describe_machine
     from sim.runtime.device import find_device
 

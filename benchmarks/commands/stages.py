@@ -1,4 +1,4 @@
-"""`python -m benchmarks stages`: what each stage costs, as a table."""
+"""`python -m benchmarks stages`: time of each stage, as a table."""
 
 import argparse
 import json
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row."""
+    """Measure the stages of a scene, and print them row by row."""
     from scenes.analysis.measurement import describe_machine
     from scenes.play.deformers import plan_of
     from scenes.script.scene import SCENES, find_scene

@@ -1,4 +1,4 @@
-"""`python -m benchmarks throughput`: how many loads a second the finite elements solve."""
+"""`python -m benchmarks throughput`: loads per second that FEM solves."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..studies.throughput import Drawn, Row, Together
 
 YOUNG = 3000.0
-# Loads together on the CPU, where more gain nothing; and loads a row there, and on CUDA.
+# Batch size on the CPU, where larger ones gain nothing; number of loads of a row on the CPU, and on CUDA.
 CPU_BATCH, CPU_COUNT, CUDA_COUNT = 64, 64, 4096
 NAMES = (
     "law", "nu", "element", "nodes", "set", "loads", "converged", "steps: median", "p99", "solves/s", "us a load",
@@ -44,12 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=PRESETS,
         metavar="SET",
-        help="of loads (default: all, of --poses the round tools)",
+        help="presets of loads (default: all; with --poses the round tools)",
     )
-    parser.add_argument("--poses", action="store_true", help="poses of the ball that stands for each tool, not forces")
+    parser.add_argument("--poses", action="store_true", help="poses of each tool's ball, instead of forces")
     parser.add_argument(
         "--laws", nargs="+", choices=LAWS, default=["stable-neo-hookean", "neo-hookean"], metavar="LAW",
-        help=f"with E = {YOUNG:g} Pa (default: stable-neo-hookean neo-hookean)",
+        help=f"laws with E = {YOUNG:g} Pa (default: stable-neo-hookean neo-hookean)",
     )  # fmt: skip
     parser.add_argument(
         "--poisson", nargs="+", type=float, default=[0.45, 0.49], metavar="NU", help="Poisson's ratios (0.45 0.49)"
@@ -59,13 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--count", type=int, help=f"loads a row and device (default: {CUDA_COUNT} on CUDA, {CPU_COUNT} on the CPU)"
     )
     parser.add_argument("--batch", type=int, help=f"loads solved together (default: all; {CPU_BATCH} on the CPU)")
-    parser.add_argument("--repeats", type=int, default=3, help="of each row; the median counts")
+    parser.add_argument("--repeats", type=int, default=3, help="repeats of each row; the median is reported")
     add_devices(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, row by row; 1 if a load did not converge."""
+    """Measure, row by row; return 1 if a load did not converge."""
     from scenes.analysis.measurement import describe_machine
     from sim.effects import ToolContact
     from sim.runtime.device import parse_device_names

@@ -1,4 +1,4 @@
-"""`python -m benchmarks track`: error of a tool's tip that a camera sees by its printed cube."""
+"""`python -m benchmarks track`: error of a tool's tip that a camera tracks by its printed cube."""
 
 import argparse
 import json
@@ -17,13 +17,13 @@ HEADS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument("--pictures", type=int, default=60, help="of each protocol")
+    parser.add_argument("--pictures", type=int, default=60, help="number of images of each protocol")
     add_seed(parser, "poses and noise")
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure; 1 if a wrong pose was called certain."""
+    """Measure; return 1 if a wrong pose was reported as certain."""
     from ..studies.track_study import studied
 
     check_at_least("--pictures", args.pictures, 2)

@@ -1,1 +1,1 @@
-"""Figures of the performance pages: their benches, records, tables and comparison."""
+"""Figures of the performance pages: their measurements, records, tables and comparison."""

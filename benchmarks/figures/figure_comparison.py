@@ -1,4 +1,4 @@
-"""Two records of figures side by side: what got worse."""
+"""Comparison of two records of figures: numbers that got worse."""
 
 import math
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ from .figure_record import Entry, Record, Value
 from .figure_tables import three_digits
 
 MARGIN = 1.1
-"""What is worse by more than this factor is named."""
+"""Factor above which a number counts as worse."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """A number that both records have."""
+    """Change of a number that both records contain."""
 
     name: str
     old: Value
@@ -22,20 +22,20 @@ class Change:
 
     @property
     def ratio(self) -> float:
-        """New over old."""
+        """Ratio of the new number to the old one."""
         if self.old.value == self.new.value:
             return 1.0
         return self.new.value / self.old.value if self.old.value else math.inf
 
     @property
     def worse(self) -> bool:
-        """Whether it is worse by more than the margin."""
+        """True if the new number is worse by more than the margin."""
         grown, shrunk = self.ratio > MARGIN, self.ratio < 1.0 / MARGIN
         return {"smaller": grown, "larger": shrunk, "same": grown or shrunk}[self.new.better]
 
     @property
     def line(self) -> str:
-        """Its line of the table."""
+        """Row of the Markdown table."""
         numbers = " | ".join(three_digits(one.value) for one in (self.old, self.new))
         ratio = f"**{self.ratio:.2f}**" if self.worse else f"{self.ratio:.2f}"
         return f"| {self.name} | {numbers} | {self.new.unit} | {ratio} |"
@@ -43,7 +43,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Changes, figures that were measured and no longer are, and sentences on what differs besides."""
+    """Changed numbers, figures that are no longer measured, and notes on other differences."""
 
     changes: tuple[Change, ...]
     lost: tuple[str, ...]
@@ -51,17 +51,17 @@ class Comparison:
 
     @property
     def worse(self) -> tuple[Change, ...]:
-        """The changes for the worse."""
+        """Changes for the worse, beyond the margin."""
         return tuple(change for change in self.changes if change.worse)
 
 
 def compared(old: Record, new: Record) -> Comparison:
-    """Compare the figures that both have, measured by the same command on the same anatomy.
+    """Compare the figures of both records that one command measured on one anatomy.
 
     Raises
     ------
     InputError
-        Records without such a figure.
+        Records without a common figure.
     """
     before = {entry.name: entry for entry in old.rows if entry.values}
     both = [(before[entry.name], entry) for entry in new.rows if entry.name in before]
@@ -84,7 +84,7 @@ def _alike(old: Entry, new: Entry) -> bool:
 
 
 def _lost(old: Entry, new: Entry) -> str:
-    """Why a figure, or a number of it, is no longer there; empty if all are."""
+    """Return the reason why a figure or one of its numbers is missing in the new record; empty if none is."""
     if new.state == "failed" or (new.state == "missed" and old.state == "measured"):
         return new.reason
     here = {value.name for value in new.values}

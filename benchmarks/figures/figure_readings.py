@@ -1,4 +1,4 @@
-"""Where the numbers of a figure stand in the JSON of each bench, and which way they are better."""
+"""Places of a figure's numbers in the JSON output of each measurement, and the better direction of each."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,17 +8,17 @@ from typing import Any, Literal
 from sim.arguments import MAX_MAGNITUDE
 
 Place = tuple[str | int | Mapping[str, str | float], ...]
-"""The way to a number in the JSON of a bench.
+"""Path to a number in the JSON output of a measurement.
 
 A text or a whole number is a key or an index. A mapping picks from a list the one item whose fields are these.
 """
 Better = Literal["smaller", "larger", "same"]
-"""Which way a number is better; "same": it should not change at all."""
+"""Better direction of a number; "same": it should not change."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One number of a figure: what it is called, its unit, which way it is better, and where it stands."""
+    """Number of a figure: its name, unit, better direction, and place in the JSON output."""
 
     name: str
     unit: str
@@ -27,7 +27,7 @@ class Reading:
 
 
 def number_at(said: Any, place: Place) -> float | None:
-    """The number at a place in what a bench said; None if none, several or no number from 0 up stands there."""
+    """Return the number >= 0 at a place in JSON output; None if there is none, or several."""
     try:
         for step in place:
             if isinstance(step, Mapping):
@@ -41,7 +41,7 @@ def number_at(said: Any, place: Place) -> float | None:
 
 
 def _fits(value: object, wanted: str | float) -> bool:
-    """Whether a field is what is wanted; a name may have its version behind it."""
+    """Return True if a field has the wanted value; a name may be followed by a version."""
     return value == wanted or (isinstance(value, str) and value.startswith(f"{wanted} "))
 
 
@@ -58,12 +58,12 @@ def _same(name: str, unit: str, *place: str | int | Mapping[str, str | float]) -
 
 
 def rates(*presets: str) -> tuple[Reading, ...]:
-    """Loads a second of `bench throughput`."""
+    """List loads per second of `benchmarks throughput`."""
     return tuple(_larger(name, "loads/s", "rows", {"preset": name}, "rate") for name in presets)
 
 
 def steps(*presets: str) -> tuple[Reading, ...]:
-    """The solver's steps in `bench throughput`."""
+    """List the solver's steps of `benchmarks throughput`."""
     return tuple(
         _smaller(f"{name}, {kind}", "steps", "rows", {"preset": name}, f"steps_{kind}")
         for name in presets
@@ -72,21 +72,21 @@ def steps(*presets: str) -> tuple[Reading, ...]:
 
 
 TOGETHER = (_larger("the tools together", "loads/s", "tools", 0, "rate"), _smaller("set-up", "s", "tools", 0, "set_up"))
-"""All tools of `bench throughput` on its first tissue."""
+"""Numbers of all tools of `benchmarks throughput` on its first tissue."""
 
 LIVE = tuple(
     _smaller(f"{ride}: {name}", unit, "rides", {"ride": ride}, field)
     for ride in ("palpation", "spatula")
     for name, unit, field in (("median", "ms", "median"), ("p99", "ms", "p99"), ("off", "mm", "error"))
 )
-"""Of `bench live`."""
+"""Numbers of `benchmarks live`."""
 
 STAGES = tuple(
     _smaller(f"{name}: {kind}", "ms", "rows", {"name": row}, kind)
     for name, row in (("a load from rest", "FEM, a single load"), ("a frame from the last", "FEM, live"))
     for kind in ("median", "p95")
 )
-"""Of `bench stages`."""
+"""Numbers of `benchmarks stages`."""
 
 PICTURE = (
     *(
@@ -96,11 +96,11 @@ PICTURE = (
     _smaller("frame, p95", "ms", "rows", {"stage": "frame"}, "p95"),
     _larger("together", "pictures/s", "pictures_per_second"),
 )
-"""Of `bench frame`."""
+"""Numbers of `benchmarks frame`."""
 
 
 def shortcuts(*pairs: tuple[str, str]) -> tuple[Reading, ...]:
-    """The medians of `bench shortcuts` with each shortcut at its work, and without."""
+    """List the medians of `benchmarks shortcuts` with and without each acceleration."""
     return tuple(
         _smaller(f"{shortcut}, {work}: {kind}", "ms", "rows", {"shortcut": shortcut, "work": work}, field)
         for shortcut, work in pairs
@@ -109,7 +109,7 @@ def shortcuts(*pairs: tuple[str, str]) -> tuple[Reading, ...]:
 
 
 def growth(*batches: str) -> tuple[Reading, ...]:
-    """One size of `bench growth`, with batches of so many loads; 1 is among them."""
+    """List one mesh size of `benchmarks growth`, with batches of these numbers of loads, 1 included."""
     return (
         _smaller("set-up", "s", "rows", {"asked": 1}, "set_up"),
         *(_smaller(f"a load of {count}", "s", "rows", {"asked": int(count)}, "load") for count in batches),
@@ -118,7 +118,7 @@ def growth(*batches: str) -> tuple[Reading, ...]:
 
 
 def beside(tolerances: Sequence[str], peers: Sequence[str]) -> tuple[Reading, ...]:
-    """Our seconds in `bench solver`, and how often as long each peer takes."""
+    """List the seconds of sulcus in `benchmarks solver`, and each peer's ratio to them."""
     loads = (("first load", "first", "first_ratio"), ("a further one", "further", "ratio"))
     found = []
     for tolerance in tolerances:
@@ -133,7 +133,7 @@ def beside(tolerances: Sequence[str], peers: Sequence[str]) -> tuple[Reading, ..
 
 
 def robust(*presets: str) -> tuple[Reading, ...]:
-    """Of `bench robust`."""
+    """List numbers of `benchmarks robust`."""
     found = []
     for name in presets:
         found.append(_larger(f"{name}: converged", "loads", "sets", {"preset": name}, "converged"))
@@ -145,7 +145,7 @@ def robust(*presets: str) -> tuple[Reading, ...]:
 
 
 def skulls(*names: str) -> tuple[Reading, ...]:
-    """Of `bench skull` with one mesh and one Poisson's ratio."""
+    """List numbers of `benchmarks skull` with one mesh and one Poisson's ratio."""
     found = []
     for name in names:
         found.append(_same(f"{name}: tumour moves", "mm", "rows", {"skull": name}, "motion"))
@@ -154,7 +154,7 @@ def skulls(*names: str) -> tuple[Reading, ...]:
 
 
 def elements(names: Sequence[str], poissons: Sequence[float]) -> tuple[Reading, ...]:
-    """Of `bench elements --coarse` with one mesh."""
+    """List numbers of `benchmarks elements --coarse` with one mesh."""
     found = []
     for name in names:
         for nu in poissons:
@@ -165,4 +165,4 @@ def elements(names: Sequence[str], poissons: Sequence[float]) -> tuple[Reading, 
 
 
 LIMIT = (_same("limit of fine meshes, nu 0.495", "mm", "limit_mm", "0.495"),)
-"""Of `bench elements --poisson 0.495`."""
+"""Numbers of `benchmarks elements --poisson 0.495`."""

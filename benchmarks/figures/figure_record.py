@@ -1,4 +1,4 @@
-"""Files of figures: what `python -m benchmarks all` writes after every figure, and reads again."""
+"""Record files of figures, which `python -m benchmarks all` writes after every figure and resumes from."""
 
 import json
 import shlex
@@ -17,13 +17,13 @@ from .figures import PROGRAM
 
 FORMAT = "sulcus bench figures 1"
 FORMER = "sulcus bench "
-"""Beginning of the commands in older records."""
+"""Start of the commands in older records."""
 KIND = "a record of `python -m benchmarks all`"
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a figure comes from: version and digest of the code, machine, digest of the anatomy, date."""
+    """Origin of a figure: version and digest of the code, machine, digest of the anatomy, date."""
 
     version: str
     machine: str
@@ -33,7 +33,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class Value:
-    """A number that was measured."""
+    """Measured number of a figure."""
 
     name: str
     value: float
@@ -43,18 +43,18 @@ class Value:
 
 @dataclass(frozen=True)
 class Entry:
-    """A figure as it was measured.
+    """Measured figure, or the reason why it has no numbers.
 
     Parameters
     ----------
     state
-        "measured"; "missed": numbers, but not all, or its command did not reach what it was asked; "failed"; "skipped".
+        "measured"; "missed": some numbers are missing, or the command missed a target; "failed"; "skipped".
     values
-        The numbers; none if it failed, or was skipped.
+        Numbers; none if the figure failed or was skipped.
     reason
-        A sentence that says why it was not measured, or what it missed.
+        Reason why the figure was not measured, or its missed target, in a sentence.
     seconds
-        That its command took.
+        Duration of the command [s].
     """
 
     name: str
@@ -68,7 +68,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Record:
-    """What a file holds; version, machine and date are the last run's, and each row has its own."""
+    """Content of a record file; version, machine and date are the last run's, and each row has its own."""
 
     format: Literal["sulcus bench figures 1"]
     version: str
@@ -78,17 +78,17 @@ class Record:
 
 
 def record_of(origin: Origin, entries: Sequence[Entry]) -> Record:
-    """The record of a run at `origin`."""
+    """Build the record of a run at `origin`."""
     return Record(FORMAT, origin.version, origin.machine, origin.date, tuple(entries))
 
 
 def read_record(path: Path) -> Record:
-    """Read a file.
+    """Read a record file.
 
     Raises
     ------
     InputError
-        A file that is not there, is damaged or is of another kind.
+        A file that is missing, damaged or of another kind.
     """
     with read_as(path, KIND, "Choose another file, or measure anew by `python -m benchmarks all --json FILE.json`."):
         record = msgspec.json.decode(path.read_bytes(), type=Record)
@@ -97,6 +97,6 @@ def read_record(path: Path) -> Record:
 
 
 def write_record(path: Path, record: Record) -> None:
-    """Write a file, whole or not at all."""
+    """Write a record file atomically."""
     with write_atomically(path, ".json") as partial:
         partial.write_text(json.dumps(asdict(record), indent=1, allow_nan=False) + "\n")

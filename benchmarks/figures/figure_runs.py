@@ -1,4 +1,4 @@
-"""Figures measured one by one, each by its own process, and its numbers taken out of what that process says."""
+"""Measurement of figures, each by a process whose JSON output contains the numbers."""
 
 import json
 import signal
@@ -24,11 +24,11 @@ from .figures import Figure, command_of, words_of
 
 BENCH = (sys.executable, "-m", "benchmarks")
 LONGEST = 400
-"""Characters of a reason."""
+"""Maximum length of a reason [characters]."""
 
 
 def version_here() -> str:
-    """The version of sulcus with a digest of its code, which changes while the version stays."""
+    """Return the version of sulcus with a digest of its code, which may change within a version."""
     paths = sorted(
         path for room in ("ar", "benchmarks", "scenes", "sim", "surrogate") for path in (HOUSE / room).rglob("*.py")
     )
@@ -38,20 +38,20 @@ def version_here() -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """What a run of figures is of.
+    """Settings of a run of figures.
 
     Parameters
     ----------
     version
-        As `version_here` gives it.
+        Version of the code from `version_here`.
     digest
-        Of the anatomy.
+        Digest of the anatomy.
     anatomy
-        Its file; None: each bench takes the template.
+        File of the anatomy; None: each measurement uses the template.
     quick
-        Whether counts are small.
+        True for small counts.
     bench
-        What is run, before a figure's words.
+        Command line before a figure's own arguments.
     """
 
     version: str
@@ -61,21 +61,21 @@ class Run:
     bench: Sequence[str] = BENCH
 
     def origin(self, device: str) -> Origin:
-        """Where a figure of a device comes from today.
+        """Return the origin of a figure that a device measures today.
 
         Raises
         ------
         InputError
-            A device that is not here.
+            A device that this machine does not have.
         """
         where, _, today = describe_machine(device).rpartition("; ")
         return Origin(self.version, where, self.digest, today)
 
 
 def entry_of(figure: Figure, run: Run, before: Entry | None, heard: Callable[[str], object]) -> Entry:
-    """The entry of a figure: the one from before if it has these numbers or none can be had here, or a new one.
+    """Return the earlier entry of a figure if it has these numbers or none can be measured here, else a new one.
 
-    `heard` is as `run_to_end` has it.
+    `heard` is as in `run_to_end`.
     """
     command = command_of(figure, run.quick)
     try:
@@ -94,12 +94,12 @@ def _not_installed(figure: Figure) -> str:
 
 
 def _same(before: Entry, now: Entry) -> bool:
-    """Whether both are by one command and one origin, whatever the date."""
+    """Return True if both entries have the same command and origin, dates aside."""
     return before.command == now.command and replace(before.origin, date=now.origin.date) == now.origin
 
 
 def _measured(figure: Figure, run: Run, entry: Entry, heard: Callable[[str], object]) -> Entry:
-    """The entry with what a process of its own measured; what went wrong there is its reason."""
+    """Measure a figure in a separate process; return the entry with its numbers, or the reason of a failure."""
     words = words_of(figure, run.quick, None if run.anatomy is None else str(run.anatomy.absolute()))
     with TemporaryDirectory() as folder:
         ended = run_to_end((*run.bench, *words, "--json"), Path(folder), heard)
@@ -109,7 +109,7 @@ def _measured(figure: Figure, run: Run, entry: Entry, heard: Callable[[str], obj
 
 
 def _values(figure: Figure, ended: Ended) -> tuple[tuple[Value, ...], str]:
-    """The numbers that a process gave, and what is wrong with them or with its end."""
+    """Return the numbers in a process's output, and the reason if some are missing or it failed; else empty."""
     lines = ended.output.strip().splitlines()
     try:
         said = json.loads(lines[-1])
@@ -126,7 +126,7 @@ def _values(figure: Figure, ended: Ended) -> tuple[tuple[Value, ...], str]:
 
 
 def _why(ended: Ended, has_numbers: bool) -> str:
-    """Why a process did not end well, without control characters."""
+    """Return the reason of a process's failure, without control characters."""
     if ended.code < 0:
         name = signal.strsignal(-ended.code) or f"signal {-ended.code}"
         return f"its process was ended ({name})" + (", as where memory runs out" if name == "Killed" else "")

@@ -1,4 +1,4 @@
-"""Figures as Markdown tables, printed or written between two marks of a page."""
+"""Markdown tables of figures, printed or written between two marks of a page."""
 
 import re
 from collections.abc import Sequence
@@ -19,12 +19,12 @@ NOT_HERE = "not measured here"
 
 
 def three_digits(value: float) -> str:
-    """A number in three digits; from 100 up, whole with its thousands apart."""
+    """Format a number with three digits; from 100 on, as a whole number with separated thousands."""
     return f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"
 
 
 def table(entries: Sequence[Entry]) -> str:
-    """One line for each figure: its numbers, or why it has none. Below, where and when they were measured."""
+    """Format a row for each figure, its numbers or a reason; below the table, machines and dates."""
     lines = [_line(it.name, _numbers(it) or f"{it.state}: {it.reason}", it.command) for it in entries]
     return _with_origins(lines, [it for it in entries if it.values])
 
@@ -49,12 +49,12 @@ def _numbers(entry: Entry) -> str:
 
 
 def read_page(path: Path) -> str:
-    """The text of a page that has marks.
+    """Read the text of a page that has marks.
 
     Raises
     ------
     InputError
-        A page without marks, with a mark that has no end, or of figures that are none.
+        A page without marks, with a mark that has no end, or with unknown figures.
     """
     with read_as(path, "a page in Markdown", "Give a page of the documentation, such as docs/notes/figures.md."):
         text = path.read_bytes().decode()
@@ -70,12 +70,12 @@ def read_page(path: Path) -> str:
 
 
 def write_page(path: Path, record: Record) -> bool:
-    """Write the tables of a page again, and return True if that changes the page.
+    """Update the tables of a page; return True if the page changed.
 
     Raises
     ------
     InputError
-        As `read_page`; a page that cannot be written.
+        See `read_page`; a page that cannot be written.
     """
     before = read_page(path)
     after = MARKED.sub(lambda block: f"{block[1]}\n{_marked(block[2].split(), record)}\n\n{block[4]}", before)
@@ -86,7 +86,7 @@ def write_page(path: Path, record: Record) -> bool:
 
 
 def _marked(names: Sequence[str], record: Record) -> str:
-    """The table of some figures, whether they were measured or not."""
+    """Format the table of some figures, measured or not."""
     known = {entry.name: entry for entry in record.rows if entry.values}
     there = {name: known[name] for name in names if name in known}
     lines = [

@@ -1,4 +1,4 @@
-"""The figures of the performance pages: by which bench, on which device, and which of its numbers they are."""
+"""Figures of the performance pages: the measurement, the device and the numbers of each."""
 
 import shlex
 from dataclasses import dataclass
@@ -27,22 +27,22 @@ PROGRAM = ("python", "-m", "benchmarks")
 
 @dataclass(frozen=True)
 class Figure:
-    """A bench and the numbers that the pages take from it.
+    """Measurement and the numbers that the pages quote from it.
 
     Parameters
     ----------
     command
-        The words after `python -m benchmarks`, without the device.
+        Arguments after `python -m benchmarks`, without the device.
     device
-        The device that it needs.
+        Required device.
     readings
-        The numbers.
+        Numbers of the figure.
     quick
-        Words that make it small, for a smoke test; they stand behind the others, and the last word counts.
+        Further arguments for a smoke test with small counts; a repeated option overrides the earlier one.
     body
-        The option by which the bench takes an anatomy; empty: it takes one without option; None: it takes none.
+        Option for an anatomy; empty: the anatomy is a positional argument; None: not supported.
     modules
-        Of Python, which it needs besides.
+        Further required Python modules.
     """
 
     name: str
@@ -180,17 +180,17 @@ FIGURES = (
     ),
     Figure("elements-limit-cpu", "elements --poisson 0.495", "cpu", LIMIT, body=""),
 )
-"""Every figure of docs/notes/figures.md and docs/notes/solver_speed.md that a bench gives."""
+"""Figures of docs/notes/figures.md and docs/notes/solver_speed.md, by measurement."""
 NAMED = {figure.name: figure for figure in FIGURES}
 
 
 def words_of(figure: Figure, quick: bool = False, anatomy: str | None = None) -> tuple[str, ...]:
-    """The words after `PROGRAM`; the anatomy stands behind the first, where no option's list takes it in."""
+    """Return the arguments after `PROGRAM`; the anatomy follows the first, where no list option can absorb it."""
     first, *rest = figure.command.split()
     body = () if anatomy is None or figure.body is None else (*filter(None, [figure.body]), anatomy)
     return (first, *body, *rest, *(figure.quick.split() if quick else ()), "--device", figure.device)
 
 
 def command_of(figure: Figure, quick: bool = False) -> str:
-    """The command by which a reader measures a figure."""
+    """Return the command line with which a reader can measure a figure."""
     return shlex.join((*PROGRAM, *words_of(figure, quick)))

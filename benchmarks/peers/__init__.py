@@ -1,1 +1,1 @@
-"""Other finite-element packages on the same loads, each in a process of its own."""
+"""Other FEM packages on the same loads, each in a separate process."""

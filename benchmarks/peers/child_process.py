@@ -1,4 +1,4 @@
-"""Processes of their own: a crash, or memory that runs out, ends only them."""
+"""Child processes: a crash or lack of memory ends the child alone."""
 
 import os
 import re
@@ -13,12 +13,12 @@ from typing import Any
 
 HOUSE = Path(__file__).parents[2]
 POLL = 0.5
-"""How often what a process says is looked at [s]."""
+"""Interval at which a process's output is read [s]."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A process that ended: its exit code, its output, the last line of its complaints, and its seconds."""
+    """Ended process: exit code, output, last line of its standard error, and duration [s]."""
 
     code: int
     output: str
@@ -27,31 +27,31 @@ class Ended:
 
 
 def package_environment(more: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment of a process that imports this very package, with `more` variables."""
+    """Build the environment of a process that imports this copy of the package, with `more` variables."""
     paths = [str(HOUSE), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {**os.environ, **(more or {}), "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def start_program(command: Sequence[str], variables: Mapping[str, str], **streams: Any) -> subprocess.Popen[str]:
-    """Start a program in a session of its own, so that `stop_program` ends what it has started, too."""
+    """Start a program in a separate session, so that `stop_program` also ends its children."""
     environment = package_environment(variables)
     return subprocess.Popen(command, env=environment, start_new_session=True, text=True, **streams)
 
 
 def stop_program(child: subprocess.Popen[str]) -> None:
-    """End a program and all of its session."""
+    """End a program and all processes of its session."""
     with suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
     child.communicate()
 
 
 def run_to_end(command: Sequence[str], folder: Path, heard: Callable[[str], object]) -> Ended:
-    """Run a command in a folder to its end, and end then what it has started.
+    """Run a command in a folder to its end, then end its children.
 
     Parameters
     ----------
     heard
-        Is given each line that the command writes to its standard error; an empty one says only that it still runs.
+        Receives each line that the command writes to its standard error; an empty line: the command still runs.
     """
     begun, complaint, left = time.perf_counter(), "", ""
     output, complaints = folder / "output.txt", folder / "complaints.txt"

@@ -1,6 +1,6 @@
-"""sulcus beside other finite-element packages: one mesh, the same loads from rest, every answer judged by one routine.
+"""Comparison with other FEM packages: one mesh, the same loads from rest, one routine for all residuals.
 
-Every engine has a process of its own and they take turns, load by load: whatever else the machine does hits all.
+Every engine has a separate process. Engines alternate load by load, so that other work of the machine slows all.
 """
 
 from __future__ import annotations
@@ -33,37 +33,37 @@ from .engine_sulcus import fem_of
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 TOLERANCE = 1e-6
 FINEST, LEAST = 1e-11, 1e-10
-"""Of the reference, and the least that may be asked of an engine."""
+"""Tolerance of the reference, and smallest tolerance of an engine."""
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 @dataclass(frozen=True)
 class Engine:
-    """A package, what of it is used, the modules that it needs, and the words after `python` that start it."""
+    """Engine: package, its part in use, required modules, and the arguments of `python` that start it."""
 
     name: str
     setting: str
     modules: tuple[str, ...]
     words: tuple[str, ...]
     cards: bool = False
-    """Whether it also runs on CUDA."""
+    """True if the engine also runs on CUDA."""
 
     def on(self, device: str) -> Engine:
-        """The same on "cpu" or "cuda", if it can."""
+        """Return the engine on "cpu" or "cuda", if it supports the device."""
         if device == "cpu" or not self.cards:
             return self
         return replace(self, setting=f"{self.setting}; CUDA", words=(*self.words, device))
 
     @property
     def missing(self) -> str:
-        """Why it cannot be started here; empty if it can."""
+        """Reason why the engine cannot be started here; empty if it can."""
         if any(find_spec(module) is None for module in self.modules):
             return f"not installed. {install_hint('peers')}"
         return ""
 
     @property
     def label(self) -> str:
-        """Its name and version."""
+        """Name and version of the engine."""
         try:
             return f"{self.name} {version(self.name)}"
         except PackageNotFoundError:
@@ -89,9 +89,9 @@ PEERS = (
 
 @dataclass(frozen=True)
 class Answer:
-    """One load: seconds, residual by our routine (inf: none), largest distance from the reference [mm], why it failed.
+    """Result of one load: seconds, residual (inf: none), maximum error [mm], and the reason if it failed.
 
-    It is good if the residual is at most `tolerance`.
+    The residual is that of `Fem.residual`, the error that relative to the reference.
     """
 
     seconds: float
@@ -102,15 +102,15 @@ class Answer:
 
     @property
     def good(self) -> bool:
-        """Whether it counts."""
+        """True if the residual is at most `tolerance`."""
         return self.residual <= self.tolerance
 
 
 @dataclass(frozen=True)
 class Row:
-    """One engine on one mesh to one tolerance: seconds of each first answer and each load's answer; or why none.
+    """Results of one engine on one mesh to one tolerance: times of first results [s] and the result of each load.
 
-    `first_ratio` and `ratio` are its seconds over ours, the latter the median over the further loads that both solved.
+    `first_ratio` and `ratio` are times relative to sulcus; `ratio` is the median over further loads that both solved.
     """
 
     engine: str
@@ -124,17 +124,17 @@ class Row:
 
     @property
     def first(self) -> float:
-        """Median seconds from a mesh to its first answer; NaN if none was measured or none came to the tolerance."""
+        """Median time [s] from a mesh to the first result; NaN if none was measured or none reached the tolerance."""
         return float(np.median(self.firsts)) if self.firsts and self.answers[0].good else np.nan
 
     @property
     def further(self) -> float:
-        """Median seconds of a further load, of those that came to the tolerance."""
+        """Median time [s] of the further loads that reached the tolerance."""
         seconds = [answer.seconds for answer in self.answers[1:] if answer.good]
         return float(np.median(seconds)) if seconds else np.nan
 
     def beside(self, ours: Row) -> Row:
-        """The same with the ratios."""
+        """Return this row with its ratios to another row."""
         pairs = zip(self.answers[1:], ours.answers[1:], strict=False)
         ratios = [mine.seconds / own.seconds for mine, own in pairs if mine.good and own.good]
         return replace(self, first_ratio=self.first / ours.first, ratio=float(np.median(ratios)) if ratios else np.nan)
@@ -142,21 +142,21 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """What judges every engine: our residual in double precision and our answers (L, V, 3) [m] to `FINEST`."""
+    """Reference of all engines: residual of sulcus in double precision, and its solutions (L, V, 3) [m] to `FINEST`."""
 
     fem: Fem
     fields: np.ndarray
 
 
 def build_judge(case: Case) -> Judge:
-    """The judge of a case, whatever its tolerance; a load that it cannot solve so well has NaN for an answer."""
+    """Build the reference of a case, for any tolerance; loads that it cannot solve to `FINEST` have NaN."""
     fem = fem_of(replace(case, tolerance=FINEST))
     found = fem.deform(Loads((Nodal(case.force),)))
     return Judge(fem, np.where((found.residual <= FINEST)[:, None, None], found.displacement, np.nan))
 
 
 def case_of(anatomy: Anatomy, loads: int, seed: int) -> Case:
-    """A case that all engines can express: sliding nodes are held, pushes are forces at nodes.
+    """Build a case that all engines support: sliding nodes are fixed, pushes are nodal forces.
 
     Raises
     ------
@@ -174,10 +174,10 @@ def case_of(anatomy: Anatomy, loads: int, seed: int) -> Case:
 def compare(
     case: Case, judge: Judge, engines: Sequence[Engine], starts: int, threads: int, done: Callable[[], object]
 ) -> list[Row]:
-    """A row for each engine, ours first; `done` is called after every answer.
+    """Measure a row for each engine, sulcus first; `done` is called after every result.
 
     Every engine is started once to warm up, so that it compiles its code and reads its files. It is then started
-    `starts` times, which may be none, for the first answer. The last process goes on with the further loads.
+    `starts` times (>= 0) for the first result. The last process also solves the further loads.
     """
     rows = [Row(engine.label, engine.setting, case.tolerance, missing=engine.missing) for engine in engines]
     here = [number for number, row in enumerate(rows) if not row.missing]
@@ -213,13 +213,13 @@ def compare(
 
 
 def _fields(folder: Path, case: Case) -> np.ndarray:
-    """The displacements (L, V, 3) [m] that an engine left; NaN where it left none."""
+    """Read the displacements (L, V, 3) [m] that an engine wrote; NaN for missing ones."""
     paths = [answer_path(folder, load) for load in range(len(case.force))]
     return np.stack([np.load(path) if path.exists() else np.full(case.nodes.shape, np.nan) for path in paths])
 
 
 def _judged(judge: Judge, case: Case, fields: np.ndarray, said: Sequence[tuple[float, str]]) -> tuple[Answer, ...]:
-    """Every answer with its residual by `Fem.residual` and its distance from the reference."""
+    """Build the result of every load, with its residual by `Fem.residual` and its error."""
     there = np.isfinite(fields).all(axis=(1, 2))
     residual, apart = np.full(len(fields), np.inf), np.full(len(fields), np.nan)
     if there.any():
@@ -232,7 +232,7 @@ def _judged(judge: Judge, case: Case, fields: np.ndarray, said: Sequence[tuple[f
 
 
 class _Process:
-    """An engine at work."""
+    """Running process of an engine."""
 
     def __init__(self, engine: Engine, folder: Path, threads: int):
         self._complaints = folder / "complaints.txt"
@@ -249,7 +249,7 @@ class _Process:
         self._ready = self._hear.readline().strip() == READY
 
     def solve(self, load: int) -> tuple[float, str]:
-        """Seconds, and why it failed, or an empty string."""
+        """Solve a load; return its time [s], and the reason of a failure or an empty string."""
         answer = ""
         if self._ready:
             try:
@@ -264,5 +264,5 @@ class _Process:
         return read["seconds"], read["reason"]
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         stop_program(self._child)

@@ -1,6 +1,6 @@
-"""An engine in a process of its own: it reads a case, then solves the loads that it is asked for, one at a time.
+"""Process of an engine: it reads a case, then solves the requested loads one at a time.
 
-Between the processes pass files and lines alone, so that an engine of another licence stays in its own.
+Processes exchange files and lines only, so that code under another licence is loaded in its own process alone.
 """
 
 import json
@@ -16,12 +16,12 @@ import numpy as np
 
 READY = "ready"
 Solve = Callable[[np.ndarray], np.ndarray]
-"""Nodal forces (V, 3) [N] to displacements (V, 3) [m], from rest."""
+"""Function from nodal forces (V, 3) [N] to displacements (V, 3) [m], from the undeformed state."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A body of linear tetrahedra of one log neo-Hookean tissue, and the loads on it.
+    """Body of linear tetrahedra of one log neo-Hookean tissue, and its loads.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Case:
     held
         (V,) bool: nodes that do not move.
     young, poisson, mu, lam
-        The tissue's constants [Pa], as engineers and as Lamé give them.
+        Constants of the tissue: Young's modulus [Pa], Poisson's ratio, and Lamé's parameters [Pa].
     force
         (L, V, 3) [N]: nodal forces of L loads.
     tolerance
@@ -49,20 +49,20 @@ class Case:
 
 
 def write_case(folder: Path, case: Case) -> None:
-    """Leave a case where `serve` finds it."""
+    """Write a case to the folder from which `serve` reads it."""
     np.savez(folder / "case.npz", **asdict(case))
 
 
 def answer_path(folder: Path, number: int) -> Path:
-    """Where an engine leaves its displacements (V, 3) [m] under a load."""
+    """Return the path of an engine's displacements (V, 3) [m] under a load."""
     return folder / f"answer{number}.npy"
 
 
 def serve(set_up: Callable[[Case], Solve]) -> None:
-    """Solve the loads whose numbers come in, a line each; the command line ends with the folder and how many threads.
+    """Solve the loads whose numbers are read, one a line; the last arguments are the folder and the number of threads.
 
-    Says `READY` when everything is imported and read, then for each load a line of JSON: its seconds, and the reason if
-    it failed. The seconds of the first include `set_up`. What an engine prints goes to standard error.
+    Prints `READY` after imports and reading, then for each load a line of JSON: its seconds, and the reason if
+    it failed. The seconds of the first include `set_up`. Other output of an engine is sent to standard error.
     """
     folder, threads = Path(sys.argv[-2]), int(sys.argv[-1])
     if hasattr(os, "sched_setaffinity"):
@@ -81,7 +81,7 @@ def serve(set_up: Callable[[Case], Solve]) -> None:
         try:
             solve = solve or set_up(case)
             displacement = solve(case.force[number])
-        except Exception as error:  # every engine has errors of its own, and the other loads are still to be tried
+        except Exception as error:  # engines raise any exceptions, and the other loads are still to be solved
             displacement, reason = None, f"{type(error).__name__}: {error}"
         seconds = time.perf_counter() - begun
         if displacement is not None:

@@ -1,4 +1,4 @@
-"""sulcus as an engine in a process of its own, beside its peers."""
+"""Engine of sulcus, in a separate process as its peers."""
 
 import sys
 from functools import partial
@@ -17,18 +17,18 @@ from .engine_process import Case, Solve, serve
 
 
 def fem_of(case: Case, device: str = "cpu") -> Fem:
-    """The finite elements of a case, in double precision."""
+    """Build the FEM solver of a case, in double precision."""
     mesh = TetMesh(case.nodes, case.tets, np.zeros(len(case.tets), int))
     held = np.repeat(case.held[:, None], 3, axis=1)
     anatomy = Anatomy(mesh, held, np.zeros_like(mesh.nodes), ~case.held)
     tissue = Material("neo-hookean", case.young, case.poisson)
     effects: tuple[Effect, ...] = (Elasticity(tissue), Held(), NodalForce())
-    # As the peers have it: the judge of all residuals must be of their discretisation.
+    # The discretisation of the peers, so that residuals can be compared.
     return Fem(anatomy, effects, Accuracy(case.tolerance), device, element="p1")
 
 
 def set_up(case: Case, device: str = "cpu") -> Solve:
-    """Kernels and the factor, kept for all loads."""
+    """Prepare kernels and the factor for all loads."""
     fem = fem_of(case, device)
     return lambda force: fem.deform(Loads((Nodal(force[None]),))).displacement[0]
 

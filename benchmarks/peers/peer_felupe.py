@@ -1,4 +1,4 @@
-"""FElupe (GPL; it is imported in this process alone): Newton, assembled by threads, PARDISO for symmetric matrices."""
+"""FElupe (GPL, imported in this process only): Newton, threaded assembly, PARDISO for symmetric matrices."""
 
 import felupe
 import numpy as np
@@ -8,7 +8,7 @@ from benchmarks.peers.engine_process import Case, Solve, serve
 
 
 def set_up(case: Case) -> Solve:
-    """A solid body and a point load on every node, kept for all loads."""
+    """Build a solid body with a point load on every node, for all loads."""
     mesh = felupe.Mesh(case.nodes, case.tets, "tetra")
     field = felupe.FieldContainer([felupe.Field(felupe.RegionTetra(mesh), dim=3)])
     body = felupe.SolidBody(felupe.NeoHookeCompressible(case.mu, case.lam, parallel=True), field)

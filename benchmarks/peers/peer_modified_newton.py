@@ -1,6 +1,6 @@
-"""Modified Newton: PARDISO keeps its factor of the rest stiffness for all loads; NumPy does the rest.
+"""Modified Newton: PARDISO factorises the undeformed stiffness once for all loads; all else is NumPy.
 
-Where steps on the kept factor promise to be more than a new factor is worth, a second one takes the stiffness at hand.
+If the expected number of steps with this factor costs more than a new one, the present stiffness is factorised too.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from benchmarks.peers.engine_process import Case, Solve, serve
 
 STEPS, TRIALS = 500, 8
 SLOPE_LEFT = 0.5
-# A new factor and its stiffness cost as much as so many steps on a kept one (5,312 nodes, two cores).
+# Cost of a new factor with its stiffness, in steps with a stored factor (5,312 nodes, two cores).
 WORTH = 20
 
 
@@ -21,7 +21,7 @@ class Body:
     def __init__(self, case: Case):
         self.case = case
         edges = np.swapaxes(case.nodes[case.tets[:, 1:]] - case.nodes[case.tets[:, :1]], 1, 2)
-        inner = np.linalg.inv(edges)  # (T, 3, 3): of nodes 1 to 3, by rows
+        inner = np.linalg.inv(edges)  # (T, 3, 3): shape gradients of nodes 1 to 3, as rows
         shape = np.concatenate([-inner.sum(axis=1, keepdims=True), inner], axis=1)
         self.volume = np.linalg.det(edges) / 6.0
         count = len(case.tets)
@@ -37,7 +37,7 @@ class Body:
         self.narrow = sp.csr_array(self.gradient[:, self.free])
 
     def at(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """F (T, 3, 3), F^-T and ln J, which is not finite outside the law."""
+        """Compute F (T, 3, 3), F^-T and ln J, which is not finite where the law is undefined."""
         F = (self.gradient @ u).reshape(-1, 3, 3) + np.eye(3)
         cofactor = np.stack([np.cross(F[:, (i + 1) % 3], F[:, (i + 2) % 3]) for i in range(3)], axis=1)
         J = np.einsum("tj,tj->t", F[:, 0], cofactor[:, 0])
@@ -45,13 +45,13 @@ class Body:
             return F, cofactor / J[:, None, None], np.log(J)
 
     def forces(self, u: np.ndarray) -> np.ndarray:
-        """Internal forces [N], not finite where the law is not."""
+        """Compute internal forces [N], not finite where the law is undefined."""
         F, inverse, log_J = self.at(u)
         stress = self.case.mu * F + (self.case.lam * log_J - self.case.mu)[:, None, None] * inverse
         return self.spread @ (self.volume[:, None, None] * stress).ravel()
 
     def stiffness(self, u: np.ndarray) -> sp.csr_array:
-        """Tangent [N/m] among free components."""
+        """Assemble the tangent stiffness [N/m] of the free components."""
         _, inverse, log_J = self.at(u)
         shear = self.case.mu - self.case.lam * log_J
         moduli = np.einsum("tij,tkl->tijkl", self.case.lam * inverse, inverse)
@@ -64,7 +64,7 @@ class Body:
 
 
 def _steps_left(kept: list[float], tolerance: float) -> float:
-    """How many steps to the tolerance at the mean rate of the last two; zero before there are two."""
+    """Estimate the number of steps to the tolerance at the mean rate of the last two; 0 before two steps."""
     if len(kept) < 3:
         return 0.0
     rate = np.sqrt(kept[-1] / kept[-3])
@@ -72,7 +72,7 @@ def _steps_left(kept: list[float], tolerance: float) -> float:
 
 
 def set_up(case: Case) -> Solve:
-    """The factor at rest, kept for all loads, and room for one of a deformed body."""
+    """Factorise the undeformed stiffness for all loads, and allocate a factor of a deformed body."""
     body, at_rest, later = Body(case), Factor(), Factor()
     at_rest.renew(body.stiffness(np.zeros(3 * len(case.nodes))))
     free = body.free
@@ -81,7 +81,7 @@ def set_up(case: Case) -> Solve:
         load = force.ravel()
 
         def state(u: np.ndarray) -> tuple[np.ndarray, float]:
-            """Free residual [N], and relative, inf where the law is not."""
+            """Compute the free residual [N], and the relative one: inf where the law is undefined."""
             inner = body.forces(u)
             residual = inner - load
             reaction = residual.copy()
@@ -109,7 +109,7 @@ def set_up(case: Case) -> Solve:
                 along = residual @ step
                 if abs(along) <= SLOPE_LEFT * abs(start):
                     break
-                # Where the force along the step would vanish if it were linear; half of it outside the law.
+                # Zero of the force along the step if that were linear; half of the step where the law is undefined.
                 share *= float(np.clip(start / (start - along), 0.2, 3.0)) if np.isfinite(left) else 0.5
             u = trial
             kept.append(left)

@@ -1,4 +1,4 @@
-"""scikit-fem: its basis once for all loads, forms on one point and in threads, PARDISO for symmetric matrices."""
+"""scikit-fem: one basis for all loads, one-point forms in threads, PARDISO for symmetric matrices."""
 
 import numpy as np
 from skfem import Basis, BilinearForm, ElementTetP1, ElementVector, LinearForm, MeshTet, condense
@@ -12,7 +12,7 @@ STEPS, HALVINGS = 30, 10
 
 
 def set_up(case: Case) -> Solve:
-    """The basis, and the forms that are assembled on it; Newton itself is left to the user there."""
+    """Build the basis, the forms on it, and Newton's method, which scikit-fem leaves to the user."""
     mesh = MeshTet(np.ascontiguousarray(case.nodes.T), np.ascontiguousarray(case.tets.T))
     basis = Basis(mesh, ElementVector(ElementTetP1()), intorder=1)
     free = np.flatnonzero(~np.repeat(case.held, 3))
@@ -29,7 +29,7 @@ def set_up(case: Case) -> Solve:
         return shape + case.lam * trace(du) * trace(dv)
 
     def state(u: np.ndarray, load: np.ndarray) -> tuple[np.ndarray, float, dict[str, np.ndarray]]:
-        """Residual [N], its free part relative (inf where the law is), and what the tangent takes."""
+        """Compute the residual [N], its relative free part (inf where the law is), and the tangent's arguments."""
         F = identity + basis.interpolate(u).grad
         J = det(F)
         if not (J > 0.0).all():

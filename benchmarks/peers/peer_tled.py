@@ -18,9 +18,9 @@ wp.config.enable_backward = False
 wp.config.log_level = wp.LOG_ERROR
 
 STEPS, EVERY = 10_000, 25
-# The critical step is that of tetrahedra at rest; squeezed ones are stiffer, then it is halved.
+# The critical step is that of undeformed tetrahedra; compressed ones are stiffer, then the step is halved.
 SAFETY, SHORTENINGS = 0.9, 4
-# Lowest eigenvalue at the start, where the highest is 1; the motion soon shows a better one.
+# Initial estimate of the lowest eigenvalue, relative to the highest; the motion soon gives a better one.
 LOWEST = 1e-3
 
 
@@ -35,10 +35,10 @@ def pull(
     # outputs
     out: wp.array2d(dtype=wp.vec3d),
 ):
-    """Forces [N] of a tetrahedron on its nodes: f_a = -V P grad N_a, P = mu F + (lam ln J - mu) F^-T."""
+    """Compute forces [N] of a tetrahedron on its nodes: f_a = -V P grad N_a, P = mu F + (lam ln J - mu) F^-T."""
     t = wp.tid()
     nodes = tets[t]
-    G = gradients[t]  # row a: the gradient of node a + 1; that of node 0 is minus their sum
+    G = gradients[t]  # row a: gradient of node a + 1; the gradient of node 0 is minus the sum of the rows
     origin = u[nodes[0]]
     F = wp.identity(n=3, dtype=wp.float64)
     for a in range(3):
@@ -68,7 +68,7 @@ def move(
     before: wp.array(dtype=wp.vec3d),
     inner: wp.array(dtype=wp.vec3d),
 ):
-    """Step of a node: u+ = u + beta (u - u-) + alpha M^-1 (f - P(u))."""
+    """Move a node by one step: u+ = u + beta (u - u-) + alpha M^-1 (f - P(u))."""
     v = wp.tid()
     force = wp.vec3d()
     for i in range(starts[v], starts[v + 1]):
@@ -92,7 +92,7 @@ def measure(
     last_force: wp.array(dtype=wp.vec3d),
     sums: wp.array(dtype=wp.float64),
 ):
-    """Squares of free residual r, reaction and internal force; for the motion q since the last call -q.dr and qMq."""
+    """Sum squares of free residual r, reaction, internal force; -q.dr and qMq of the motion q since the last call."""
     v = wp.tid()
     force = load[v] - inner[v]
     wp.atomic_add(sums, 2, wp.dot(inner[v], inner[v]))
@@ -108,11 +108,11 @@ def measure(
 
 
 def set_up(case: Case, device: str = "cpu") -> Solve:
-    """Rest gradients, masses and the tetrahedra around each node, kept for all loads."""
+    """Compute undeformed gradients, masses and the tetrahedra around each node, for all loads."""
     count, size = len(case.tets), len(case.nodes)
     edges = np.swapaxes(case.nodes[case.tets[:, 1:]] - case.nodes[case.tets[:, :1]], 1, 2)
     gradients, volume = np.linalg.inv(edges), np.linalg.det(edges) / 6.0
-    # No eigenvalue of an element's stiffness is above (lam + 2 mu) V sum |grad N|^2: by this mass none is above 1.
+    # No eigenvalue of an element's stiffness is above (lam + 2 mu) V sum |grad N|^2: with this mass all are <= 1.
     square = (gradients**2).sum(axis=(1, 2)) + (gradients.sum(axis=1) ** 2).sum(axis=1)
     mass = np.bincount(case.tets.ravel(), np.repeat((case.lam + 2.0 * case.mu) * volume * square, 4), size)
     starts = np.concatenate([[0], np.cumsum(np.bincount(case.tets.ravel(), minlength=size))])
@@ -134,7 +134,7 @@ def set_up(case: Case, device: str = "cpu") -> Solve:
     measuring = command(measure, size, [before, inner, load, *fixed], [*last, sums])
 
     def steps() -> None:
-        """Several steps and the sums at the place before the last of them."""
+        """Run several steps, and compute the sums at the state before the last step."""
         for _ in range(EVERY):
             pulling.launch()
             moving.launch()
@@ -144,7 +144,7 @@ def set_up(case: Case, device: str = "cpu") -> Solve:
     go = _captured(steps, device)
 
     def relax(force: np.ndarray, step: float) -> tuple[float, int]:
-        """Relative residual at the end, not finite where the law is not, and how many steps it took."""
+        """Iterate to equilibrium; return relative residual (not finite where the law is) and number of steps."""
         for place in (u, before):
             place.zero_()
         load.assign(force)
@@ -157,7 +157,7 @@ def set_up(case: Case, device: str = "cpu") -> Solve:
             left = float(np.sqrt(residual / max(reaction, inside, outer)))
             if not np.isfinite(left) or left <= case.tolerance:
                 return left, done
-            # Rayleigh's quotient of what moves last; the first has no place to be measured from.
+            # Rayleigh quotient of the last motion; the first motion has no earlier state.
             if done > EVERY and 0.0 < change < motion:
                 lowest = change / motion
         return left, STEPS
@@ -177,10 +177,10 @@ def set_up(case: Case, device: str = "cpu") -> Solve:
 
 
 def _captured(steps: Callable[[], None], device: str) -> Callable[[], None]:
-    """The same as one CUDA graph; on the CPU as it is."""
+    """Capture the steps as one CUDA graph; on the CPU, return them unchanged."""
     if device == "cpu":
         return steps
-    steps()  # kernels are loaded before, at rest and without a load
+    steps()  # load kernels before the capture, undeformed and without a load
     with wp.ScopedCapture(device=device) as capture:
         steps()
     return lambda: wp.capture_launch(capture.graph)

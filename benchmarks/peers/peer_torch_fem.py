@@ -1,4 +1,4 @@
-"""torch-fem: Newton on increments that are cut back where it fails, a direct solver (PARDISO where it is installed)."""
+"""torch-fem: Newton with load increments that are shortened on failure, and a direct solver (PARDISO if installed)."""
 
 import numpy as np
 import torch
@@ -9,14 +9,14 @@ from benchmarks.peers.engine_process import Case, Solve, serve
 
 
 def psi(F: torch.Tensor, lame: torch.Tensor) -> torch.Tensor:
-    """Energy density [Pa] of the log neo-Hookean law, as torch-fem's own benchmark writes it."""
+    """Compute the energy density [Pa] of the log neo-Hookean law, as in torch-fem's own benchmark."""
     C = F.transpose(-1, -2) @ F
     log_J = 0.5 * torch.logdet(C)
     return lame[0] / 2 * (torch.trace(C) - 3.0) - lame[0] * log_J + lame[1] / 2 * log_J**2
 
 
 def set_up(case: Case) -> Solve:
-    """A solid with its assembly maps, kept for all loads."""
+    """Build a solid with its assembly maps, for all loads."""
     torch.set_default_dtype(torch.float64)
     law = Hyperelastic3D(psi, [case.mu, case.lam])
     body = Solid(torch.tensor(case.nodes), torch.tensor(case.tets, dtype=torch.int64), law)
@@ -25,7 +25,7 @@ def set_up(case: Case) -> Solve:
     @torch.no_grad()
     def solve(force: np.ndarray) -> np.ndarray:
         body.forces = torch.tensor(force)
-        # Against the load, which is at most our scale. `rtol` is of a substep's own start, which may be far off.
+        # Relative to the load, which is at most our scale; `rtol` is relative to a substep's start, perhaps far away.
         enough = case.tolerance * float(np.linalg.norm(force))
         return body.solve(rtol=0.0, atol=enough, method="direct")[0].numpy()
 

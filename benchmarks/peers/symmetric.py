@@ -1,4 +1,4 @@
-"""PARDISO for symmetric matrices, as FElupe's how-to gives it; matrices of one pattern share its analysis."""
+"""PARDISO for symmetric matrices, after FElupe's how-to; matrices of one pattern share the symbolic analysis."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -8,19 +8,19 @@ ANALYSE, FACTORISE, SOLVE = 11, 22, 33
 
 
 class Factor:
-    """The factor of a symmetric matrix of which only the upper triangle is read, in memory of its own."""
+    """Factor of a symmetric matrix, of which only the upper triangle is read, in separate memory."""
 
     def __init__(self):
         self._pardiso = PyPardisoSolver(mtype=-2)
         self._upper = sp.csr_matrix((0, 0))
 
     def _call(self, phase: int, right: np.ndarray) -> np.ndarray:
-        # `PyPardisoSolver.solve` would compare the matrix with the factorised one, which costs more than to solve.
+        # `PyPardisoSolver.solve` would compare the matrix with the factorised one, which takes longer than the solve.
         self._pardiso.set_phase(phase)
         return self._pardiso._call_pardiso(self._upper, right)
 
     def renew(self, matrix: sp.spmatrix) -> None:
-        """Factorise (n, n); the analysis stays where the pattern is the last one's."""
+        """Factorise a matrix (n, n); the symbolic analysis is reused if the pattern is that of the last one."""
         before, self._upper = self._upper, sp.csr_matrix(sp.triu(matrix, format="csr"))
         self._upper.sort_indices()
         nothing = np.zeros(self._upper.shape[0])
@@ -30,7 +30,7 @@ class Factor:
         self._call(FACTORISE, nothing)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """The solution (n,) for a right-hand side (n,)."""
+        """Solve for a right-hand side (n,): (n,)."""
         return self._call(SOLVE, right)
 
 
@@ -38,6 +38,6 @@ KEPT = Factor()
 
 
 def solve(matrix: sp.spmatrix, right: np.ndarray) -> np.ndarray:
-    """The solution (n,) of a symmetric system, by one factor for all."""
+    """Solve a symmetric system (n, n) for (n,), with one factor object for all calls."""
     KEPT.renew(matrix)
     return KEPT.solve(np.ascontiguousarray(right, float).ravel())

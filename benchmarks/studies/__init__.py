@@ -1,1 +1,1 @@
-"""Measurements, and what they print as rows."""
+"""Measurements, and the rows that they print."""

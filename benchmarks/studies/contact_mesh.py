@@ -1,4 +1,4 @@
-"""The mesh's share of a contact force: a ball is moved over one cell, and over the same cell cut into smaller ones."""
+"""Error of a contact force due to the mesh: a ball moves over one cell, and over the same cell refined."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -18,26 +18,26 @@ from surrogate.data.tool_loads import build_axes_about
 
 from .elements import above_tumour
 
-# Places of the ball along one long edge of the surface, as shares of its length.
+# Positions of the ball along one long edge of the surface, as shares of the edge's length.
 PLACES = np.linspace(0.0, 1.0, 5)
 
 
 @dataclass(frozen=True)
 class Row:
-    """Forces on a ball [N] over the places; NaN where the answer is not good.
+    """Forces on a ball [N] at its positions; NaN where the solution is not good.
 
     Parameters
     ----------
     element, depth
-        Finite element, and how deep the ball stands in the surface at rest [m].
+        Finite element, and depth of the ball in the undeformed surface [m].
     along
-        (places,) component along the surface's normal.
+        (places,) force component along the surface's normal.
     sideways
-        (places,) length of the rest.
+        (places,) norm of the tangential component.
     fine
-        (places,) the component along the normal on the mesh whose cells at the opening are halved.
+        (places,) normal component on the mesh with halved cells at the opening.
     seconds, fine_seconds
-        Duration of all places together on each mesh.
+        Duration of all positions together on each mesh.
     """
 
     element: str
@@ -50,19 +50,19 @@ class Row:
 
     @property
     def share(self) -> float:
-        """Mean excess of the force over that on the finer mesh, as a share of the latter."""
+        """Mean excess of the force over that on the finer mesh, as a share of the finer mesh's force."""
         return float(np.mean(self.along / self.fine - 1.0))
 
     @property
     def scatter(self) -> float:
-        """Range of the force over the places, as a share of its mean."""
+        """Range of the force over the positions, as a share of the mean force."""
         return float(np.ptp(self.along) / self.along.mean())
 
 
 def rows(
     anatomy: Anatomy, elements: Sequence[str], depths: Sequence[float], radius: float, tissue: Tissue, device: str
 ) -> Iterator[Row]:
-    """One row for each element and depth [m] of a ball of a radius [m].
+    """Yield a row for each element and depth [m] of a ball of a radius [m].
 
     Raises
     ------
@@ -89,7 +89,7 @@ def rows(
 
 
 def _line(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
-    """The outward normal (3,) over the tumour, and places (p, 3) [m] along the open triangle's longest edge there."""
+    """Return the outward normal (3,) over the tumour, and positions (p, 3) [m] along the longest edge there."""
     point, _ = above_tumour(anatomy)
     corners = anatomy.mesh.nodes[anatomy.open_surface]
     a, b, c = corners[np.linalg.norm(corners.mean(axis=1) - point, axis=1).argmin()]

@@ -1,4 +1,4 @@
-"""What each element is worth: the tumour's motion under one press, on meshes from coarse to fine."""
+"""Accuracy of each element: the tumour's motion under one press, on meshes from coarse to fine."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from sim.fem import Fem
 from sim.loads import Loads, push
 from sim.material import Material
 
-# Fine enough that what is left is the mesh's error, and within reach of float64 at any Poisson's ratio.
+# Small compared with the mesh's error, and attainable in float64 at any Poisson's ratio.
 ACCURACY = Accuracy(tolerance=1e-5)
 
 
@@ -31,7 +31,7 @@ class Press:
 
 @dataclass(frozen=True)
 class Row:
-    """The tumour's mean motion [mm] on one mesh; seconds of set-up and of the solve, and whether it converged."""
+    """Mean motion of the tumour [mm] on one mesh; time of set-up and of the solve [s]; True if converged."""
 
     poisson: float
     element: str
@@ -47,7 +47,7 @@ class Row:
 def rows(
     anatomies: Sequence[Anatomy], elements: Sequence[str], poissons: Sequence[float], press: Press, device: str
 ) -> Iterator[Row]:
-    """One row for each Poisson's ratio, element and anatomy.
+    """Yield a row for each Poisson's ratio, element and anatomy.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def rows(
 
 
 def limits(found: Sequence[Row]) -> dict[float, float]:
-    """The tumour's motion [mm] on an infinitely fine mesh, for each Poisson's ratio.
+    """Extrapolate the tumour's motion [mm] to an infinitely fine mesh, for each Poisson's ratio.
 
     Richardson's extrapolation of the quadratic element on the two finest meshes. Its error is taken as second order in
     h = vertices^(-1/3): at the rim of the opening the solution is not smooth enough for more.
@@ -81,14 +81,14 @@ def limits(found: Sequence[Row]) -> dict[float, float]:
 
 
 def _loads(anatomy: Anatomy, press: Press) -> Loads:
-    """A push towards the tumour's centre at the nearest point of the open cortex."""
+    """Build a push towards the tumour's centre at the nearest point of the open cortex."""
     point, centre = above_tumour(anatomy)
     inward = (centre - point) / np.linalg.norm(centre - point)
     return push(point, press.force * inward, press.footprint)
 
 
 def above_tumour(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
-    """Point (3,) [m] of the open cortex that is nearest to the tumour's centre, and that centre.
+    """Return the point (3,) [m] of the open cortex nearest to the tumour's centre, and the centre (3,) [m].
 
     Raises
     ------
@@ -118,7 +118,7 @@ def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, devi
 
 
 def tumour_motion(anatomy: Anatomy, displacement: np.ndarray) -> np.ndarray:
-    """Mean motion (B, 3) [m] of the tumour by volume, of displacements (B, V, 3) [m]."""
+    """Compute the volume mean (B, 3) [m] of the tumour's motion from displacements (B, V, 3) [m]."""
     mesh = anatomy.mesh
     inside = anatomy.in_tumour
     return np.average(displacement[:, mesh.tets[inside]].mean(axis=2), axis=1, weights=mesh.volumes[inside])

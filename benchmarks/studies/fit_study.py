@@ -1,4 +1,4 @@
-"""What `sulcus fit` says of patients whose tissue is known."""
+"""Errors of `sulcus fit` on synthetic patients of known tissue."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,25 +18,25 @@ from .locate_study import PointsSeen, observed
 from .locate_twins import ogden
 
 NEAR, NEAR_YOUNG = 1.5, 1.2
-"""Factors within which the tumour's stiffness, and Young's modulus, were wanted."""
+"""Target factors on the errors of the tumour's stiffness, and of Young's modulus."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """All patients at one level of noise; shares in per cent.
+    """Results of all patients at one level of noise; shares in percent.
 
     Parameters
     ----------
     factor, within
-        Of the tumour's stiffness over the brain's: median factor that it is off by, and share within 1.5.
+        Stiffness ratio of tumour to brain: median error as a factor, and share of patients with a factor within 1.5.
     held
-        Share of the intervals of 95 % that hold it.
+        Share of the 95 % intervals that cover the stiffness ratio.
     sliding, skull
-        Share of patients of which it was said rightly whether the skull holds the brain, and which skull it is.
+        Shares of patients with a correct decision between bonded and sliding skull, and with the correct skull.
     poisson
-        Share whose class of Poisson's ratio was right.
+        Share of patients with the correct class of Poisson's ratio.
     young, young_within, young_held, forces
-        As the first three of Young's modulus, and of how many patients a force was read; None: of none.
+        `factor`, `within` and `held` of Young's modulus; number of patients with a measured force. None: no force.
     """
 
     noise: int
@@ -55,20 +55,20 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Library:
-    """What is made once for a body: motions by drained fluid, and by tools on every place."""
+    """Responses computed once for a body: motions by drained fluid, and by tools at every position."""
 
     tools: Pushed
     drained: Responses
     pressed: Responses
 
     def pressed_on(self, chosen: Sequence[int]) -> Responses:
-        """Those by tools on some places alone."""
+        """Return the responses to tools at some positions alone."""
         columns = (3 * np.array(chosen)[:, None] + np.arange(3)).ravel()
         return replace(self.pressed, motion={name: each[:, :, columns] for name, each in self.pressed.motion.items()})
 
 
 def library_of(locator: Locator, device: str, folder: Path | None, progress: Callable[[int, int], object]) -> Library:
-    """Solve it; what a `folder` keeps is read."""
+    """Solve the library of a locator's anatomy; results in `folder` are read."""
     body, tools = locator.anatomy, places(locator.anatomy)
     drained = solve_responses(body, build_drained_loads(body), device, folder, progress)
     pressed = solve_responses(body, build_force_loads(body, tools.point, tools.footprint), device, folder, progress)
@@ -78,7 +78,7 @@ def library_of(locator: Locator, device: str, folder: Path | None, progress: Cal
 def fitted_to(
     locator: Locator, library: Library, seen: Seen, sight: PointsSeen, seed: int, read: bool, device: str
 ) -> FittedTissue:
-    """What is said of one patient; the first tool's force is `read`, or none."""
+    """Fit the tissue of one patient; the first tool's force is measured if `read`."""
     patient, frames = seen.patient, []
     for number, motion in enumerate(seen.motion):
         observation = observed(locator.anatomy, motion, sight, (seed, patient.number, number))
@@ -97,7 +97,7 @@ def _tools(tools: Pushed, patient: Patient, number: int, read: bool) -> tuple[To
 
 
 def row(noise: int, said: Sequence[tuple[Patient, FittedTissue]]) -> Row:
-    """How right it was."""
+    """Summarise the fits at one level of noise."""
     ratio = [(patient.ratio, tissue.ratio) for patient, tissue in said]
     young = [(young_of(patient), tissue.stiffness) for patient, tissue in said if tissue.stiffness is not None]
     held = [(patient.skull == "bonded") == (tissue.skulls["bonded"] > 0.5) for patient, tissue in said]
@@ -115,14 +115,14 @@ def row(noise: int, said: Sequence[tuple[Patient, FittedTissue]]) -> Row:
 
 
 def young_of(patient: Patient) -> float:
-    """Young's modulus [Pa] of a patient's brain at small strain."""
+    """Return Young's modulus [Pa] of a patient's brain at small strain."""
     tissue = ogden(patient.stiffness, patient.poisson)
     (c, _), *_ = tissue.terms
     return c * (1.0 + patient.poisson)
 
 
 def _off(pairs: Sequence[tuple[float, tuple[float, float, float] | None]], near: float) -> tuple[float, float, float]:
-    """Median factor off, share [%] within `near`, and share [%] within the interval."""
+    """Compute the median error as a factor, the share [%] within `near`, and the share [%] in the interval."""
     table = np.array([[true, *(found or ())] for true, found in pairs])
     off = np.abs(np.log(table[:, 2] / table[:, 0]))
     held = (table[:, 1] <= table[:, 0]) & (table[:, 0] <= table[:, 3])

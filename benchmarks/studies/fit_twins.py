@@ -1,4 +1,4 @@
-"""Patients of known tissue, whose cortex is seen while a tool presses here and there and while fluid drains."""
+"""Synthetic patients of known tissue: frames in which a tool presses the cortex, and in which fluid drains."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -21,32 +21,32 @@ from surrogate.model.kept_arrays import find_kept_path, keep_arrays
 from .locate_twins import LEFT, PROBABLE, RATIO, SKULLS, STIFFNESS, TILT, check_same, ogden
 
 POISSON = (0.45, 0.4945)
-"""Of a twin's brain and tumour, uniform."""
-# Places that tools press on in all twins together, and of these in each; mean pressure of a press [Pa], below harm.
+"""Range of Poisson's ratio of a patient's brain and tumour; uniform."""
+# Number of tool positions in all patients together; range of the mean pressure of a press [Pa], below harm.
 PLACES, PRESSURE = 14, (1000.0, 2700.0)
 ACCURACY = Accuracy(tolerance=1e-3)
 
 
 @dataclass(frozen=True)
 class Patient:
-    """What a twin is.
+    """Synthetic patient.
 
     Parameters
     ----------
     number
-        From 0.
+        Number of the patient, from 0.
     skull
-        A name of `locate_twins.SKULLS`.
+        Name in `locate_twins.SKULLS`.
     stiffness, ratio, poisson
-        Of the tissue over `MATERIALS["minutes"]`, of the tumour over the brain, and Poisson's ratio.
+        Stiffness of the brain over `MATERIALS["minutes"]`, of the tumour over the brain; Poisson's ratio.
     places
-        Numbers of the places that are pressed, one a frame.
+        Numbers of the pressed positions, one a frame.
     force
-        Of each (3,) [N].
+        Force (3,) [N] of each press.
     left
-        Share of the fluid that is left, in each of the frames that follow.
+        Remaining share of the fluid in each of the following frames.
     tilt
-        Of each (3,): gravity pulls along the opening's axis and this.
+        Vector (3,) of each such frame, which is added to the opening's axis for the direction of gravity.
     """
 
     number: int
@@ -62,27 +62,27 @@ class Patient:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A patient, and the motions (frames, V, 3) [m] of the vertices of the mesh that is asked about."""
+    """Patient, and motions (frames, V, 3) [m] of the vertices of the mesh for which tissue is estimated."""
 
     patient: Patient
     motion: np.ndarray
 
 
 def places(anatomy: Anatomy, seed: int = 0) -> Pushed:
-    """Where tools may press, how wide they are, and which way their forces lean: one a place."""
+    """Sample a push at each tool position: point, radius, and a force that gives the direction."""
     found = drawn_loads("palpation", anatomy, PLACES, 1000 + seed).get(Pushed)
     assert found is not None
     return found
 
 
 def patient(tools: Pushed, seed: int, number: int, presses: int, drainages: int) -> Patient:
-    """The patient of a number, under so many tools and in so many postures; it depends on these and the seed alone."""
+    """Sample patient `number`, for some presses and postures; the result depends on their numbers and the seed."""
     random = np.random.default_rng([seed, number, 7])
     stiffness, ratio = (float(np.exp(random.uniform(*np.log(limits)))) for limits in (STIFFNESS, RATIO))
     skull, poisson = str(random.choice(list(SKULLS), p=PROBABLE)), float(random.uniform(*POISSON))
     chosen = random.permutation(PLACES)[:presses]
     pressure = np.exp(random.uniform(*np.log(PRESSURE), size=presses))
-    # The way of some other place's force: within the tool's cone nearly everywhere.
+    # Directions near the sampled force's: within the tool's cone nearly everywhere.
     way = np.stack([_leaning(tools.force[place], random) for place in chosen])
     force = way * (pressure * np.pi * tools.footprint[chosen] ** 2)[:, None]
     left, tilt = random.uniform(LEFT[0], LEFT[1], drainages), TILT * random.standard_normal((drainages, 3))
@@ -94,19 +94,19 @@ def patient(tools: Pushed, seed: int, number: int, presses: int, drainages: int)
 
 
 def _leaning(force: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """A unit vector (3,) that leans by some degrees from a force (3,)."""
+    """Sample a unit vector (3,) tilted by some degrees from a force (3,)."""
     way = force / np.linalg.norm(force) + 0.25 * random.standard_normal(3)
     return way / np.linalg.norm(way)
 
 
 def effects_of(patient: Patient) -> tuple[Effect, ...]:
-    """What a patient's finite elements are made of."""
+    """Build the effects of a patient's FEM."""
     brain, tumour = (ogden(share, patient.poisson) for share in (patient.stiffness, patient.stiffness * patient.ratio))
     return Elasticity(brain, {TUMOUR_LABEL: tumour}), Held(), SKULLS[patient.skull], ToolForce(), Gravity()
 
 
 def loads_of(anatomy: Anatomy, tools: Pushed, patient: Patient) -> Loads:
-    """A press in each of the first frames, by tools on these places; in the others fluid has drained."""
+    """Build the loads: a press in each of the first frames, at these positions; drained fluid in the others."""
     idle, drained = len(patient.left), np.array(patient.tilt).reshape(-1, 3) + open_cortex(anatomy).axis
     chosen = np.array([*patient.places, *[patient.places[0]] * idle])
     force = np.concatenate([np.array(patient.force), np.zeros((idle, 3))])
@@ -129,15 +129,14 @@ def patients(
     folder: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Iterator[Seen | None]:
-    """So many patients of `finer`, read at the vertices of `body`; None for one without an equilibrium.
+    """Solve patients on the mesh `finer`, interpolated at the vertices of `body`; None for one without equilibrium.
 
-    Those that a `folder` keeps from a run that was stopped are read. `progress` hears how many are done, and of how
-    many.
+    Patients in `folder`, from an interrupted run, are read. `progress` receives the number done and the total.
 
     Raises
     ------
     InputError
-        Bodies of two brains; bodies without tumour or open cortex.
+        Meshes of two brains; meshes without tumour or open cortex.
     """
     check_same(body, finer)
     place, tools = locate(finer.mesh, body.mesh.nodes), places(body)
@@ -149,7 +148,7 @@ def patients(
 
 
 def _kept(finer: Anatomy, loads: Loads, patient: Patient, device: str, folder: Path | None) -> np.ndarray:
-    """Motions (frames, V, 3) [m] of a patient's own mesh, from the folder if they are there; (0, V, 3): none."""
+    """Read or solve the motions (frames, V, 3) [m] of a patient's own mesh; (0, V, 3): no equilibrium."""
     stated = finer.digest, recommend_element(finer.mesh), patient, ACCURACY
     path = find_kept_path(folder, f"patient-{patient.number:04d}-", device, *stated)
 

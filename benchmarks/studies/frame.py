@@ -1,4 +1,4 @@
-"""A frame of the page, stage by stage: load, deform, render, composite, encode, send."""
+"""Times of a frame of the page by stage: load, deform, render, composite, encode, send."""
 
 import time as clock
 from collections.abc import Iterator, Sequence
@@ -17,13 +17,13 @@ from scenes.play.stage import CORTEX_COLOUR, TUMOUR_COLOUR
 from sim.errors import InputError
 
 STAGES = ("load", "deform", "render", "composite", "encode", "send")
-# Frames before the first that counts: kernels are loaded, and what stands still is drawn.
+# Warm-up frames, not timed: kernels are loaded, and fixed layers are drawn.
 WARM_UP = 10
 
 
 @dataclass(frozen=True)
 class Spent:
-    """What a stage of so many frames took [ms]: median, 95th percentile and mean."""
+    """Time of a stage over all frames [ms]: median, 95th percentile and mean."""
 
     stage: str
     frames: int
@@ -33,12 +33,12 @@ class Spent:
 
 
 def measure_size(text: str) -> tuple[int, int]:
-    """The width and height [pixel] that a text such as 640x480 asks for.
+    """Parse width and height [pixel] from a text such as 640x480.
 
     Raises
     ------
     InputError
-        Another text, or a picture of less than 16 or more than 8,192 pixels a side.
+        Another text, or an image side outside 16 to 8,192 pixels.
     """
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isdecimal() and 16 <= int(part) <= 8192 for part in parts):
@@ -47,9 +47,9 @@ def measure_size(text: str) -> tuple[int, int]:
 
 
 def frames_of(player: Player, count: int) -> Iterator[tuple[float, ...]]:
-    """The seconds of each of `STAGES`, frame by frame: the scene is played in order, again and again.
+    """Yield the times [s] of `STAGES`, frame by frame: the scene is played in order, repeatedly.
 
-    The page is open on this machine alone, and nobody looks at it.
+    The page is open on this machine only, without clients.
     """
     page, last = open_page(player), None
     try:
@@ -83,9 +83,9 @@ def frames_of(player: Player, count: int) -> Iterator[tuple[float, ...]]:
 
 
 def batch_rate(player: Player, count: int, seconds: float = 2.0) -> float:
-    """Pictures a second, of as many frames together, each by a camera of its own: colour, depth and segmentation.
+    """Measure images per second, rendered in one batch with a separate camera each: colour, depth, segmentation.
 
-    The vertices come from the host; the pictures stay on the device that draws them.
+    Vertices are copied from the host; images stay on the device.
     """
     stage, scene = player.stage, player.scene
     scenes = []
@@ -95,7 +95,7 @@ def batch_rate(player: Player, count: int, seconds: float = 2.0) -> float:
         held = None if scene.tool is None else player.place_tool(scene.tool, touch, positions)
         scenes.append(stage.build_layers(positions, None if held is None else held.pose))
     moved = np.stack([np.concatenate([layer.vertices for layer in each if not layer.still]) for each in scenes])
-    # All within half a degree.
+    # Cameras within half a degree of each other.
     cameras = [player.camera.perturb(0.5 * (row - 0.5 * count) / count) for row in range(count)]
     renderer = Renderer(scenes[0], stage.lamp, stage.device)
     renderer.render_batch(moved, cameras)
@@ -109,7 +109,7 @@ def batch_rate(player: Player, count: int, seconds: float = 2.0) -> float:
 
 
 def open_page(player: Player) -> Browser:
-    """A page with the scene's moving bodies, on this machine alone."""
+    """Open a page with the scene's moving bodies, on this machine only."""
     positions, site = player.site.anatomy.mesh.nodes, player.site
     bodies = [
         SceneSurface(layer.name, layer.vertices, layer.triangles, colour)
@@ -123,7 +123,7 @@ def open_page(player: Player) -> Browser:
 
 
 def table(seconds: Sequence[tuple[float, ...]]) -> list[Spent]:
-    """What each of `STAGES` and the whole frame took; seconds: a row for each frame."""
+    """Summarise the times of `STAGES` and of the whole frame; `seconds` has a row for each frame."""
     each = 1e3 * np.array(seconds)
     columns = dict(zip(STAGES, each.T, strict=True)) | {"frame": each.sum(axis=1)}
     return [

@@ -1,4 +1,4 @@
-"""How many steps a second Gymnasium environments make, all of them stepped together."""
+"""Steps per second of Gymnasium environments that are stepped together."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ from scenes.gym.scripted import compute_scripted_actions
 
 @dataclass(frozen=True)
 class Rate:
-    """Steps a second of a task, summed over its environments.
+    """Steps per second of a task, summed over its environments.
 
     Parameters
     ----------
     task, observation, environments
-        What was stepped.
+        Task, type of observation, and number of environments.
     median, least, most
-        Of the repeats [1/s].
+        Median, minimum and maximum over the repeats [1/s].
     touching
         Share of the steps in which a tool exerted a force.
     """
@@ -41,16 +41,16 @@ def measure_rate(
     repeats: int,
     progress: Callable[[], object] = lambda: None,
 ) -> Rate:
-    """Measure a task under its scripted policy; a first repeat is not counted, as it compiles and solves what is kept.
+    """Measure a task under its scripted policy; the first repeat, with compilation and cached solves, does not count.
 
     Parameters
     ----------
     steps
-        Of every environment in a repeat.
+        Number of steps of every environment in a repeat.
     repeats
-        That are counted.
+        Number of counted repeats.
     progress
-        Is called after each repeat.
+        Called after each repeat.
     """
     seen, _ = environment.reset(seed=0)
     rates, touched = [], []

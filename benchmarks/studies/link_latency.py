@@ -1,4 +1,4 @@
-"""How long a live link takes: from a pose's time stamp to when each client has the whole surface that answers it."""
+"""Latency of a live link: from a pose's time stamp until each client has received the resulting surface."""
 
 import asyncio
 import socket
@@ -21,15 +21,15 @@ from sim.runtime.processes import process_pool, run_on_each
 HOST = "127.0.0.1"
 NAME = TransformNames().tool
 CLIENTS = 3
-# Poses before the first that counts.
+# Number of warm-up poses, not timed.
 WARM_UP = 15
-# So long a message may be awaited [s].
+# Maximum waiting time for a message [s].
 PATIENCE = 20.0
 
 
 @dataclass(frozen=True)
 class Latency:
-    """Of one run [ms], over all clients: median, 99th percentile and largest; and the share of poses answered [%]."""
+    """Latency of one run over all clients [ms]: median, 99th percentile, maximum; share of poses with a result [%]."""
 
     median: float
     p99: float
@@ -38,10 +38,10 @@ class Latency:
 
 
 class Moved:
-    """Answers a pose by a surface of so many points that is shifted by it: all but the deformer's own time is there."""
+    """Responder that shifts a surface by the pose: all work of a link without the time of a deformation model."""
 
     def __init__(self, points: int) -> None:
-        """A strip of triangles between points at random."""
+        """Build a strip of triangles between random points."""
         self._points = 0.05 * np.random.default_rng(0).normal(size=(points, 3))
         corners = np.arange(2 * points)[:, None] + np.arange(3)
         self._mesh = SentMesh.from_triangles(corners % points)
@@ -49,7 +49,7 @@ class Moved:
     def compute_result(
         self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
     ) -> PoseResult:
-        """The pose's shift, as the motion of a brain that is known."""
+        """Return the pose's shift, as the motion of a brain with a valid result."""
         body = heard.find_relative(heard.names.tool, now)
         if isinstance(body, str):
             return PoseResult(
@@ -59,34 +59,34 @@ class Moved:
         return PoseResult(body.stamp, TrackingResult(moment, TumourState.GOOD, "", NO_TARGETS, motion))
 
     def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
-        """No camera is listened to."""
+        """Return the reason: there is no camera."""
         return "no camera"
 
     def build_scan(self, stamp: int) -> bytes:
-        """The points where they were."""
+        """Return the undeformed points."""
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * self._points, self._mesh), stamp)
 
     def build_messages(self, result: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
-        """The surface."""
+        """Return the message with the surface."""
         body = encode_polydata(1e3 * result.known.motion.positions, self._mesh)
         return (pack_message("POLYDATA", "TumourNow", body, result.stamp),)
 
     def build_status(self, result: PoseResult, refused: str) -> bytes:
-        """What is known."""
+        """Return the status of the result."""
         return pack_message("STATUS", "Sulcus", encode_status(Code.OK, result.known.words), result.stamp)
 
     def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
-        """No places are followed."""
+        """Raise BadMessageError: no points are tracked."""
         raise BadMessageError("no places are followed")
 
 
 def measured(points: int, rate: float, seconds: float) -> Latency:
-    """Send poses at a rate [1/s] for so long, to a server and three clients in processes of their own.
+    """Send poses at a rate [1/s] for a duration [s]; the server and three clients run in separate processes.
 
     Raises
     ------
     LostError
-        A process that was ended.
+        A process that was killed.
     """
     count = WARM_UP + max(1, round(rate * seconds))
     with process_pool(["cpu"], _serve, points) as server, process_pool(["cpu"] * CLIENTS, _nothing) as clients:
@@ -102,11 +102,11 @@ def measured(points: int, rate: float, seconds: float) -> Latency:
 
 
 def _nothing(device: str) -> None:
-    """What a client's process starts with."""
+    """Return None, the state with which a client's process starts."""
 
 
 def _serve(device: str, points: int) -> int:
-    """Serve in a thread of this process; returns the port."""
+    """Serve in a thread of this process; return the port."""
     found: list[int] = []
     ready = threading.Event()
 
@@ -127,7 +127,7 @@ def _port(port: int, task: int) -> int:
 
 
 def _send(port: int, rate: float, count: int) -> None:
-    """Send poses, each with its time; the last time stamp says that it is over."""
+    """Send poses, each with its time; the last time stamp marks the end."""
     T = np.eye(4)
     with socket.create_connection((HOST, port)) as out:
         out.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -147,11 +147,11 @@ def _drain(source: socket.socket) -> None:
         while source.recv(1 << 16):
             pass
     except OSError:
-        pass  # it was closed
+        pass  # the connection was closed
 
 
 def _received(nothing: None, task: tuple[int, int]) -> list[tuple[int, float]]:
-    """Time stamps of answers, and when each was here whole [s since 1970]; the first ones are left out."""
+    """Receive results: time stamps, and times of complete arrival [s since 1970], without warm-up poses."""
     port, _ = task
     stamps: list[tuple[int, float]] = []
     with socket.create_connection((HOST, port), PATIENCE) as source:

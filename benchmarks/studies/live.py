@@ -1,4 +1,4 @@
-"""Live frames: a tool moves over the open cortex, one warm-started solve a frame; how long they take, how exact."""
+"""Time and error of live frames: a tool moves over the open cortex, with one warm-started solve a frame."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,14 +18,14 @@ from sim.fem import Fem
 from sim.loads import Loads, stack
 
 SPEED = 20e-3
-# Frames before the first that counts: the tool arrives, and kernels are loaded.
+# Warm-up frames, not timed: the tool arrives, and kernels are loaded.
 WARM_UP = 30
 CONVERGED = Accuracy(tolerance=1e-6)
 
 
 @dataclass(frozen=True)
 class Ride:
-    """A tool of a footprint's `radius` [m] that presses with `force` [N] while it wanders over the open cortex."""
+    """Tool with a footprint of `radius` [m] that presses with `force` [N] while it moves over the open cortex."""
 
     name: str
     force: float
@@ -37,7 +37,7 @@ RIDES = (Ride("palpation", 0.25, 7e-3), Ride("spatula", 0.5, 10e-3))
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Loads, their answer and the wall seconds that it took."""
+    """Frame: loads, their result and the wall time [s]."""
 
     loads: Loads
     answer: Deformation
@@ -46,7 +46,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Tally:
-    """One ride: milliseconds a frame, outer steps, outcomes by name; error of `checked` frames [mm]."""
+    """Statistics of a trajectory: time per frame [ms], outer steps, outcomes by name; errors of `checked` frames."""
 
     ride: str
     frames: int
@@ -63,7 +63,7 @@ class Tally:
 
 
 def loads_of(ride: Ride, scene: Scene, site: CraniotomyFrame, frames: int) -> list[Loads]:
-    """The loads of each frame, those of the warm-up first.
+    """Build the loads of each frame, warm-up frames first.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def loads_of(ride: Ride, scene: Scene, site: CraniotomyFrame, frames: int) -> li
 
 
 def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:
-    """Each frame in turn, from the last one's answer; the device is waited for at each reading."""
+    """Yield the frames, each started from the last result; times include synchronisation with the device."""
     last = None
     for number, load in enumerate(loads):
         last, seconds = time_work(fem.deform, load, start=last)
@@ -91,12 +91,12 @@ def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:
 
 
 def live_fem(scene: Scene, site: CraniotomyFrame, device: str, element: str) -> Fem:
-    """Finite elements for live frames."""
+    """Build the FEM solver for live frames."""
     return Fem(site.anatomy, scene.effects, LIVE, device, element=element, live=True)
 
 
 def errors(frames: Sequence[Frame], scene: Scene, site: CraniotomyFrame, element: str) -> np.ndarray:
-    """Largest distance (n,) [m] over all nodes between each frame's answer and the converged solution."""
+    """Compute the maximum distance (n,) [m] over all nodes between each frame's result and the converged solution."""
     exact = Fem(site.anatomy, scene.effects, CONVERGED, "cpu", element=element)
     converged = exact.deform(stack([frame.loads for frame in frames])).displacement
     found = np.concatenate([frame.answer.displacement for frame in frames])
@@ -104,7 +104,7 @@ def errors(frames: Sequence[Frame], scene: Scene, site: CraniotomyFrame, element
 
 
 def tally(ride: Ride, frames: Sequence[Frame], off: np.ndarray) -> Tally:
-    """What became of a ride's frames, of which some were found `off` (n,) [m]."""
+    """Summarise a trajectory's frames; `off` (n,) [m] are the errors of the checked ones."""
     milliseconds = 1e3 * np.array([frame.seconds for frame in frames])
     steps = np.array([frame.answer.iterations[0] for frame in frames])
     outcomes = [frame.answer.outcome[0] for frame in frames]

@@ -1,4 +1,4 @@
-"""How else a tumour's motion is estimated from points that are seen to move: rivals of `sulcus locate`."""
+"""Baselines of `sulcus locate`: other estimators of a tumour's motion from observed motions of points."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,26 +22,26 @@ from sim.runtime.device import find_device
 from surrogate.locating.prior import MotionPrior
 
 Rival = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Motion (q, 3) [m] of the tumour's vertices by points (n, 3) [m] at rest and how each was seen to move (n, 3) [m]."""
-# The ridge of forces, as a share of what the points' own forces do there.
+"""Function from undeformed points (n, 3) [m] and their motions (n, 3) [m] to the tumour's motion (q, 3) [m]."""
+# Ridge penalty of forces, relative to the response of each point to its own force.
 RIDGE = 1e-2
-SPREAD = 10e-3  # Radius over which a force of a Kelvinlet is spread [m].
-# Smoothings that leaving one point out chooses from, of coordinates in units of the points' spread.
+SPREAD = 10e-3  # Radius over which the force of a Kelvinlet is spread [m].
+# Candidate smoothings for leave-one-out selection; coordinates are in units of the points' spread.
 SMOOTHINGS = 10.0 ** np.arange(-6.0, 3.0)
-# Linear tissue, and a tumour twice as stiff; E in Pa.
+# Linear tissue, and a tumour twice as stiff; Young's modulus [Pa].
 YOUNG, POISSON, STIFFER = 3000.0, 0.45, 2.0
-# Springs of the skull along every direction [N/m for each m^2], and of each seen point [N/m]. Of 1e2 to 1e6 and of 1 to
-# 100 these removed most of 20 other twins, at all levels of noise together (100 points on 36 % of the cortex).
+# Springs of the skull in every direction [N/m per m^2], and of each observed point [N/m]. Of 1e2 to 1e6 and of 1 to
+# 100 these removed most motion of 20 other cases, over all levels of noise (100 points on 36 % of the cortex).
 SKULL, POINT = 3e3, 30.0
 
 
 def nothing(at: np.ndarray) -> Rival:
-    """The tumour is where the scan shows it; places `at` are (q, 3) [m]."""
+    """Return zero motion at positions `at` (q, 3) [m]: the tumour is where the scan shows it."""
     return lambda rest, motion: np.zeros_like(at)
 
 
 def rigid(at: np.ndarray) -> Rival:
-    """The points' best rigid motion, at places (q, 3) [m]: Kabsch 1976, Acta Cryst. A 32:922-923."""
+    """Fit the rigid motion of the points, at positions (q, 3) [m]: Kabsch 1976, Acta Cryst. A 32:922-923."""
 
     def moved(rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
         middle, now = rest.mean(axis=0), rest + motion
@@ -52,9 +52,9 @@ def rigid(at: np.ndarray) -> Rival:
 
 
 def thin_plates(at: np.ndarray) -> Rival:
-    """Thin-plate splines at places (q, 3) [m], by the smoothing that best predicts points that are left out.
+    """Fit thin-plate splines, at positions (q, 3) [m], with the smoothing of least leave-one-out error.
 
-    The error of leaving a point out is its coefficient over the diagonal of the inverse: Wahba 1990, "Spline Models for
+    The error at a left-out point is its coefficient over the diagonal of the inverse: Wahba 1990, "Spline Models for
     Observational Data", section 4.2.
     """
 
@@ -68,7 +68,7 @@ def thin_plates(at: np.ndarray) -> Rival:
 
 
 def _left_out(points: np.ndarray, values: np.ndarray, smoothing: float) -> float:
-    """Sum of squares by which splines through all other points miss each of the points (n, 3) with values (n, k)."""
+    """Compute the sum of squared leave-one-out errors of splines at points (n, 3) with values (n, k)."""
     count = len(points)
     square = ((points[:, None] - points) ** 2).sum(axis=2)
     kernel = 0.5 * square * np.log(np.where(square > 0.0, square, 1.0))
@@ -79,7 +79,7 @@ def _left_out(points: np.ndarray, values: np.ndarray, smoothing: float) -> float
 
 
 def kelvin_forces(at: np.ndarray) -> Rival:
-    """Regularised Kelvinlets of forces at the points, by least squares with a ridge, at places (q, 3) [m]."""
+    """Fit regularised Kelvinlets of forces at the points, by ridge regression, at positions (q, 3) [m]."""
 
     def moved(rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
         size = 3 * len(rest)
@@ -94,16 +94,16 @@ def kelvin_forces(at: np.ndarray) -> Rival:
 
 @dataclass(frozen=True, eq=False)
 class Springs:
-    """Linear finite elements on springs, reduced to what points on the open cortex and the tumour have to do with it.
+    """Linear finite elements on springs, condensed to the open cortex and the tumour.
 
     Parameters
     ----------
     anatomy
         The body.
     compliance
-        (m, 3, m + q, 3) [m/N]: what unit forces at the m vertices of the open cortex do to these and to the tumour's q.
+        (m, 3, m + q, 3) [m/N]: motion of the open cortex's m and the tumour's q vertices by unit forces at the former.
     point
-        Stiffness [N/m] of the spring that pulls at each point.
+        Stiffness [N/m] of the spring at each point.
     """
 
     anatomy: Anatomy
@@ -111,7 +111,7 @@ class Springs:
     point: float = POINT
 
     def __call__(self, rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """As `Rival`: forces (n, 3) at the points answer (C + 1/k) f = motion."""
+        """Compute as `Rival`, with forces f (n, 3) at the points that solve (C + 1/k) f = motion."""
         size, count = 3 * len(rest), len(self.compliance)
         weights = _on_surface(self.anatomy, rest)
         pulled = np.einsum("nm,miva->niva", weights, self.compliance, optimize=True)
@@ -123,7 +123,7 @@ class Springs:
 def springs(anatomy: Anatomy, skull: float = SKULL, point: float = POINT) -> Springs:
     """Assemble linear tetrahedra on springs (`skull` [Pa/m], `point` [N/m]), and solve for forces on the open cortex.
 
-    Nodes that the skull covers or that are held are on springs along all directions. A node's spring has the area of
+    Fixed nodes and nodes under the skull are on springs in all directions. A node's spring has the area of
     the surface that is nearest to it.
     """
     mesh = anatomy.mesh
@@ -145,7 +145,7 @@ def springs(anatomy: Anatomy, skull: float = SKULL, point: float = POINT) -> Spr
 
 
 def _on_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
-    """Weights (n, m) of the open cortex's vertices, in their order, at the places nearest to points (n, 3) [m]."""
+    """Compute weights (n, m) of the open cortex's vertices at the cortex points nearest to points (n, 3) [m]."""
     triangles, corners = anatomy.open_surface, anatomy.mesh.nodes[anatomy.open_surface]
     vertices = np.unique(triangles)
     weights = np.zeros((len(points), len(vertices)))
@@ -155,7 +155,7 @@ def _on_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
 
 
 def rivals(anatomy: Anatomy) -> dict[str, Rival]:
-    """Every rival, by name; what each makes once for a body is made here."""
+    """Build every baseline, by name, with its set-up for a body."""
     at = anatomy.mesh.nodes[anatomy.tumour_nodes]
     return {
         "nothing moved": nothing(at),
@@ -167,9 +167,9 @@ def rivals(anatomy: Anatomy) -> dict[str, Rival]:
 
 
 def oracle(prior: MotionPrior, motion: np.ndarray) -> np.ndarray:
-    """What no sum of a prior's shapes beats: motion (q, 3) [m] of the tumour's vertices.
+    """Compute the best motion (q, 3) [m] of the tumour's vertices that a sum of a prior's shapes can give.
 
-    The sum is nearest, in least squares at the open cortex and the tumour, to a true motion (V, 3) [m].
+    It is the least-squares fit to the true motion (V, 3) [m] at the open cortex and the tumour.
     """
     anatomy = prior.anatomy
     cortex, tumour = np.unique(anatomy.open_surface), anatomy.tumour_nodes

@@ -1,4 +1,4 @@
-"""Twin experiments: what of a known motion of a tumour is found from points on the open cortex, and how surely."""
+"""Synthetic test cases: error and coverage of estimates of a tumour's known motion from cortex points."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,23 +23,23 @@ from .locate_rivals import Rival, oracle
 from .locate_twins import Twin
 
 OURS, ORACLE = "sulcus locate", "best sum of its shapes"
-"""The locator, and what no estimator by its shapes can beat: it knows the truth."""
-# What is stated of points without error [m], as a locator must be given some.
+"""Names of the locator, and of the best estimate by its shapes, which uses the true motion."""
+# Reported standard deviation of points without error [m], since a locator requires one.
 EXACT = 5e-5
-# Errors of points: white and smooth [m], the smooth one's length [m], and the angle of the rigid one [rad].
+# Errors of points: independent and correlated [m], correlation length [m], angle of the rigid error [rad].
 WHITE, SMOOTH, LENGTH, TURN = 0.3e-3, 0.5e-3, 15e-3, float(np.radians(0.5))
 TRANSLATIONS = (0.0, 1e-3, 2e-3)
-"""Of the rigid error, at each level of noise [m]; at level 0 there is no error at all."""
-# Least and greatest error of a wrong registration: a translation [m], or a rotation [rad] about the brain's middle.
+"""Translation of the rigid error at each level of noise [m]; level 0 has no error of any kind."""
+# Range of a wrong registration's error: a translation [m], or a rotation [rad] about the brain's centre.
 WRONG_BY = (2e-3, 5e-3), (float(np.radians(2.0)), float(np.radians(4.0)))
 
 
 @dataclass(frozen=True)
 class PointsSeen:
-    """What is seen: so many points, on a round share `cover` [%] of the open cortex, at a level of noise.
+    """Observation model: number of points, on a round share `cover` [%] of the open cortex, and level of noise.
 
-    Points without names are a cloud. A registration that slips displaces all by `slip` [m], along the open cortex. One
-    that is `wrong` displaces or rotates all, as `misplaced` does.
+    Points that are not `named` are a cloud. A slipped registration displaces all by `slip` [m] along the cortex. One
+    that is `wrong` displaces or rotates all by `misplaced`.
     """
 
     points: int
@@ -52,22 +52,22 @@ class PointsSeen:
 
 @dataclass(frozen=True)
 class Estimate:
-    """One estimate of one twin.
+    """Estimate of one test case.
 
     Parameters
     ----------
     error, motion
-        (q,) [m]: distance from the truth, and length of the true motion, of each of the tumour's vertices.
+        (q,) [m]: error, and length of the true motion, of each of the tumour's vertices.
     square
-        Square Mahalanobis distance of the centroid's error, by the stated covariance; None where none is stated.
+        Square Mahalanobis distance of the centroid's error by the reported covariance; None without covariance.
     seconds
-        What it took, what is made once for a body apart; None of the oracle and of what was refused.
+        Computing time [s] without the set-up for a body; None of the oracle and of rejected observations.
     refused
-        Whether the observation was refused: the tumour is then believed where the scan shows it.
+        True if the observation was rejected: the estimate is then zero motion.
     doubted
-        Whether it was said that the registration may have slipped.
+        True if the result reports a possible slip of the registration.
     warned
-        True if a warning names a wrong registration, one that may have slipped included.
+        True if a warning reports a wrong registration, a possible slip included.
     """
 
     error: np.ndarray
@@ -81,20 +81,20 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Row:
-    """One estimator under one sight.
+    """Results of one estimator under one observation model.
 
     Parameters
     ----------
     removed
-        Share of the tumour's motion that is removed, [%] of its sum over vertices and twins.
+        Removed share [%] of the tumour's motion, summed over vertices and cases.
     mean, p95
-        Error over vertices and twins [mm].
+        Error over vertices and cases [mm].
     held
-        Share of the twins [%] whose centroid lies in the ellipsoid that is said to hold 95 %; None: none is stated.
+        Share of cases [%] whose true centroid is inside the 95 % ellipsoid; None without ellipsoid.
     milliseconds
-        Median of an estimate; None of the oracle, which is none.
+        Median time of an estimate; None of the oracle, which is no estimator.
     twins, refused, doubted, warned
-        Numbers of twins, of refused observations, of suspected slips, and of warnings of a wrong registration.
+        Numbers of cases, of rejected observations, of reported slips, and of warnings of a wrong registration.
     """
 
     points: int
@@ -113,9 +113,9 @@ class Row:
 
 
 def observed(body: Anatomy, motion: np.ndarray, sight: PointsSeen, seed: tuple[int, ...]) -> Observation:
-    """What is seen of a motion (V, 3) [m], with how far a tracker like this is off.
+    """Sample the observation of a motion (V, 3) [m] by an observation model, with its reported errors.
 
-    Where the points lie is the same at every level of noise.
+    The points are the same at every level of noise.
     """
     place = np.random.default_rng([*seed, sight.points, sight.cover])
     evidence = sample_seen_patch(body, motion, place, sight.points, 1e-2 * sight.cover)
@@ -142,15 +142,15 @@ def misplaced(body: Anatomy, now: np.ndarray, random: np.random.Generator) -> np
 
 
 def _along(body: Anatomy, random: np.random.Generator) -> np.ndarray:
-    """A unit vector (3,) across the open cortex's axis, by chance."""
+    """Sample a unit vector (3,) perpendicular to the open cortex's axis."""
     way = np.cross(open_cortex(body).axis, random.standard_normal(3))
     return way / np.linalg.norm(way)
 
 
 def spoilt(rest: np.ndarray, now: np.ndarray, translation: float, random: np.random.Generator) -> np.ndarray:
-    """Positions (n, 3) [m] with a white, a smooth and a rigid error, of points that were at `rest` (n, 3) [m].
+    """Add independent, correlated and rigid errors to positions (n, 3) [m] of points from `rest` (n, 3) [m].
 
-    The rigid one turns by half a degree about an axis through the points' middle, and moves by `translation` [m].
+    The rigid error is half a degree about an axis through the points' centroid, and `translation` [m].
     """
     middle = rest.mean(axis=0)
     axis, way = random.standard_normal((2, 3))
@@ -168,14 +168,14 @@ def rows(
     seed: int = 0,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Iterator[Row]:
-    """Every estimator under each sight, sight by sight; rivals where points have names, which they need.
+    """Yield a row of every estimator under each observation model; baselines need points with correspondences.
 
-    `progress` hears how many observations are done, and of how many.
+    `progress` receives the number of observations done, and the total.
 
     Raises
     ------
     InputError
-        No twins, or a level of noise that there is not.
+        No test cases, or an unknown level of noise.
     """
     if not twins:
         raise InputError("there is no twin to look at: of none was an equilibrium found.")
@@ -200,12 +200,12 @@ def rows(
 def sights_of(
     points: Sequence[int], covers: Sequence[int], noises: Sequence[int], **others: Any
 ) -> tuple[PointsSeen, ...]:
-    """Every combination, with `others` of a `PointsSeen`."""
+    """Build all combinations, with `others` as further fields of `PointsSeen`."""
     return tuple(PointsSeen(*each, **others) for each in product(points, covers, noises))
 
 
 def row(sight: PointsSeen, name: str, estimates: Sequence[Estimate]) -> Row:
-    """What became of an estimator's estimates."""
+    """Summarise the estimates of an estimator."""
     error, motion = (np.concatenate([getattr(each, key) for each in estimates]) for key in ("error", "motion"))
     squares = [each.square for each in estimates if each.square is not None]
     held = 100.0 * float(np.mean(np.array(squares) < RADIUS_SQUARED)) if squares else None
@@ -233,13 +233,13 @@ def estimate(
     doubted: bool = False,
     warned: bool = False,
 ) -> Estimate:
-    """An estimate of the motion (q, 3) [m] of the tumour's vertices, beside the truth (q, 3) [m]."""
+    """Compare an estimated motion (q, 3) [m] of the tumour's vertices with the true motion (q, 3) [m]."""
     error, motion = np.linalg.norm(found - true, axis=1), np.linalg.norm(true, axis=1)
     return Estimate(error, motion, square, seconds, refused, doubted, warned)
 
 
 def ours(locator: Locator, motion: np.ndarray, seen: Observation) -> Estimate:
-    """What the locator says of an observation, beside the true motion (V, 3) [m]."""
+    """Compare the locator's result for an observation with the true motion (V, 3) [m]."""
     body = locator.anatomy
     true = motion[body.tumour_nodes]
     try:
@@ -254,7 +254,7 @@ def ours(locator: Locator, motion: np.ndarray, seen: Observation) -> Estimate:
 
 def _rivalling(body: Anatomy, twin: Twin, rival: Rival, seen: Observation) -> Estimate:
     assert seen.rest is not None
-    with limit_to_one_thread():  # products are small
+    with limit_to_one_thread():  # matrix products are small
         found, seconds = time_work(rival, seen.rest, seen.now - seen.rest)
     return estimate(found, twin.motion[body.tumour_nodes], None, seconds)
 

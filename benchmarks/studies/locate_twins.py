@@ -1,4 +1,4 @@
-"""Truths to locate a tumour in: another mesh, law, stiffness and skull than an estimator knows, moved by some cause."""
+"""Synthetic test cases of `locate`, with mesh, law, stiffness and skull other than the estimator's."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -21,42 +21,42 @@ from surrogate.data.tool_loads import draw as drawn_loads
 from surrogate.model.kept_arrays import find_kept_path, keep_arrays
 
 CAUSES = ("tool", "drainage", "swelling", "drainage and tool")
-"""What moves twins, one after the other: each takes part in a quarter of them, or in half."""
+"""Causes of motion, used in turn: each one acts in a quarter or in half of the test cases."""
 SKULLS = {"contact": SkullContact(2e-4), "bonded": Bonded(), "slide": Slide()}
-"""What the skulls of twins do."""
-# How probable each is; fluid that drains alone leaves a brain that sinks, which only the first lets it do.
+"""Skull models of the test cases."""
+# Probability of each skull; with drained fluid alone the brain sinks, which only the first skull permits.
 PROBABLE = (0.2, 0.4, 0.4)
-# Of the tissue: its stiffness over that of `MATERIALS["minutes"]`, the tumour's over the brain's; both log-uniform.
+# Ranges of the stiffness over that of `MATERIALS["minutes"]`, and of the tumour's over the brain's; log-uniform.
 STIFFNESS, RATIO, POISSON = (0.5, 1.3), (0.5, 3.0), 0.49
-# Change of the brain's volume, and how often it grows; share of the fluid that is left; how gravity deviates from the
-# opening's axis, as a Gaussian's deviation along each axis.
+# Change of the brain's volume, and probability of growth; remaining share of fluid; deviation of gravity from the
+# opening's axis, as a standard deviation along each axis.
 SWELLING, SWOLLEN, LEFT, TILT = (0.02, 0.06), 0.7, (0.1, 0.5), 0.35
 TOOLS = ("palpation", "spatula")
 ACCURACY = Accuracy(tolerance=1e-3)
-# How far [m] tumours' middles may be apart in two meshes of one brain.
+# Maximum distance [m] between the tumour's centres in two meshes of one brain.
 SAME = 3e-3
 
 
 @dataclass(frozen=True)
 class Draw:
-    """What a twin is.
+    """Parameters of a test case.
 
     Parameters
     ----------
     number
-        From 0.
+        Number of the test case, from 0.
     cause, skull, tool
         One of `CAUSES`, a name of `SKULLS`, one of `TOOLS`.
     stiffness, ratio
-        Of the tissue over `MATERIALS["minutes"]`, and of the tumour over the brain.
+        Stiffness of the brain over `MATERIALS["minutes"]`, and of the tumour over the brain.
     swelling
-        Change of the brain's volume, if that is the cause.
+        Change of the brain's volume, if it is the cause.
     left
-        Share of the fluid that is left, if some drains.
+        Remaining share of the fluid, if some drains.
     tilt
-        (3,): gravity pulls along the opening's inward axis and this, together made a unit vector.
+        (3,): added to the opening's inward axis for the direction of gravity.
     push
-        Seed of the tool's load.
+        Random seed of the tool's load.
     """
 
     number: int
@@ -73,14 +73,14 @@ class Draw:
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """A draw, and the motion (V, 3) [m] of the vertices of the mesh that is asked about."""
+    """Test case: its parameters, and the motion (V, 3) [m] of the vertices of the estimator's mesh."""
 
     draw: Draw
     motion: np.ndarray
 
 
 def drawn(seed: int, number: int) -> Draw:
-    """The draw of a number; it depends on that and the seed alone."""
+    """Sample the parameters of a test case; they depend on its number and the seed alone."""
     random = np.random.default_rng([seed, number])
     cause = CAUSES[number % len(CAUSES)]
     stiffness, ratio = (float(np.exp(random.uniform(*np.log(limits)))) for limits in (STIFFNESS, RATIO))
@@ -103,7 +103,7 @@ def drawn(seed: int, number: int) -> Draw:
 
 
 def effects_of(draw: Draw) -> tuple[Effect, ...]:
-    """What a twin's finite elements are made of."""
+    """Build the effects of a test case's FEM."""
     tumour = {TUMOUR_LABEL: ogden(draw.stiffness * draw.ratio)}
     swells = Pulsation(Wave(0.25, abs(draw.swelling)), Wave(0.25, 0.0))
     skull = SKULLS[draw.skull]
@@ -111,7 +111,7 @@ def effects_of(draw: Draw) -> tuple[Effect, ...]:
 
 
 def ogden(share: float, poisson: float = POISSON) -> Ogden:
-    """Tissue of one exponent, so many times as stiff as that of minutes."""
+    """Build Ogden tissue of one exponent, `share` times as stiff as `MATERIALS["minutes"]`."""
     minutes = MATERIALS["minutes"].tissue
     assert isinstance(minutes, Ogden)
     (c, m), *_ = minutes.terms
@@ -120,24 +120,24 @@ def ogden(share: float, poisson: float = POISSON) -> Ogden:
 
 
 def loads_of(anatomy: Anatomy, draw: Draw) -> Loads:
-    """What moves a twin of this body."""
+    """Build the loads of a test case on this body."""
     pushed = drawn_loads(draw.tool, anatomy, 1, draw.push).get(Pushed)
     assert pushed is not None
     if "tool" not in draw.cause:
         pushed = Pushed(pushed.point, 0.0 * pushed.force, pushed.footprint)
-    # As in the scan, supine in a full skull; only the change acts.
+    # Posture of the scan, supine with a full skull: no change of weight acts.
     down, left = np.array(Gravity().direction), 1.0
     if "drainage" in draw.cause:
         down, left = open_cortex(anatomy).axis + draw.tilt, draw.left
         down /= np.linalg.norm(down)
     level = compute_fluid_level(anatomy.mesh.nodes, down, left)
-    # The wave has its crest after a second, and its trough a second before.
+    # The wave has its maximum at 1 s, and its minimum at -1 s.
     time = float(np.sign(draw.swelling)) if draw.cause == "swelling" else 0.0
     return Loads((pushed, Posture(down[None], np.array([level]), np.ones(1))), np.array([time]))
 
 
 def solved(anatomy: Anatomy, draw: Draw, device: str = "auto", element: str = RECOMMENDED) -> np.ndarray | None:
-    """The motion (V, 3) [m] of a twin's own mesh; None where no equilibrium was found."""
+    """Solve for the motion (V, 3) [m] of a test case's own mesh; None without equilibrium."""
     answer = Fem(anatomy, effects_of(draw), ACCURACY, device, element=element).deform(loads_of(anatomy, draw))
     return answer.displacement[0] if answer.outcome[0].good else None
 
@@ -152,15 +152,14 @@ def twins(
     folder: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Iterator[Twin | None]:
-    """So many twins of `finer`, read at the vertices of `body`; None for one of which no equilibrium was found.
+    """Solve test cases on the mesh `finer`, interpolated at the vertices of `body`; None for one without equilibrium.
 
-    Those that a `folder` keeps from a run that was stopped are read. `progress` hears how many are done, and of how
-    many.
+    Cases in `folder`, from an interrupted run, are read. `progress` receives the number done and the total.
 
     Raises
     ------
     InputError
-        Bodies of two brains; bodies without tumour or open cortex.
+        Meshes of two brains; meshes without tumour or open cortex.
     """
     check_same(body, finer)
     place = locate(finer.mesh, body.mesh.nodes)
@@ -172,12 +171,12 @@ def twins(
 
 
 def check_same(body: Anatomy, finer: Anatomy) -> None:
-    """Refuse two meshes that are not of one brain.
+    """Check that two meshes are of one brain.
 
     Raises
     ------
     InputError
-        A mesh without a tumour; tumours in two places.
+        A mesh without a tumour; tumours at different positions.
     """
     for one in (body, finer):
         if not len(one.tumour_nodes):
@@ -193,7 +192,7 @@ def check_same(body: Anatomy, finer: Anatomy) -> None:
 
 
 def _kept(anatomy: Anatomy, draw: Draw, device: str, element: str, folder: Path | None) -> np.ndarray | None:
-    """The motion of a twin's own mesh, from the folder if it is there, of the same draw."""
+    """Read the motion of a test case's own mesh from the folder, or solve and store it."""
     path = find_kept_path(folder, f"twin-{draw.number:04d}-", device, anatomy.digest, element, draw)
 
     def made() -> dict[str, np.ndarray]:

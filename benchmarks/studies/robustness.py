@@ -1,4 +1,4 @@
-"""How many random loads converge: from the tools of surgery to what no surgeon does, on record load by load."""
+"""Convergence of random loads, from surgical tools to far beyond surgery, with a record of each load."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ from sim.loads import Loads, Pushed
 from surrogate.data.tool_loads import BRUTAL, TOOLS, draw
 
 SETS = (*TOOLS, "seed", BRUTAL.name)
-# One load in so many has its residual computed again in double precision.
+# Stride of the loads whose residual is computed again in double precision.
 CHECKED = 100
 
 
 @dataclass(frozen=True)
 class Record:
-    """One load and what became of it; `double` is the residual in double precision, NaN where it was not computed."""
+    """Load and its outcome; `double` is the residual in double precision, NaN if not computed."""
 
     preset: str
     number: int
@@ -36,7 +36,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Trial:
-    """What is tried: body, effects and element, on which device, so many loads together."""
+    """Solver under test: body, effects, element, device and batch size."""
 
     anatomy: Anatomy
     effects: tuple[Effect, ...]
@@ -45,21 +45,21 @@ class Trial:
     batch: int
 
     def fem(self, accuracy: Accuracy) -> Fem:
-        """The finite elements of this trial."""
+        """Build the FEM solver under test."""
         return Fem(self.anatomy, self.effects, accuracy, self.device, self.batch, self.element)
 
 
 def shares(count: int) -> dict[str, int]:
-    """How many of `count` loads each set gets: half are brutal, the tools and the published protocol share the rest."""
+    """Divide `count` loads among the sets: half are brutal, the tools and the published protocol share the others."""
     gentle = [name for name in SETS if name != BRUTAL.name]
     whole, left = divmod(count - count // 2, len(gentle))
     return {**{name: whole + (place < left) for place, name in enumerate(gentle)}, BRUTAL.name: count // 2}
 
 
 def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iterator[list[Record]]:
-    """Solve what is not `done` yet of `count` loads, to 1e-4 in single precision, in the batches of a whole run.
+    """Solve those of `count` loads that are not `done`, to 1e-4 in single precision, in the batches of a whole run.
 
-    Strains are not limited: what is measured is the solver.
+    Strains are not limited, since the solver is tested, not the tissue.
     """
     fem, double = trial.fem(NO_STRAIN_LIMIT), trial.fem(REFERENCE)
     for preset, wanted in shares(count).items():
@@ -96,7 +96,7 @@ def _written(
 
 @dataclass(frozen=True)
 class Tally:
-    """One set of loads: how many converged, of them after a rescue; outer steps; ms a load; the hardest one.
+    """Statistics of a set of loads: number converged, of these by load steps; outer steps; ms per load; hardest load.
 
     `double` is the largest residual in double precision among the `checked` loads.
     """
@@ -114,7 +114,7 @@ class Tally:
 
 
 def tallies(found: Sequence[Record]) -> list[Tally]:
-    """The sets that were tried, in order. The hardest load failed with the largest residual, or took the most steps."""
+    """Summarise the sets, in order. The hardest load failed with the largest residual, or took the most steps."""
     out = []
     for preset in SETS:
         mine = [record for record in found if record.preset == preset]

@@ -1,4 +1,4 @@
-"""What a load costs as the mesh grows: seconds and memory, each size and batch in a process of its own."""
+"""Time and memory of a load over mesh size; each size and batch is measured in a separate process."""
 
 import resource
 import sys
@@ -23,31 +23,31 @@ from sim.runtime.processes import LostError, map_apart
 from sim.strategy.memory_needed import estimate_needed
 from surrogate.data.tool_loads import draw
 
-# Batches are solved until so many loads, or so many seconds, are spent.
+# Number of loads, or of seconds, after which no further batch is solved.
 LOADS, PATIENCE = 12, 60.0
 SEED = 4
 
 
 @dataclass(frozen=True)
 class Row:
-    """What loads on one mesh cost, in batches of one size.
+    """Time and memory of loads on one mesh, in batches of one size.
 
     Parameters
     ----------
     size, asked
-        Nodes and batch that were asked for.
+        Requested number of nodes, and batch size.
     nodes, tets, preconditioner, batch
-        What was had.
+        Actual numbers of nodes and tetrahedra, preconditioner, and batch size.
     set_up, load
-        Seconds: of the set-up, and of each load.
+        Time of the set-up, and of each load [s].
     outer
-        Median of the loads' outer steps.
+        Median number of outer steps.
     loads, converged
-        How many were solved, and how many of these converged.
+        Number of solved loads, and number of these that converged.
     memory, card
-        Peak of the process's own memory, and of what it took of the graphics card [GiB].
+        Peak memory of the process, and its peak memory on the GPU [GiB].
     foreseen
-        What it was thought to take of the card before it began [GiB].
+        Estimate of the GPU memory before the measurement [GiB].
     """
 
     size: int
@@ -68,7 +68,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Trial:
-    """What is measured: the element, the device, and the folder where meshes are kept."""
+    """Solver under test: element, device, and folder of stored meshes."""
 
     element: str
     device: str
@@ -81,7 +81,7 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
     Raises
     ------
     InputError
-        As `Fem`; a card on which they would not fit.
+        See `Fem`; a GPU with too little memory.
     """
     anatomy = read_anatomy(build_template_mesh(trial.folder, size))
     needed = estimate_needed(anatomy, trial.element, TRAIN, trial.device, batch, batch)
@@ -112,12 +112,12 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
 def rows(
     trial: Trial, sizes: Sequence[int], batches: Sequence[int], done: Sequence[Row], said: Callable[[str], object]
 ) -> Iterator[Row]:
-    """A row for each size and batch that is not `done`, each measured in a fresh process. `said` hears what is done.
+    """Measure a row for each size and batch that is not `done`, in a new process each; `said` receives the progress.
 
     Raises
     ------
     InputError
-        What meshes, devices and memory refuse; a process that was ended, for want of memory most likely.
+        Invalid meshes or devices, too little memory; a process that was killed, most likely out of memory.
     """
     known = {(row.size, row.asked) for row in done}
     for size in sizes:
@@ -137,7 +137,7 @@ def rows(
 
 
 def panels(found: Sequence[Row]) -> tuple[ChartPanel, ...]:
-    """Seconds and memory over nodes; where another preconditioner is chosen, a mark between the two sizes."""
+    """Build the plots of time and memory over nodes, with a mark between sizes of different preconditioners."""
     batches = sorted({row.asked for row in found})
     by_size = sorted({row.nodes: row.preconditioner for row in found}.items())
     marks = tuple(((a * b) ** 0.5, _kind(two)) for (a, one), (b, two) in pairwise(by_size) if _kind(one) != _kind(two))
@@ -158,5 +158,5 @@ def panels(found: Sequence[Row]) -> tuple[ChartPanel, ...]:
 
 
 def _kind(name: str) -> str:
-    """Without the number of levels."""
+    """Return a preconditioner's name without the number of levels."""
     return name.split(",")[0]

@@ -1,4 +1,4 @@
-"""What each shortcut of the solver is worth: the same loads with it and without it, in turn."""
+"""Speed-up by each acceleration of the solver: the same loads with it and without it, alternately."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,22 +23,22 @@ BATCH, BATCH_ON_CUDA, POSES = 32, 2048, 16
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """Loads that users ask for, and how.
+    """Typical loads, and the acceleration that they test.
 
     Parameters
     ----------
     shortcut
-        In words.
+        Description of the acceleration.
     name
-        The work in words.
+        Description of the loads.
     step
-        The solver that is left out; None: what is warm in a start is dropped.
+        Solver that is disabled; None: warm-start data are dropped.
     loads
-        One after the other.
+        Batches of loads, in order.
     effects, accuracy, element, live
-        As `Fem` has them.
+        Arguments of `Fem`.
     follows
-        Whether each load starts from the last answer.
+        True if each load starts from the last result.
     """
 
     shortcut: str
@@ -54,7 +54,7 @@ class Work:
 
 @dataclass(frozen=True)
 class Row:
-    """Median and 95th percentile [ms] of a load (of a batch) with a shortcut, and without; how often each was timed."""
+    """Median and 95th percentile [ms] of a load or batch with and without an acceleration; number of timings."""
 
     shortcut: str
     work: str
@@ -68,17 +68,17 @@ class Row:
 
     @property
     def ratio(self) -> float:
-        """Median without over median with."""
+        """Ratio of the median without to the median with the acceleration."""
         return self.median_without / self.median
 
     @property
     def ratio_of_totals(self) -> float:
-        """All the time without over all the time with: rare loads that take long count here."""
+        """Ratio of the total times without and with the acceleration, which includes rare slow loads."""
         return self.total_without / self.total
 
 
 def works(site: CraniotomyFrame, runs: int, on_cuda: bool) -> Iterator[Work]:
-    """What is measured; of each the first load only warms up."""
+    """Yield the loads to be measured; the first load of each is a warm-up."""
     anatomy, some = site.anatomy, BATCH_ON_CUDA if on_cuda else BATCH
     pushed = build_push_effects(anatomy, BRAIN)
     loads = draw("palpation", anatomy, runs + 1, SEED)
@@ -102,7 +102,7 @@ def works(site: CraniotomyFrame, runs: int, on_cuda: bool) -> Iterator[Work]:
         ("press", SolverStep.FRAME, "frame as one captured graph"),
     ):
         played = find_scene(scene)
-        effects, first = played.get_effects_on(anatomy), len(played.times) // 3  # the tool has arrived
+        effects, first = played.get_effects_on(anatomy), len(played.times) // 3  # frames with the tool in contact
         frames = [
             played.build_loads(site, played.path(time), time)
             for time in played.times[first : first + runs + 1].tolist()
@@ -112,7 +112,7 @@ def works(site: CraniotomyFrame, runs: int, on_cuda: bool) -> Iterator[Work]:
 
 
 def tried(fem: Fem, step: SolverStep | None) -> bool:
-    """Whether a solver has a shortcut at all on its device, with its element and effects."""
+    """Return True if a solver uses an acceleration on its device, with its element and effects."""
     plan = fem.plan
     own = {plan.many, plan.single, plan.contact}
     return (
@@ -124,7 +124,7 @@ def tried(fem: Fem, step: SolverStep | None) -> bool:
 
 
 def measure(work: Work, site: CraniotomyFrame, device: str) -> Row | None:
-    """Time a work with and without its shortcut, load by load in turn; None where the shortcut is not taken."""
+    """Time loads with and without an acceleration, alternately; None if the solver does not use it."""
     avoid = () if work.step is None else (work.step,)
     batch = len(work.loads[0])
     fem, without = (
@@ -142,7 +142,7 @@ def measure(work: Work, site: CraniotomyFrame, device: str) -> Row | None:
 
 
 def _timed(fem: Fem, work: Work, warm: bool) -> Iterator[float]:
-    """Seconds of each load."""
+    """Measure the time [s] of each load."""
     last = None
     for loads in work.loads:
         answer, seconds = time_work(fem.deform, loads, last)

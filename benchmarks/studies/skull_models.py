@@ -1,4 +1,4 @@
-"""What the skull and the mesh decide: the tumour's motion, what passes the closed skull, what its bond bears."""
+"""Influence of skull model and mesh: tumour motion, volume that passes the closed skull, traction on its bond."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,25 +17,25 @@ from sim.material import Material
 
 from .elements import tumour_motion
 
-# A bond that lets go where it bears too much, and one that bears nothing: the skull presses only, without a gap.
+# A bond that fails above its strength, and one without strength: a skull that only presses, without a gap.
 TORN = {"tearing": Bonded(), "pressing": Bonded(1e-6, 1e-6)}
 
 
 @dataclass(frozen=True)
 class Row:
-    """One skull on one mesh at one Poisson's ratio.
+    """Results of one skull on one mesh at one Poisson's ratio.
 
     Parameters
     ----------
     motion
-        Mean motion of the tumour by volume, its mean over the loads [mm].
+        Volume mean of the tumour's motion, averaged over the loads [mm].
     leaked, bond
-        The largest over the loads, as in `Deformation`; None where nothing is bonded, and of what passes a skull that
+        Maximum over the loads, as in `Deformation`. `bond` is None without a bond; `leaked` is None for a skull that
         the brain may leave.
     seconds
-        A load, set-up left out.
+        Time of a load [s], without set-up.
     failed
-        Loads that did not converge; they are in no figure.
+        Number of loads that did not converge, which are excluded from all numbers.
     """
 
     skull: str
@@ -56,7 +56,7 @@ def rows(
     device: str,
     tearing: Tearing = TEARING,
 ) -> Iterator[Row]:
-    """The same loads on every mesh, Poisson's ratio and skull; E 3 kPa, neo-Hookean, the recommended element."""
+    """Yield a row for each mesh, Poisson's ratio and skull, of the same loads; 3 kPa, neo-Hookean, default element."""
     for poisson in poissons:
         for skull in skulls:
             for anatomy in anatomies:
@@ -81,7 +81,7 @@ def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device
 def _answered(
     anatomy: Anatomy, skull: str, tissue: Material, loads: Loads, device: str, tearing: Tearing
 ) -> tuple[Deformation, np.ndarray, float]:
-    """Answers, which of them are good (B,), and seconds a load: set-up left out, but for what tears, which needs it."""
+    """Solve; return results, mask (B,) of good ones, and time per load [s], with set-up for debonding only."""
     if skull in TORN:
         effects = [TORN[skull] if isinstance(one, Bonded) else one for one in build_push_effects(anatomy, tissue)]
         each = [loads.select(np.array([row])) for row in range(len(loads))]

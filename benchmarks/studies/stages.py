@@ -1,4 +1,4 @@
-"""What each stage costs: medians where a stage is short, warm-up excluded, the device waited for at each reading."""
+"""Time of each stage: medians of short stages, without warm-up, with device synchronisation at each reading."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class Row:
-    """One figure in `unit`: median and 95th percentile of `runs` (None: one reading); `note` says what was done."""
+    """Measured value in `unit`: median and 95th percentile of `runs` (None: one reading); `note` describes it."""
 
     name: str
     median: float
@@ -29,7 +29,7 @@ class Row:
 
 
 def figure(name: str, unit: str, scale: float, runs: int, note: str, work: Callable[[int], object]) -> Row:
-    """Run `work(i)` and report seconds x scale."""
+    """Run `work(i)`, and return the row of its times [s] x scale."""
     seconds = [time_work(work, run % runs)[1] for run in range(-WARM_UP, runs)][WARM_UP:]
     return Row(name, scale * float(np.median(seconds)), scale * float(np.percentile(seconds, 95)), unit, runs, note)
 
@@ -42,9 +42,9 @@ def rows(
     batch: int,
     made: Callable[[Fem | OperatedFem], object] = lambda fem: None,
 ) -> Iterator[Row]:
-    """The figures of a theatre, one by one: finite elements, learners, and the pictures of a player of `deformer`.
+    """Yield the rows of a patient setup: FEM, trained models, and images of a player with a `deformer`.
 
-    `made` hears of the finite elements that solve the batch.
+    `made` receives the FEM solver of the batch.
     """
     scene = player.scene
     nodes = theatre.anatomy.tumour_nodes

@@ -1,4 +1,4 @@
-"""How far off a tumour is that is located from pairs of pictures, frame by frame, and how long an update takes."""
+"""Error of a tumour position estimated from stereo images, frame by frame, and time of an update."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,26 +14,26 @@ from sim.errors import InputError
 
 @dataclass(frozen=True)
 class Row:
-    """What came of the frames of a scene by one seed, or by several.
+    """Results of the frames of a scene by one seed, or by several.
 
     Parameters
     ----------
     seed
-        Of vessels, noise and rigid errors; -1: of all.
+        Seed of vessels, noise and rigid errors; -1: all seeds.
     frames, refused
-        How many there are, and how many pairs were refused.
+        Numbers of frames, and of rejected image pairs.
     points
-        Median number of points of those that were not.
+        Median number of points of accepted pairs.
     moved_mm, off_mm, p95_mm, most_mm
-        Of the tumour's middle: how far it truly moves at most, and how far off the estimate is: median, 95 % of the
-        frames, most. A refused pair shows the scan, and counts as so far off.
+        Motion of the tumour's centroid: its maximum; error of the estimate: median, 95th percentile and
+        maximum. A rejected pair counts as an estimate of no motion.
     removed, covered
-        Share of its motion over all frames that the estimate removes. Share of the ellipsoids that hold it, of pairs
-        that were not refused.
+        Share of the motion over all frames that the estimate removes; empirical coverage of the ellipsoids of pairs
+        that were accepted.
     radius_mm
-        Median radius that is said to hold it in 95 of 100 cases.
+        Median of the reported radius of 95 % probability [mm].
     milliseconds, slowest_ms
-        Of an update, from two pictures to the estimate: median, and 95 % of the frames.
+        Time of an update, from two images to the estimate [ms]: median, and 95th percentile over frames.
     """
 
     seed: int
@@ -58,12 +58,12 @@ def rows(
     every: int,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Iterator[Row]:
-    """A row for each seed, and one for all. The finite elements answer once for all seeds.
+    """Measure a row for each seed, and one for all; FEM is solved once for all seeds.
 
     Raises
     ------
     InputError
-        A scene that no pair of eyes sees; an anatomy without a locator.
+        A scene without a stereo camera; an anatomy without a locator.
     """
     if not isinstance(scene.observation_model, StereoObservation):
         raise InputError(f"no pair of eyes sees the scene {scene.name}: choose one with a StereoSight, as microscope.")
@@ -94,7 +94,7 @@ def rows(
 
 
 def row(seed: int, estimates: Sequence[TumourEstimate]) -> Row:
-    """Sum estimates up."""
+    """Summarise estimates."""
     off = 1e3 * np.array([each.off for each in estimates])
     true = 1e3 * np.array([np.linalg.norm(each.true) for each in estimates])
     seen = [each for each in estimates if each.location is not None]

@@ -1,4 +1,4 @@
-"""How many loads a second the finite elements solve: one mesh, thousands of loads, set-up off the clock."""
+"""Loads per second that FEM solves: one mesh, thousands of loads, without set-up."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,35 +25,35 @@ from surrogate.data.tool_poses import draw_poses
 from .robustness import CHECKED, Trial
 
 SEED = 0
-# However few the loads, so many have their residual computed again in double precision.
+# Minimum number of loads whose residual is computed again in double precision.
 LEAST_CHECKED = 4
 
 
-# Loads of one preset, and the seconds that drawing them took.
+# Loads of one preset, and the time of their sampling [s].
 Drawn = tuple[Loads, float]
 
 
 @dataclass(frozen=True)
 class Row:
-    """One set of loads on one tissue.
+    """Results of one set of loads on one tissue.
 
     Parameters
     ----------
     devices
-        That solve at the same time, each all the loads of the set; `loads` counts each of them.
+        Number of devices, each of which solves all loads at the same time; `loads` counts those of all devices.
     set_up
-        Seconds from the mesh to a solver; kernels are compiled in the warm-up, which nobody counts.
+        Time [s] from the mesh to a solver, without the compilation of kernels in the warm-up.
     converged
-        Of the loads, in the worst repeat.
+        Number of converged loads in the worst repeat.
     steps_median, steps_p99
-        Outer steps of a load.
+        Outer steps of a load: median and 99th percentile.
     seconds
-        Of each repeat: all loads solved, the tumour's vertices fetched. From the first device's beginning to the last
+        Time of each repeat: all loads solved, the tumour's vertices fetched. From the first device's start to the last
         one's end.
     draw_seconds
-        Of drawing the loads, apart.
+        Time to sample the loads, not included above.
     checked, double
-        So many loads solved again for every vertex, and the largest of their residuals in double precision.
+        Number of loads solved again for every vertex, and their largest residual in double precision.
     """
 
     law: str
@@ -75,18 +75,18 @@ class Row:
 
     @property
     def median(self) -> float:
-        """Seconds for all loads, median of the repeats."""
+        """Time for all loads [s], median of the repeats."""
         return float(np.median(self.seconds))
 
     @property
     def rate(self) -> float:
-        """Solves a second."""
+        """Solves per second."""
         return self.loads / self.median
 
 
 @dataclass(frozen=True)
 class Together:
-    """The tools of surgery on one tissue: their names, all their loads, the seconds for all, and to draw them."""
+    """Surgical tools on one tissue: their names, number of loads, time for all, and time to sample them [s]."""
 
     law: str
     poisson: float
@@ -98,28 +98,28 @@ class Together:
 
     @property
     def rate(self) -> float | None:
-        """Solves a second; None where no tool was asked for."""
+        """Solves per second; None if no tool was requested."""
         return self.loads / self.seconds if self.loads else None
 
 
 def drawn(anatomy: Anatomy, presets: Sequence[str], count: int, posed: bool = False) -> dict[str, Drawn]:
-    """`count` loads of each preset, or poses of its ball; of the published protocol no more than it has.
+    """Sample `count` loads of each preset, or poses of its ball; the published protocol may have fewer.
 
     Raises
     ------
     InputError
-        As `draw`, or as `draw_poses`.
+        See `draw` and `draw_poses`.
     """
     out, by = {}, draw_poses if posed else draw
     for preset in presets:
-        by(preset, anatomy, 1, SEED)  # the cortex is measured at the first draw
+        by(preset, anatomy, 1, SEED)  # exclude the first call, which prepares the cortex
         out[preset] = time_work(by, preset, anatomy, count, SEED)
     return out
 
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """A trial's finite elements, and the seconds that they took."""
+    """FEM solver of a trial, and its set-up time [s]."""
 
     fem: Fem
     set_up: float
@@ -127,7 +127,7 @@ class Made:
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """When all loads of a set were begun and solved, on a clock that all processes share [s]; what came of them."""
+    """Times at which all loads of a set were begun and solved, on a clock common to all processes [s]; outcomes."""
 
     begun: float
     ended: float
@@ -135,20 +135,20 @@ class Repeat:
     steps: np.ndarray
 
 
-# Work and task -> what each device gives for it.
+# Function from work and task to the result of each device.
 Asked = Callable[[Callable[[Made, Any], Any], Any], list[Any]]
 
 
 @contextmanager
 def on_each(devices: Sequence[str], trial: Trial) -> Iterator[Asked]:
-    """Finite elements on each of the devices, asked at the same time; on one device they are in this process.
+    """Open a FEM solver on each device for simultaneous work; with one device, the solver is in this process.
 
     Raises
     ------
     InputError
         As `Fem`.
     LostError
-        A process that was ended.
+        A process that was killed.
     """
     if len(devices) == 1:
         own = made(devices[0], trial)
@@ -159,18 +159,18 @@ def on_each(devices: Sequence[str], trial: Trial) -> Iterator[Asked]:
 
 
 def made(device: str, trial: Trial) -> Made:
-    """A trial's finite elements on a device, in single precision."""
-    find_device(device, NO_STRAIN_LIMIT.precision)  # starts Warp, off the clock
+    """Build the FEM solver of a trial on a device, in single precision."""
+    find_device(device, NO_STRAIN_LIMIT.precision)  # starts Warp, not timed
     return Made(*time_work(replace(trial, device=device).fem, NO_STRAIN_LIMIT))
 
 
 def facts(made: Made, task: None) -> tuple[int, str, float]:
-    """Nodes, preconditioner, and the seconds of set-up."""
+    """Return the number of nodes, the preconditioner, and the set-up time [s]."""
     return made.fem.space.count, made.fem.plan.preconditioner, made.set_up
 
 
 def warmed(made: Made, loads: Loads) -> None:
-    """Solve once what nobody counts."""
+    """Solve once as a warm-up, not timed."""
     made.fem.deform(loads, at=made.fem.anatomy.tumour_nodes)
 
 
@@ -198,7 +198,7 @@ def rows(
     tools: tuple[Effect, ...] = (),
     devices: Sequence[str] = (),
 ) -> Iterator[Row]:
-    """A row for each set of loads on one tissue under `tools`, to 1e-4 in single precision.
+    """Measure a row for each set of loads on one tissue under `tools`, to 1e-4 in single precision.
 
     Each of the `devices`, by default the trial's, has a process and solves all loads of a set. `done` is called
     `repeats` + 2 times a row: after the warm-up, after each repeat, and after the check.
@@ -206,13 +206,13 @@ def rows(
     Raises
     ------
     InputError
-        As `on_each`.
+        See `on_each`.
     """
     trial = replace(trial, effects=(*build_push_effects(trial.anatomy, material), *tools))
     with on_each(devices or (trial.device,), trial) as asked:
         known = asked(facts, None)
         nodes, preconditioner, _ = known[0]
-        # Judged on the host whatever the device: other kernels and other arithmetic than those that are measured.
+        # Residuals are computed on the host for every device: with kernels and arithmetic other than the measured ones.
         judge = replace(trial, device="cpu", batch=CHECKED).fem(REFERENCE)
         for preset, (loads, drawing) in sets.items():
             asked(warmed, loads.select(slice(trial.batch)))
@@ -240,7 +240,7 @@ def rows(
 
 
 def together(found: Sequence[Row]) -> list[Together]:
-    """The tools of surgery taken together, tissue by tissue."""
+    """Combine the rows of surgical tools, tissue by tissue."""
     out = []
     for law, poisson in dict.fromkeys((row.law, row.poisson) for row in found):
         mine = [row for row in found if (row.law, row.poisson) == (law, poisson)]
@@ -252,5 +252,5 @@ def together(found: Sequence[Row]) -> list[Together]:
 
 
 def checked(count: int) -> np.ndarray:
-    """Which (k,) of so many loads are checked: one in a hundred, evenly picked."""
+    """Select the numbers (k,) of the loads that are checked: one in a hundred, evenly spaced."""
     return np.linspace(0, count - 1, min(count, max(LEAST_CHECKED, -(-count // CHECKED)))).astype(int)

@@ -1,7 +1,7 @@
-"""How well a printed cube tells where a tool's tip is: pictures with known poses, by two published protocols.
+"""Error of a tool's tip tracked by its printed cube: images with known poses, by two published protocols.
 
-FMAC (arXiv 2601.07723) spreads poses evenly over all six freedoms. ASTM F2554 (2022) has one point touched again and
-again, the tool turned about it, and distances between points.
+FMAC (arXiv 2601.07723) spreads poses evenly over all six degrees of freedom. ASTM F2554 (2022) touches one point
+repeatedly, rotates the tool about it, and measures distances between points.
 """
 
 import time
@@ -19,33 +19,33 @@ from ar.tracking.pose import Pose, Tracker, Verdict
 from ar.tracking.synthetic_images import render_targets
 from ar.tracking.targets import MARKER_RATIO, TIP_DISTANCE, build_tool_cube
 
-# The camera of the published trials: pixels, focal length [pixel], how far its targets are [m], and a usual lens.
+# Camera of the published trials: image size and focal length [pixel], distance of targets [m], and a typical lens.
 WIDTH, HEIGHT, FOCAL, AWAY = 1280, 960, 1400.0, 0.4
 LENS = Lens(-0.1, 0.02, 5e-4, -3e-4)
-# Blur [pixel] and noise [of 255] of its pictures; a marker that is smaller [pixel] need not be found.
+# Blur [pixel] and noise [of 255] of the images; side [pixel] below which a marker need not be detected.
 BLUR, NOISE, SEEN = 0.5, 2.0, 20.0
-# Half the volume that the cube is in [m], and how far it is turned at most [degree].
+# Half sizes of the volume of the cube's positions [m], and maximum rotation [degree].
 VOLUME, TURNED = np.array([0.09, 0.06, 0.03]), 45.0
-# Half the cube in which points are touched [m], and the tool's turns there.
+# Half side of the cube of touched points [m], and the tool's maximum rotation there [degree].
 TOUCHED, LEANING = 0.03, 30.0
 
 
 @dataclass(frozen=True)
 class Row:
-    """One protocol; errors of the tip in millimetres.
+    """Results of one protocol; errors of the tip [mm].
 
     Parameters
     ----------
     median, p95, most
-        Of what the protocol measures: distance from the truth, from the mean, or between points.
+        Statistics of the protocol's error: distance from the truth, from the mean, or error of distances.
     certain
-        Of the pictures in which a face's markers have 20 pixels, those with a certain pose [%]; None: there are none.
+        Share [%] of images with a certain pose, of those with markers of at least 20 pixels; None without such images.
     wrong
-        Poses that were called certain, and are off by more than 5 of their own standard deviations and 1 mm.
+        Number of certain poses with an error above 5 of their standard deviations and 1 mm.
     held
-        How often the ellipsoid of 95 % held the tip [%].
+        Empirical coverage of the tip by the 95 % ellipsoid [%].
     milliseconds
-        Of a picture, the target being followed: median.
+        Median time of an image while the target is tracked [ms].
     """
 
     protocol: str
@@ -61,7 +61,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One picture: where the tip was, and where it was found, if that is certain, with its covariance; and the time."""
+    """Image: true tip; tip and covariance of a certain pose; and the computing time."""
 
     tip: np.ndarray
     markers: float
@@ -71,17 +71,17 @@ class Shot:
 
 
 def trial_camera() -> Camera:
-    """The camera of the trials, at the world's origin."""
+    """Build the camera of the trials, at the world's origin."""
     K = np.array([[FOCAL, 0.0, 0.5 * WIDTH - 20.0], [0.0, FOCAL, 0.5 * HEIGHT + 12.0], [0.0, 0.0, 1.0]])
     return Camera(K, np.eye(4), WIDTH, HEIGHT, LENS)
 
 
 def studied(count: int, seed: int = 0, progress: Callable[[int, int], object] = lambda done, total: None) -> list[Row]:
-    """All protocols, of `count` pictures each."""
+    """Measure all protocols, with `count` images each."""
     plans = {
         "FMAC: all six freedoms": (spread(count, seed), _off),
-        "F2554: one point": (calibrate_pivot(count, seed, np.zeros(3)), _from_mean),
-        "F2554: between points": (calibrate_pivot(count, seed, None), between),
+        "F2554: one point": (build_pivot_poses(count, seed, np.zeros(3)), _from_mean),
+        "F2554: between points": (build_pivot_poses(count, seed, None), between),
     }
     rows, done, total = [], 0, count * len(plans)
     for name, (poses, measure) in plans.items():
@@ -95,7 +95,7 @@ def studied(count: int, seed: int = 0, progress: Callable[[int, int], object] = 
 
 
 def build_row(name: str, shots: list[Shot], measure: Callable[[list[Shot]], np.ndarray]) -> Row:
-    """A protocol's row, whose errors (n,) [m] are measured on the certain ones of its pictures."""
+    """Build a protocol's row from errors (n,) [m] of its images with certain poses."""
     certain = [shot for shot in shots if shot.found is not None]
     fair = [shot for shot in shots if shot.markers >= SEEN]
     error = 1e3 * measure(certain)
@@ -116,32 +116,32 @@ def build_row(name: str, shots: list[Shot], measure: Callable[[list[Shot]], np.n
 
 
 def _in_deviations(shot: Shot) -> float:
-    """Squared distance of the found tip from the true one, in units of its covariance."""
+    """Compute the squared Mahalanobis distance of the estimated tip from the true one."""
     assert shot.found is not None and shot.covariance is not None
     error = shot.found - shot.tip
     return float(error @ np.linalg.solve(shot.covariance, error))
 
 
 def _off(shots: list[Shot]) -> np.ndarray:
-    """Distances (n,) [m] from where the tip was."""
+    """Compute distances (n,) [m] from the true tips."""
     return np.array([np.linalg.norm(shot.found - shot.tip) for shot in shots if shot.found is not None])
 
 
 def _from_mean(shots: list[Shot]) -> np.ndarray:
-    """Distances (n,) [m] of repeated touches from their mean."""
+    """Compute distances (n,) [m] of repeated touches from their mean."""
     found = np.array([shot.found for shot in shots])
     return np.linalg.norm(found - found.mean(axis=0), axis=1)
 
 
 def between(shots: list[Shot]) -> np.ndarray:
-    """By how much distances between points, each and the next, are off (n - 1,) [m]."""
+    """Compute errors (n - 1,) [m] of the distances between successive points."""
     found, true = (np.array([getattr(shot, name) for shot in shots]) for name in ("found", "tip"))
     lengths = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in (found, true)]
     return np.abs(lengths[0] - lengths[1])
 
 
 def spread(count: int, seed: int) -> Iterator[np.ndarray]:
-    """Poses (4, 4) of the cube, evenly over its volume and its turns."""
+    """Yield poses (4, 4) of the cube, uniform over its volume and rotations."""
     for u in _numbers(count, seed):
         axis = _direction(u[0], u[1])
         T = _facing(Rotation.from_rotvec(np.radians(TURNED) * np.cbrt(u[2]) * axis))
@@ -150,12 +150,12 @@ def spread(count: int, seed: int) -> Iterator[np.ndarray]:
 
 
 def _numbers(count: int, seed: int) -> np.ndarray:
-    """Numbers (count, 6) in [0, 1) of low discrepancy; those of another seed go on where these end."""
+    """Generate low-discrepancy numbers (count, 6) in [0, 1); the next seed continues the sequence."""
     return qmc.Halton(6, scramble=False).fast_forward(1 + seed * count).random(count)
 
 
-def calibrate_pivot(count: int, seed: int, point: np.ndarray | None) -> Iterator[np.ndarray]:
-    """Poses (4, 4) of the cube, the tip on a point (3,) [m] beside the middle of the volume, or on one of many."""
+def build_pivot_poses(count: int, seed: int, point: np.ndarray | None) -> Iterator[np.ndarray]:
+    """Yield poses (4, 4) of the cube with the tip on a point (3,) [m] about the volume's centre; None: many points."""
     for u in _numbers(count, seed):
         axis = _direction(u[0], u[1])
         T = _facing(Rotation.from_rotvec(np.radians(LEANING) * np.cbrt(u[2]) * axis))
@@ -166,14 +166,14 @@ def calibrate_pivot(count: int, seed: int, point: np.ndarray | None) -> Iterator
 
 
 def _direction(u: float, v: float) -> np.ndarray:
-    """A unit vector (3,) of two numbers in [0, 1), uniform by area."""
+    """Map two numbers in [0, 1) to a unit vector (3,), uniform by area."""
     z = 2.0 * u - 1.0
     ring = np.sqrt(1.0 - z * z)
     return np.array([ring * np.cos(2.0 * np.pi * v), ring * np.sin(2.0 * np.pi * v), z])
 
 
 def _facing(turn: Rotation) -> np.ndarray:
-    """The cube turned from where the corner between its faces looks at the camera (4, 4)."""
+    """Build a pose (4, 4) of the cube, rotated from the one whose corner between its faces points to the camera."""
     forward = -np.ones(3) / np.sqrt(3.0)
     right = -np.cross([0.0, 0.0, 1.0], forward)
     right = right / np.linalg.norm(right)
@@ -191,7 +191,7 @@ def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[Shot]:
         picture = np.clip(blurred + rng.normal(0.0, NOISE, blurred.shape), 0.0, 255.0).astype(np.uint8)
         first = tracker.track(picture)
         begun = time.perf_counter()
-        again = tracker.track(picture, first)  # as it is followed
+        again = tracker.track(picture, first)  # as in tracking
         seconds = time.perf_counter() - begun
         tip = np.array([0.0, 0.0, -TIP_DISTANCE])
         pose: Pose | None = again.poses.get(cube.name) if again.verdicts[cube.name] is Verdict.GOOD else None
@@ -200,11 +200,11 @@ def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[Shot]:
 
 
 def _markers(camera: Camera, T: np.ndarray) -> float:
-    """Side [pixel] of the markers on the face that is seen largest: the root of what a square covers."""
+    """Compute the side [pixel] of the markers on the largest visible face: root of a square's area."""
     sides = [0.0]
     for face in build_tool_cube().faces:
         pixels = camera.project(face.outline @ T[:3, :3].T + T[:3, 3])[0]
         (x, y), (x_next, y_next) = pixels.T, np.roll(pixels, -1, axis=0).T
-        area = 0.5 * float(np.sum(x * y_next - x_next * y))  # negative where it is seen from behind
+        area = 0.5 * float(np.sum(x * y_next - x_next * y))  # negative for a face seen from behind
         sides.append(MARKER_RATIO * np.sqrt(max(area, 0.0) / (face.columns * face.rows)))
     return float(max(sides))

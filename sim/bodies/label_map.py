@@ -62,7 +62,7 @@ class LabelMap:
         Raises
         ------
         InputError
-            See `places`.
+            See `find_layers`.
         """
         found = np.asarray(self.layers.any(axis=-1)) if not labels else np.zeros(self.layers.shape[:3], bool, order="F")
         places = self.find_layers(labels)

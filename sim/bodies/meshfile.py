@@ -105,7 +105,7 @@ def _read_with_meshio(path: Path) -> meshio.Mesh:
     InputError
         With meshio's reason if it gives one. Its other exceptions indicate a damaged file.
     """
-    import meshio  # optional dependency: machines for training only lack it
+    import meshio  # optional dependency, missing on machines for training alone
 
     if path.suffix.lower() == ".vtu":
         with path.open("rb") as file:

@@ -232,7 +232,7 @@ def _find_on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def _select_nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
-    """Return the one nearer to `point`."""
+    """Return the one of two points that is nearer to `point`."""
     return wp.where(wp.length_sq(one - point) <= wp.length_sq(other - point), one, other)
 
 

@@ -107,7 +107,7 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
     inner = ~_is_among(triangles, mesh.surface)
     covered = body.fixed[triangles].all(axis=1) & ~inner
     _check_places(body, triangles[covered], np.unique(triangles[inner]))
-    # Refined: the free surface, what touches it, and the interface if that does.
+    # Refine the free surface, triangles with a vertex on it, and, if these include it, the interface.
     marked = np.any(np.isin(triangles, triangles[~covered & ~inner]), axis=1)
     marked = marked | (inner & np.any(marked[inner]))
     walls = triangles[covered][:, TRIANGLE_EDGES].reshape(-1, 2)
@@ -118,7 +118,7 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
     move = _number(np.setdiff1d(triangles, np.flatnonzero(fixed)), count)
     pull = _number(np.unique(triangles[covered | inner]), count)
     act, density = _number(np.asarray(body.acting), count), np.zeros(count)
-    # A refined triangle has a quarter of the area. Ends of the edge that a node halves; itself if it is a vertex.
+    # All triangles at `acting` are refined. `halved`: ends of the edge that a node halves; for a vertex, itself twice.
     density[body.acting] = 0.25 / compute_vertex_areas(nodes, triangles[~inner])[body.acting]
     halved = np.vstack([np.arange(len(mesh.nodes)).repeat(2).reshape(-1, 2), edges])
     regions = []
@@ -171,7 +171,7 @@ def _distribute(row: np.ndarray, value: np.ndarray, count: int) -> sp.csr_array:
 
 
 def _is_among(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Mark (n,) the rows (n, k) of vertex numbers that are, in any order in the row, among others (m, k)."""
+    """Mark (n,) the rows (n, k) of vertex numbers that equal one of other rows (m, k), in any order of the numbers."""
     keys = compute_row_keys(np.vstack([rows, others]))
     return np.isin(keys[: len(rows)], keys[len(rows) :])
 

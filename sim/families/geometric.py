@@ -13,7 +13,7 @@ from scipy.sparse.linalg import LaplacianNd, splu
 from ..geometry.surface import compute_areas, compute_vertex_normals
 from .linear_body import LinearBody
 
-PINS = 400  # Most fixed vertices at which the models stay in place.
+PINS = 400  # Maximum number of fixed vertices at which the displacement is forced to zero.
 LATTICE = 16  # Cells along the longest side of a free-form lattice.
 SMOOTHING = 1e-2  # Weight of a lattice's roughness relative to its misfit.
 

@@ -156,7 +156,7 @@ class LinearModel(_ForceModel):
     """Deformation model with a table of responses to unit forces at the free surface.
 
     `inverted`, `stretch` and `strained` of its results count tetrahedra at the free surface and in the tumour only.
-    Its outcome says nothing of the error of linear theory, which is 10 % of the motion at surgical forces.
+    Its outcome does not include the error of linear theory, which is 10 % of the motion at surgical forces.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ class _Samples(NamedTuple):
 def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: NodalField) -> None:
     """Fit a field (3, I, J, K), sampled in a body (mask `inside`) and its `collar`, to the body's field between nodes.
 
-    Changed in place are nodes at interpolation errors above 0.02 mm, in the collar only where it moves. The squared
+    Nodes at interpolation errors above 0.02 mm change in place, in the collar only where it moves. The squared
     error is minimised over points of the tetrahedra and of their surface (L2 projection). The field has a kink at the
     surface, which nodes outside represent. Small weights keep changes small and even, and the field straight in
     the collar.

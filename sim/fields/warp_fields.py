@@ -51,7 +51,7 @@ class WarpFields:
         (I, J, K) bool: nodes in resected tissue, in the undeformed configuration.
     least
         Least Jacobian determinants of the two fields, and least relative volume of a tetrahedron.
-        If one is not above 0, the fields fold, or only the body does.
+        If one is <= 0, the fields fold, or the body alone.
     reach
         Distance from the body over which the field fades to zero [m].
     """

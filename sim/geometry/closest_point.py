@@ -70,8 +70,8 @@ def _list_candidates(points: np.ndarray, middle: np.ndarray, reach: np.ndarray) 
 
     A triangle is left out if no point of it can be closer than the nearest centroid.
 
-    Each row begins with the possibly closest triangles in ascending order, so that of equal ones the first is found.
-    The remainder of the row repeats the first of them.
+    Each row begins with the possibly closest triangles in ascending order, so that the first of equals is found.
+    The remainder of the row repeats its first triangle.
     """
     x, y, z = (points[:, axis, None] - middle[:, axis] for axis in range(3))
     away = np.sqrt(x * x + y * y + z * z)

@@ -21,7 +21,7 @@ class Located:
     weights: np.ndarray
 
     def read(self, field: np.ndarray) -> np.ndarray:
-        """Interpolate linearly to values (B, n, k) at the points from those (B, V, k) at the vertices."""
+        """Interpolate values (B, V, k) at the vertices linearly to the points: (B, n, k)."""
         return np.einsum("nc,bnck->bnk", self.weights, field[:, self.vertices])
 
 

@@ -24,16 +24,16 @@ class Preconditioner(Protocol):
     def on_device(self) -> bool:
         """True if `apply` only launches kernels on the device, in the same arrays for all batches of one width.
 
-        Then a GPU can replay it, whatever is `live`.
+        A GPU can then replay `apply` for any `live`.
         """
         ...
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Use the last linearisation, if it matters; `columns` is the width of the batch."""
+        """Prepare `apply` for the last linearisation, if it depends on that; `columns` is the width of the batch."""
         ...
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Compute out = M^-1 r (3N, b) for load cases `live` (b,); the others may hold anything finite."""
+        """Compute out = M^-1 r (3N, b) for load cases `live` (b,); the other columns may have any finite values."""
         ...
 
 
@@ -128,7 +128,7 @@ def solve_conjugate_gradients(
         Largest number of iterations.
     radius
         (b,) [J^1/2]: bound of x in the preconditioner's norm; at negative curvature x is extended to it.
-        Without a radius x stops there with its present value, or with the first direction.
+        Without a radius, the iteration ends there with the present x, or with the first direction.
     """
     device, columns = problem.device, r.shape[1]
     reach = np.full(columns, np.inf) if radius is None else radius

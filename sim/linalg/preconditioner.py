@@ -106,7 +106,7 @@ def name_of(preconditioner: Preconditioner) -> str:
 
 
 def is_exact(preconditioner: Preconditioner) -> bool:
-    """Return True if it is the inverse of the whole undeformed stiffness, up to rounding."""
+    """Return True if a preconditioner is the inverse of the whole undeformed stiffness, up to rounding."""
     return name_of(preconditioner) in ("sparse factor", "dense inverse")
 
 

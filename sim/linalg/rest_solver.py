@@ -24,7 +24,7 @@ class RestStiffnessSolver:
     preconditioner
         Preconditioner of the problem: for conjugate gradients, if there is no exact inverse.
     inner
-        Maximum iterations of these.
+        Maximum number of conjugate gradient iterations.
     tolerance
         Relative residual of the linear solves.
     max_factorised

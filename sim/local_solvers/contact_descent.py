@@ -97,7 +97,7 @@ class ContactDescent:
 
     @cached_property
     def _room(self) -> Callable[[int, int, int], Scratch]:
-        """`allocate_scratch`, which is slow, with the last two results cached."""
+        """Function `allocate_scratch` with a cache of its last two results, as allocation is slow."""
         return lru_cache(2)(partial(allocate_scratch, self._exact))
 
     @property
@@ -155,7 +155,7 @@ class ContactDescent:
     def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:
         """Run captured steps of a single load case until it ends.
 
-        Return early if it needs what only the other path has: more workspace for touched nodes, or Newton.
+        Return early if the load case needs more workspace for touched nodes, or Newton: captured steps have neither.
         """
         known, judge, limits = None, batch.evaluator, self.limits
         if batch.model is None or not steps.set_tools(judge.constant):
@@ -173,7 +173,7 @@ class ContactDescent:
             if self._increase_proximal_term(batch, said[[STATUS]] != SOLVED).any():
                 return
             if batch.waiting.any():
-                # Its model may have been reset.
+                # The load case's model may have been reset.
                 known = None if batch.failed[0] % limits.max_failures == 0 else known
                 continue
             batch.predicted[:] = said[PREDICTED_DECREASE]
@@ -186,7 +186,7 @@ class ContactDescent:
             if there.any():
                 steps.move_to_last_step()
                 batch.state.free[:], batch.state.scale[:] = free, scale
-            else:  # its model has been reset
+            else:  # the load case's model has been reset
                 known = None
 
     def _find_ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
@@ -232,7 +232,7 @@ class ContactDescent:
         return batch.failed >= 2 * self.limits.max_failures
 
     def _increase_proximal_term(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
-        """Increase the proximal coefficient where no forces were found (b,) bool; return which (b,) fail finally."""
+        """Increase the proximal coefficient of `waiting` cases (b,), without forces; return those (b,) to give up."""
         times = self.limits.max_failures
         batch.waiting = waiting
         batch.failed = np.where(waiting, batch.failed + 1, 0)
@@ -302,8 +302,8 @@ class ContactDescent:
     def _try_steps(self, batch: Batch) -> np.ndarray:
         """Evaluate the trial step of each load case that does not wait; return which (b,) need another direction.
 
-        That is, they accepted the step, because the energy still falls there, or nearly so; or backtracking left almost
-        no step: then they stay, and their model is reset.
+        These accepted the step, because the energy still falls there, or nearly so; or backtracking left almost
+        no step: then the state is kept, and the model is reset.
         """
         now, going = batch.state, ~(batch.waiting | batch.ended)
         t = np.where(going, batch.length, 0.0)
@@ -324,7 +324,7 @@ class ContactDescent:
     def _take_steps(self, batch: Batch, t: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, ...]:
         """Accept steps of length t (b,), or shorten them; return which (b,) are accepted, and which reset their model.
 
-        The decision uses the slopes `ahead` (b,) and the residuals `free` (b,) there.
+        The decision uses the slopes `ahead` (b,) and the residuals `free` (b,) after the step.
         """
         limits, now, going = self.limits, batch.state, ~(batch.waiting | batch.ended)
         far = going & is_step_too_long(ahead, batch.predicted) & (t > limits.accepted_length)

@@ -38,22 +38,22 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return total(own)
 
     @wp.func
-    def acts(x: wp.array2d(dtype=wp.float64), i: int, c: int) -> bool:
+    def is_nonzero(x: wp.array2d(dtype=wp.float64), i: int, c: int) -> bool:
         """Return True if x is not zero at a node."""
         zero = wp.float64(0.0)
         return x[3 * i, c] != zero or x[3 * i + 1, c] != zero or x[3 * i + 2, c] != zero
 
     @wp.func
-    def alike(x: wp.array2d(dtype=wp.float64), place: wp.array2d(dtype=wp.int32), c: int, me: int) -> bool:
+    def has_same_nodes(x: wp.array2d(dtype=wp.float64), place: wp.array2d(dtype=wp.int32), c: int, me: int) -> bool:
         """Return True if the nodes where x is not zero are exactly those that have a place."""
         other = wp.float64(0.0)
         for i in range(me, place.shape[0], threads):
-            if acts(x, i, c) != (place[i, c] >= 0):
+            if is_nonzero(x, i, c) != (place[i, c] >= 0):
                 other += wp.float64(1.0)
         return total(other) == wp.float64(0.0)
 
     @wp.func
-    def listed(
+    def list_nodes(
         x: wp.array2d(dtype=wp.float64),
         place: wp.array2d(dtype=wp.int32),
         nodes: wp.array2d(dtype=wp.int32),
@@ -68,12 +68,12 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         begin, end = wp.min(me * own, n), wp.min((me + 1) * own, n)
         mine = wp.int32(0)
         for i in range(begin, end):
-            if acts(x, i, c):
+            if is_nonzero(x, i, c):
                 mine += 1
         number = before(mine)
         for i in range(begin, end):
             place[i, c] = -1
-            if acts(x, i, c):
+            if is_nonzero(x, i, c):
                 nodes[c, number] = i
                 place[i, c] = number
                 number += 1
@@ -83,7 +83,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return counts[c, which]
 
     @wp.func
-    def feel(
+    def compute_gradient(
         x: wp.array2d(dtype=wp.float64),
         here: wp.array2d(dtype=wp.float64),
         stage: Stage,
@@ -98,7 +98,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         add_force(x, stage, near, c, me, s.slope)
 
     @wp.func
-    def curve(stage: Stage, near: Near, definite: int, m: int, s: Scratch, c: int, me: int):
+    def assemble_curvature(stage: Stage, near: Near, definite: int, m: int, s: Scratch, c: int, me: int):
         """Assemble the curvature of barrier and proximal term at w between the m touched nodes."""
         for i in range(me // across, 3 * m, down):
             for j in range(me % across, 3 * m, across):
@@ -110,7 +110,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         wait()
 
     @wp.func
-    def changed(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
+    def get_change(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
         """Return the change of the compliance by strained tissue."""
         own = wp.float64(0.0)
         if model.own.shape[1] > 0:
@@ -118,14 +118,14 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return own
 
     @wp.func
-    def between(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
+    def get_compliance(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
         """Return the compliance between touched nodes, symmetrised: half precision may have rounded its columns."""
-        return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + changed(model, c, i, j)
+        return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + get_change(model, c, i, j)
 
     @wp.func
-    def pull(model: ComplianceModel, s: Scratch, c: int, me: int) -> int:
+    def list_changes(model: ComplianceModel, s: Scratch, c: int, me: int) -> int:
         """List the nodes on which the change acts, compute the L-BFGS weights of it, and return their number."""
-        m = listed(s.change, s.acts, s.acting, s.counts, ACTING, c, me)
+        m = list_nodes(s.change, s.acts, s.acting, s.counts, ACTING, c, me)
         pairs = model.history.shape[1]
         for p in range(me, pairs, threads):
             own = wp.float64(0.0)
@@ -143,9 +143,9 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return m
 
     @wp.func
-    def give(model: ComplianceModel, out: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
+    def compute_motion(model: ComplianceModel, out: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
         """Compute the motion of all nodes under the negative change of the forces: out = -C change."""
-        m, size = pull(model, s, c, me), out.shape[0]
+        m, size = list_changes(model, s, c, me), out.shape[0]
         for first in range(me, size, wide * threads):
             sums = Strip()
             for a in range(m):
@@ -154,9 +154,9 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                     share = s.change[j, c]
                     for q in range(wide):
                         i = wp.min(first + q * threads, size - 1)
-                        soft = model.rest[j, i] + changed(model, c, j, i)
+                        soft = model.rest[j, i] + get_change(model, c, j, i)
                         if s.place[i // 3, c] >= 0:
-                            soft = between(model, c, i, j)
+                            soft = get_compliance(model, c, i, j)
                         sums[q] += soft * share
             for p in range(model.history.shape[1]):
                 share = s.y[c, p]
@@ -168,22 +168,22 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         wait()
 
     @wp.func
-    def give_touched(model: ComplianceModel, size: int, s: Scratch, c: int, me: int):
+    def compute_touched_motion(model: ComplianceModel, size: int, s: Scratch, c: int, me: int):
         """Compute the motion of the touched nodes, `size` rows, under the change of the forces: at = C change."""
-        m = pull(model, s, c, me)
+        m = list_changes(model, s, c, me)
         for i in range(me, size, threads):
             row = 3 * s.touched[c, i // 3] + i % 3
             own = wp.float64(0.0)
             for a in range(3 * m):
                 j = 3 * s.acting[c, a // 3] + a % 3
-                own += between(model, c, row, j) * s.change[j, c]
+                own += get_compliance(model, c, row, j) * s.change[j, c]
             for p in range(model.history.shape[1]):
                 own += model.history[c, p, row] * s.y[c, p]
             s.at[row, c] = own
         wait()
 
     @wp.func
-    def soften(model: ComplianceModel, m: int, s: Scratch, c: int, me: int) -> wp.float64:
+    def assemble_compliance(model: ComplianceModel, m: int, s: Scratch, c: int, me: int) -> wp.float64:
         """Assemble the compliance between m touched nodes, and return its mean diagonal."""
         pairs = model.history.shape[1]
         for j in range(me, 3 * m, threads):
@@ -197,7 +197,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         for i in range(me // across, 3 * m, down):
             first = 3 * s.touched[c, i // 3] + i % 3
             for j in range(i + me % across, 3 * m, across):
-                own = between(model, c, first, 3 * s.touched[c, j // 3] + j % 3)
+                own = get_compliance(model, c, first, 3 * s.touched[c, j // 3] + j % 3)
                 for p in range(pairs):
                     own += model.history[c, p, first] * s.middle_history[c, p, j]
                 s.soft[c, i, j] = own
@@ -212,7 +212,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return mean
 
     @wp.func
-    def relieve(m: int, s: Scratch, c: int, me: int) -> bool:
+    def apply_woodbury(m: int, s: Scratch, c: int, me: int) -> bool:
         """Subtract D (1 + C D)^-1 a from the change, for the compliance C = L L' of `soft`; False if not convex.
 
         It is D (a - L (1 + L' D L)^-1 L' D a): Woodbury 1950. a is `at` at the touched nodes.
@@ -276,7 +276,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return missing == 0
 
     @forward_kernel(module="unique", launch_bounds=threads)
-    def copy_to_host(
+    def solve_forces(
         here: wp.array2d(dtype=wp.float64),
         there: wp.array2d(dtype=wp.float64),
         known: wp.array2d(dtype=wp.float64),
@@ -303,8 +303,8 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             s.force[r, c] = known[r, c]
             s.w[r, c] = here[r, c]
         wait()
-        feel(s.w, here, stage, near, s, c, me)
-        m = listed(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
+        compute_gradient(s.w, here, stage, near, s, c, me)
+        m = list_nodes(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
         if m > ends.capacity or not are_known(model, m, s, c):
             wait()
             if me == 0:
@@ -312,7 +312,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             return
         sound = wp.bool(False)  # True if `soft` holds a valid Cholesky factor
         if m > 0:
-            stiff = drag[c] / soften(model, m, s, c, me)
+            stiff = drag[c] / assemble_compliance(model, m, s, c, me)
             for i in range(me, 3 * m, threads):
                 row = 3 * s.touched[c, i // 3] + i % 3
                 s.held[row, c] = stiff
@@ -328,16 +328,16 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         for r in range(me, size, threads):
             s.change[r, c] = s.force[r, c] - known[r, c]
         wait()
-        give(model, s.at, s, c, me)
+        compute_motion(model, s.at, s, c, me)
         for r in range(me, size, threads):
             s.w[r, c] = there[r, c] + s.at[r, c]
         wait()
-        feel(s.w, here, stage, near, s, c, me)
+        compute_gradient(s.w, here, stage, near, s, c, me)
         convex, verdict = wp.bool(True), wp.int32(OPEN)
         for step in range(ends.max_iterations + 1):
-            fresh = not alike(s.slope, s.place, c, me)
+            fresh = not has_same_nodes(s.slope, s.place, c, me)
             if fresh:
-                m = listed(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
+                m = list_nodes(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
             for r in range(me, size, threads):
                 s.change[r, c] = s.slope[r, c] - s.force[r, c]
             wait()
@@ -355,18 +355,18 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             # Residual, and the Newton step of the forces.
             convex = True
             if m > 0:
-                give_touched(model, 3 * m, s, c, me)
+                compute_touched_motion(model, 3 * m, s, c, me)
                 if fresh:
-                    soften(model, m, s, c, me)
+                    assemble_compliance(model, m, s, c, me)
                     sound = factor(s.soft, 3 * m, c, me)
                 convex = sound
                 if sound:
-                    curve(stage, near, 0, m, s, c, me)
-                    convex = relieve(m, s, c, me)
+                    assemble_curvature(stage, near, 0, m, s, c, me)
+                    convex = apply_woodbury(m, s, c, me)
                 if sound and not convex:  # retry with positive semi-definite contact curvature
-                    curve(stage, near, 1, m, s, c, me)
-                    relieve(m, s, c, me)
-            give(model, s.way, s, c, me)
+                    assemble_curvature(stage, near, 1, m, s, c, me)
+                    apply_woodbury(m, s, c, me)
+            compute_motion(model, s.way, s, c, me)
             own = wp.float64(0.0)
             for r in range(me, size, threads):
                 own += (s.slope[r, c] - s.force[r, c]) * s.way[r, c]
@@ -376,7 +376,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 for r in range(me, size, threads):
                     s.at[r, c] = s.w[r, c] + t * s.way[r, c]
                 wait()
-                feel(s.at, here, stage, near, s, c, me)
+                compute_gradient(s.at, here, stage, near, s, c, me)
                 own = wp.float64(0.0)
                 for r in range(me, size, threads):
                     own += (s.slope[r, c] - s.force[r, c] - t * s.change[r, c]) * s.way[r, c]
@@ -397,4 +397,4 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         if me == 0:
             status[c] = verdict
 
-    return copy_to_host
+    return solve_forces

@@ -41,11 +41,11 @@ STATUS, TRIED_LENGTH, PREDICTED_DECREASE, TRIAL_SLOPE, MAX_SQUARE_NORM, WHOLE_SU
 class ContactStepKernels:
     """Kernels between the matrix products of a step, in one scalar type."""
 
-    look: wp.Kernel
-    change: wp.Kernel
-    shorten: wp.Kernel
-    push: wp.Kernel
-    report: wp.Kernel
+    compute_positions: wp.Kernel
+    compute_change: wp.Kernel
+    read_length: wp.Kernel
+    add_forces: wp.Kernel
+    write_results: wp.Kernel
 
 
 @cache
@@ -54,7 +54,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
     scalar = device.scalar
 
     @forward_kernel(module="unique")
-    def look(
+    def compute_positions(
         rows: wp.array(dtype=wp.int32),
         u: wp.array2d(dtype=scalar),
         rest: wp.array2d(dtype=scalar),
@@ -69,7 +69,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         there[i, 0] = here[i, 0] - wp.float64(rest[rows[i], 0]) - wp.float64(more[i, 0])
 
     @forward_kernel(module="unique")
-    def change(
+    def compute_change(
         found: wp.array2d(dtype=wp.float64),
         force: wp.array2d(dtype=wp.float64),
         # outputs
@@ -80,7 +80,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         out[i, 0] = scalar(found[i, 0] - force[i, 0])
 
     @forward_kernel(module="unique")
-    def shorten(
+    def read_length(
         given: wp.array(dtype=wp.float64),
         # outputs
         length: wp.array(dtype=scalar),
@@ -89,7 +89,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         length[0] = scalar(given[LENGTH])
 
     @forward_kernel(module="unique")
-    def push(
+    def add_forces(
         rows: wp.array(dtype=wp.int32),
         force: wp.array2d(dtype=wp.float64),
         # outputs
@@ -100,7 +100,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         out[rows[i], 0] += scalar(force[i, 0])
 
     @forward_kernel(module="unique")
-    def report(
+    def write_results(
         status: wp.array(dtype=wp.int32),
         length: wp.array(dtype=scalar),
         predicted: wp.array(dtype=wp.float64),
@@ -122,7 +122,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         out[WHOLE_SUM] = sums[WHOLE, 0]
         out[FREE_SUM] = sums[FREE, 0]
 
-    return ContactStepKernels(look, change, shorten, push, report)
+    return ContactStepKernels(compute_positions, compute_change, read_length, add_forces, write_results)
 
 
 def read_step_result(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -260,14 +260,14 @@ class ContactSteps:
         self._more.zero_()
         self._give(self._own, self._more, len(self._touched))
         inputs = [self._touched, self._u, self._rest, self._more]
-        device.launch(k.look, (len(self._touched),), inputs, [self._here, self._there])
+        device.launch(k.compute_positions, (len(self._touched),), inputs, [self._here, self._there])
         self._status.zero_()
         self._found.zero_()
         given = [self._given[TOLERANCE : TOLERANCE + 1], self._given[DRAG : DRAG + 1], 0]
         inputs = [self._here, self._there, self._force, *given, *stage, self._model, ends, self._scratch]
         blocks.launch(self._exact, kernel, 1, inputs, [self._found, self._status])
         self._change.zero_()
-        device.launch(k.change, (len(self._touched),), [self._found, self._force], [self._change])
+        device.launch(k.compute_change, (len(self._touched),), [self._found, self._force], [self._change])
         self._give(self._change, self._near, len(self._rows))
         self._press()
         combine_columns(device, self._own, 1.0, self._change, self._own)
@@ -285,7 +285,7 @@ class ContactSteps:
 
     def _retry_shorter_step(self) -> None:
         wp.copy(self._given, self._up)
-        self._device.launch(build_kernels(self._device).shorten, (1,), [self._given], [self._length])
+        self._device.launch(build_kernels(self._device).read_length, (1,), [self._given], [self._length])
         self._try()
 
     def _try(self) -> None:
@@ -301,10 +301,10 @@ class ContactSteps:
         self._ahead.zero_()
         add_dots(device, found.g, self._x, self._ahead)
         wp.copy(self._pull, self._new_smooth)
-        device.launch(k.push, (len(self._touched),), [self._touched, self._found], [self._pull])
+        device.launch(k.add_forces, (len(self._touched),), [self._touched, self._found], [self._pull])
         self._compute_response(self._new_rest)
         inputs = [self._status, self._length, self._promised, self._ahead, found.sums, found.own]
-        device.launch(k.report, (1,), inputs, [self._out])
+        device.launch(k.write_results, (1,), inputs, [self._out])
         wp.copy(self._down, self._out)
 
     def _take_step(self) -> None:

@@ -134,7 +134,7 @@ class ResidualEvaluator:
             return ResidualState(u, found.g, np.sqrt(sums[FREE]), np.sqrt(largest))
 
     def select(self, stay: np.ndarray) -> ResidualEvaluator:
-        """Keep only some load cases (k,), in the problem too, and return their judge."""
+        """Keep only some load cases (k,), in the problem too, and return their evaluator."""
         self.problem.keep(stay)
         return ResidualEvaluator(
             self.problem, gather_columns(self.problem.device, self.constant, stay), self.square[stay]
@@ -142,7 +142,7 @@ class ResidualEvaluator:
 
 
 def build_evaluator(problem: Problem, u: wp.array) -> ResidualEvaluator:
-    """Build the judge of the batch that the problem has begun, with start u (3N, b) [m]."""
+    """Build the evaluator of the batch that the problem has begun, with start u (3N, b) [m]."""
     constant, loud = compute_constant_gradients(problem, u)
     return ResidualEvaluator(problem, constant, loud.numpy().max(axis=0, initial=0.0))
 

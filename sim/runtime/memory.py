@@ -26,7 +26,7 @@ class MemoryBudget:
     share
         Fraction of the free memory: the remainder is for other programs.
     batch_fraction
-        Fraction of it for a batch of automatic size: half, to leave memory for results and other programs.
+        Fraction of the free memory for a batch of automatic size; the remainder is for results and other programs.
     max_cases, max_cases_on_cuda
         Maximum load cases solved together: more do not use the processor better.
     group
@@ -78,7 +78,7 @@ def check_fits(
     Raises
     ------
     InputError
-        With the demand, the free memory, and what would fit. Its cause is a MemoryError: other processes may end.
+        With the demand, the free memory, and what would fit. The cause is a MemoryError, as memory may be free later.
     """
     column = estimate_column_bytes(rows, device)
     free = measure_host_bytes(budget)  # read once: Linux takes almost a millisecond to count

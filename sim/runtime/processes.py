@@ -38,8 +38,8 @@ def start_process(
 ) -> BaseProcess:
     """Start a spawned process that calls `target(*given)`, a function of a module.
 
-    It ends with this process in any case, and ignores Ctrl-C, which the terminal sends to all: this process ends it.
-    The `variables` are in its environment before it imports anything.
+    The child ends with this process. It ignores Ctrl-C, which the terminal sends to both: this process ends it.
+    The `variables` are set in its environment before its first import.
     """
     process = get_context("spawn").Process(target=_run, args=(target, given), name=name, daemon=True)
     with _set_environment(variables or {}), _ignore_interrupts():
@@ -122,7 +122,7 @@ def map_unordered(
 
 
 def run_on_each(children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
-    """Return the result of each process for its own task; all of them begin together.
+    """Return the result of each process for its own task; all tasks begin together.
 
     Raises
     ------

@@ -77,7 +77,7 @@ def solve_dense(matrix: Any, right: Any) -> Any:
 
 
 def to_library(device: Device, values: np.ndarray) -> Any:
-    """Copy a NumPy array to the library's; on the CPU it is returned itself."""
+    """Copy a NumPy array to the library's; on the CPU, return the array itself."""
     return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values
 
 

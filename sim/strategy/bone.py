@@ -1,4 +1,4 @@
-"""Load cases whose tools overlap bone: they are not solved, and the mesh stays as it was."""
+"""Load cases whose tools overlap bone: they are not solved, and the mesh keeps its start."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -35,11 +35,11 @@ HEADER_SIZE = 8  # Number of these slots.
 class FrameKernels:
     """Kernels before, between and after the L-BFGS iterations of a frame, in one scalar type."""
 
-    pull: wp.Kernel
-    move_on: wp.Kernel
-    renew: wp.Kernel
-    look: wp.Kernel
-    report: wp.Kernel
+    apply_push: wp.Kernel
+    extrapolate: wp.Kernel
+    reset: wp.Kernel
+    check_ended: wp.Kernel
+    write_results: wp.Kernel
 
 
 @cache
@@ -48,7 +48,7 @@ def build_kernels(device: Device) -> FrameKernels:
     scalar, most, m, head, lanes = device.scalar, MAX_FRAME_EVALUATIONS, PAIRS, HEADER_SIZE, get_warp_width(device)
 
     @forward_kernel(module="unique")
-    def pull(
+    def apply_push(
         given: wp.array(dtype=wp.float64),
         nodes: wp.array(dtype=wp.int32),
         weight: wp.array2d(dtype=wp.float64),
@@ -71,7 +71,7 @@ def build_kernels(device: Device) -> FrameKernels:
             wp.atomic_add(loud, 0, 0, square)
 
     @forward_kernel(module="unique")
-    def move_on(
+    def extrapolate(
         given: wp.array(dtype=wp.float64),
         # outputs
         past: wp.array2d(dtype=scalar),
@@ -90,7 +90,7 @@ def build_kernels(device: Device) -> FrameKernels:
         z[r, 0] = scalar(0.0)
 
     @forward_kernel(module="unique")
-    def renew(
+    def reset(
         # outputs
         t: wp.array(dtype=wp.float64),
         predicted: wp.array(dtype=wp.float64),
@@ -121,7 +121,7 @@ def build_kernels(device: Device) -> FrameKernels:
         inverted[0] = 0
 
     @forward_kernel(module="unique")
-    def look(
+    def check_ended(
         status: wp.array(dtype=wp.int32),
         # outputs
         tried: wp.array(dtype=wp.int32),
@@ -132,7 +132,7 @@ def build_kernels(device: Device) -> FrameKernels:
         going[0] = wp.where(status[0] == LIVE and tried[0] < most, 1, 0)
 
     @forward_kernel(module="unique")
-    def report(
+    def write_results(
         status: wp.array(dtype=wp.int32),
         steps: wp.array(dtype=wp.int32),
         residual: wp.array(dtype=wp.float64),
@@ -153,7 +153,7 @@ def build_kernels(device: Device) -> FrameKernels:
             for k in range(4):
                 out[SUMS + k] = sums[0][k]
 
-    return FrameKernels(pull, move_on, renew, look, report)
+    return FrameKernels(apply_push, extrapolate, reset, check_ended, write_results)
 
 
 class CapturedFrame:
@@ -272,22 +272,22 @@ class CapturedFrame:
         self._skin.put(imprint)
         names = ("t", "predicted", "residual", "loud", "sg", "wg", "steps", "cut", "status")
         outputs = [*(a[name] for name in names), self._tried, self._going, self._inverted]
-        device.launch(k.renew, (1,), [], outputs)
+        device.launch(k.reset, (1,), [], outputs)
         vectors = [self._past, *(a[name] for name in ("u", "d", "g", "z"))]
-        device.launch(k.move_on, (len(self._past),), [self._given], vectors)
+        device.launch(k.extrapolate, (len(self._past),), [self._given], vectors)
         inputs = [self._given, self._skin.numbers, imprint.weight, imprint.sums]
         lanes = get_warp_width(device)
-        device.launch(k.pull, (-(-len(self._skin.numbers) // lanes) * lanes,), inputs, [a["constant"], a["loud"]])
+        device.launch(k.apply_push, (-(-len(self._skin.numbers) // lanes) * lanes,), inputs, [a["constant"], a["loud"]])
         wp.capture_while(self._going, self._iterate)
         self._inversion.add_count(a["u"], self._inverted)
         inputs = [a["status"], a["steps"], a["residual"], self._inverted, imprint.sums, a["u"]]
-        device.launch(k.report, (len(self._past),), inputs, [self._out])
+        device.launch(k.write_results, (len(self._past),), inputs, [self._out])
         wp.copy(self._down, self._out)
 
     def _iterate(self) -> None:
         self._workspace.run_iteration()
         inputs = [self._workspace.columns["status"]]
-        self._device.launch(build_kernels(self._device).look, (1,), inputs, [self._tried, self._going])
+        self._device.launch(build_kernels(self._device).check_ended, (1,), inputs, [self._tried, self._going])
 
     def _allocate_pair(self, count: int) -> tuple[wp.array, wp.array]:
         """Allocate `count` values on the device, and as many in pinned host memory for direct transfer."""

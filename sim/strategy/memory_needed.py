@@ -70,7 +70,7 @@ class Needed:
         return f"{self.nodes:,} nodes ({self.element}), {loads}: about {taken} of {self.device.name}, {free} free"
 
     def check_fits(self, budget: MemoryBudget = BUDGET) -> Needed:
-        """Return itself if it fits.
+        """Return this object if its peak fits in the free memory.
 
         Raises
         ------

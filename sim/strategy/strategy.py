@@ -323,7 +323,7 @@ class Strategy:
     def _move_tools(self, cases: Cases, start: wp.array) -> SolverResult:
         """Move the tools from start (3N, b), where they were, in steps of the allowed length.
 
-        An undeformed mesh on which nothing acts where the tools end is the solution, whatever they met on their path.
+        If nothing acts on the undeformed mesh at the end of the path, it is the solution, regardless of contact before.
         """
 
         def moved(part: Cases, share: np.ndarray) -> Cases:
@@ -383,7 +383,7 @@ class Strategy:
         return self._finish(cases, aimed, result)
 
     def _finish(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], result: SolverResult) -> SolverResult:
-        """Finish cases after their last step, in place: mark those that tools pierce, and those that fell short."""
+        """Finish cases in place after their last step: mark those pierced by a tool, and those below the whole load."""
         problem, u, outcome, reached = self.problem, result.u, result.outcome, result.reached
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]

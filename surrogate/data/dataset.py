@@ -3,7 +3,7 @@
 Layout: `anatomy/` the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/`, each with `displacement`
 (n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` belongs to `loads/`. `unit/` holds
 the small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, then y, then z.
-Data of poses have none, but `answers/reaction` (n, tools, 6), which older files lack. The attributes of each array
+Data of poses have no `unit/`, but `answers/reaction` (n, tools, 6), which older files lack. Attributes of each array
 describe it (`array_meanings`).
 """
 
@@ -156,7 +156,7 @@ class Dataset:
         Raises
         ------
         InputError
-            See `displacement`.
+            See `read_displacement`.
         """
         return self._read_rows("unit", nodes, self.unit_good, CHECK_FORCE)
 
@@ -263,7 +263,7 @@ def compute_texts_digest(stated: Mapping[str, str]) -> str:
 
 
 def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Read rows `first` to `last` (`get_row_type`) of `answers` or `unit`, and (B,) bool: valid checksum."""
+    """Read rows `first` to `last` (`get_row_type`) of `answers` or `unit`, and the mask (B,) of valid checksums."""
     here = slice(first, last)
     displacement = read_stored(file, f"{group}/displacement", "f", (None, vertices, 3))
     known = f"{group}/reaction" in file

@@ -28,7 +28,7 @@ def compute_nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
 
 
 def compute_rooted_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """Scale `compute_nodal_shares` by the root of the force: products of two are those of forces, for one newton."""
+    """Scale `compute_nodal_shares` by the root of the force: products of two are products of forces per newton."""
     return scale_by_root_force(compute_nodal_shares(patch, pushed), pushed)
 
 
@@ -45,8 +45,8 @@ def distribute_forces(weights: np.ndarray, pushed: Pushed) -> np.ndarray:
 def compute_tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Compute point [m], unit direction, force [N] and footprint radius [m]: (B, 8).
 
-    For a rod or a blade followed by its shaft, and products x_i x_j of its other axis, which do not depend on its sign:
-    (B, 17). Last, for relaxing tissue, the lost share of its resistance to a change of shape.
+    A rod or a blade adds its shaft, and the products x_i x_j of its other axis, which do not depend on the axis's sign:
+    (B, 17). For relaxing tissue, the last feature is the lost share of the resistance to a change of shape.
 
     The published 13 features describe the load relative to one node (its distance, its angles). A model of all nodes at
     once needs the load alone, because the basis holds the positions of the nodes.
@@ -62,7 +62,7 @@ def compute_tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
 def compute_core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Compute a rod's or blade's pose (B, 17): `compute_tool_features` of a ball, centre of its core [m], axes x and z.
 
-    Last, for relaxing tissue, as `compute_tool_features`.
+    For relaxing tissue, the last feature is that of `compute_tool_features`.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def compute_core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
 
 
 def _list_relaxation(pushed: Pushed) -> list[np.ndarray]:
-    """Return the relaxed share of tissue (B,), if it relaxes: a list of one, or of none."""
+    """Return a list with the relaxed share (B,) of the tissue; an empty list if it does not relax."""
     known = get_relaxation(pushed)
     return [] if known is None else [known]
 
@@ -117,10 +117,10 @@ class Basis:
 
 
 def reduce(nodes: np.ndarray, response: np.ndarray, tolerance: float, most: int) -> Basis:
-    """Compute the fewest modes, up to `most`, that leave `tolerance` of responses (B, n, 3) in the Frobenius norm.
+    """Compute the fewest modes, up to `most`, with a relative error <= `tolerance` of responses (B, n, 3).
 
-    The mean is not subtracted: zero force must give zero motion. If as many are needed as there are components, the
-    modes are the components.
+    Errors are Frobenius norms. The mean is not subtracted: zero force must give zero motion. If as many modes as
+    components are needed, the modes are the components.
     """
     matrix = response.reshape(len(response), -1).astype(np.float64)
     _, size, modes = np.linalg.svd(matrix, full_matrices=False)

@@ -58,7 +58,7 @@ def get_relaxation(pushed: Pushed) -> np.ndarray | None:
 
 
 def get_poses(loads: Loads, tool: BuiltIn) -> np.ndarray:
-    """Return T_world_tool (B, 4, 4) of one tool: of `Touching` of it alone, or of a blade's `Retracted`.
+    """Return T_world_tool (B, 4, 4) of one tool, from `Touching` loads of it alone or a blade's `Retracted` loads.
 
     Raises
     ------

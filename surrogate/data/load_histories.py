@@ -56,9 +56,9 @@ def solve_histories(deformer: Deformer, loads: Loads) -> Deformation:
 
 
 def compute_unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
-    """Compute the remainder (B, n) of each g of a series at the end of histories of B times [s].
+    """Compute the remainder (B, n) of each coefficient g of a Prony series after histories of B durations [s].
 
-    As in the FEM's time steps: load that arrives within a step acts for half of it.
+    As in the FEM, a load that arrives within a time step acts for half of the step.
     """
     coming = np.minimum(times, APPROACH_TIME)
     g, tau = np.array(series).T

@@ -44,7 +44,7 @@ from .tasks import LoadBatch, SolverPool, count_posed_tools, solve_batches
 STAGES = {"unit": "unit responses", "answers": "loads"}  # Names of the file's groups in reports of their seconds.
 # Lower and upper bound of the HDF5 version: from v108 on, metadata of arrays have checksums.
 HDF5_VERSIONS = ("v108", "v108")
-UNKNOWN_RATE = "not known"  # same width as a number
+UNKNOWN_RATE = "not known"  # width of a formatted number
 RATE_KEYS = {"unit": "seconds a unit response", "answers": "seconds a load"}  # Provenance keys of the solver's rates.
 CREATION_KEYS = ("date", *RATE_KEYS.values())
 """Provenance entries that differ each time a data set is made."""
@@ -140,7 +140,7 @@ def simulate(
     ------
     InputError
         A batch below one, a file that holds something else or is being written, a folder that cannot be written to or
-        has too little space. A crew that lost a process.
+        has too little space. A solver pool that lost a process.
 
     Warns
     -----

@@ -125,7 +125,7 @@ def describe_fem_task(asked: LazyFem, task: None) -> tuple[str, str, int]:
 
 
 def choose_even_batch(most: int, loads: int, devices: int) -> int:
-    """Compute the widest batch of at most `most` loads with which every device has equally many, but for the last."""
+    """Compute the batch size, at most `most`, for equal batches, equally many per device; the last may be smaller."""
     rounds = -(-loads // (max(most, 1) * devices))
     return max(1, -(-loads // (max(rounds, 1) * devices)))
 

@@ -37,7 +37,7 @@ class SolverPool:
 
 
 def solve_batches(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -> Iterator[tuple[LoadBatch, bytes]]:
-    """Yield each task with its rows from `solve_batch`: one after the other in this process, by a crew in any order."""
+    """Yield each task with its rows from `solve_batch`: in order in this process, in any order from a pool."""
     if isinstance(deformer, SolverPool):
         yield from map_unordered(deformer.children, solve_batch, tasks)
     else:

@@ -12,7 +12,7 @@ from sim.material import BRAIN
 from .cortex_patch import Patch, find_nearest, open_patch
 
 MAX_ATTEMPTS = 2000  # Maximum number of draws of a load.
-BLOCK_LOADS = 8192  # Number of loads sampled together: more only take memory.
+BLOCK_LOADS = 8192  # Number of loads sampled together: larger blocks take more memory and no less time.
 NUMBERS_PER_LOAD = 8  # Number of random numbers of a load in each attempt.
 MAX_DEPTH = 15e-3  # Largest depth of a tool [m]: beyond, it perforates.
 MAX_PRESSURE = 8e3  # Largest mean contact pressure [Pa]: beyond, a tool perforates; tissue harm begins at 2.7-4 kPa.
@@ -123,7 +123,7 @@ def _sample_in_blocks(tools: list[ToolLoads], patch: Patch, count: int, seed: in
 def compute_rejected_share(preset: str) -> float:
     """Compute the share of a preset's nominal loads, by radius and force, that are not sampled: too strong or too deep.
 
-    No model is trained on them. Zero for other presets.
+    No model is trained on these loads. Zero for other presets.
     """
     tools = {**{name: [tool] for name, tool in TOOLS.items()}, "mixed": list(TOOLS.values())}.get(preset, [])
     middles = (np.arange(LATTICE_SIZE) + 0.5) / LATTICE_SIZE
@@ -159,8 +159,8 @@ def _sample_block(tools: list[ToolLoads], patch: Patch, key: int, block: range) 
 def _generate_uniform(key: int, attempt: int, block: range) -> np.ndarray:
     """Generate numbers (n, NUMBERS_PER_LOAD) in [0, 1) of each load of a block.
 
-    Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": its counter gives any load's numbers
-    without those before.
+    Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": a load's counter gives its numbers
+    without those of earlier loads.
     """
     source = np.random.Philox(key=np.array([key, attempt], np.uint64))
     source.advance(block.start * NUMBERS_PER_LOAD // 4)  # each count gives four numbers
@@ -276,7 +276,7 @@ def build_published_loads(
 def spread(points: np.ndarray, count: int) -> np.ndarray:
     """Select at most `count` of the `points` (n, 3) by farthest-point sampling; return their numbers (k,).
 
-    Starts at the point nearest to the mean, so that it depends on nothing but the points. Gonzalez 1985, Theor. Comput.
+    The first one is nearest to the mean, so that the result depends on the points alone. Gonzalez 1985, Theor. Comput.
     Sci. 38:293-306.
     """
     chosen = [int(find_nearest(points.mean(axis=0, keepdims=True), points)[0][0])]

@@ -141,7 +141,7 @@ class Score:
     mean_mm, p95_mm, p999_mm, max_mm
         Mean, percentiles and maximum [mm]; p999 is None for fewer than `MIN_LOADS_FOR_P999` loads.
     mean_percent, p95_percent, p999_percent, max_percent
-        The same of errors divided by the load's motion, the mean displacement of the vertices in the reference [%].
+        Statistics of errors divided by the load's motion, the mean displacement of the reference's vertices [%].
     worst_mean_mm, worst_p95_mm, worst_p999_mm
         Mean and percentiles over loads of the maximum vertex error of each load [mm]; the largest is `max_mm`.
     microseconds

@@ -152,7 +152,7 @@ def fit_tissue(
 ) -> FittedTissue:
     """Estimate the tissue of a locator's anatomy from some frames.
 
-    Points without support by others are removed: `left_out`, or those found now. FEM results in `folder` are read.
+    Points that no others support are removed: `left_out`, or by `find_unsupported`. FEM results in `folder` are read.
     `progress` receives a stage, the number of its parts done, and their total.
 
     Raises
@@ -184,7 +184,7 @@ def fit_from_evidence(
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> FittedTissue:
     """Estimate the tissue as `fit_tissue`, from solved responses; `progress` receives the number of forces done."""
-    with limit_to_one_thread():  # products are small
+    with limit_to_one_thread():  # matrix products are small
         probability = compute_probability(weigh_tissues(locator, frames, drained, pressed))
     tissue = FittedTissue(locator.anatomy.digest, len(frames), probability, np.zeros(0))
     return replace(tissue, young=estimate_young_moduli(locator.anatomy, frames, tissue, pressed, device, progress))

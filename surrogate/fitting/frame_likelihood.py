@@ -52,8 +52,8 @@ def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) ->
 def weigh_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
     """Compute the log-likelihood (skulls, 1, 1) of a frame with tools: its `columns` (k,) of the responses.
 
-    Dents of tools determine the skull only. Their information on Poisson's ratio and stiffness ratio is mostly that on
-    how they stiffen tissue.
+    Dents of tools determine the skull only: their information on Poisson's ratio and stiffness ratio is mostly
+    nonlinear stiffening, which linear responses lack.
     """
     lower, seen = factorise_errors(evidence)
     rows = {name: predict_seen(pressed, name, evidence)[:, :, columns] for name in SOLVED_SKULLS}
@@ -78,8 +78,8 @@ def _compute_size(rows: np.ndarray) -> float:
 def factorise_errors(evidence: Evidence, believed: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Compute the Cholesky factor (m, m) of the covariance of all errors, and the root mean square observation [m].
 
-    The model error is a share of the motion that is `believed` (m,) [m]; None: of the observation. That includes noise:
-    points that seem to move farther are then down-weighted, so that motions are underestimated.
+    The model error is a share of the motion `believed` (m,) [m]; None: of the observation, noise included. Then
+    points that seem to move farther are down-weighted, so that motions are underestimated.
     """
     value = evidence.value if believed is None else believed
     length = np.sqrt(np.bincount(evidence.point, value**2))[evidence.point]

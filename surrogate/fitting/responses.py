@@ -87,7 +87,7 @@ def solve_responses(
     progress: Callable[[int, int], object] = lambda done, total: None,
     regions: tuple[Region, ...] = (),
 ) -> Responses:
-    """Solve each tissue, with known `regions`. Results that a `folder` holds for the same loads are read.
+    """Solve each tissue, with known `regions`. Results for the same loads in `folder` are read.
 
     `progress` receives the number of tissues done and their total.
     """

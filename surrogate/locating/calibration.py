@@ -115,8 +115,8 @@ def compute_likeness(evidence: Evidence) -> np.ndarray:
     """Compute the features (4,) by which trials are compared: three logarithms, then 0, or `CLOUD_OFFSET` for a cloud.
 
     Logarithms of the observed motion over its error (rigid error included), of the number of points, and of the extent
-    of the observed patch: root mean square distance [m] from its centroid, weighted by `EXTENT_WEIGHT`. A named point
-    gives three numbers, a point of a cloud one.
+    of the observed patch: root mean square distance [m] from its centroid, weighted by `EXTENT_WEIGHT`. A point
+    with a correspondence gives three numbers, a point of a cloud one.
     """
     first = np.unique(evidence.point, return_index=True)[1]
     count, at = len(first), evidence.at[first]

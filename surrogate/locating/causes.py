@@ -36,7 +36,7 @@ class Causes:
     poisson
         Poisson's ratios; drained tissue gives 0.45, brain within seconds 0.49 (`sim.MATERIALS`).
     poisson_let_go
-        Largest one for a skull that separates: beyond, swelling takes minutes to solve and explains no more.
+        Largest Poisson's ratio for a skull that separates: above it, swelling takes minutes and explains no more.
     stiffness
         Smallest and largest ratio of tumour to brain stiffness, log-uniform.
     exponent
@@ -160,7 +160,7 @@ def build_pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes =
 
 
 def build_swellings(anatomy: Anatomy, shares: tuple[float, ...]) -> Loads:
-    """Build loads of these volume changes; `Group.build_effects` must have been given the same ones."""
+    """Build loads of these volume changes; pass the same changes to `Group.build_effects`."""
     # The wave gives the time at which each volume change is reached.
     time = np.arcsin(np.array(shares) / max(map(abs, shares))) / (2.0 * np.pi * SWELLING_WAVE.frequency)
     return Loads((_build_idle(anatomy, len(time)), _build_posture(anatomy, np.tile(SUPINE, (len(time), 1)), 1.0)), time)

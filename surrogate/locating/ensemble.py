@@ -35,10 +35,10 @@ ACCURACY = Accuracy(tolerance=3e-3)  # Relative solver tolerance far below obser
 MIN_MOTION = 2e-5  # Smallest RMS motion of the open cortex [m]: below it, a member is mainly round-off.
 
 
-def round_tumour(anatomy: Anatomy, reach: float) -> tuple[Anatomy, tuple[int, ...]]:
-    """Make brain within `reach` [m] of the tumour a region of its own; return the body and the labels that swell.
+def mark_tumour_surroundings(anatomy: Anatomy, reach: float) -> tuple[Anatomy, tuple[int, ...]]:
+    """Mark brain within `reach` [m] of the tumour as a separate region; return the body and the labels that swell.
 
-    These are the new region's label and that of oedema in the anatomy, if present. Tissue is unchanged if the material
+    These labels are the new region's, and the oedema's if the anatomy has one. Tissue is unchanged if the material
     laws name only regions of the anatomy.
     """
     mesh = anatomy.mesh
@@ -134,7 +134,7 @@ def solve_members(
     ]
     kind = [TOOL, SWELLING, TUMOUR_SWELLING]
     for reach in group.reach:
-        body, marked = round_tumour(anatomy, reach)
+        body, marked = mark_tumour_surroundings(anatomy, reach)
         answers.append(_solve_swelling(body, group, causes.oedema, marked, device, fem))
         kind.append(OEDEMA)
     last: Deformation | None = None

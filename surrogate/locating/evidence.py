@@ -99,7 +99,7 @@ class Evidence:
 
     @property
     def beyond(self) -> float:
-        """Size of `rigid_alone` over the reported rigid error: larger ratio of translation and rotation."""
+        """Ratio of `rigid_alone` to the reported rigid error: the larger of translation and rotation."""
         return float((np.linalg.norm(self.rigid_alone.reshape(2, 3), axis=1) / self.rigid_scale[[0, 3]]).max())
 
     @property

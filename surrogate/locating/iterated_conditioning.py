@@ -6,7 +6,7 @@ IEEE Trans. Pattern Anal. Mach. Intell. 14:239-256.
 
 import numpy as np
 
-from .observation import Observation, place_again, to_evidence
+from .observation import Observation, to_evidence, to_moved_evidence
 from .posterior import Posterior, condition_prior
 from .prior import MotionPrior
 
@@ -32,7 +32,7 @@ def match_and_update(prior: MotionPrior, observation: Observation, free: bool = 
         cortex, motion = np.unique(anatomy.open_surface), np.zeros_like(anatomy.mesh.nodes)
         for _ in range(MAX_ITERATIONS):
             motion[cortex] = np.tensordot(found.weight, prior.restrict_shapes(cortex), 1)
-            evidence = place_again(anatomy, observation, near, motion, found.compute_bias)
+            evidence = to_moved_evidence(anatomy, observation, near, motion, found.compute_bias)
             supported = np.delete(np.arange(len(tips)), found.outliers[found.outliers >= count] - count)
             before, found = found, condition_prior(prior, evidence, tips[supported], free)
             if np.linalg.norm((found.weight - before.weight) @ prior.middle) < CENTROID_TOLERANCE:

@@ -116,7 +116,7 @@ class Location:
 
     @property
     def centroid_covariance(self) -> np.ndarray:
-        """(3, 3) [m^2]: covariance of that motion."""
+        """(3, 3) [m^2]: covariance of the motion `centroid`."""
         return self.posterior.compute_covariance(self.prior.middle[:, None])[0]
 
     @property
@@ -126,7 +126,7 @@ class Location:
 
     @property
     def rotation(self) -> np.ndarray:
-        """(3,) [rad]: mean registration rotation about that centroid."""
+        """(3,) [rad]: mean registration rotation about the centroid of the points."""
         return self.posterior.rigid[3:]
 
     @property
@@ -239,7 +239,7 @@ class Locator:
     prior
         Prior of motions.
     tried
-        (k, 5): results of trials (`calibration.trials`).
+        (k, 5): results of trials (`calibration.run_trials`).
     regions
         Regions whose stiffness was known.
     """
@@ -256,7 +256,7 @@ class Locator:
     def restrict(self) -> Locator:
         """Return this locator restricted to vertices at the open cortex and of the tumour: a tenth of the size.
 
-        It accepts observations on the open cortex alone, and gives no motion of other tissue.
+        The restricted locator accepts observations on the open cortex alone, and gives no motion of other tissue.
         """
         return replace(self, prior=self.prior.restrict(find_observed_nodes(self.anatomy)))
 
@@ -268,7 +268,7 @@ class Locator:
         InputError
             An observation that is too small, is elsewhere, or that no cause of the ensemble explains.
         """
-        with limit_to_one_thread():  # products are small
+        with limit_to_one_thread():  # matrix products are small
             return self._locate_tumour(observation)
 
     def _locate_tumour(self, observation: Observation) -> Location:
@@ -321,7 +321,7 @@ def _is_slip_likely(anatomy: Anatomy, found: Posterior) -> bool:
     """Return True if an excessive slip explains the observation nearly as well as a motion does, and is no sinking.
 
     A brain that sinks by a centimetre resembles a registration shift, but moves uniformly and mostly along the
-    craniotomy's axis. A slip shifts it across, or turns it.
+    craniotomy's axis. A slip shifts the brain across this axis, or rotates it.
     """
     if found.slipped < LIMITS.min_slip_log_odds or found.evidence.beyond <= LIMITS.max_rigid_ratio:
         return False

@@ -1,4 +1,4 @@
-"""Locators of patients: made once before anything is seen, kept in files, and read in a second."""
+"""Locators of patients: built once before surgery, stored in files, and read within a second."""
 
 import json
 from collections.abc import Callable
@@ -104,6 +104,6 @@ def make_locator(
     ensemble = solve_groups(anatomy, seed, device, causes, folder, lambda done, total: progress("causes", done, total))
     progress("forces on the cortex", 0, 1)
     presses = solve_presses(anatomy, tuple(dict.fromkeys(TOOL_SKULLS.values())), device, causes.regions)
-    with limit_to_one_thread():  # products are small
+    with limit_to_one_thread():  # matrix products are small
         tried = run_trials(ensemble, presses, lambda done, total: progress("trials", done, total), count)
     return Locator(build_prior(ensemble, presses), tried, causes.regions)

@@ -132,7 +132,7 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
                 "millimetres, RAS, or leave it out."
             )
     here = np.zeros_like(anatomy.mesh.nodes)
-    return place_again(anatomy, observation, some[off <= far], here, lambda at: np.zeros_like(at))
+    return to_moved_evidence(anatomy, observation, some[off <= far], here, lambda at: np.zeros_like(at))
 
 
 def choose_points(count: int) -> np.ndarray:
@@ -140,7 +140,7 @@ def choose_points(count: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(int))
 
 
-def place_again(
+def to_moved_evidence(
     anatomy: Anatomy,
     observation: Observation,
     near: np.ndarray,
@@ -149,9 +149,9 @@ def place_again(
 ) -> Evidence:
     """Convert an observation to evidence, with the body deformed by `motion` (V, 3) [m].
 
-    Only points `near` (k,) the cortex count, by number. Points without an undeformed position, and tips, are matched to
-    the closest point of the surface and give its motion along its normal. `bias` gives the estimated rigid error (n, 3)
-    [m] at positions (n, 3). Tips are numbered after the points.
+    Only the points with the numbers `near` (k,) are used. Points without an undeformed position, and tips, are matched
+    to the closest point of the surface and give its motion along its normal. `bias` gives the estimated rigid error
+    (n, 3) [m] at positions (n, 3). Tips are numbered after the points.
     """
     parts, count = [], len(observation.now)
     cloud, number = observation.tips, count + np.arange(len(observation.tips))

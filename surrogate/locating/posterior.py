@@ -45,10 +45,10 @@ POSTERIOR = PosteriorSettings()
 def is_within_errors(posterior: Posterior) -> bool:
     """Return True if the observation is within its errors, the reported rigid error included: no motion is significant.
 
-    Two tests are of its size: the square Mahalanobis distance has a rigid part, by generalised least squares, and a
-    remainder. Both are chi-squared. The third is of its form: the ratio of the mean evidence of motions of the prior to
-    that of errors alone. By Markov's inequality errors alone exceed 1 / p with a probability of p at most. So a dent is
-    detected that is no larger in all than errors might be.
+    Two tests compare its size: the square Mahalanobis distance has a rigid part, by generalised least squares, and a
+    remainder. Both are chi-squared. The third compares its form: the ratio of the mean evidence of prior motions to
+    that of errors alone. By Markov's inequality errors alone exceed 1 / p with a probability of p at most. This
+    test detects a dent whose total size is within the errors.
     """
     evidence = posterior.evidence
     whitening, scale = evidence.build_whitening(0.0), evidence.rigid_scale
@@ -71,9 +71,9 @@ class HypothesisResult:
     Parameters
     ----------
     share
-        Its probability.
+        Probability of the hypothesis.
     rows, mean
-        (k,) of the unknowns.
+        (k,): row numbers of the unknowns, and their posterior means.
     size
         (k,): their prior standard deviations.
     lower
@@ -111,7 +111,7 @@ class Posterior:
     slipped
         Log-odds of a slipped registration against one that did not slip: of the best hypothesis of each.
     moving
-        `moving` of a `ObservedPrior`.
+        `moving` of the `ObservedPrior`.
     factor
         Calibration factor on the mixture's covariances.
     """
@@ -289,7 +289,7 @@ def build_observed_prior(prior: MotionPrior, evidence: Evidence, tips: np.ndarra
 def condition_prior(
     prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS, free: bool = False
 ) -> Posterior:
-    """Condition a prior on evidence, without points that no other supports. Tips (k, 3) [m] touch the cortex.
+    """Condition a prior on evidence, without points that no others support. Tips (k, 3) [m] touch the cortex.
 
     The rigid error is of the reported size, or `free`: then it may be that of a slipped registration.
 

@@ -139,7 +139,7 @@ class MotionPrior:
         return self.shape[:, self._find_columns(nodes)]
 
     def restrict(self, nodes: np.ndarray) -> MotionPrior:
-        """Return this prior restricted to some vertices (k,); it raises InputError as `at` does.
+        """Return this prior restricted to some vertices (k,); raises InputError as `restrict_shapes`.
 
         Results are unchanged where available. An observation that touches other vertices is rejected.
         """
@@ -180,7 +180,7 @@ class MotionPrior:
         return np.ascontiguousarray(self.shape.transpose(1, 2, 0))
 
     def restrict_to_vertices(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the shapes (k, 3, r) float32 [m] at some vertices (k,); it raises InputError as `at` does."""
+        """Return the shapes (k, 3, r) float32 [m] at some vertices (k,); raises InputError as `restrict_shapes`."""
         return self._by_vertex[self._find_columns(nodes)]
 
     def project_shapes(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:

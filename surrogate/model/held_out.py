@@ -90,14 +90,14 @@ def find_handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np
 def measure_held_out(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> HeldOutErrors:
     """Compute errors on B loads, and the largest of `VERTEX_ERROR_LIMITS` with a guarded model of small error.
 
-    Its mean error is at most `MAX_MEAN_ERROR`, its 99.9th percentile `MAX_P999_ERROR`.
+    The guarded model's mean error is at most `MAX_MEAN_ERROR`, its 99.9th percentile `MAX_P999_ERROR`.
 
     Parameters
     ----------
     distance
         Error relative to FEM (B, n) [m], at the tumour's vertices.
     motion
-        Mean displacement of these (B,) [m].
+        Mean displacement (B,) [m] of the tumour's vertices.
     bound
         Bound of the maximum vertex error, at 95 % (B,) [m].
     outside

@@ -75,7 +75,7 @@ class Learned:
     parts
         Parts, which are summed where they overlap.
     envelope
-        Range of its training loads.
+        Range of the training loads.
     bound
         95th percentile of the maximum vertex error of the tumour on held-out loads, relative to FEM [m].
     bounds
@@ -160,7 +160,7 @@ class Learned:
         return lru_cache(maxsize=4)(modes_at)
 
     @cached_property
-    def _knows(self) -> np.ndarray:
+    def _is_predicted(self) -> np.ndarray:
         """(V,) bool: mask of the predicted vertices."""
         known = np.zeros(len(self.anatomy.mesh.nodes), bool)
         known[self.nodes] = True
@@ -191,8 +191,8 @@ class Learned:
             self._patch.skin.check_tools_touch(pushed.point, pushed.footprint)
 
     def _check_nodes(self, nodes: np.ndarray) -> None:
-        inside = (nodes >= 0) & (nodes < len(self._knows))
-        strange = ~(inside & self._knows[np.where(inside, nodes, 0)])
+        inside = (nodes >= 0) & (nodes < len(self._is_predicted))
+        strange = ~(inside & self._is_predicted[np.where(inside, nodes, 0)])
         if strange.any():
             raise InputError(
                 f"this model knows the {len(self.nodes)} vertices of tumour and open cortex, not vertex "
@@ -204,13 +204,13 @@ class Learned:
 
         With a start, a rod's or blade's contact search continues from it, which is faster; without, it approaches
         straight. For relaxing tissue the time between counts; without a start the tool was held until the loads' time,
-        see `data.holding`.
+        see `data.load_histories`.
 
         Raises
         ------
         InputError
             Loads of another kind, or that do not touch the open cortex, or are more than `MAX_TRAINING_RATIO` times as
-            strong or as wide as any of the training. A start with other rows, or as `relaxation.followed`; a vertex in
+            strong or as wide as any of the training. A start with other rows, see `follow_relaxation`; a vertex in
             `at` that the model does not predict.
         """
         check_loads(loads)
@@ -282,7 +282,7 @@ class Learned:
         return magnitude, replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
 
     def predict_force(self, pushed: Pushed, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
-        """Predict forces (B, 3) [N] of the tool at indentations; as `motion`, in proportion beyond the training.
+        """Predict forces (B, 3) [N] of the tool at indentations; proportional to depth beyond the training.
 
         Raises
         ------

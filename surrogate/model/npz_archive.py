@@ -72,7 +72,7 @@ class Archive:
         Raises
         ------
         InputError
-            See `arrays`; an array whose content has another digest.
+            See `read_arrays`; an array whose content has another digest.
         """
         found = self.read_arrays(digests)
         for name, array in found.items():
@@ -86,7 +86,7 @@ class Archive:
         Raises
         ------
         InputError
-            See `arrays`; header or arrays that do not match the seal.
+            See `read_arrays`; header or arrays that do not match the seal.
         """
         found = self.read_arrays(names)
         if compute_seal(header, found) != header["seal"]:

@@ -4,7 +4,7 @@ FEM stores the decaying part of the stress, for each pair (g, tau) of a Prony se
 model stores the same for one number, the tool's depth d:
     h <- exp(-dt / tau) h + g exp(-dt / (2 tau)) (d - its last value).
 
-The resistance to a change of shape has then lost the share r = sum_i (g_i - h_i / d), which all else depends on.
+The resistance to a change of shape has then lost the share r = sum_i (g_i - h_i / d), which all predictions depend on.
 """
 
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ class Relaxed:
 def follow_relaxation(
     series: Pairs, pushed: Pushed, times: np.ndarray, start: Deformation | None, shallowest: float
 ) -> Relaxed:
-    """Advance relaxation at indentations from the previous result; without one, each is a history of `holding`.
+    """Advance relaxation at indentations from the previous result; without one, assume `load_histories`.
 
     Parameters
     ----------

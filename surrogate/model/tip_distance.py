@@ -51,7 +51,7 @@ class TipModel:
     bound: Bound | None = None
 
     def apply_correction(self, distance: np.ndarray, patch: Patch, asked: Pushed, magnitude: np.ndarray) -> np.ndarray:
-        """Correct distances (B,) [m] for loads `asked` within the training forces, of true magnitude (B,) [N]."""
+        """Correct distances (B,) [m]: loads `asked` clipped to the training range, unclipped magnitude (B,) [N]."""
         if self.correction is None:
             return distance
         off = self.correction.predict(compute_correction_features(patch, asked))[:, 0]

@@ -1,4 +1,4 @@
-"""Contact of a tool that a model of its poses learned: its force, and the start of the search for contact."""
+"""Tool contact of a pose model: model of the tool's force, and warm starts of the contact search."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -41,7 +41,7 @@ class Outside(NamedTuple):
 
     @property
     def here(self) -> Outside:
-        """The same position with all distances zero, as for training loads."""
+        """Position with all distances zero, as of training loads."""
         return Outside(*(0.0 * each for each in self))
 
 

@@ -58,12 +58,12 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> Sheet:
     Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has them.
     If the result depends on a compliance matrix, which that of the cortex always does, also `weight` (B, m). It is the
     share of the force on each of the nodes `pressed` (m,) of the open cortex. `compute_footprint_weights` of
-    `sim.discretisation.footprint` integrates it over `Patch`: no operator of a graph could.
+    `sim.discretisation.footprint` integrates it over `Patch`, which no operator of ONNX can do.
 
     Outputs, as in `Learned.deform`: `displacement` (B, n, 3) [m] of the mesh vertices `nodes` (n,), whose undeformed
     positions are `rest` (n, 3) [m]. `bound` (B, 2) [m] of the tumour, at the metadata's levels, is NaN if nothing was
     calibrated. Then come `excess` (B,), that of `Outside`; and `extrapolated` (B,), True if it is above zero. All in
-    single precision, but in between in the precision of the model.
+    single precision; intermediate values have the precision of the model.
 
     Raises
     ------

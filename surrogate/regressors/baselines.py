@@ -1,6 +1,6 @@
 """Regressors of published models: principal components, support vectors and a small neural network.
 
-torch and scikit-learn fit; NumPy predicts.
+They are fitted by torch and scikit-learn, and predict by NumPy.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -37,7 +37,7 @@ class Pcr(Stored):
     share: float = 0.999
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Learn from rows X (n, f), Y (n, r)."""
+        """Fit to rows X (n, f), Y (n, r)."""
         self.mean_, self.offset_ = X.mean(axis=0), Y.mean(axis=0)
         components, size, axes = np.linalg.svd(X - self.mean_, full_matrices=False)
         kept = 1 + int(np.searchsorted(np.cumsum(size**2), self.share * np.sum(size**2)))
@@ -48,7 +48,7 @@ class Pcr(Stored):
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Coefficients (B, r) float32 of features (B, f)."""
+        """Predict coefficients (B, r) float32 of features (B, f)."""
         return ((X - self.mean_) @ self.map_ + self.offset_).astype(np.float32)
 
 
@@ -72,7 +72,7 @@ class Svr(Stored):
     tube: float = 1.0 / 13.49
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Learn from rows X (n, f), Y (n, r)."""
+        """Fit to rows X (n, f), Y (n, r)."""
         from sklearn.svm import SVR  # needed to fit, not to predict
 
         self.mean_, self.deviation_ = compute_standardisation(X)
@@ -99,7 +99,7 @@ class Svr(Stored):
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Coefficients (B, r) float32 of features (B, f)."""
+        """Predict coefficients (B, r) float32 of features (B, f)."""
         squared = compute_squared_distances((X - self.mean_) / self.deviation_, self.support_)
         return (np.exp(squared / -len(self.mean_)) @ self.dual_ + self.intercept_).astype(np.float32)
 
@@ -148,7 +148,7 @@ class Ann:
     seed: int = 0
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Learn from rows X (n, f), Y (n, r)."""
+        """Fit to rows X (n, f), Y (n, r)."""
         import torch  # needed to fit, not to predict
 
         self.mean_, self.deviation_ = compute_standardisation(X)
@@ -190,7 +190,7 @@ class Ann:
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Coefficients (B, r) float32 of features (B, f)."""
+        """Predict coefficients (B, r) float32 of features (B, f)."""
         x = ((X - self.mean_) / self.deviation_).astype(np.float32)
         y = forward(x, self.weights_, self.biases_, np.tanh)
         return y * np.float32(self.scale_) + self.offset_.astype(np.float32)
@@ -203,7 +203,7 @@ class Ann:
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """From `state`."""
+        """Rebuild the regressor from `state`."""
         model = cls()
         model.mean_, model.deviation_, model.offset_ = state["mean"], state["deviation"], state["offset"]
         model.scale_ = state["scale"]

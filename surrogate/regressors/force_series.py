@@ -44,8 +44,8 @@ def compute_forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
 class Series:
     """Regressor of the response to one newton: first orders of the power series in the force, from a table.
 
-    Between tabulated places and radii it interpolates: parabolas on each triangle, and through three radii. In the
-    direction every order is a form of its degree, so that the table is exact there.
+    Between tabulated places and radii it interpolates: parabolas on each triangle, and through three radii. In
+    the direction, each order is a homogeneous polynomial, which the table represents exactly.
 
     Parameters
     ----------

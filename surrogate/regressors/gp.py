@@ -106,7 +106,7 @@ def compute_negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -
     """Compute minus the log marginal likelihood of x (n, f), y (n, r), up to a constant, and its gradient (f + 1,).
 
     `log` (f + 1,) holds the logarithms of the lengths and of the noise. Each output's variance is the most likely one,
-    y^T K^-1 y / n, so that one K serves them all.
+    y^T K^-1 y / n, so that all outputs share one K.
     """
     count, outputs = y.shape
     u = x / np.exp(log[:-1])
@@ -118,7 +118,7 @@ def compute_negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -
     dual = cho_solve(factor, y, check_finite=False)
     misfit = np.einsum("nr,nr->r", y, dual)
     value = 0.5 * count * np.log(misfit / count).sum() + outputs * np.log(np.diagonal(factor[0])).sum()
-    # Derivative by K, of which every other is a trace with dK (equation 5.9).
+    # Derivative by K; derivatives by hyperparameters are traces of its product with dK (equation 5.9).
     (inverted,) = get_lapack_funcs(("potri",), factor[:1])
     lower, _ = inverted(factor[0], lower=True)
     slope = outputs * (np.tril(lower) + np.tril(lower, -1).T)

@@ -2,10 +2,10 @@
 
 The body is condensed to the nodes that a tool may touch: u = C f, C their compliance, undeformed. Of all frictionless
 forces that keep the tool out of every facet, the solution has the least energy f.Cf / 2 (Signorini's problem). A tool
-is all points within a radius of a point, a line or a rectangle, and enters a flat facet first where that is nearest. So
-constraints are added where a facet is entered, until none is (the exchange method: Hettich, Kortanek 1993,
-"Semi-infinite programming", SIAM Rev. 35:380-429). Each is linearised at the present position of its point: a distance
-from a convex set is convex, so that a solution of the linear constraints satisfies all. Their multipliers are a
+is all points within a radius of a point, a line or a rectangle, and enters a flat facet first at the facet's nearest
+point. So each entered facet adds a constraint, until no facet is entered (the exchange method: Hettich, Kortanek 1993,
+"Semi-infinite programming", SIAM Rev. 35:380-429). They are linearised at the points' present positions: a distance
+from a convex set is convex, so that a solution of the linear constraints satisfies all. The multipliers are a
 nonnegative least-squares problem (Lawson, Hanson 1974, "Solving Least Squares Problems", chapter 23). Stiffness
 cancels: the tissue's stiffness need not be known.
 """
@@ -74,7 +74,7 @@ class RigidContact:
     time.
 
     The nonlinear contribution far from the tool is nearly a factor on the force that is linear in depth over radius:
-    this line is all that is fitted. For relaxing tissue there is another line, in proportion to the relaxed share.
+    only this line is fitted. For relaxing tissue there is another line, in proportion to the relaxed share.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ class RigidContact:
     def _solve_contact(self, stations: list[PlacedBox], radius: float, begun: np.ndarray | None) -> np.ndarray:
         """Solve the contact of a tool of a radius [m] at the last station of its path: a row of `_find_contact`.
 
-        begun is the result at the first of them; None: no contact before.
+        begun is the result at the first station; None: no contact before.
         """
         from sim.discretisation.nearest_points import Nearest
 

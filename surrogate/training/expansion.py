@@ -123,7 +123,7 @@ class Expansion:
     def tables(self) -> tuple[ModelPart, ...]:
         """Compliance of the tumour, and of the cortex if there is more: exact at every node of the open cortex.
 
-        With as many modes as the unit responses need.
+        The number of modes follows from `ExpansionSettings.table_tolerance`.
         """
         return tuple(self._build_compliance(nodes) for nodes in self._known)
 

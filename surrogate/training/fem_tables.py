@@ -1,4 +1,4 @@
-"""Tables of finite elements: a body condensed to what a tool may touch, and the series at places of the cortex."""
+"""Tables of finite elements: a body condensed to the touchable nodes, and the series at places of the cortex."""
 
 from collections.abc import Callable
 
@@ -91,8 +91,8 @@ def tabulate(
 ) -> np.ndarray:
     """Compute the coefficients of `forms` at each of the places (P, 3) [m] and each radius: (P, R, 19, r) float32.
 
-    Each has r components, by `reading`; `progress` receives places done and their total. Places in the `journal` are
-    not solved again.
+    `reading` projects each response on r modes; `progress` receives places done and their total. Places in the
+    `journal` are not solved again.
     """
     table = np.empty((len(places), len(radii), TERM_COUNT, reading.count), np.float32)
     some = max(1, fem.batch // (len(radii) * FACTORS[-1].shape[1]))

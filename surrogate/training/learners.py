@@ -1,4 +1,4 @@
-"""Learners: what each is given, and the summands of its response, fitted to displacements."""
+"""Learners: inputs of each model type, and fits of the summands of its response to displacements."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,8 +32,8 @@ class SharedInputs:
     """Common inputs of all model types on a data set, computed on first use.
 
     Results and series within held-out discs are excluded. The response of linear tissue is included at every node: a
-    dent is no sum of dents elsewhere, and the motion below follows it. The second order of the tumour follows from that
-    response and the material law, so that it is included too.
+    dent is not a sum of dents elsewhere, and the motion below it follows the dent. The tumour's second order follows
+    from that response and the material law, so that it is included too.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ def check_learners(names: Sequence[str], of_poses: bool, where: str) -> None:
     Raises
     ------
     InputError
-        No name, an unknown one, or one of the other kind of data.
+        No name, an unknown name, or a model type for the other kind of data.
     """
     kinds, others, held = (POSE_LEARNERS, LEARNERS, "poses") if of_poses else (LEARNERS, POSE_LEARNERS, "pushes")
     unknown = [name for name in names if name not in (*kinds, *others) and find_own(name) is None]
@@ -129,7 +129,7 @@ def train(
     Raises
     ------
     InputError
-        Unknown model types, or such as loads of the data's kind do not train; no training loads. Data with other causes
+        Unknown model types, or types for another kind of loads; no training loads. Data with other causes
         than `Pushed` or the `Touching` of one tool, an anatomy without tumour, too few loads, or unit responses that
         did not converge.
     """
@@ -167,7 +167,7 @@ def train(
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Inputs of a fit: rows (B,) bool of the results, these as examples, and common inputs of all model types."""
+    """Inputs of a fit: mask (B,) of the results to fit, these as examples, and the inputs common to all model types."""
 
     rows: np.ndarray
     examples: Examples
@@ -277,7 +277,7 @@ def _compute_motion(answers: TrainingSolutions, rows: np.ndarray) -> np.ndarray:
 
 
 def _select_first(rows: np.ndarray, most: int | None) -> np.ndarray:
-    """Select the first `most` of rows (B,) bool."""
+    """Select the first `most` rows of a mask (B,)."""
     return rows if most is None else rows & (np.cumsum(rows) <= most)
 
 
