@@ -1,5 +1,7 @@
 """Rasteriser compared with ray casting and analytic planes, with degenerate meshes."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -172,3 +174,14 @@ def test_gpu_rasteriser_matches_cpu_rasteriser():
     assert np.mean(here.face != there.face) < 1e-3
     same = here.face == there.face
     assert np.abs(here.depth - there.depth)[same].max() < 1e-6
+
+
+def test_threads_draw_the_same_image_as_one(monkeypatch):
+    """4,680 triangles upon 19,200 pixels are shared by the threads, each with its own z-buffer."""
+    images = []
+    for cores in (1, 3):
+        with ThreadPoolExecutor(cores) as pool:
+            monkeypatch.setattr("ar.rendering.rasteriser.get_workers", lambda: (pool, cores))  # noqa: B023
+            images.append(rasterise(camera(), *build_sphere()))
+    for name in ("face", "weights", "depth"):
+        assert np.array_equal(*(getattr(image, name) for image in images))

@@ -55,8 +55,8 @@ def test_page_fits_the_window_and_matches_server_image(demo, window, size):
     """No element is cut off, both errors are visible, and the image equals the server's to one pixel."""
     window.size(*size)
     said = f"document.getElementById('{SAID}')"
-    assert window.wait(f"innerWidth == {size[0]} && {said}.innerText.includes('tumour position error')")
-    assert_fits(window, size, ("surrogate error", "tumour position error"))
+    assert window.wait(f"innerWidth == {size[0]} && {said}.innerText.includes('motion error')")
+    assert_fits(window, size, ("surrogate error", "motion error"))
     assert_in_register(window, demo.browser.shown[1])
     track = box_of(window, f"{FRAME}?.closest('.mantine-Slider-root')")
     assert track[2] - track[0] > 150.0 and track[2] <= size[0]

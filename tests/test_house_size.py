@@ -9,7 +9,7 @@ from test_house import FILES, HOUSE, PACKAGED, name_of, nodes_of
 # Lower a number when lines have gone. Raise it only with the reason in the commit.
 # 1,380 of the packages are the families of models that finite elements are compared with; 770 lines are their tests.
 # 900 more measure the published experiment, choose among families, and plot batches and effects; 490 were deleted.
-MOST = {"packages": 84_200, "tests": 53_600}
+MOST = {"packages": 84_215, "tests": 53_610}
 
 
 def lines(paths):

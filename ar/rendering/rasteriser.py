@@ -14,14 +14,14 @@ A lens changes the pixels, not the formulas: p is then the undistorted position 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import warp as wp
 
 from ..optics.camera import Camera
 from .lens_rasteriser import Unbent, box_through_lens, build_undistortion, get_no_undistortion, pixel_at
-from .parallel import forward_kernel, launch_in_bands, load, run_in_bands, run_length
+from .parallel import forward_kernel, get_workers, launch_in_bands, load, run_in_bands, run_length
 from .triangle import box_of, edge, first_row, weights_of
 
 EMPTY_PIXEL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
@@ -29,6 +29,7 @@ EMPTY_PIXEL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 NEAR_PLANE = 1e-3
 """Near plane [m]: nothing closer to a camera is drawn."""
 ROW_THREADS = 8  # Number of threads that share the rows of a triangle on a GPU.
+MIN_PIXELS = 8  # Pixels of an image per triangle above which CPU threads share the rows, below the triangles.
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,13 +157,24 @@ def draw(
     count, run = triangles.shape[0] - since, run_length(device)
     # On a GPU the rows of a triangle are shared by several threads.
     parts = 1 if device == "cpu" else ROW_THREADS
-    size = nearest.shape[0], -(-count // run), parts
 
-    def scan(begin: int, end: int) -> None:
-        inputs = [points, triangles, since, wp.float64(near), rows.start + begin, rows.start + end, parts, run, through]
-        wp.launch(keep_nearest, size, inputs, [nearest], device=device)
+    def scan(begin: int, end: int, first: int = 0, last: int = count, out: wp.array = nearest) -> None:
+        size = nearest.shape[0], -(-(last - first) // run), parts
+        span = rows.start + begin, rows.start + end
+        inputs = [points, triangles[: since + last], since + first, wp.float64(near), *span, parts, run, through]
+        wp.launch(keep_nearest, size, inputs, [out], device=device)
 
-    run_in_bands(scan, rows.stop - rows.start, device)
+    pool, cores = get_workers()
+    if not count:
+        return None
+    if device != "cpu" or cores == 1 or count * MIN_PIXELS < nearest.size:
+        return run_in_bands(scan, rows.stop - rows.start, device)
+    # Many small triangles: every band of rows would prepare all of them, so each thread draws some into its own buffer.
+    edges = np.linspace(0, count, cores + 1).astype(int).tolist()
+    buffers = [nearest, *(wp.full_like(nearest, EMPTY_PIXEL) for _ in edges[2:])]
+    list(pool.map(partial(scan, 0, rows.stop - rows.start), edges[:-1], edges[1:], buffers))
+    for other in buffers[1:]:
+        np.minimum(nearest.numpy(), other.numpy(), out=nearest.numpy())
 
 
 def find_rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int, int]:
