@@ -14,7 +14,7 @@ from theatres import short
 from scenes.cli import main
 from scenes.options.placement_options import add_opening_arguments, get_trajectory_option, to_opening_options
 from scenes.play.deformers import PatientSetup
-from scenes.script.approach import Approach, approach_of
+from scenes.script.approach import Approach, parse_approach
 from scenes.script.craniotomy_frame import CraniotomyFrame, build_craniotomy_frame
 from scenes.script.scene import PALPATION, find_scene
 from scenes.script.tool import Blade
@@ -58,7 +58,7 @@ def planned(
 def test_tool_follows_entry_and_direction_of_trajectory(site, tmp_path, right, up, tilt, swapped):
     """For both drawing orders of the line; the scene's own positions and tilts are added."""
     entry, way, line = planned(site, right, up, tilt)
-    approach = approach_of(read_markup(marked(tmp_path, line[::-1] if swapped else line)), site)
+    approach = parse_approach(read_markup(marked(tmp_path, line[::-1] if swapped else line)), site)
     touch = approach.follow(press(0.3))(2.0)
     assert (
         np.linalg.norm(site.find_nearest(site.origin + touch.x * site.right + touch.y * site.up).point - entry) < 1e-4
@@ -72,7 +72,7 @@ def test_tool_follows_entry_and_direction_of_trajectory(site, tmp_path, right, u
 
 def test_single_point_gives_entry_without_tilt(site, tmp_path):
     entry, _, _ = planned(site, 5e-3, 5e-3, (0.0, 0.0))
-    approach = approach_of(read_markup(marked(tmp_path, entry[None] - 2e-3 * site.axis, "Fiducial")), site)
+    approach = parse_approach(read_markup(marked(tmp_path, entry[None] - 2e-3 * site.axis, "Fiducial")), site)
     assert approach.tilt == pytest.approx((0.0, 0.0), abs=1e-12)
     assert np.hypot(approach.x - 5e-3, approach.y - 5e-3) < 2e-3
 
@@ -80,7 +80,7 @@ def test_single_point_gives_entry_without_tilt(site, tmp_path):
 def test_trajectory_ending_near_the_cortex_is_extended(site, tmp_path):
     entry, way, _ = planned(site, 9e-3, -6e-3, (0.5, -0.3))
     through, *short = (
-        approach_of(read_markup(marked(tmp_path, entry + np.outer(ends, way))), site)
+        parse_approach(read_markup(marked(tmp_path, entry + np.outer(ends, way))), site)
         for ends in ([-40e-3, 30e-3], [9e-3, 30e-3], [-40e-3, -9e-3])
     )
     for approach in short:
@@ -91,7 +91,7 @@ def test_trajectory_ending_near_the_cortex_is_extended(site, tmp_path):
 def test_probe_shaft_aligns_with_trajectory(site, tmp_path, tilt):
     """Points and blades leave the orientation of the tool unchanged."""
     entry, way, line = planned(site, 4e-3, 2e-3, tilt)
-    approach = approach_of(read_markup(marked(tmp_path, line)), site)
+    approach = parse_approach(read_markup(marked(tmp_path, line)), site)
     held, plain = approach.align_tool(PALPATION), PALPATION
     turned, usual = (tool.pose(entry, site.axis, site.right) for tool in (held, plain))
     np.testing.assert_allclose(turned[:3, 2], -way, atol=1e-9)
@@ -99,7 +99,7 @@ def test_probe_shaft_aligns_with_trajectory(site, tmp_path, tilt):
     assert np.linalg.det(turned[:3, :3]) == pytest.approx(1.0)
     centres = [pose[:3, 3] + plain.radius * pose[:3, 2] for pose in (turned, usual)]
     np.testing.assert_allclose(*centres, atol=1e-12)
-    point = approach_of(read_markup(marked(tmp_path, entry[None], "Fiducial")), site)
+    point = parse_approach(read_markup(marked(tmp_path, entry[None], "Fiducial")), site)
     assert point.align_tool(plain) == plain and approach.align_tool(Blade()) == Blade()
 
 
@@ -122,7 +122,7 @@ def test_trajectory_outside_the_craniotomy_is_rejected(site, tmp_path):
         (line, "ClosedCurve", "is no trajectory"),
     ):
         with pytest.raises(InputError, match=reason):
-            approach_of(read_markup(marked(tmp_path, points, kind)), site)
+            parse_approach(read_markup(marked(tmp_path, points, kind)), site)
 
 
 def test_trajectory_option_moves_the_tool_of_the_scene(site, tmp_path, capsys):

@@ -15,7 +15,7 @@ from scenes.analysis.error_budget import (
     PARAMETERS,
     SHUTTER,
     TECHNICAL,
-    Filmed,
+    FilmedScene,
     compute_budget,
     sample_errors,
 )
@@ -47,7 +47,7 @@ def filmed(box):
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     rest = site.origin + 0.015 * site.axis + 5e-3 * ball
     bodies = 1e-3 * rng.normal(size=(100, 1, 3)) + np.zeros_like(rest)
-    return Filmed(
+    return FilmedScene(
         site=site, viewpoint=VIEW, duration=2.0, T_scan_patient=place_reference(site, VIEW.build_camera(site)),
         covariance=sample_usual_covariance(USUAL_CALIBRATION), time=1.0, rest=rest,
         field=0.002 * site.axis + np.zeros_like(rest), normals=ball, velocity=np.zeros_like(rest), bodies=bodies,

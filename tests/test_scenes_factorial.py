@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scenes.analysis import factorial
-from scenes.analysis.factorial import LEVELS, Cell, build_panels, compute_variance_shares, solve_cells
+from scenes.analysis.factorial import LEVELS, FactorCombination, build_panels, compute_variance_shares, solve_cells
 from scenes.cli import main
 
 FEW = {
@@ -26,7 +26,7 @@ def made(rule):
     """Cells of a rule for the motion."""
     levels = {"opening [mm]": (30.0, 50.0), "nu": (0.45, 0.49), "skull": ("bonded", "slide")}
     combinations = [dict(zip(levels, each, strict=True)) for each in product(*levels.values())]
-    return [Cell(each, rule(each), 1.0) for each in combinations]
+    return [FactorCombination(each, rule(each), 1.0) for each in combinations]
 
 
 def test_multiplicative_factors_have_no_interaction():
@@ -78,7 +78,7 @@ def test_factorial_command_writes_table_and_plot(few, tmp_path, monkeypatch, cap
 
 
 def test_plot_has_panel_per_opening_and_curve_per_change():
-    whole = [Cell(dict(zip(LEVELS, each, strict=True)), 1.0, 1.0) for each in product(*LEVELS.values())]
+    whole = [FactorCombination(dict(zip(LEVELS, each, strict=True)), 1.0, 1.0) for each in product(*LEVELS.values())]
     drawn = build_panels(whole)
     assert len(drawn) == 3 and [len(panel.curves) for panel in drawn] == [5, 5, 5]
     assert [len(curve.points) for curve in drawn[0].curves] == [3] * 5

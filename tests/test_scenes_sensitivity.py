@@ -10,8 +10,8 @@ from conftest import make_box
 from theatres import knowing_nothing
 
 from scenes.analysis.sensitivity import (
-    Aim,
     BodyVariant,
+    LoadPerturbation,
     SensitivityStudy,
     apply_aim,
     change,
@@ -162,8 +162,8 @@ def test_aim_errors_have_the_given_angle_and_shift(anatomy):
     loads, patch = draw("palpation", anatomy, 5, 1), open_patch(anatomy)
     drawn = loads.get(Pushed)
     size = np.linalg.norm(drawn.force, axis=1)
-    turned = apply_aim(loads, Aim(turn=0.2), patch).get(Pushed)
-    shifted = apply_aim(loads, Aim(shift=1e-3), patch).get(Pushed)
+    turned = apply_aim(loads, LoadPerturbation(turn=0.2), patch).get(Pushed)
+    shifted = apply_aim(loads, LoadPerturbation(shift=1e-3), patch).get(Pushed)
     assert (len(turned.force), len(shifted.force)) == (10, 20)
     np.testing.assert_allclose(np.linalg.norm(turned.force, axis=1), np.tile(size, 2))
     cosine = np.einsum("bi,bi->b", turned.force, np.tile(drawn.force, (2, 1))) / np.tile(size, 2) ** 2

@@ -16,7 +16,7 @@ from scenes.page.text import (
     plan_words,
     report,
 )
-from scenes.play.deformers import GUARDED, plan_of
+from scenes.play.deformers import GUARDED, explain_plan
 from scenes.play.player import Player
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import press
@@ -95,7 +95,7 @@ class TestWords:
 
     def test_solver_plan_is_an_html_list_and_only_for_fem(self, theatre):
         assert plan_words(("First <this>.", "Then that.")) == "<ul><li>First &lt;this&gt;.</li><li>Then that.</li></ul>"
-        assert plan_words(()) == "" == plan_words(plan_of(theatre.models["linear"]))
+        assert plan_words(()) == "" == plan_words(explain_plan(theatre.models["linear"]))
         scene = small("resection")
-        assert plan_of(theatre.build_fem(scene, scene.accuracy)) == ()
-        assert plan_of(theatre.build_fem(short(), LIVE)) == theatre.build_fem(short(), LIVE).plan.explain()
+        assert explain_plan(theatre.build_fem(scene, scene.accuracy)) == ()
+        assert explain_plan(theatre.build_fem(short(), LIVE)) == theatre.build_fem(short(), LIVE).plan.explain()

@@ -31,8 +31,8 @@ from scenes.script.uncertainty import (
     NOT_KNOWN,
     TumourError,
     Uncertainty,
+    compute_scene_mark,
     fit_motion_error,
-    mark_of,
     read_uncertainties,
     to_uncertainty_path,
     write_uncertainties,
@@ -66,7 +66,7 @@ class Hasty:
 
 def stated(scene, theatre, worst=(2e-3, 4e-3), **values):
     """An uncertainty that grows from the first frame to the last."""
-    mark = mark_of(scene, theatre.site, theatre.choose_element(scene))
+    mark = compute_scene_mark(scene, theatre.site, theatre.choose_element(scene))
     flat = (1e-3, 1e-3)
     lists = {"times": (0.0, scene.duration), "worst": worst, "middle": flat, "moved": flat}
     lists |= {"registered": (1e-3, 3.5e-3), "motion": (0.0, 2.5e-3)}

@@ -10,7 +10,7 @@ from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held
 from sim.linalg.amg import build_rigid_motions
 from sim.linalg.pcg import BlockJacobi, solve_conjugate_gradients
-from sim.linalg.preconditioner import Preconditioning, name_of
+from sim.linalg.preconditioner import Preconditioning, get_preconditioner_name
 from sim.material import Material
 from sim.runtime.device import find_device
 
@@ -61,8 +61,8 @@ def test_amg_cycle_is_deterministic() -> None:
 def test_preconditioner_is_selected_by_size_and_element(kind: str, largest: int, name: str) -> None:
     settings = Preconditioning(max_factorised=largest, max_coarsest_nodes=5)
     problem, preconditioner = built(kind, 0.45, (5, 5, 5), settings=settings)
-    assert name_of(preconditioner) == name
-    assert name_of(BlockJacobi(problem.device)) == "block Jacobi"
+    assert get_preconditioner_name(preconditioner) == name
+    assert get_preconditioner_name(BlockJacobi(problem.device)) == "block Jacobi"
 
 
 def test_rigid_motions_lie_in_kernel_of_rest_stiffness() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from sim.errors import InputError
-from sim.runtime.journal import RECORD_HEADER, DamageWarning, open_journal, run_of
+from sim.runtime.journal import RECORD_HEADER, DamageWarning, open_journal, read_description
 
 
 def test_damaged_journal_header_discards_records(tmp_path):
@@ -40,7 +40,7 @@ def test_journal_rows_are_read_except_truncated_ones(tmp_path):
     with open_journal(path, {"seed": "0"}) as journal:
         for row in ROWS:
             journal.append(row)
-    assert run_of(path) == {"seed": "0"}
+    assert read_description(path) == {"seed": "0"}
     path.write_bytes(path.read_bytes()[:-3])
     with open_journal(path, {"seed": "0"}) as journal:
         assert journal.read_rows(Row) == ROWS[:2] and len(journal) == 2
@@ -58,4 +58,4 @@ def test_files_that_are_not_journals_are_rejected(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"is not an unfinished run.*delete it"), open_journal(path, {}):
         pass
-    assert path.read_bytes() == content and run_of(path) == {}
+    assert path.read_bytes() == content and read_description(path) == {}

@@ -6,14 +6,14 @@ import warp as wp
 
 from sim.minimisers import lbfgs_trial_kernels
 from sim.minimisers.lbfgs_kernels import PAIRS, PRODUCTS, ROWS_PER_THREAD, SUMS, build_kernels
-from sim.minimisers.lbfgs_trial_kernels import build_multiply_kernel, spread_of
+from sim.minimisers.lbfgs_trial_kernels import build_multiply_kernel, choose_thread_spread
 from sim.runtime.device import find_device
 
 NODES = 1500
 """More than one thread takes."""
 ROWS = 3 * NODES
 DEVICE = find_device("cpu", "float64")
-ONE, MANY = spread_of(DEVICE, 1), spread_of(DEVICE, 2)
+ONE, MANY = choose_thread_spread(DEVICE, 1), choose_thread_spread(DEVICE, 2)
 RNG = np.random.default_rng(0)
 
 

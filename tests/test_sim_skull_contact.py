@@ -17,7 +17,7 @@ from sim.loads import Loads, Nodal
 from sim.material import Material
 from sim.runtime.device import find_device
 from sim.terms.contact.skull_contact import Skull
-from sim.terms.contact.skull_surface import BONE_SETTINGS, Bone, bend_of
+from sim.terms.contact.skull_surface import BONE_SETTINGS, Bone, compute_bend
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 MESH = box((4, 4, 4), 0.05)
@@ -102,11 +102,11 @@ def test_skull_curvature_agrees_with_sphere_and_plane() -> None:
     normal = rng.normal(size=(800, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     exact = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / 0.07
-    assert np.abs(bend_of(0.07 * normal, normal) - exact).max() < 0.1 / 0.07
-    hollow = bend_of(-0.07 * normal, normal)
+    assert np.abs(compute_bend(0.07 * normal, normal) - exact).max() < 0.1 / 0.07
+    hollow = compute_bend(-0.07 * normal, normal)
     np.testing.assert_allclose(hollow, 0.0, atol=1e-9)
     flat = np.column_stack([rng.uniform(size=(50, 2)), np.zeros(50)])
-    np.testing.assert_allclose(bend_of(flat, np.tile([0.0, 0.0, 1.0], (50, 1))), 0.0, atol=1e-12)
+    np.testing.assert_allclose(compute_bend(flat, np.tile([0.0, 0.0, 1.0], (50, 1))), 0.0, atol=1e-12)
 
 
 def test_rotating_body_slides_along_a_round_skull() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from scenes.episodes.engine import find_still_missing, make_all
 from scenes.episodes.run_folder import BODIES, RunSettings, begin, get_versions, list_finished, to_episode_name
-from scenes.episodes.tasks import Made, RunWork
+from scenes.episodes.tasks import MadeEpisode, RunWork
 from sim.runtime.atomic_files import write_stream_atomically
 
 PER_BODY = 5
@@ -35,7 +35,7 @@ def write(path, values):
     with write_stream_atomically(path, path.suffix, sweep=False) as stream, h5py.File(stream, "w") as file:
         for name, value in values.items():
             file[name] = value
-    return Made(path, len(values), path.stat().st_size)
+    return MadeEpisode(path, len(values), path.stat().st_size)
 
 
 def to_body_path(folder, number):
@@ -45,16 +45,16 @@ def to_body_path(folder, number):
 def make_body(folder, seed, trouble, number):
     path = to_body_path(folder, number)
     if number in trouble.bodies:
-        return Made(path, failed=trouble.bodies[number])
+        return MadeEpisode(path, failed=trouble.bodies[number])
     if path.exists():
-        return Made(path, skipped=True)
+        return MadeEpisode(path, skipped=True)
     return write(path, {"body": np.random.default_rng([seed, number]).random(50)})
 
 
 def make_episode(folder, seed, trouble, number):
     path = folder / to_episode_name(number)
     if path.exists():
-        return Made(path, skipped=True)
+        return MadeEpisode(path, skipped=True)
     wrong = trouble.episodes.get(number, "")
     with (folder / "tried.txt").open("a") as file:
         file.write(f"{number} {os.getpid()} {os.environ.get(CARD)}\n")
@@ -65,7 +65,7 @@ def make_episode(folder, seed, trouble, number):
     if wrong == "broken once" and sum(line.startswith(f"{number} ") for line in tried(folder)) == 1:
         raise RuntimeError("the card has failed")
     if wrong.startswith("does not"):
-        return Made(path, failed=wrong)
+        return MadeEpisode(path, failed=wrong)
     with h5py.File(to_body_path(folder, body_of(number))) as file:
         body = np.asarray(file["body"])
     time.sleep(trouble.seconds)

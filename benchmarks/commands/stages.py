@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure the stages of a scene, and print them row by row."""
     from scenes.analysis.measurement import describe_machine
-    from scenes.play.deformers import plan_of
+    from scenes.play.deformers import explain_plan
     from scenes.script.scene import SCENES, find_scene
     from sim.effects import ToolForce
 
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         found.append(row)
         p95 = "" if row.p95 is None else f"{row.p95:.3g}"
         print(f"| {row.name} | {row.median:.3g} | {p95} | {row.unit} | {row.note} |", file=table, flush=True)
-    plan = tuple(line for fem in solvers for line in plan_of(fem))
+    plan = tuple(line for fem in solvers for line in explain_plan(fem))
     if plan:
         print("\nHow the finite elements go about a load:\n", *(f"- {line}" for line in plan), sep="\n", file=table)
     if args.json:

@@ -34,7 +34,7 @@ CALIBRATION_COUNT = 100  # Number of sampled calibrations.
 
 
 @dataclass(frozen=True, eq=False)
-class Filmed:
+class FilmedScene:
     """Scene at one time, seen by a tracked camera.
 
     Parameters
@@ -136,7 +136,7 @@ class OverlayErrors:
         return np.hypot(self.across, self.along)
 
 
-def sample_errors(filmed: Filmed, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
+def sample_errors(filmed: FilmedScene, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
     """Sample the overlay error caused by the contributors, all others being exact.
 
     The same seed gives the same random numbers for any set of contributors.
@@ -151,7 +151,7 @@ def sample_errors(filmed: Filmed, contributors: Sequence[str], count: int, seed:
 
 
 def _generate_samples(
-    filmed: Filmed, contributors: frozenset[str], count: int, seed: int
+    filmed: FilmedScene, contributors: frozenset[str], count: int, seed: int
 ) -> Iterator[tuple[Camera, Camera, np.ndarray, np.ndarray]]:
     """Yield the true and the estimated camera, and the true and the drawn tumour surface (n, 3) [m]."""
     target = build_patient_reference()
@@ -189,14 +189,14 @@ def _generate_samples(
         yield true, believed, surface, shown + _compute_registration_shift(filmed, shift, shown)
 
 
-def _sample_time_and_body(filmed: Filmed, seed: int, number: int) -> tuple[np.random.Generator, float, int]:
+def _sample_time_and_body(filmed: FilmedScene, seed: int, number: int) -> tuple[np.random.Generator, float, int]:
     """Return the numbers of a sample, of which the first say its time [s] and its body."""
     random = np.random.default_rng([seed, number])
     return random, random.uniform(0.0, filmed.duration), int(random.integers(len(filmed.bodies)))
 
 
 def _build_cameras(
-    filmed: Filmed, time: float, late: float, readout: float, middle: np.ndarray
+    filmed: FilmedScene, time: float, late: float, readout: float, middle: np.ndarray
 ) -> tuple[Camera, Camera]:
     """Return the camera that sees the tumour's `middle` (3,) [m] in the image of a time [s], and the tracked camera."""
     true = _build_delayed_camera(filmed, time, 0.0)
@@ -207,12 +207,12 @@ def _build_cameras(
     return true, then
 
 
-def _build_delayed_camera(filmed: Filmed, time: float, seconds: float) -> Camera:
+def _build_delayed_camera(filmed: FilmedScene, time: float, seconds: float) -> Camera:
     """Return the true camera at a delay after a time [s]."""
     return filmed.viewpoint.build_camera(filmed.site, time + seconds)
 
 
-def _sample_registration_error(filmed: Filmed, numbers: np.ndarray) -> np.ndarray:
+def _sample_registration_error(filmed: FilmedScene, numbers: np.ndarray) -> np.ndarray:
     """Return an error of registration (6,): a shift [m] and a turn [rad] in the frame of the patient's reference."""
     if filmed.registration is None:
         return np.append(REGISTRATION_PRIOR.range[1] * numbers[:3], np.zeros(3))
@@ -221,7 +221,7 @@ def _sample_registration_error(filmed: Filmed, numbers: np.ndarray) -> np.ndarra
     return scale * (root @ numbers)
 
 
-def _compute_registration_shift(filmed: Filmed, error: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _compute_registration_shift(filmed: FilmedScene, error: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the displacement (n, 3) [m] of scan points (n, 3) by a registration error (6,)."""
     if filmed.registration is None:
         return np.broadcast_to(error[:3], points.shape)
@@ -270,10 +270,10 @@ class ErrorBudget:
 
 
 def compute_budget(
-    filmed: Filmed,
+    filmed: FilmedScene,
     count: int,
     seed: int = 0,
-    twins: Filmed | None = None,
+    twins: FilmedScene | None = None,
     progress: Callable[[Sequence[str]], Iterable[str]] = iter,
 ) -> ErrorBudget:
     """Compute the budget from `count` samples; `twins`, other bodies, test the band with other random numbers."""

@@ -34,7 +34,7 @@ PLACES = ((0.0, 0.0), (6.0, 0.0), (0.0, 6.0))
 
 
 @dataclass(frozen=True)
-class Cell:
+class FactorCombination:
     """Combination of levels by factor, with the tumour's mean motion [mm] under prescribed force and prescribed motion.
 
     The prescribed motion is that of the tool under the force in the default body of the same opening and depth. NaN if
@@ -46,7 +46,7 @@ class Cell:
     motion: float
 
 
-def solve_cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[Cell]:
+def solve_cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[FactorCombination]:
     """Solve every combination on template meshes of about `nodes` nodes; the tool presses at three places."""
     for opening, depth in product(levels["opening [mm]"], levels["depth [mm]"]):
         subject = build_template_subject(Tumour(cover=1e-3 * float(depth)))
@@ -61,7 +61,7 @@ def solve_cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto"
             chosen = dict(zip(DEFAULT, combination, strict=True))
             fem = study.build_fem(_build_body_variant(chosen))
             moved = [_compute_mean_motion(fem, anatomy, loads) for loads in (forces, motions)]
-            yield Cell({"opening [mm]": opening, "depth [mm]": depth, **chosen}, *moved)
+            yield FactorCombination({"opening [mm]": opening, "depth [mm]": depth, **chosen}, *moved)
 
 
 def _build_body_variant(chosen: Mapping[str, str | float]) -> BodyVariant:
@@ -76,7 +76,7 @@ def _compute_mean_motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
     return 1e3 * float(np.linalg.norm(result.displacement, axis=2).mean())
 
 
-def compute_variance_shares(found: Sequence[Cell], response: str = "force") -> dict[str, float]:
+def compute_variance_shares(found: Sequence[FactorCombination], response: str = "force") -> dict[str, float]:
     """Return the share of variance of the logarithmic motion explained by each factor, and by each interaction of two.
 
     The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. The
@@ -98,7 +98,7 @@ def compute_variance_shares(found: Sequence[Cell], response: str = "force") -> d
     return dict(sorted({**own, **pairs}.items(), key=lambda item: -item[1]))
 
 
-def build_panels(found: Sequence[Cell]) -> list[ChartPanel]:
+def build_panels(found: Sequence[FactorCombination]) -> list[ChartPanel]:
     """Plot the motion over the tumour's depth, one panel per craniotomy: skulls, Poisson's ratios of the default."""
     chosen = [{**DEFAULT, "nu": nu} for nu in _list_levels(found, "nu")]
     chosen += [{**DEFAULT, "skull": skull} for skull in _list_levels(found, "skull") if skull != DEFAULT["skull"]]
@@ -119,5 +119,5 @@ def build_panels(found: Sequence[Cell]) -> list[ChartPanel]:
     return out
 
 
-def _list_levels(found: Sequence[Cell], name: str) -> list[str | float]:
+def _list_levels(found: Sequence[FactorCombination], name: str) -> list[str | float]:
     return list(dict.fromkeys(cell.levels[name] for cell in found))

@@ -33,7 +33,7 @@ class BodyVariant:
 
 
 @dataclass(frozen=True)
-class Aim:
+class LoadPerturbation:
     """Perturbation of a load: force or motion scaled by `share` and turned by `turn` [rad], point moved by `shift` [m].
 
     Each perturbation has several directions: more and less, about two axes, to four sides.
@@ -52,7 +52,7 @@ class Variant:
     default: str
     now: str
     body: BodyVariant
-    aim: Aim = Aim()
+    aim: LoadPerturbation = LoadPerturbation()
 
 
 def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) -> list[Variant]:
@@ -60,9 +60,9 @@ def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] =
     tissue = body.tissue
     young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
     changed = [
-        Variant("force or motion", "as drawn", "+-5 %", body, Aim(share=0.05)),
-        Variant("its direction", "as drawn", "+-2 deg", body, Aim(turn=np.radians(2.0))),
-        Variant("its position", "as drawn", "+-1 mm", body, Aim(shift=1e-3)),
+        Variant("force or motion", "as drawn", "+-5 %", body, LoadPerturbation(share=0.05)),
+        Variant("its direction", "as drawn", "+-2 deg", body, LoadPerturbation(turn=np.radians(2.0))),
+        Variant("its position", "as drawn", "+-1 mm", body, LoadPerturbation(shift=1e-3)),
         *(
             Variant(
                 "E", young, f"{step:+.0%}", replace(body, tissue=replace(tissue, young=(1.0 + step) * tissue.young))
@@ -81,10 +81,10 @@ def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] =
     if anatomy.slide_normal.any():
         changed += [Variant("skull", body.skull, skull, replace(body, skull=skull)) for skull in SKULLS]
     changed += [Variant("element", body.element, element, replace(body, element=element)) for element in elements]
-    return [variant for variant in changed if variant.body != body or variant.aim != Aim()]
+    return [variant for variant in changed if variant.body != body or variant.aim != LoadPerturbation()]
 
 
-def apply_aim(loads: Loads, aim: Aim, patch: Patch) -> Loads:
+def apply_aim(loads: Loads, aim: LoadPerturbation, patch: Patch) -> Loads:
     """Perturb the loads of one tool by `aim`: one block of loads for each direction.
 
     Points are shifted along the open cortex.

@@ -38,7 +38,7 @@ from ..script.priors import (
 )  # fmt: skip
 from ..script.scene import Scene
 from ..script.tool_paths import Path, Touch
-from ..script.uncertainty import LEVEL, Uncertainty, mark_of
+from ..script.uncertainty import LEVEL, Uncertainty, compute_scene_mark
 
 ACCURACY = Accuracy(tolerance=3e-3, limit_strain=False)  # Samples with inverted tetrahedra are counted, not left out.
 
@@ -294,7 +294,7 @@ def estimate_uncertainty(
     *lists, by_name = zip(*rows, strict=True)
     return Uncertainty(
         scene=scene.name,
-        mark=mark_of(scene, theatre.site, theatre.choose_element(scene)),
+        mark=compute_scene_mark(scene, theatre.site, theatre.choose_element(scene)),
         draws=len(draws),
         failed=len(draws) - len(sound),
         times=still.times,

@@ -25,7 +25,7 @@ from ..options.tissue_options import add_model_tissue
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
 
-    from ..analysis.error_budget import ErrorBudget, Filmed, OverlayErrors
+    from ..analysis.error_budget import ErrorBudget, FilmedScene, OverlayErrors
     from ..play.deformers import PatientSetup
     from ..script.priors import PatientSample
     from ..script.scene import Scene
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Unreadable files, numbers out of range, or a scene that cannot be solved.
     """
-    from ..analysis.error_budget import Filmed, choose_moment, compute_budget, compute_velocity
+    from ..analysis.error_budget import FilmedScene, choose_moment, compute_budget, compute_velocity
     from ..analysis.uncertainty import sample_mesh_errors, solve_nominal, split_contributions
     from ..play.deformers import open_theatre
     from ..play.stage import Stage
@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     number = choose_moment(still, [answer for _, answer in bodies], sample_mesh_errors(scene, draws))
     time = still.times[number]
     own_bodies, meshes, own_mesh = _extract_motions_at(scene, bodies, number)
-    filmed = Filmed(
+    filmed = FilmedScene(
         site=site, viewpoint=scene.viewpoint, duration=scene.duration, covariance=covariance, time=time,
         T_scan_patient=place_reference(site, scene.viewpoint.build_camera(site)),
         rest=Stage(scene, site).select_stage(scene.build_loads(site, scene.path(time), time)).tumour_at_rest.vertices,
@@ -229,7 +229,7 @@ def _compute_model_bound(theatre: PatientSetup, scene: Scene, time: float) -> fl
 
 
 def _collect_figures(
-    args: argparse.Namespace, filmed: Filmed, found: ErrorBudget, split: dict[str, float]
+    args: argparse.Namespace, filmed: FilmedScene, found: ErrorBudget, split: dict[str, float]
 ) -> dict[str, Any]:
     """Collect the results for JSON, in millimetres and pixels."""
     from ..analysis.error_budget import PARAMETERS

@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     plan = fem.plan.explain() if args.explain else ()
     for line in plan:
         print(line, file=sys.stderr)
-    deformation = fem.deform(loads, start_of(file, args.mesh, UNITS[args.unit]))
+    deformation = fem.deform(loads, read_start(file, args.mesh, UNITS[args.unit]))
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
     outcome, reached, inverted = deformation.outcome[0], float(deformation.reached[0]), int(deformation.inverted[0])
@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if outcome.good else 1
 
 
-def start_of(file: MeshFile, name: str, metre: float) -> Deformation | None:
+def read_start(file: MeshFile, name: str, metre: float) -> Deformation | None:
     """Return the initial guess in a file's point data `start`, if there is one. `metre`: the file's unit of length [m].
 
     Raises

@@ -53,7 +53,7 @@ def build_generator(seed: int, number: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, number, crc32(name.encode())])
 
 
-def spread_of(value: object) -> Distribution:
+def get_distribution(value: object) -> Distribution:
     """Return a plan's value as a `Distribution`."""
     if isinstance(value, Distribution):
         return value
@@ -64,7 +64,7 @@ def spread_of(value: object) -> Distribution:
 
 def sample_value(value: object, random: np.random.Generator) -> float | str | bool:
     """Sample a value of a plan's `Number` or `Word`."""
-    spread = spread_of(value)
+    spread = get_distribution(value)
     if spread.uniform is not None:
         return float(random.uniform(*spread.uniform))
     if spread.log is not None:
@@ -93,7 +93,7 @@ def check_spread(value: object, name: str, limits: ValueLimits | None, words: tu
         A reversed or infinite range, invalid weights, a value outside the limits, or a word that is not in
         `words`.
     """
-    spread = spread_of(value)
+    spread = get_distribution(value)
     given = [kind for kind in ("uniform", "log", "normal", "choice") if getattr(spread, kind) is not None]
     if len(given) != 1:
         said = " and ".join(given) or "none"

@@ -20,7 +20,7 @@ from distributed.scheduler import KilledWorker
 from sim.errors import InputError
 
 from .run_folder import Failure, RunSettings, list_failed, list_failures, mark_failed, to_episode_name, unmark
-from .tasks import Made, RunWork, TaskOutcome, try_task
+from .tasks import MadeEpisode, RunWork, TaskOutcome, try_task
 from .workers import MAX_WORKER_DEATHS, Workers, describe_scheduler_end
 
 MAX_RETRIES = 3
@@ -118,7 +118,7 @@ def make_all(
     failed_before, token = list_failed(folder), uuid4().hex
     tally, count, counted = before, workers.count(), monotonic()
 
-    def hand_out(kind: str, number: int, make: Callable[[int], Made], *needed: Future) -> Future:
+    def hand_out(kind: str, number: int, make: Callable[[int], MadeEpisode], *needed: Future) -> Future:
         future = workers.client.submit(
             try_task, make, number, folder, run, *needed,
             key=f"{kind}-{number}-{token}", retries=MAX_RETRIES, resources=workers.needs,

@@ -28,7 +28,7 @@ from .incomplete_bodies import clear_folder, is_begun
 from .plan import NO_LEARNER, EpisodePlan
 from .run_folder import BODIES, to_episode_name
 from .scripted import build_scene, sample_body_number, sample_episode
-from .tasks import Made
+from .tasks import MadeEpisode
 
 # 256 equally probable quantiles of the normal distribution [standard deviations].
 QUANTILES = ndtri((np.arange(256) + 0.5) / 256)
@@ -94,17 +94,17 @@ def choose_body(plan: EpisodePlan, seed: int, number: int) -> int:
     return sample_body_number(plan.contents, seed, number)
 
 
-def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> Made:
-    """Make a body, unless it exists; a failure is reported in `Made.failed`.
+def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> MadeEpisode:
+    """Make a body, unless it exists; a failure is reported in `MadeEpisode.failed`.
 
     It is made under another name, so that a folder of its name is whole. A second
     process discards its own copy: both are equal. Loads that were solved before are not solved again.
     """
     path = to_body_path(folder, number)
     if (path / BODY_FILE).is_file():
-        return Made(path, skipped=True)
+        return MadeEpisode(path, skipped=True)
     if path.exists() and not (path / BODY_FILE).is_file():  # checked again: another process may have made it meanwhile
-        return Made(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
+        return MadeEpisode(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
     resumed = False
     try:
         with write_folder_atomically(path, kept=is_begun) as partial:
@@ -116,19 +116,19 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
             raise
         rmtree(to_partial_path(path), ignore_errors=True)
         if not whole:
-            return Made(path, failed=str(error))
+            return MadeEpisode(path, failed=str(error))
     size = sum(file.stat().st_size for file in path.iterdir())
-    return Made(path, bytes=size, resumed=resumed)
+    return MadeEpisode(path, bytes=size, resumed=resumed)
 
 
-def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> Made:
-    """Make an episode, unless it exists; its body must exist. A failure is reported in `Made.failed`.
+def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> MadeEpisode:
+    """Make an episode, unless it exists; its body must exist. A failure is reported in `MadeEpisode.failed`.
 
     Loads without equilibrium do not fail an episode: `outcome_predicted` and `outcome_fem` record them by frame.
     """
     path = to_episode_path(folder, number)
     if path.is_file():
-        return Made(path, skipped=True)
+        return MadeEpisode(path, skipped=True)
     try:
         report = _collect_episode(
             path, plan, seed, number, to_body_path(folder, choose_body(plan, seed, number)), device
@@ -136,12 +136,12 @@ def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device
     except InputError as error:
         if isinstance(error.__cause__, TRANSIENT_ERRORS):
             raise
-        return Made(path, failed=str(error))
-    return Made(path, int(str(report["frames"])), path.stat().st_size)
+        return MadeEpisode(path, failed=str(error))
+    return MadeEpisode(path, int(str(report["frames"])), path.stat().st_size)
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
+class OpenedEpisode:
     """Body whose files were read, and its FEM solvers by the effects that they solve."""
 
     body: EpisodeBody
@@ -159,10 +159,10 @@ class Opened:
 
 
 @lru_cache(maxsize=MAX_CACHE_SIZE)
-def open_body(place: Path, device: str) -> Opened:
+def open_body(place: Path, device: str) -> OpenedEpisode:
     """Return an existing body, read once for many episodes; InputError as `read_body`."""
     body = read_body(place)
-    return Opened(body, body.open_theatre(device))
+    return OpenedEpisode(body, body.open_theatre(device))
 
 
 def _collect_episode(

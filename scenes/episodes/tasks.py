@@ -21,7 +21,7 @@ FIRST = FIRST_OF_PROCESS, FIRST_OF_BODY, NOT_FIRST = "process", "body", "no"
 
 
 @dataclass(frozen=True)
-class Made:
+class MadeEpisode:
     """Outcome of making an episode or a body.
 
     Parameters
@@ -59,8 +59,8 @@ class RunWork:
     """
 
     body_of: Callable[[int], int]
-    make_body: Callable[[int], Made]
-    make_episode: Callable[[int], Made]
+    make_body: Callable[[int], MadeEpisode]
+    make_episode: Callable[[int], MadeEpisode]
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class _Process:
 
 
 def try_task(
-    make: Callable[[int], Made], number: int, folder: Path, run: RunSettings, body: TaskOutcome | None = None
+    make: Callable[[int], MadeEpisode], number: int, folder: Path, run: RunSettings, body: TaskOutcome | None = None
 ) -> TaskOutcome:
     """Make item `number`, if the worker can access the run's folder and has the run's versions.
 

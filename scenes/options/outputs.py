@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import check_output, remove_empty_parents
-from sim.runtime.journal import run_of
+from sim.runtime.journal import read_description
 from sim.runtime.partial_files import to_unfinished_path
 
 FRAME_PATTERN = re.compile(r"frame_\d{4,}\.png")  # Pattern of a frame's file name.
@@ -97,7 +97,7 @@ def read_statements(path: Path) -> dict[str, str]:
         if h5py.is_hdf5(path):
             with h5py.File(path, "r") as file:
                 return {name: str(value) for name, value in file.attrs.items()}
-        return run_of(path)
+        return read_description(path)
     except (OSError, ValueError, LookupError, AttributeError, zipfile.BadZipFile):
         return {}
 

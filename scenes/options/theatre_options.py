@@ -95,7 +95,7 @@ def build_requested_scene(args: argparse.Namespace, name: str, theatre: PatientS
     Raises
     ------
     InputError
-        See `find_scene`, `apply_tissue_options`, `read_markup` and `approach_of`.
+        See `find_scene`, `apply_tissue_options`, `read_markup` and `parse_approach`.
     """
     from ..script.scene import find_scene
 
@@ -110,10 +110,10 @@ def _follow_trajectory(args: argparse.Namespace, scene: Scene, site: CraniotomyF
     """Let the scene's tool follow the trajectory; a notice reports if the bone's edge stops the tool."""
     from sim.bodies.markups import read_markup
 
-    from ..script.approach import approach_of
+    from ..script.approach import parse_approach
     from ..script.tool_paths import keep_idle
 
-    approach = approach_of(read_markup(args.trajectory), site)
+    approach = parse_approach(read_markup(args.trajectory), site)
     if scene.tool is None:
         print(f"{args.program}: {scene.name} has no tool that could follow {args.trajectory}", file=sys.stderr)
         return scene

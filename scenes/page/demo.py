@@ -39,7 +39,7 @@ from .effect_costs import build_effect_fold
 from .fem_worker import FemResult, FemWorker
 from .requests import HAND, SCRIPT, Look, Requests, describe_holder
 from .scene_solvers import SceneSolvers
-from .side_panels import list_lines, render_slices, sample_of
+from .side_panels import build_sample, list_lines, render_slices
 from .text import describe_effect, describe_work, format_caption, format_pending, plan_words, report
 from .view import (
     FEM_COLOUR,
@@ -258,7 +258,7 @@ class Demo:
         frame = player.draw_frame(solution.number, tool_touch, solution.loads, solution.deformation, solution.seconds)
         state.frame = frame
         state.record_rendering(frame.seconds["render"])
-        self.history.add(sample_of(frame, self.stage.scene, clock.monotonic()))
+        self.history.add(build_sample(frame, self.stage.scene, clock.monotonic()))
         if solution.number == number:
             self._mark_shown()
         if name == "fem" and not disabled:

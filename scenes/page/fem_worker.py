@@ -9,7 +9,7 @@ from sim.errors import InputError
 from sim.loads import Loads
 from sim.runtime.threads import enter_background
 
-from ..play.deformers import PatientSetup, plan_of
+from ..play.deformers import PatientSetup, explain_plan
 from ..play.player import Player
 from ..play.replay import ReplaySession
 from ..script.scene import Scene
@@ -135,5 +135,5 @@ class FemWorker:
             if self.closed.is_set() or self.newest is None:
                 return None
             session = ReplaySession(theatre.build_player("fem", scene))
-        self.player, self.plan = session.player, plan_of(session.player.deformer)
+        self.player, self.plan = session.player, explain_plan(session.player.deformer)
         return session

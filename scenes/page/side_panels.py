@@ -31,7 +31,7 @@ def list_lines(scene: Scene) -> tuple[Line, ...]:
     return DISTANCE, FORCE if scene.posed else SET_FORCE
 
 
-def sample_of(frame: Frame, scene: Scene, now: float) -> Sample:
+def build_sample(frame: Frame, scene: Scene, now: float) -> Sample:
     """Build the readings, with errors, of a frame that is shown at a time [s], in the order of `list_lines`."""
     if scene.tool is None:
         location = frame.estimate.location if frame.estimate is not None else None

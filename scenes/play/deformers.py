@@ -37,8 +37,8 @@ from ..script.shipped_files import get_template_path
 from ..script.uncertainty import (
     MotionError,
     Uncertainty,
+    compute_scene_mark,
     fit_motion_error,
-    mark_of,
     read_uncertainties,
     to_uncertainty_path,
 )
@@ -282,7 +282,7 @@ class PatientSetup:
 
     def compute_mark(self, scene: Scene) -> str:
         """Compute the fingerprint of a scene on this anatomy."""
-        return mark_of(scene, self.site, self.choose_element(scene))
+        return compute_scene_mark(scene, self.site, self.choose_element(scene))
 
     def estimate_motion_error(self, scene: Scene) -> MotionError | None:
         """Return the error in proportion to the motion, from this anatomy's ensemble of the scene or the template's.
@@ -319,7 +319,7 @@ def read_template_uncertainties() -> Mapping[str, Uncertainty]:
     return read_uncertainties(to_uncertainty_path(get_template_path()))
 
 
-def plan_of(deformer: Deformer) -> tuple[str, ...]:
+def explain_plan(deformer: Deformer) -> tuple[str, ...]:
     """List the solvers that a deformer tries for a load, as sentences; empty for a model or a resected body."""
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 

@@ -22,7 +22,7 @@ REMEDY = "Delete it, and measure again by `sulcus effects --out`."  # Remedy for
 class EffectRecord:
     """Measured effects of one scene on one anatomy, of which a number of `frames` was solved.
 
-    `mark`: fingerprint of the scene, see `scenes.script.uncertainty.mark_of`; `day`: ISO 8601; `machine` in words.
+    `mark`: fingerprint of the scene, see `compute_scene_mark`; `day`: ISO 8601; `machine` in words.
     `effects`, by class name: FEM time per frame that an effect adds [ms], and tumour motion that it causes [mm]; None:
     not solvable without it, `refused` has the reason. `all`: time and motion of the whole scene. `unphysical`: number
     of frames with inverted or overstrained tetrahedra, in the solutions with and without each effect.

@@ -143,7 +143,7 @@ class TumourEstimate:
         return Layer("ellipsoid", ELLIPSOID, self.middle + self.motion + at, SPHERE_FACES, ELLIPSOID_COLOUR)
 
 
-class Sees(Protocol):
+class TumourObserver(Protocol):
     """Observer that estimates the tumour position from observations, for a stage."""
 
     def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:

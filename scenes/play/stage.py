@@ -30,7 +30,7 @@ from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, bu
 from .drape import DRAPE_DEPTH, build_drape
 from .fine_cortex import FineCortex, build_fine_cortex
 from .instruments import build_instrument, has_instrument
-from .observer import Sees
+from .observer import TumourObserver
 
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 """Segmentation ids."""
@@ -96,7 +96,7 @@ class Stage:
     intensity: Intensity | None = None
     left: RemainingBody | None = None
     device: str = "cpu"
-    observer: Sees | None = None
+    observer: TumourObserver | None = None
 
     @property
     def anatomy(self) -> Anatomy:

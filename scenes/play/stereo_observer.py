@@ -14,7 +14,7 @@ from surrogate.locating.observation import Observation
 from ..script.observation_models import StereoObservation
 from .observer import NO_POINTS, RigidError, TumourEstimate, find_touched, locate_tumour, sample_rigid_error
 from .stage import Stage
-from .stereo_update import First, StereoPair, observe_first, observe_point_cloud, observe_points
+from .stereo_update import FirstView, StereoPair, observe_first, observe_point_cloud, observe_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class StereoObserver:
         return StereoPair((left, right), (pictures[0], pictures[1]), seen)
 
     @cached_property
-    def first(self) -> First:
+    def first(self) -> FirstView:
         """First image pair, of the brain as in the scan.
 
         Raises

@@ -82,7 +82,7 @@ class StereoPair:
 
 
 @dataclass(frozen=True, eq=False)
-class First:
+class FirstView:
     """First image pair.
 
     Parameters
@@ -103,7 +103,7 @@ class First:
     still: np.ndarray
 
 
-def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Rigid) -> First:
+def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Rigid) -> FirstView:
     """Match the first pair, of an undeformed brain: `count` points, each at the nearest point of the scan.
 
     Raises
@@ -124,11 +124,11 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
     good = find_supported(rest, points - rest)
     require_points(int(good.sum()), len(pixels))
     around, still = find_surroundings(site, view)
-    return First(view, pixels[found.which[good]], rest[good], len(pixels), around, rigid(still))
+    return FirstView(view, pixels[found.which[good]], rest[good], len(pixels), around, rigid(still))
 
 
 def observe_points(
-    site: CraniotomyFrame, first: First, shot: StereoPair, rigid: Rigid, tips: np.ndarray
+    site: CraniotomyFrame, first: FirstView, shot: StereoPair, rigid: Rigid, tips: np.ndarray
 ) -> Observation:
     """Track the points of the first pair in a later pair; `tips` (k, 3) [m] are contact points of a tool.
 
@@ -207,7 +207,7 @@ def find_surroundings(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarr
     return pixels[found.which[some]], found.points[some]
 
 
-def check_no_motion(first: First, view: StereoView, rigid: Rigid) -> None:
+def check_no_motion(first: FirstView, view: StereoView, rigid: Rigid) -> None:
     """Raise InputError if the surroundings of the opening seem to have moved since the first pair."""
     which, there = follow_pixels(first.view, view, first.around)
     try:

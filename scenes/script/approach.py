@@ -51,7 +51,7 @@ class Approach:
         return replace(tool, lean=float(np.arctan(np.hypot(right, up))), turn=float(np.arctan2(up, right)))
 
 
-def approach_of(markup: Markup, site: CraniotomyFrame) -> Approach:
+def parse_approach(markup: Markup, site: CraniotomyFrame) -> Approach:
     """Compute the approach of a line markup, or of a point, which is approached along the axis.
 
     Raises

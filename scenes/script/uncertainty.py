@@ -79,7 +79,7 @@ class Uncertainty:
     Parameters
     ----------
     scene, mark
-        Name of the scene, and its fingerprint, see `mark_of`.
+        Name of the scene, and its fingerprint, see `compute_scene_mark`.
     draws, failed
         Number of samples, and of those without equilibrium: these are excluded.
     times
@@ -187,7 +187,7 @@ def fit_motion_error(found: Uncertainty) -> MotionError | None:
     return MotionError(rest, float(surface.max()), float((mean[enough] / moved[enough]).max()))
 
 
-def mark_of(scene: Scene, site: CraniotomyFrame, element: str) -> str:
+def compute_scene_mark(scene: Scene, site: CraniotomyFrame, element: str) -> str:
     """Compute the fingerprint of a scene: 16 hexadecimal digits of its loads, its anatomy and the priors."""
     times = np.linspace(0.0, scene.duration, 25).tolist()
     # Rounded, because sines differ between machines in the last digit.

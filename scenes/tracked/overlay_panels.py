@@ -21,7 +21,7 @@ def list_lines(tooled: bool) -> tuple[Line, ...]:
     return (DISTANCE, OVERLAY_ERROR) if tooled else (OVERLAY_ERROR,)
 
 
-def sample_of(known: TrackingResult, gauge: Gauge | None, tooled: bool, now: float) -> Sample:
+def build_history_sample(known: TrackingResult, gauge: Gauge | None, tooled: bool, now: float) -> Sample:
     """Build the readings of an image that is shown at a time [s], in the order of `list_lines`."""
     within = 1e3 * known.band if known.relied and known.band is not None else None
     if not tooled:

@@ -23,7 +23,7 @@ from ..play.stage import TOOL_COLOUR, TUMOUR_COLOUR
 from ..play.waiting_notice import Busy
 from .follower import MAX_INTERVAL, Follower, TrackingResult, TumourState
 from .overlay_painter import GREY_STATES, Painter
-from .overlay_panels import list_lines, render_slices, sample_of
+from .overlay_panels import build_history_sample, list_lines, render_slices
 from .overlay_text import describe_overlay, report
 from .run import Shown, Timed, overlay_one
 from .seekable_video import SeekableFilm
@@ -224,7 +224,7 @@ class OverlayPage:
         now = clock.monotonic()
         if number not in (before, before + 1):
             self.history.break_off(now)
-        self.history.add(sample_of(one.known, self._measure_gauge(one.known), self.tooled, now))
+        self.history.add(build_history_sample(one.known, self._measure_gauge(one.known), self.tooled, now))
         self._draw(one)
 
     def _measure_gauge(self, known: TrackingResult) -> Gauge | None:

@@ -125,12 +125,12 @@ def _compute_centroids(anatomy: Anatomy) -> np.ndarray:
 
 def _find_voxels(affine: np.ndarray, shape: tuple[int, ...], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest voxels (n, 3) to points (n, 3) [m], and which of these lie within the volume (n,)."""
-    index, last = index_of(affine, points), np.array(shape) - 1
+    index, last = compute_index(affine, points), np.array(shape) - 1
     inside = np.asarray(((index >= -0.5) & (index <= last + 0.5)).all(axis=1))
     return np.clip(np.rint(index), 0, last).astype(int), inside
 
 
-def index_of(affine: np.ndarray, points: np.ndarray) -> np.ndarray:
+def compute_index(affine: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return indices (n, 3) of points (n, 3) [m] in a volume of an affine (4, 4)."""
     return (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
 
@@ -259,7 +259,7 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
         if not len(rows):
             continue
         then = now[rows] + went
-        place = index_of(affine, then)
+        place = compute_index(affine, then)
         off = ((place < -0.5) | (place > last + 0.5)).any(axis=1)
         cut = np.zeros(len(rows), bool)
         if fields.resected.any():

@@ -71,13 +71,13 @@ def choose_preconditioner(
             if device.on_cuda and _can_invert(len(constraint.build_basis().indptr) - 1, device):
                 return _build_solver(stiffness, constraint, space.nodes, device, settings)
             lifted = _build_corner_preconditioner(stiffness, space, constraint, device, settings)
-            name = f"p-multigrid on {name_of(lifted.coarse)}"
+            name = f"p-multigrid on {get_preconditioner_name(lifted.coarse)}"
             return TwoLevel(lifted, project_to_free(stiffness, constraint), device, name, settings.smoother)
         if space.element in ("smoothed", "element-free") and problem.rows > settings.max_smoothed_factorised:
             # Averaging reduces the stiffness, so that the coarse solver never overshoots. Element-free, it overshoots
             # at nu >= 0.49; the cycle was positive definite up to 0.499.
             coarse = _build_solver(unsmoothed(step), constraint, space.nodes, device, settings)
-            name = f"two levels on {name_of(coarse)}"
+            name = f"two levels on {get_preconditioner_name(coarse)}"
             fine = project_to_free(problem.rest_curvature(step), constraint)
             return TwoLevel(coarse, fine, device, name, settings.smoother)
         return _build_solver(problem.rest_curvature(step), constraint, space.nodes, device, settings)
@@ -92,7 +92,7 @@ def explain_no_factor(error: RuntimeError, device: str) -> str:
     return f"the undeformed stiffness cannot be factorised ({error}): fix or support every part."
 
 
-def name_of(preconditioner: Preconditioner) -> str:
+def get_preconditioner_name(preconditioner: Preconditioner) -> str:
     """Return the name of a preconditioner for messages."""
     match preconditioner:
         case TwoLevel():
@@ -107,7 +107,7 @@ def name_of(preconditioner: Preconditioner) -> str:
 
 def is_exact(preconditioner: Preconditioner) -> bool:
     """Return True if a preconditioner is the inverse of the whole undeformed stiffness, up to rounding."""
-    return name_of(preconditioner) in ("sparse factor", "dense inverse")
+    return get_preconditioner_name(preconditioner) in ("sparse factor", "dense inverse")
 
 
 def build_rest_solver(problem: Problem) -> Preconditioner:

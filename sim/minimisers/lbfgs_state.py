@@ -190,7 +190,7 @@ class Workspace:
         a, k = self.columns, self._kernels
         problem, device = self._problem, self._problem.device
         rows, count = a["u"].shape
-        spread, one = lbfgs_trial_kernels.spread_of(device, count), (count,)
+        spread, one = lbfgs_trial_kernels.choose_thread_spread(device, count), (count,)
         step = lbfgs_trial_kernels.build_kernels(device, spread).step
         device.launch(step, (spread.count_threads(rows), count), [a["u"], a["t"], a["d"]], [a["v"]])
         found = compute_residual_arrays(problem, a["v"], a["constant"], a["d"], self._trial)
@@ -220,7 +220,7 @@ class Workspace:
         a["products"].zero_()
         inputs, outputs = [a["known"], a["s"], a["w"], a["g"], a["z"], g, a["new_z"]], [a["products"]]
         if count == 1 and device.on_cuda:
-            dim = (len(a["products"]), lbfgs_trial_kernels.spread_of(device, 1).count_threads(rows))
+            dim = (len(a["products"]), lbfgs_trial_kernels.choose_thread_spread(device, 1).count_threads(rows))
             device.launch(build_multiply_kernel(device, PAIRS), dim, inputs, outputs)
         else:
             device.launch(k.multiply, (-(-rows // ROWS_PER_THREAD), count), inputs, outputs)

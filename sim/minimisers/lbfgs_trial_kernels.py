@@ -30,7 +30,7 @@ class ThreadSpread:
         return -(-count // (self.lanes * self.each)) * self.lanes
 
 
-def spread_of(device: Device, columns: int) -> ThreadSpread:
+def choose_thread_spread(device: Device, columns: int) -> ThreadSpread:
     """Choose how the threads of a device share the rows of a batch of this many load cases."""
     if columns > 1:
         return ThreadSpread(1, ROWS_PER_THREAD)
@@ -120,7 +120,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
 @cache
 def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
     """Build the kernel `multiply` for a single load case, launched over (products, threads of rows)."""
-    scalar, m, spread = device.scalar, pairs, spread_of(device, 1)
+    scalar, m, spread = device.scalar, pairs, choose_thread_spread(device, 1)
     lanes, each = spread.lanes, spread.each
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GZ_OLD, 2 * m + YW
 

@@ -61,7 +61,7 @@ def compute_residual_arrays(
             term.add_gradient(v, workspace.part)
             device.launch(absorb, (-(-rows // CHUNK), count), [], [workspace.part, workspace.g, workspace.own[number]])
     inputs = [constant, *problem.constraint.nodes, v if d is None else d]
-    spread = lbfgs_trial_kernels.spread_of(device, count)
+    spread = lbfgs_trial_kernels.choose_thread_spread(device, count)
     device.launch(
         lbfgs_trial_kernels.build_kernels(device, spread).finish,
         (spread.count_threads(rows // 3), count),

@@ -123,7 +123,7 @@ def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
         yield Journal(path, file, key, _restore_records(path, file, opening, key, stated))
 
 
-def run_of(path: Path) -> dict[str, str]:
+def read_description(path: Path) -> dict[str, str]:
     """Return the description of the run that a journal belongs to; empty if it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         head = file.read(MAX_DESCRIPTION_BYTES)

@@ -15,7 +15,7 @@ from ..effects import Effect
 from ..linalg.multifrontal import Factor
 from ..linalg.multigrid import TwoLevel
 from ..linalg.pcg import BlockJacobi, Preconditioner
-from ..linalg.preconditioner import is_exact, name_of
+from ..linalg.preconditioner import get_preconditioner_name, is_exact
 from ..local_solvers.batch_elimination import BatchElimination, build_batch_elimination, has_small_opening
 from ..local_solvers.clamped_elimination import ClampedElimination
 from ..local_solvers.strained_descent import StrainedDescent, build_strained_part
@@ -59,7 +59,7 @@ class SolverPlan:
     Parameters
     ----------
     preconditioner
-        Name of the preconditioner, from `name_of`.
+        Name of the preconditioner, from `get_preconditioner_name`.
     many, single
         Local solver that is tried first for `PLAN_LIMITS.min_shared_cases` loads or more, and for one; or None.
     contact
@@ -163,7 +163,7 @@ def plan_for(
     most = PLAN_LIMITS.max_cuda_evaluations if cuda else PLAN_LIMITS.max_evaluations
     most = most if accuracy.evaluations is None else min(most, accuracy.evaluations)
     return SolverPlan(
-        preconditioner=name_of(preconditioner),
+        preconditioner=get_preconditioner_name(preconditioner),
         many=SolverStep.NEAR if small and exact and SolverStep.NEAR not in avoid else None,
         single=single,
         contact=contact,

@@ -28,7 +28,7 @@ from ..discretisation.term import Cases
 from ..material import Pairs
 from ..runtime.device import Device, forward_kernel
 from .laws.invariants import exp_less_one
-from .laws.isochoric_split import split_of
+from .laws.isochoric_split import build_law_split
 from .laws.law import Law
 
 # components of a symmetric tensor
@@ -39,7 +39,7 @@ TENSOR_COMPONENTS = 6
 def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
     """Return the law on `count` coefficients that also takes f - 1 and components xx, yy, zz, yz, zx, xy of A [Pa]."""
     scalar, mat = device.scalar, device.matrix
-    parts = split_of(law, device)
+    parts = build_law_split(law, device)
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1 + TENSOR_COMPONENTS))
     own_energy, own_stress, own_change = parts.energy, parts.stress, parts.stress_change
 
@@ -96,7 +96,7 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
     """Build kernels for a law of `count` coefficients; each launches over (element, point, column)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
-    overstress = split_of(law, device).overstress
+    overstress = build_law_split(law, device).overstress
     six = TENSOR_COMPONENTS
 
     @forward_kernel(module="unique")

@@ -96,7 +96,7 @@ def find_own(name: str) -> Own | None:
     return None
 
 
-def name_of(kind: type) -> str | None:
+def find_learner_name(kind: type) -> str | None:
     """Return the name under which a class was registered."""
     return next((name for name, own in OWN_LEARNERS.items() if own.regressor is kind), None)
 

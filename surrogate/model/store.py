@@ -29,7 +29,7 @@ from .conformal import GROWTH, Bound
 from .held_out import HeldOutErrors, ReportedErrors
 from .learned import Learned, ModelPart
 from .npz_archive import Archive, compute_seal, write_archive
-from .own_learners import find_own, name_of
+from .own_learners import find_learner_name, find_own
 from .tip_distance import TipModel
 from .tool_contact import ForceModel
 from .training_range import Envelope
@@ -202,7 +202,7 @@ def _list_array_keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
 
 
 def _get_own_name(regressor: Fitted) -> str:
-    name = name_of(type(regressor))
+    name = find_learner_name(type(regressor))
     if name is None:
         raise InputError(f"{type(regressor).__name__} was never registered: see surrogate.learner.")
     return name

@@ -73,7 +73,7 @@ BOUND_FITS = {"tumour": TUMOUR_FIT, "tip": TIP_FIT, "force": FORCE_FIT}  # Setti
 
 
 @dataclass(frozen=True, eq=False)
-class Missed:
+class HeldOutMisses:
     """Errors of a model on loads that none of its fits has used.
 
     Parameters
@@ -92,10 +92,10 @@ class Missed:
     features: np.ndarray
     error: np.ndarray
 
-    def select(self, some: np.ndarray) -> Missed:
+    def select(self, some: np.ndarray) -> HeldOutMisses:
         """Select loads by number or (B,) bool."""
         known, outside = Measured(*(each[some] for each in self.known)), Outside(*(each[some] for each in self.outside))
-        return Missed(select_rows(self.pushed, some), known, outside, self.features[some], self.error[some])
+        return HeldOutMisses(select_rows(self.pushed, some), known, outside, self.features[some], self.error[some])
 
     @property
     def extrapolated(self) -> np.ndarray:
@@ -108,14 +108,14 @@ class Missed:
         return self.known.magnitude
 
 
-def collect_missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> Missed:
+def collect_missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> HeldOutMisses:
     """Combine errors (B,) [m] of a model with its input loads."""
     known, envelope = measure_loads(patch, pushed), model.envelope
     features = compute_features(pushed, envelope.clip_to_range(known))
-    return Missed(pushed, known, envelope.locate_outside(pushed, known), features, error)
+    return HeldOutMisses(pushed, known, envelope.locate_outside(pushed, known), features, error)
 
 
-def bound_by(near: Missed, way: BoundSettings, growth: float, seen: Missed | None = None) -> Bound:
+def bound_by(near: HeldOutMisses, way: BoundSettings, growth: float, seen: HeldOutMisses | None = None) -> Bound:
     """Calibrate a bound on loads `near` the training loads, with a `growth` [1/m] by distance from these.
 
     One in `SCALE_STRIDE` of these loads fits its scale, and the others its quantiles: they have the distribution of the
@@ -129,13 +129,13 @@ def bound_by(near: Missed, way: BoundSettings, growth: float, seen: Missed | Non
     return fit_bound((seen.features, seen.error), *known, way, away=near.outside.away, growth=growth)
 
 
-def compute_growth(near: Missed, far: Missed, way: BoundSettings) -> float:
+def compute_growth(near: HeldOutMisses, far: HeldOutMisses, way: BoundSettings) -> float:
     """Compute the growth [1/m] with which a bound has equal coverage `far` from training loads and near them."""
     return fit_growth(*_compute_relative_errors(near, far, way))
 
 
 def compute_held_out_bounds(
-    model: Learned, near: Missed, far: Missed, split: DiscSplit, way: BoundSettings
+    model: Learned, near: HeldOutMisses, far: HeldOutMisses, split: DiscSplit, way: BoundSettings
 ) -> np.ndarray:
     """Compute bounds (2, B) [m] of loads on held-out discs, each with the growth estimated from the other discs."""
     known, (ratio, away) = _compute_relative_errors(near, far, way)
@@ -148,12 +148,14 @@ def compute_held_out_bounds(
     return bound
 
 
-def measure_coverage_by(bound: np.ndarray, far: Missed) -> Coverage:
+def measure_coverage_by(bound: np.ndarray, far: HeldOutMisses) -> Coverage:
     """Compute the empirical coverage of bounds (2, B) [m]."""
     return measure_covered(far.force, far.error, bound, int(far.extrapolated.sum()))
 
 
-def _compute_relative_errors(near: Missed, far: Missed, way: BoundSettings) -> list[tuple[np.ndarray, np.ndarray]]:
+def _compute_relative_errors(
+    near: HeldOutMisses, far: HeldOutMisses, way: BoundSettings
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Compute errors over a bound without growth, and distances [m] from training loads: calibration loads, `far`."""
     plain = bound_by(near, way, 0.0)
     return [
@@ -162,7 +164,7 @@ def _compute_relative_errors(near: Missed, far: Missed, way: BoundSettings) -> l
     ]
 
 
-def _select_scale_loads(near: Missed) -> np.ndarray:
+def _select_scale_loads(near: HeldOutMisses) -> np.ndarray:
     """Select the loads that fit the scale: (B,) bool."""
     return np.arange(len(near.error)) % SCALE_STRIDE == 0
 
@@ -174,11 +176,11 @@ class ModelErrors:
     The force is that of a tool moved by pose; None if not available.
     """
 
-    tumour: Missed
-    tip: Missed
-    force: Missed | None = None
+    tumour: HeldOutMisses
+    tip: HeldOutMisses
+    force: HeldOutMisses | None = None
 
-    def list_available(self) -> dict[str, Missed]:
+    def list_available(self) -> dict[str, HeldOutMisses]:
         """Return the available errors, by the names of `BOUND_FITS`."""
         found = {"tumour": self.tumour, "tip": self.tip}
         return found if self.force is None else {**found, "force": self.force}
@@ -226,7 +228,7 @@ class TrainingSolutions:
         """Compute a model's errors on rows (B,) bool; those at the tumour or of the tip (k,) [m] may be given."""
         asked = select_rows(self.pushed, rows)
 
-        def of(error: np.ndarray) -> Missed:
+        def of(error: np.ndarray) -> HeldOutMisses:
             return collect_missed(model, self.patch, asked, error)
 
         return ModelErrors(

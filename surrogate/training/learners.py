@@ -15,7 +15,7 @@ from ..data.splits import DiscSplit
 from ..data.tool_loads import spread
 from ..evaluation.score import SolveCounts
 from ..model.learned import ModelPart
-from ..model.own_learners import find_own, name_of
+from ..model.own_learners import find_learner_name, find_own
 from ..model.tool_contact import ForceModel
 from ..regressors.baselines import Ann, Pcr, Svr
 from ..regressors.force_series import TERM_COUNT, Remainder
@@ -194,7 +194,7 @@ def fit_force_model(name: str, parts: Sequence[ModelPart], patch: Patch, example
         if isinstance(part.regressor, RigidContact):
             left = left - part.regressor.predict_force(ENCODERS[part.encoder](patch, examples.loads))
     learned = make().fit(X, left)
-    if name_of(type(learned)) is not None:
+    if find_learner_name(type(learned)) is not None:
         _check_own(learned, X, left)
     return ForceModel(encoder, learned)
 
@@ -236,7 +236,7 @@ def _fit_part(
     encoder, make = kind
     X, Y = ENCODERS[encoder](patch, loads), basis.encode(response)
     regressor = make().fit(X, Y)
-    if name_of(type(regressor)) is not None:
+    if find_learner_name(type(regressor)) is not None:
         _check_own(regressor, X, Y)
     return ModelPart(encoder, regressor, basis)
 
@@ -246,6 +246,6 @@ def _check_own(regressor: Fitted, X: np.ndarray, Y: np.ndarray) -> None:
     found = np.asarray(regressor.predict(X))
     if found.shape != Y.shape or not np.isfinite(found).all():
         raise InputError(
-            f"the learner {name_of(type(regressor))} returns shape {found.shape} for {X.shape[0]} loads: "
+            f"the learner {find_learner_name(type(regressor))} returns shape {found.shape} for {X.shape[0]} loads: "
             f"let `predict` give {Y.shape}, all finite."
         )

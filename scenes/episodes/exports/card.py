@@ -74,7 +74,7 @@ def write_card(
     gone = len(list_failed(folder))
     missing = [f"Of those asked for {gone} could not be made and are missing: `failed` says why."] if gone else []
     notes = [*missing, *describe_weak(list_model_errors(folder))]
-    sheet = write_datasheet(folder.resolve().name, episodes, rows, notes, run_of(folder))
+    sheet = write_datasheet(folder.resolve().name, episodes, rows, notes, read_run_settings(folder))
     description = (
         f"{len(rows)} episodes of scripted surgery on simulated brains with a tumour: images, depth, poses of camera "
         "and tool, forces, and tumour positions by FEM."
@@ -136,7 +136,7 @@ def list_card_files(folder: Path) -> dict[str, int]:
         return {}
 
 
-def run_of(folder: Path) -> RunSettings | None:
+def read_run_settings(folder: Path) -> RunSettings | None:
     """Return the settings of the run in a folder; None without a run, or if its settings cannot be read."""
     try:
         return read_run(folder)

@@ -16,7 +16,7 @@ from sim.runtime.outside_files import read_as
 from sim.runtime.processes import LostError, map_apart
 
 from ...play.reference import build_reference_fem, is_history_dependent, solve_reference_frames
-from ..make import Opened, open_body, to_body_path
+from ..make import OpenedEpisode, open_body, to_body_path
 from ..plan import plan_from
 from ..scripted import build_scene, sample_episode
 from .contents import REMEDY, format_finding, inspect_contents
@@ -60,7 +60,7 @@ def _add_skipped(report: Report, words: str) -> Report:
 
 
 def _solve_again(
-    said: Mapping[str, Any], opened: Opened, solved: np.ndarray, count: int
+    said: Mapping[str, Any], opened: OpenedEpisode, solved: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve frames again: numbers of the frames (k,), and the tumour's displacement (k, n, 3) [m] in each."""
     plan = plan_from(str(said["plan"]), str(said.get("plan_name", "plan")), Path())

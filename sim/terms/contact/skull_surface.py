@@ -119,7 +119,7 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
     return Bone(
         nodes=nodes,
         normal=normal[nodes],
-        bend=bend_of(space.nodes[nodes], normal[nodes], settings),
+        bend=compute_bend(space.nodes[nodes], normal[nodes], settings),
         inside=inside[nodes],
         inward=way[nodes],
         activation=activation[nodes],
@@ -136,7 +136,7 @@ def _compute_nodal_areas(space: Discretisation) -> np.ndarray:
     return np.bincount(space.surface.ravel(), (area[:, None] * shares).ravel(), space.count)
 
 
-def bend_of(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BONE_SETTINGS) -> np.ndarray:
+def compute_bend(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BONE_SETTINGS) -> np.ndarray:
     """Estimate derivatives (k, 3, 3) [1/m], symmetric, of unit normals (k, 3) along a wall at points (k, 3) [m].
 
     Least-squares fit of n_j - n_i = H (x_j - x_i) in the tangent plane, to the nearest points with similar

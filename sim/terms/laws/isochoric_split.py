@@ -47,7 +47,7 @@ class LawSplit:
     needs_positive_volume: bool
 
 
-def split_of(law: Law, device: Device) -> LawSplit:
+def build_law_split(law: Law, device: Device) -> LawSplit:
     """Return the law's own split if it has one, else the split by the isochoric part of F."""
     return build_isochoric_split(law, device) if law.of_shape is None else build_own_split(law, law.of_shape, device)
 
