@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sim.anatomy import Anatomy
+from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import read_as
@@ -20,7 +21,7 @@ from .calibration import TRIAL_COUNT, run_trials
 from .causes import KINDS, USUAL_CAUSES, Causes, solve_presses
 from .ensemble import solve_groups
 from .locator import Locator
-from .prior import TOOL_SKULLS, MotionPrior, build_prior
+from .prior import NO_PLACE, TOOL_SKULLS, MotionPrior, build_prior
 from .regions import Region, check_regions
 
 FORMAT = "sulcus locator 6"  # Name and version of the file format.
@@ -71,6 +72,7 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
         regions = tuple(Region(**one) for one in header.get("regions", ()))
         check_regions(regions, anatomy)
         arrays = archive.read_sealed(header, [*_list_array_names(header), "tried"])
+        _check(path, anatomy, arrays)
         tried = arrays.pop("tried")
         return Locator(MotionPrior(anatomy, **arrays), tried, regions)
 
@@ -78,6 +80,21 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
 def _list_array_names(header: dict[str, Any]) -> tuple[str, ...]:
     """Return the array names of a prior that is complete, or restricted to some vertices."""
     return ARRAYS if header.get("whole", True) else (*ARRAYS, "nodes")
+
+
+def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) -> None:
+    """Raise InputError if arrays do not fit the anatomy or each other."""
+    shape, tried, every = arrays["shape"], arrays["tried"], np.arange(len(anatomy.mesh.nodes))
+    nodes = arrays.get("nodes", every)
+    fits = nodes.dtype.kind == "i" and np.array_equal(nodes, np.intersect1d(nodes, every))
+    fits = fits and shape.ndim == 3 and shape.shape[1:] == (len(nodes), 3) and tried.ndim == 2 and tried.shape[1] == 5
+    fits = fits and all(arrays[name].shape == (len(shape),) for name in NUMBER_ARRAYS) and len(shape) and len(tried)
+    fits = fits and arrays["centre"].ndim == 2 and arrays["centre"].shape[1] == 3
+    limits = ((0, len(KINDS)), (0, len(SKULLS)), (NO_PLACE, len(arrays["centre"])))
+    for name, (low, high) in zip(NUMBER_ARRAYS, limits, strict=True):
+        fits = fits and arrays[name].dtype.kind == "i" and arrays[name].min() >= low and arrays[name].max() < high
+    if not fits or not all(np.isfinite(arrays[name]).all() for name in ("shape", "centre", "tried")):
+        raise InputError(f"{path}: has arrays that do not fit the anatomy. {REMEDY}")
 
 
 def make_locator(
