@@ -28,6 +28,7 @@ from ..regressors.rigid_contact import RigidContact
 from .conformal import GROWTH, Bound
 from .held_out import HeldOutErrors, ReportedErrors
 from .learned import Learned, ModelPart
+from .model_validation import check_finite_state, check_model_state
 from .npz_archive import Archive, compute_seal, write_archive
 from .own_learners import find_learner_name, find_own
 from .tip_distance import TipModel
@@ -116,27 +117,8 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
         arrays = archive.read_by_digest(_list_array_keys(header["models"].values()))
         models = {name: _rebuild_model(description, arrays, anatomy) for name, description in header["models"].items()}
         for name, model in models.items():
-            _check_numbers(name, model)
+            check_model_state(name, model)
         return models
-
-
-def _check_numbers(name: str, model: Learned) -> None:
-    """Check that the basis of each part is one of the mesh's vertices, and that arrays hold numbers.
-
-    Raises
-    ------
-    InputError
-        With the model's name.
-    """
-    count = len(model.anatomy.mesh.nodes)
-    for basis in (part.basis for part in model.parts):
-        if basis.nodes.dtype.kind not in "iu" or basis.nodes.min() < 0 or basis.nodes.max() >= count:
-            raise InputError(f"the model {name!r} has nodes outside the mesh. {REMEDY}")
-    bounds = [model.bounds, model.tip and model.tip.bound, model.force and model.force.bound]
-    arrays = [array for bound in bounds if bound for array in vars(bound).values()]  # infinite without a guarantee
-    arrays += [model.envelope.points, *(part.basis.modes for part in model.parts)]
-    if not model.parts or any(np.isnan(array).any() for array in arrays):
-        raise InputError(f"the model {name!r} has values that are no numbers. {REMEDY}")
 
 
 def read_reported_errors(path: str | Path) -> dict[str, ReportedErrors]:
@@ -251,16 +233,9 @@ def _describe_regressor(regressor: Fitted, put: Any) -> dict[str, Any]:
     return {"regressor": names.get(type(regressor)) or _get_own_name(regressor), "state": state}
 
 
-def _check_finite(state: Mapping[str, np.ndarray]) -> None:
-    """Check that a regressor's state consists of finite numbers."""
-    for name, array in state.items():
-        if array.dtype.kind not in "fiub" or not np.isfinite(array).all():
-            raise InputError(f"a regressor's {name!r} are no finite numbers. {REMEDY}")
-
-
 def _rebuild_regressor(description: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Fitted:
     state = {name: arrays[key] for name, key in description["state"].items()}
-    _check_finite(state)
+    check_finite_state(state)
     return _find_type(description["regressor"]).restored(state)
 
 
@@ -293,7 +268,7 @@ def _rebuild_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.nda
         return None
     known = description["correction"]
     state = {} if known is None else {name: arrays[key] for name, key in known.items()}
-    _check_finite(state)
+    check_finite_state(state)
     correction = None if known is None else Gp.restored(state)
     return TipModel(correction, _rebuild_bound(description["bound"], arrays, reach))
 
