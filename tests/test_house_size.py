@@ -8,8 +8,8 @@ from test_house import FILES, HOUSE, PACKAGED, name_of, nodes_of
 # Lines of the packages and of their tests. Nobody reads more than this: a feature that exceeds it deletes something.
 # Lower a number when lines have gone. Raise it only with the reason in the commit.
 # 1,380 of the packages are the families of models that finite elements are compared with; 770 lines are their tests.
-# 900 more measure the published experiment, choose among families, and plot batches and effects; 490 were deleted.
-MOST = {"packages": 84_215, "tests": 53_610}
+# 900 more measure the published experiment, choose among families, and plot batches and effects.
+MOST = {"packages": 84_520, "tests": 53_780}
 
 
 def lines(paths):

@@ -73,7 +73,7 @@ def test_patient_command_runs_all_steps(tmp_path, capsys, short_fits):
     size = ["--nodes", "2000", "--count", "80", "--device", "cpu", "--element", "p1", "--learners", "linear,residual"]
     assert main(["patient", *volumes, *size, "--out", str(out)]) == 0
     text = capsys.readouterr().out
-    for step in ("sulcus anatomy --labels", "sulcus simulate", "sulcus train", "wins", "ready: sulcus demo --anatomy"):
+    for step in ("sulcus anatomy --labels", "sulcus simulate", "sulcus train", "ready: sulcus demo --anatomy"):
         assert step in text
     for part in ("labels", "mesh", "set-up", "unit responses", "loads", "learn residual", "score", "save", "rest"):
         assert f"\n  {part} " in text

@@ -6,7 +6,7 @@ import re
 import traceback
 import warnings
 from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -24,6 +24,7 @@ from .abaqus import AbaqusMesh, read_abaqus
 from .markups import SIGNS
 from .mesh_checks import check_cell_types, check_one_body, collect_regions, merge_nodes, note_pieces
 from .mesh_references import check_mesh_references
+from .vtu_size import check_vtu_size
 
 if TYPE_CHECKING:
     import meshio
@@ -50,11 +51,6 @@ REASONS = {
     r" string$": "it has an array of text (`string`): save it without, as arrays of numbers alone are read.",
 }
 """Messages by a pattern in meshio's reason, or in a line that meshio cannot read."""
-VTU_HEADER = {
-    rb"""header_type=["'](?!UInt(?:32|64)["'])(\w*)""": "its header_type is {!r}. Write it again with UInt64.",
-    rb"""compressor=["'](?!vtk(?:ZLib|LZMA)Data)(\w+)""": "its arrays are packed by {}. Write it with zlib or LZMA.",
-}
-"""Messages by a pattern in the first kilobyte of a .vtu file: meshio follows negative sizes in a circle."""
 UNREAD = re.compile(rb"^\$ParametricNodes|^\$NOD\b|np\.float|^\S+ \d+ \d+ string$")  # lines that meshio cannot read
 
 MIN_SIZE = 5e-3  # minimum of an anatomy's longest side [m]; a mouse brain has 15 mm
@@ -90,10 +86,12 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
         raise InputError(f"no unit is called {unit!r}: choose one of {', '.join(UNITS)}.")
     with read_as(path, "a mesh", REMEDY):
         most = limits.limit_bytes(path.stat().st_size)
-        with warnings.catch_warnings(), limit_memory(most):
+        counted = path.suffix.lower() == ".vtu" and check_vtu_size(path, most)
+        with warnings.catch_warnings(), nullcontext() if counted else limit_memory(limits.max_bytes):
             warnings.simplefilter("ignore")  # meshio warns about arrays that it skips
             check_mesh_references(path, limits)
             raw = read_abaqus(path) if path.suffix.lower() == ".inp" else _read_with_meshio(path)
+    with read_as(path, "a mesh", REMEDY):
         return _build_mesh_file(path, raw, UNITS[unit])
 
 
@@ -107,12 +105,6 @@ def _read_with_meshio(path: Path) -> meshio.Mesh:
     """
     import meshio  # optional dependency, missing on machines for training alone
 
-    if path.suffix.lower() == ".vtu":
-        with path.open("rb") as file:
-            head = file.read(1024)
-        for words, reason in VTU_HEADER.items():
-            if found := re.search(words, head):
-                raise InputError(reason.format(found[1].decode()))
     printed = StringIO()  # meshio prints its reason
     try:
         with redirect_stdout(printed), redirect_stderr(StringIO()):

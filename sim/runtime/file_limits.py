@@ -40,7 +40,7 @@ class MeshBytes:
 
     max_bytes: int = 4 * 1024**3
     max_ratio: int = 100
-    small: int = 2**30
+    small: int = 2**28
 
     def limit_bytes(self, size: int) -> int:
         """Return the inflated size [bytes] that is allowed for a file of `size` bytes.
@@ -58,7 +58,7 @@ class MeshBytes:
 
 
 MESH_BYTES = MeshBytes()
-"""Default limits: four gigabytes, and a hundred times a file's size, but at least one gigabyte."""
+"""Default limits: four gigabytes, and a hundred times a file's size."""
 
 
 def build_too_large_error(most: int) -> InputError:

@@ -1,0 +1,117 @@
+"""Uncompressed size of a `.vtu` file, measured in bounded memory: a few bytes may expand to gigabytes."""
+
+import base64
+import lzma
+import re
+import zlib
+from collections.abc import Callable, Iterator
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..errors import InputError
+from ..runtime.file_limits import build_too_large_error
+
+# Start of raw appended data, as meshio finds it.
+RAW = re.compile(rb'<AppendedData[^>]+">')
+# Block size of decompression [bytes].
+BLOCK = 2**20
+# Decompressor by VTK name.
+OPENERS = {"vtkZLibDataCompressor": zlib.decompressobj, "vtkLZMADataCompressor": lzma.LZMADecompressor}
+WORDS = {"UInt32": "u4", "UInt64": "u8"}  # header word type
+
+
+def check_vtu_size(path: Path, most: int) -> bool:
+    """Reject a file whose compressed arrays expand to more than `most` bytes, or to more than they declare.
+
+    Return False if the arrays cannot be measured as reliably as meshio reads them: not XML, raw or uncompressed data.
+
+    Raises
+    ------
+    InputError
+        With the limit.
+    """
+    text, behind = path.read_bytes(), None
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError:  # raw bytes are not valid XML
+        raw = RAW.search(text)
+        if raw is None:
+            return False
+        end = text.find(b"</AppendedData>")
+        behind = text[raw.end() : end].lstrip()[1:]
+        try:
+            root = ElementTree.fromstring(text[: raw.end()] + text[end:])
+        except ElementTree.ParseError:
+            return False
+    headed = root.get("header_type", "UInt32")
+    if headed not in WORDS:
+        raise InputError(f"its header_type is {headed!r}. Write it again with {' or '.join(WORDS)}.")
+    opener = OPENERS.get(root.get("compressor", ""))
+    if opener is None:
+        if root.get("compressor"):
+            raise InputError(
+                f"its arrays are packed by {root.get('compressor')}, and {', '.join(OPENERS)} are read. Write it so."
+            )
+        return False
+    word = np.dtype(WORDS[headed]).newbyteorder(">" if root.get("byte_order") == "BigEndian" else "<")
+    raw = behind is not None
+    if behind is None:
+        behind = (root.findtext("AppendedData") or "").strip()[1:]
+    left = most
+    for array in root.iter("DataArray"):
+        kind = array.get("format")
+        if kind in ("binary", "appended"):
+            inside = behind[int(array.get("offset", 0)) :] if kind == "appended" else (array.text or "").strip()
+            declared, blocks = _parse_blocks(inside, word)
+            left -= declared
+            if left < 0:
+                raise build_too_large_error(most)
+            for block in blocks:
+                declared -= _measure_inflated_size(opener, block, declared)
+                if declared < 0:
+                    raise InputError("an array inflates to more than its header says. Write the file again.")
+    return not raw
+
+
+def _parse_blocks(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[bytes]]:
+    """Return the size an array declares [bytes], and its compressed blocks.
+
+    They follow a header: number of blocks, size of a block and of the last one, compressed size of each.
+    `inside` is raw, or the header and the blocks are base64.
+    """
+
+    def part(place: int, size: int) -> bytes:
+        if isinstance(inside, bytes):
+            return inside[place : place + size]
+        return base64.b64decode(inside[place : place + _count_base64_characters(size)])
+
+    count = int(np.frombuffer(part(0, word.itemsize), word, 1)[0])
+    header = word.itemsize * (3 + count)
+    size, _, *sizes = map(int, np.frombuffer(part(0, header), word)[1 : 3 + count])
+    packed = part(header if isinstance(inside, bytes) else _count_base64_characters(header), sum(sizes))
+    ends = [0, *accumulate(sizes)]
+    return count * size, (packed[start:end] for start, end in pairwise(ends))
+
+
+def _count_base64_characters(size: int) -> int:
+    """Return the base64 characters for `size` bytes."""
+    return -(-size // 3) * 4
+
+
+def _measure_inflated_size(opener: Callable[[], Any], block: bytes, most: int) -> int:
+    """Return the decompressed size of all streams of a block [bytes], or any number above `most`."""
+    total, rest = 0, block
+    while rest and total <= most:
+        opened = opener()
+        while total <= most and not opened.eof:
+            piece = opened.decompress(rest, BLOCK)
+            rest = getattr(opened, "unconsumed_tail", b"")
+            total += len(piece)
+            if not piece and not rest:
+                return total
+        rest = opened.unused_data
+    return total
