@@ -8,8 +8,9 @@ import pytest
 
 from scenes.cli import main
 from scenes.report import seed_protocol
-from scenes.report.finite_elements import FemVariant
+from scenes.report.finite_elements import FemVariant, describe_difference
 from scenes.report.learner import LearnerSpec
+from scenes.report.row import ERROR, TOLERANCE_ALONE
 from scenes.report.seed_bodies import POINT_FOOTPRINT, read_seed_mesh
 from scenes.report.seed_learners import select_vertices
 from sim.errors import InputError
@@ -89,6 +90,8 @@ def test_the_command_measures_both_bodies(seed_file, study, tmp_path, monkeypatc
     assert [section["name"] for section in found["sections"]] == ["seed-authors", "seed-template"]
     rows = {row["name"]: row for row in found["sections"][0]["rows"]}
     assert list(rows) == [spec.name for spec in SPECS] and {row["state"] for row in rows.values()} == {"measured"}
+    assert rows["FEM p1"]["against"] == TOLERANCE_ALONE
+    assert describe_difference(study, FemVariant("FEM p2", element="p2")) == ERROR
     own = rows["FEM p1"]["reference"]
     assert own["mm"]["mean"] < 1e-3 * own["motion"] < 1e-2 * rows["linear"]["reference"]["mm"]["mean"]
     assert (tmp_path / "out/seed-template-time.png").exists()

@@ -160,7 +160,9 @@ def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
     """Describe the kind of difference from the reference."""
     if change_law(study.tissue, spec.law) != study.tissue:
         return DIFFERENCE
-    same = (spec.element or study.element) == "p2" and spec.mesh == (HALVED_MESH if study.fine else OWN_MESH)
+    same = (spec.element or study.element) == study.reference_element and spec.mesh == (
+        HALVED_MESH if study.fine else OWN_MESH
+    )
     return TOLERANCE_ALONE if same else ERROR
 
 
@@ -175,9 +177,13 @@ def find_body(study: ReportStudy, mesh: str) -> Anatomy:
 
 def build_template_mesh(folder: Path, size: int) -> Path:
     """Return the template's brain of about `size` nodes; build the mesh if it does not exist."""
-    path = folder / f"template_{size}.vtu"
+    return build_mesh_once(folder / f"template_{size}.vtu", Tumour(), MeshPlan(size))
+
+
+def build_mesh_once(path: Path, tumour: Tumour, plan: MeshPlan) -> Path:
+    """Return the path of a mesh of the template's brain with a tumour; build it if it does not exist."""
     if not path.exists():
-        write_anatomy(path, make_anatomy(build_template_subject(Tumour()), MeshPlan(size)))
+        write_anatomy(path, make_anatomy(build_template_subject(tumour), plan))
     return path
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.bodies.meshfile import read_anatomy, write_anatomy
-from sim.bodies.subject import MeshPlan, make_anatomy
-from sim.bodies.template import Tumour, build_template_subject
+from sim.bodies.meshfile import read_anatomy
+from sim.bodies.subject import MeshPlan
+from sim.bodies.template import Tumour
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads
@@ -17,6 +17,8 @@ from sim.runtime.outside_files import read_as
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.tool_loads import PublishedSettings, build_published_loads, draw
 from surrogate.model.npz_archive import Archive
+
+from .finite_elements import build_mesh_once
 
 # Tissue of brain and tumour in the authors' public FEBio model; c [Pa], m, and the bulk modulus [Pa].
 SEED_TISSUE = Ogden(((1044.0, 4.309), (1183.0, 7.736)), 1e5)
@@ -69,8 +71,6 @@ def read_seed_mesh(path: Path, count: int) -> tuple[Anatomy, Loads]:
 
 def make_seed_template(folder: Path, count: int) -> tuple[Anatomy, Loads]:
     """Return the template's brain like the authors', kept in `folder`, and at most `count` of the published loads."""
-    path = folder / "meshes" / "seed_template.vtu"
-    if not path.exists():
-        write_anatomy(path, make_anatomy(build_template_subject(SEED_TUMOUR), MeshPlan(craniotomy=SEED_CRANIOTOMY)))
-    body = read_anatomy(path)
+    plan = MeshPlan(craniotomy=SEED_CRANIOTOMY)
+    body = read_anatomy(build_mesh_once(folder / "meshes" / "seed_template.vtu", SEED_TUMOUR, plan))
     return body, draw("seed", body, count, 0)
