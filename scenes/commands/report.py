@@ -159,6 +159,7 @@ def _measure_seed_sections(args: argparse.Namespace) -> list[Section]:
     from ..report import seed_protocol
     from ..report.page import Section, write_report
     from ..report.seed_bodies import make_seed_template, read_seed_mesh
+    from .simulate import show_progress
 
     device = _check_options(args)
     if args.data or args.anatomy:
@@ -173,17 +174,12 @@ def _measure_seed_sections(args: argparse.Namespace) -> list[Section]:
     for name, (body, wanted) in bodies.items():
         study = seed_protocol.SeedStudy(args.out / f"seed-{name}.h5", args.out, device, loads)
         with tqdm(desc=name, unit="load", file=sys.stderr) as bar:
-            seed_protocol.simulate_seed(study, body, wanted, partial(_show_progress, bar))
+            seed_protocol.simulate_seed(study, body, wanted, partial(show_progress, bar))
         rows = seed_protocol.measure_seed_rows(study)
         found = tuple(tqdm(rows, desc=name, total=len(seed_protocol.list_seed_specs()), unit="row", file=sys.stderr))
         sections.append(Section(study.data.stem, seed_protocol.describe_seed_study(study, found), found))
         write_report(args.out, describe_machine(device), sections)
     return sections
-
-
-def _show_progress(bar: tqdm, done: int, total: int) -> None:
-    bar.total = total
-    bar.update(done - bar.n)
 
 
 def _tabulate(study: ReportStudy, bar: tqdm) -> None:

@@ -142,8 +142,7 @@ def run(args: argparse.Namespace) -> int:
 
         def progress(done: int, total: int) -> None:
             stop_if_asked()
-            bar.total = total
-            bar.update(done - bar.n)
+            show_progress(bar, done, total)
 
         try:
             solved = simulate(out, solver.deformer, loads, provenance, solver.batch, progress)
@@ -153,6 +152,12 @@ def run(args: argparse.Namespace) -> int:
             return INTERRUPTED_CODE
     _report(args, solver.description, len(loads), solved)
     return 0
+
+
+def show_progress(bar: tqdm, done: int, total: int) -> None:
+    """Show that `done` of `total` rows are finished."""
+    bar.total = total
+    bar.update(done - bar.n)
 
 
 def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:

@@ -376,5 +376,8 @@ def open_theatre(
     intensity = read_intensity(scan) if scan.is_file() else None
     uncertainties = read_uncertainties(to_uncertainty_path(path))
     records = read_effect_records(path.with_suffix(SUFFIX))
-    setup = PatientSetup(body, intensity, models, device, to_locator_path(path), uncertainties, effect_records=records)
-    return replace(setup, family_figures=read_family_figures(path, body.digest))
+    figures = read_family_figures(path, body.digest)
+    return PatientSetup(
+        body, intensity, models, device, to_locator_path(path), uncertainties,
+        effect_records=records, family_figures=figures,
+    )  # fmt: skip
