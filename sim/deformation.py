@@ -23,20 +23,18 @@ COLUMNS = ("bound", "reaction_bound", "stretch")
 class Outcome(Enum):
     """Outcome of a load case; the value is the description for users."""
 
-    CONVERGED = "converged to the tolerance asked for"
-    CONVERGED_ANEW = "converged to the tolerance asked for, from the undeformed state, as the start failed"
-    CONVERGED_IN_STEPS = "converged to the tolerance asked for, the load applied in steps"
-    BUDGET = "stopped when the budget of steps was spent"
-    STALLED = "stopped because no step lowered the energy"
-    ROUND_OFF = (
-        "stopped because the residual is at the round-off of its number type: use float64 or a coarser tolerance"
-    )
-    PIERCED = "stopped because a tool came to be inside the tissue, where it has no surface to press on"
-    ON_BONE = "a tool overlaps surface that is fixed or covered by the skull: it stands on bone"
-    INVERTED = "in equilibrium, but tetrahedra are inverted, as in no tissue: the load is too strong for this mesh"
-    OVERSTRAINED = "in equilibrium, but more than 1 ml is strained beyond what was measured on brain"
-    NOT_FINITE = "stopped because a number overflowed"
-    GUESSED = "a first guess: nothing was solved"
+    CONVERGED = "converged to the requested tolerance"
+    CONVERGED_ANEW = "converged to the requested tolerance from the undeformed state, because the start failed"
+    CONVERGED_IN_STEPS = "converged to the requested tolerance, with the load applied in steps"
+    BUDGET = "not converged: the maximum number of steps is reached"
+    STALLED = "not converged: no step lowers the energy"
+    ROUND_OFF = "not converged: the residual is at the round-off of its number type; use float64 or a larger tolerance"
+    PIERCED = "not converged: a tool penetrates the tissue"
+    ON_BONE = "a tool overlaps bone: surface that is fixed or covered by the skull"
+    INVERTED = "in equilibrium, but tetrahedra are inverted: the load is too strong for this mesh"
+    OVERSTRAINED = "in equilibrium, but more than 1 ml is strained beyond the range measured on brain"
+    NOT_FINITE = "not converged: numerical overflow"
+    GUESSED = "no equilibrium equations were solved: approximation"
     PREDICTED = "predicted by a trained model inside its training range"
     EXTRAPOLATED = "predicted by a trained model outside its training range: do not rely on it"
 

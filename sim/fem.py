@@ -90,7 +90,7 @@ class Fem:
     >>> fem = Fem(anatomy, [Elasticity(), Held(), Bonded(), ToolForce()], device="cpu", element="p1")
     >>> result = fem.deform(push(place.point, 0.1 * place.inward, footprint=7e-3), at=anatomy.tumour_nodes)
     >>> print(f"{1e3 * np.linalg.norm(result.displacement[0].mean(axis=0)):.1f} mm; {result.outcome[0].value}")
-    0.3 mm; converged to the tolerance asked for
+    0.3 mm; converged to the requested tolerance
     """
 
     def __init__(

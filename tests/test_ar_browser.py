@@ -159,7 +159,7 @@ def test_only_the_first_visitor_controls_the_page(page, heard):
     page.show_line(lambda visitor: f"number {visitor}")
     assert wait_for(lambda: set(page.crowd.rows) == {0, 1} and page.crowd.rows[1].ask.visible)
     leads, looks = (page.crowd.rows[number] for number in (0, 1))
-    assert "You lead" in leads.line.content and "(number 1) leads" in looks.line.content
+    assert "You have control" in leads.line.content and "Visitor 1 has control" in looks.line.content
     assert "number 2" in looks.line.content and not leads.dim.content and "opacity" in looks.dim.content
     second.set(page.inputs["force [N]"], 0.4)
     second.set(page.button, True)
@@ -171,7 +171,7 @@ def test_only_the_first_visitor_controls_the_page(page, heard):
     page.show_line(lambda visitor: "")
     assert wait_for(lambda: page.crowd.lead.asking == (2,))
     page.show_line(lambda visitor: "")
-    assert wait_for(lambda: leads.give.visible and "Visitor 2 asks to lead" in leads.line.content)
+    assert wait_for(lambda: leads.give.visible and "Visitor 2 requests control" in leads.line.content)
     assert not looks.ask.visible
     first.set(leads.give, True)
     assert wait_for(lambda: page.crowd.lead.leader == 2)

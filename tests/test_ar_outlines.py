@@ -237,7 +237,7 @@ def test_motion_and_warning_are_on_separate_lines():
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
     before, now = tumour((0.0, 0.0, -0.02)), tumour((0.003, 0.0, -0.02))
-    doubt = "outside what the model learned: do not rely on it"
+    doubt = "outside the training range: do not rely on it"
     shown = composite(picture, here, now, marks=Marks(np.nan, before=before), words=Words(doubt)).colour
     assert has_text(shown, "moved 3.0 mm", TEXT_SCALE)
     assert all(has_text(shown, line, TEXT_SCALE, compute_ink(WARNING_COLOUR)) for line in format_warning(doubt, 400))

@@ -74,8 +74,8 @@ def test_cost_record_round_trips(theatre, tmp_path):
     assert list(read) == [found.scene, "other"] and read[found.scene] == found
     assert found.effects == {ALL: (240.04, 4.3), "ToolForce": (180.0, 4.25), "Gravity": (None, None)}
     note = words_of(replace(theatre, effect_records=read), short())[EFFECT_COSTS]
-    assert "2 frames have inverted" in note and "Not solvable without gravity and fluid: it &lt;moves&gt;." in note
-    assert format_switch("Gravity", found.effects) == "gravity and fluid: cannot be disabled"
+    assert "2 frames have inverted" in note and "Not solvable without gravity and CSF: it &lt;moves&gt;." in note
+    assert format_switch("Gravity", found.effects) == "gravity and CSF: cannot be disabled"
     assert format_switch("ToolForce", found.effects) == "push of the tool: +180 ms, 4.25 mm"
 
 

@@ -136,7 +136,7 @@ class TestSwitches:
         assert {"ToolForce", "Gravity"} < set(page.inputs) and not {"Held", "Elasticity"} & set(page.inputs)
         assert wait_for(lambda: demo.run(0.3) and "result of the FEM solver" in page.shown[2])
         visitor.set(page.inputs["Gravity"], False)
-        words = "without gravity and fluid the tumour position differs"
+        words = "without gravity and CSF the tumour position differs"
         assert wait_for(lambda: demo.run(0.3) and words in page.shown[2])
         said = float(page.shown[2].split("position differs by ")[1].split(" mm")[0])
         scene, nodes = demo.stage.scene, theatre.anatomy.tumour_nodes
@@ -159,7 +159,7 @@ class TestSwitches:
         demo.wish.switch("Gravity", False)
         demo.wish.switch("ToolForce", False)
         assert wait_for(
-            lambda: demo.run(0.3) and "without gravity and fluid, push of the tool the" in demo.browser.shown[2]
+            lambda: demo.run(0.3) and "without gravity and CSF, push of the tool the" in demo.browser.shown[2]
         )
         assert "Nothing moves the tumour" in demo.browser.shown[2]
         demo.wish.switch("Gravity", True)

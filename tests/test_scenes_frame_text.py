@@ -31,7 +31,7 @@ def test_rough_estimate_is_labelled_without_largest_part():
     alone, seen = TumourError(4.11e-3, "E", guess=True), TumourError(4.11e-3, "E", 1e-3, guess=True)
     assert format_errors(None, alone, False)[-1] == "tumour position error <= 4.2 mm (95 %), rough estimate"
     assert format_tumour_error(seen).endswith(
-        "position error <= 1.0 mm (95 %); without observation 4.2 mm, rough estimate"
+        "position error <= 1.0 mm (95 %); without cortex observation: 4.2 mm, rough estimate"
     )
     for error in (alone, seen):
         named = replace(error, registration=1.56e-3)

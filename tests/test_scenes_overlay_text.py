@@ -21,7 +21,7 @@ from scenes.script.tool_paths import Touch
 SIZES = (480, 360), (640, 480), (800, 600), (1280, 960)
 # So far words stay from lines, from the border, and lines of text from each other [pixel].
 LINE, BORDER, WORD = 4, 4, 1
-DOUBT = "outside what the model learned do not rely on it"
+DOUBT = "outside the training range do not rely on it"
 
 
 @dataclass(frozen=True)

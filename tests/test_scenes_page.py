@@ -42,7 +42,7 @@ def test_page_text_has_the_values_of_the_frame(theatre):
     for line in (
         ">tip to tumour 12.3&nbsp;mm<",
         "<p>tumour moved 1.23 mm (surrogate error 0.02 mm, motion error not known)</p><label ",
-        "<p>frame 3 of 6; 0.10 s; force 0.25 N; error of the distance &lt;= 2.5 mm (95 %, relative to FEM)</p>",
+        "0.25 N; error of the tip-to-tumour distance &lt;= 2.5 mm (95 %, relative to FEM)</p>",
         "<p>Tumour position error: not known.",
         "time [ms]: deformation 12.3, rendering 4.5, overlay 0.7<",
     ):
@@ -55,7 +55,7 @@ def test_page_text_has_the_values_of_the_frame(theatre):
     prior, seen = (report(replace(frame, tumour_error=one), player.stage, "linear", "", (), 7) for one in known)
     where, whole = "at most", "at any point of its surface"
     assert f"<p>Tumour position error (95 %): {where} 4.7 mm {whole}; the largest part is E.</p>" in prior
-    assert f"<p>Tumour position error (95 %): {where} 1.2 mm {whole}; without cortex observation 4.7 mm.</p>" in seen
+    assert f"<p>Tumour position error (95 %): {where} 1.2 mm {whole}; without cortex observation: 4.7 mm.</p>" in seen
     guess = report(replace(frame, tumour_error=replace(known[0], guess=True)), player.stage, "linear", "", (), 7)
     assert f"{where} 4.7 mm {whole}: rough estimate (few samples," in guess and "largest part" not in guess
     for said, off in ((prior, "4.7"), (seen, "1.2")):

@@ -133,7 +133,7 @@ def test_intermediate_frames_are_shown_and_slider_stays(demo, gated, monkeypatch
         for number in (1, 2, 3):
             gated.let(1)
             assert wait_for(lambda number=number: shows(page, number))
-            pending = f"Result pending: on the way to frame 12, this is frame {number} of 15."
+            pending = f"Result pending: frame {number} of 15 is shown, on the way to frame 12."
             assert wait_for(lambda pending=pending: pending in page.shown[2])
             assert wait_for(lambda number=number: said[-1] == f"on the way to frame 12: frame {number} is solved")
         assert page.frame.value == 12 and page.shown[3] == 12

@@ -275,7 +275,7 @@ class TestSaid:
             ),
             (
                 False, None, TumourError(4.11e-3, "E", 1e-3),
-                ["tumour position error <= 1.0 mm (95 %); without observation 4.2 mm"],
+                ["tumour position error <= 1.0 mm (95 %); without cortex observation: 4.2 mm"],
             ),
         ],
     )  # fmt: skip

@@ -109,7 +109,7 @@ class AccessPolicy:
                 "with --address and the address that your browser shows.\n"
             )
         if origins and (len(origins) > 1 or origins[0].lower() not in allowed):
-            return "Another page may not use this one.\n"
+            return "Requests from other web pages are rejected.\n"
         if self.token is not None and not any(map(self.is_token, self.read_tokens(request, port))):
             return "This page asks for a token: open the address that was printed, with its ?token=...\n"
         return None
@@ -165,7 +165,7 @@ class Connection(ServerConnection):
                 if self.credit < 0.0:
                     self.transport.abort()  # do not wait for unread data
                 elif error.malformed:
-                    await self.close(1008, "That is no message of this page.")
+                    await self.close(1008, "The message has an invalid format.")
 
     def count(self) -> None:
         """Count a message.
@@ -276,9 +276,9 @@ def handle_request(
         return connection.respond(HTTPStatus.FORBIDDEN, refusal)
     if request.headers.get_all("Upgrade"):
         if request.headers.get_all("Sec-WebSocket-Protocol") != [f"viser-v{viser.__version__}"]:
-            return connection.respond(HTTPStatus.BAD_REQUEST, "This is no page of this server: load it again.\n")
+            return connection.respond(HTTPStatus.BAD_REQUEST, "The page is of another version: reload it.\n")
         if len(connection.server.connections) >= limits.visitors:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{limits.visitors} visitors look already.\n")
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"At most {limits.visitors} visitors.\n")
     try:
         response = served(connection, request)
     except (OSError, ValueError):

@@ -57,10 +57,10 @@ class ControlLock:
         if len(here) < 2:
             return ""
         if visitor == self.leader:
-            asked = f" **Visitor {self.asking[0]} asks to lead.**" if self.asking else ""
-            return f"You lead: the others look on.{asked}"
-        waits = " You have asked to lead." if visitor in self.asking else ""
-        return f"Another visitor (number {self.leader}) leads: what you set here is put back.{waits}"
+            asked = f" **Visitor {self.asking[0]} requests control.**" if self.asking else ""
+            return f"You have control; the others can only view.{asked}"
+        waits = " You have requested control." if visitor in self.asking else ""
+        return f"Visitor {self.leader} has control: your changes are reset.{waits}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,8 +92,8 @@ PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAO
 
 PLAY_KEY = Key(" ", "space", "space", "play or pause")  # Key that plays or pauses.
 BACK_KEY, ON_KEY = (  # Keys that move one frame back and one frame on.
-    Key("ArrowLeft", "arrowleft", "\N{LEFTWARDS ARROW}", "one frame back"),
-    Key("ArrowRight", "arrowright", "\N{RIGHTWARDS ARROW}", "one frame on"),
+    Key("ArrowLeft", "arrowleft", "\N{LEFTWARDS ARROW}", "previous frame"),
+    Key("ArrowRight", "arrowright", "\N{RIGHTWARDS ARROW}", "next frame"),
 )
 STYLE_KEY = Key("s", "S", "s", "next overlay")  # Key that selects the next overlay.
 RECORD_KEY = Key("r", "R", "r", "start or stop recording")  # Key that starts or stops a recording.

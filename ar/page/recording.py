@@ -95,7 +95,7 @@ class Recorder:
 
     def add_button(self, name: str) -> viser.GuiButtonHandle:
         """Add the button to the page; `name` is the file name without suffix."""
-        hint = f"what the page shows, as a video (.mp4), {MAX_DURATION:.0f} seconds at most"
+        hint = f"record the image as a video (.mp4), at most {MAX_DURATION:.0f} seconds"
         self.button, self.name = (
             self.server.gui.add_button(RECORD_LABEL, hint=hint, icon=viser.Icon.PLAYER_RECORD, color="gray"),
             name,

@@ -48,7 +48,7 @@ PRESETS = {  # Values of the options that differ from the default, by preset.
     "superficial": {"cover": 3.0},
     "subcortical": {"cover": 10.0},
     "deep": {"cover": 25.0},
-    # Tonutti et al. 2017: forces act 20 mm from the centre of a tumour of 12 mm radius; 98 cm2 of exposed cortex.
+    # Tonutti et al. 2017: forces act 20 mm from the centre of a tumour of 12 mm radius; 98 cm2 of open cortex.
     "seed": {"cover": 8.0, "craniotomy": 110.0},
 }
 MIN_REPORTED_LOSS = 3.0

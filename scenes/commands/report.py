@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed-mesh",
         type=Path,
         metavar="FILE.npz",
-        help="mesh of the authors for --seed-protocol, which measures it before the template",
+        help="mesh of Tonutti et al. 2017: --seed-protocol measures it in addition to the template",
     )
     add_force(parser)
     add_json(parser)

@@ -65,7 +65,7 @@ def build_controls(
     tool_controls = [] if scene.tool is None else build_tool_controls(scene, site, requests, set_mode, move)
     scenes = SCENES if scene.name in SCENES else (scene.name, *SCENES)
     return [
-        Dropdown("scene", scenes, scene.name, lambda name: requests.set(scene=name), hint="what deforms the brain"),
+        Dropdown("scene", scenes, scene.name, lambda name: requests.set(scene=name), hint="cause of the deformation"),
         Dropdown(
             "deformer",
             tuple(models),
@@ -154,14 +154,14 @@ def build_tool_controls(
     positions = (
         Slider(
             f"place {name} [mm]", -limit, limit, 0.5, 0.0, lambda value, axis=axis: move(**{axis: 1e-3 * value}),
-            f"{name}, to {side} [mm]", limit_hint,
+            f"position {name} (to {side}) [mm]", limit_hint,
         )
         for name, axis, side in directions
     )  # fmt: skip
     tilts = (
         Slider(
             f"direction {name} [deg]", -MAX_TILT, MAX_TILT, 1.0, 0.0,
-            lambda value, name=name: move(**{name: np.radians(value)}), f"tilt {name}, to {side} [deg]", tilt_hint,
+            lambda value, name=name: move(**{name: np.radians(value)}), f"tilt {name} (to {side}) [deg]", tilt_hint,
         )
         for name, _, side in directions
     )  # fmt: skip
@@ -189,9 +189,7 @@ def build_strength_slider(scene: Scene, requests: Requests, move: Callable[..., 
         low = -1e3 * IDLE_HEIGHT
         high = max(MAX_DEPTH, round(1e3 * scene.max_depth, 1))
         current = min(max(1e3 * touch.depth, low), high)
-        hint = "how far the tool is beyond where it just touches; negative: in the air"
+        hint = "depth of the tool beyond first contact; negative: no contact"
         return Slider("depth [mm]", low, high, 0.1, current, lambda value: move(depth=1e-3 * value), hint=hint)
     current = min(touch.force, MAX_FORCE)
-    return Slider(
-        "force [N]", 0.0, MAX_FORCE, 0.01, current, lambda value: move(force=value), hint="how hard it pushes"
-    )
+    return Slider("force [N]", 0.0, MAX_FORCE, 0.01, current, lambda value: move(force=value), hint="force of the tool")

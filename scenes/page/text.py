@@ -23,7 +23,7 @@ from .comparison import ComparisonRow
 from .cost_plot import format_cost_plot
 
 ESTIMATE_EXPLANATION = (  # Explanation of the image where the motion is estimated from the cortex.
-    "The tumour's position is estimated from the dots on the cortex alone: no force and no stiffness is known."
+    "The tumour's position is estimated from the dots on the cortex alone: force and stiffness are not used."
 )
 WARNING = 'class="warn"'  # Mark of a warning in HTML.
 RESEARCH_ONLY = "Research only. Not a medical device."  # Restriction of use.
@@ -33,7 +33,7 @@ EFFECTS = {
     "ToolForce": "push of the tool",
     "ToolContact": "contact of the tool",
     "Retraction": "the spatula",
-    "Gravity": "gravity and fluid",
+    "Gravity": "gravity and CSF",
     "Resection": "the resection",
     "Pulsation": "heartbeat and breath",
     "SkullContact": "contact with the skull",
@@ -138,13 +138,13 @@ def describe_work(scene: Scene, name: str, number: int, touch: Touch | None) -> 
     """Describe the running solve: a frame of the script, or the manual touch."""
     if touch is None:
         return f"solving frame {number} ({describe_deformer(name)})"
-    strength = f"{1e3 * touch.depth:.1f} mm deep" if scene.posed else f"{touch.force:.2f} N"
+    strength = f"depth {1e3 * touch.depth:.1f} mm" if scene.posed else f"{touch.force:.2f} N"
     return f"computing the deformation for the manual tool, {strength} ({describe_deformer(name)})"
 
 
 def format_pending(shown: int, requested: int, frames: int) -> str:
     """Describe an image that does not show the requested frame yet."""
-    progress = f" on the way to frame {requested}, this is frame {shown} of {frames - 1}" if shown != requested else ""
+    progress = f" frame {shown} of {frames - 1} is shown, on the way to frame {requested}" if shown != requested else ""
     return f'<p class="stale">Result pending:{progress or " it is being computed"}.</p>'
 
 
@@ -197,7 +197,7 @@ def format_tumour_trust(error: TumourError) -> str:
         text += f" ({error.registration_words})"
     if error.observed is None:
         return f"<p>{text}{caveat or f'; the largest part is {escape(error.largest)}'}.</p>"
-    prior = "" if error.prior is None else f"; without cortex observation {hud.bound_words(error.prior, 1)}{caveat}"
+    prior = "" if error.prior is None else f"; without cortex observation: {hud.bound_words(error.prior, 1)}{caveat}"
     return f"<p>{text}{prior}.</p>"
 
 
@@ -214,7 +214,9 @@ def report(
     remaining = stage.select_stage(frame.loads).left
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
     if frame.distance_error is not None and frame.distance_error < np.inf:
-        facts += [f"error of the distance <= {hud.bound_words(frame.distance_error, 1)} (95 %, relative to FEM)"]
+        facts += [
+            f"error of the tip-to-tumour distance <= {hud.bound_words(frame.distance_error, 1)} (95 %, relative to FEM)"
+        ]
     error = None if frame.doubt else frame.tumour_error.bound
     parts = [] if frame.distance is None else [format_tip_distance(frame.distance, error, frame.inside)]
     headline, *estimate_texts = [""] if frame.estimate is None else describe_estimate(frame.estimate)

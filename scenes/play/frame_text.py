@@ -24,7 +24,7 @@ REGION_PATTERN = re.compile(r"(?:(?<=; )|\()([\w ]+)\)?: ")  # Pattern of the na
 
 
 OUTCOME_WARNINGS = {  # Warnings written into an image whose solution is unreliable.
-    Outcome.EXTRAPOLATED: "outside what the model learned: do not rely on it",
+    Outcome.EXTRAPOLATED: "outside the training range: do not rely on it",
     Outcome.PIERCED: "the tool penetrates the tissue: do not rely on it",
     Outcome.ON_BONE: "the tool stands on bone: do not rely on it",
     Outcome.INVERTED: "the mesh is inverted under this load: do not rely on it",
@@ -142,7 +142,7 @@ def format_tumour_error(error: TumourError, brief: bool = False) -> str:
             return f"{said}, {of}"
         return f"{said}{guess or f', mainly {error.largest}'}{f'; {of}' * bool(of)}"
     said += f", {of}" * bool(of)
-    return said if error.prior is None else f"{said}; without observation {bound_words(error.prior, 1)}{guess}"
+    return said if error.prior is None else f"{said}; without cortex observation: {bound_words(error.prior, 1)}{guess}"
 
 
 def find_worst(errors: Sequence[TumourError]) -> TumourError:
