@@ -132,7 +132,7 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
     for number in range(len(loads)):
         result, spent = time_work(model.deform, loads.select(np.array([number])), None, drawn if same else None)
         seconds.append(spent)
-        fields.append(result.displacement[0] if located is None else located.read(result.displacement)[0])
+        fields.append(result.displacement[0] if located is None else located.interpolate(result.displacement)[0])
         outcomes.append(result.outcome[0])
     together = time_work(model.deform, loads, None, drawn if same else None)[1]
     field, tumour = np.array(fields), np.isin(drawn, own.tumour_nodes)
