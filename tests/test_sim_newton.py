@@ -263,7 +263,7 @@ class Scaled:
     def keep(self, device: Device, columns: np.ndarray) -> None:
         self.plain.keep(device, columns)
 
-    def find(
+    def find_direction(
         self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
     ) -> Direction:
         found = self.plain.find_direction(problem, u, g, gap, forcing, taken)
