@@ -19,7 +19,7 @@ import numpy as np
 from sim import Bonded, Elasticity, Fem, Held, Slide, ToolForce, open_cortex, push
 from sim.bodies.healthy_heads import build_masked_head, read_fsaverage_head
 from sim.bodies.subject import MeshPlan, Subject, make_anatomy
-from sim.bodies.template import SITES, Head, HealthyHead, Tumour, build_synthetic_subject, build_template_subject
+from sim.bodies.template import SITES, HeadScaling, HealthyHead, Tumour, build_synthetic_subject, build_template_subject
 from sim.errors import InputError
 
 FORCE, FOOTPRINT = 0.3, 7e-3  # [N], [m]
@@ -27,7 +27,7 @@ FORCE, FOOTPRINT = 0.3, 7e-3  # [N], [m]
 
 def heads(mask: Path | None) -> dict[str, Callable[[Tumour], Subject]]:
     """Return the functions that build a subject with a tumour, by the name of the head."""
-    volume = Head().volume
+    volume = HeadScaling().volume
     found = {"template": build_template_subject, "fsaverage": partial(_drawn, read_fsaverage_head(volume))}
     if mask is not None:
         found |= {

@@ -169,7 +169,7 @@ def measure_sequence(folder: Path, mesh: str, name: str) -> str:
         spread = covariance.reshape(len(liver.patch), 3, len(liver.patch), 3).sum(axis=(0, 2))
         off.append(np.linalg.norm(miss) / np.linalg.norm(truth))
         held.append(miss @ np.linalg.solve(spread, miss) < RADIUS_SQUARED)
-        position.append(np.linalg.norm(rest + at.read((liver.motion @ force)[None])[0] - place, axis=1))
+        position.append(np.linalg.norm(rest + at.interpolate((liver.motion @ force)[None])[0] - place, axis=1))
         seconds.append(took)
     mean, p95 = 1e3 * np.mean(position), 1e3 * np.percentile(position, 95.0)
     kind = "neohookean" if "neohookean" in name else "linear"

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Literal
 
-from .arguments import check_at_least
+from .arguments import check_integer
 from .errors import InputError
 
 Precision = Literal["float32", "float64"]  # scalar types of a solver
@@ -66,9 +66,9 @@ class Accuracy:
                 "ask for that, or for float64."
             )
         for name, least in (("outer", 1), ("inner", 1), ("steps", 0)):
-            check_at_least(name, getattr(self, name), least)
+            check_integer(name, getattr(self, name), least)
         if self.evaluations is not None:
-            check_at_least("evaluations", self.evaluations, 0)
+            check_integer("evaluations", self.evaluations, 0)
 
 
 DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32", steps=0)

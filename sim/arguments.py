@@ -31,14 +31,14 @@ def as_array(name: str, values: object) -> np.ndarray:
         ) from error
 
 
-def check_numbers_array(name: str, values: object, largest: float = MAX_MAGNITUDE) -> np.ndarray:
+def check_numbers_array(name: str, values: object, limit: float = MAX_MAGNITUDE) -> np.ndarray:
     """Return real, finite numbers as float64, in any shape; `name` identifies them in messages.
 
     Raises
     ------
     InputError
         Text, booleans, complex numbers, objects, rows of different lengths; a number that is not finite, or beyond
-        `largest`.
+        `limit`.
     """
     array = as_array(name, values)
     if array.dtype != np.float64:
@@ -47,16 +47,16 @@ def check_numbers_array(name: str, values: object, largest: float = MAX_MAGNITUD
         with np.errstate(over="ignore"):  # overflow of wider types is detected below
             array = array.astype(np.float64)
     # one pass, since comparisons with NaN are False
-    if np.count_nonzero(np.abs(array) <= largest) != array.size:
+    if np.count_nonzero(np.abs(array) <= limit) != array.size:
         if not is_all_finite(array):
             raise InputError(f"{name} has a value that is not finite: every number must be finite.")
         raise InputError(
-            f"{name} has a value of {np.abs(array).max():g}, beyond {largest:g}: give numbers in SI units (m, N, s)."
+            f"{name} has a value of {np.abs(array).max():g}, beyond {limit:g}: give numbers in SI units (m, N, s)."
         )
     return array
 
 
-def check_whole_numbers(name: str, values: object) -> np.ndarray:
+def check_integers(name: str, values: object) -> np.ndarray:
     """Return vertex numbers (n,) as integers.
 
     Raises
@@ -80,17 +80,17 @@ def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
     Raises
     ------
     InputError
-        See `check_whole_numbers`; a vertex that the mesh does not have.
+        See `check_integers`; a vertex that the mesh does not have.
     """
-    vertices = check_whole_numbers(name, values)
+    vertices = check_integers(name, values)
     beyond = vertices[(vertices < 0) | (vertices >= count)]
     if len(beyond):
         raise InputError(f"the mesh has no vertex {beyond[0]}: choose from 0 to {count - 1}.")
     return vertices
 
 
-def check_at_least(name: str, value: object, least: int) -> int:
-    """Return an integer that is at least `least`.
+def check_integer(name: str, value: object, minimum: int) -> int:
+    """Return an integer that is at least `minimum`.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def check_at_least(name: str, value: object, least: int) -> int:
     try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]
     except TypeError:
-        number = least - 1
-    if isinstance(value, bool | np.bool) or number < least:
-        raise InputError(f"{name} is {value!r}: give a whole number from {least} up.")
+        number = minimum - 1
+    if isinstance(value, bool | np.bool) or number < minimum:
+        raise InputError(f"{name} is {value!r}: give a whole number from {minimum} up.")
     return number

@@ -17,10 +17,10 @@ from .discretisation.body import Body
 from .discretisation.constraint import Constraint
 from .discretisation.element import Elements
 from .discretisation.footprint import ContactSurface
-from .discretisation.problem import Imposed, Problem
+from .discretisation.problem import ImposedMotion, Problem
 from .discretisation.rigid_modes import check_fixed
 from .discretisation.space import Discretisation, discretise
-from .discretisation.term import Barrier, Curved, Term
+from .discretisation.term import AssembledTerm, Barrier, Term
 from .effects import (
     Bonded,
     BuiltIn,
@@ -54,7 +54,7 @@ from .loads import (
     check_field,
     check_loads,
 )
-from .material import Tissue, build_functions, collect_coefficients, get_portion
+from .material import Tissue, build_functions, collect_coefficients, get_lame
 from .runtime.device import Device
 
 CAUSES = {
@@ -75,11 +75,11 @@ def compile_problem(
     anatomy: Anatomy,
     device: Device,
     space: Discretisation | None = None,
-    skin: ContactSurface | None = None,
+    surface: ContactSurface | None = None,
 ) -> Problem:
     """Build the terms and constraints of `effects`; default `space`: linear tetrahedra.
 
-    `skin` is the surface of `space`, if it is shared with other code.
+    `surface` is the surface of `space`, if it is shared with other code.
 
     Raises
     ------
@@ -87,9 +87,8 @@ def compile_problem(
         Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not fixed. A
         user-defined effect that does not return a term, or whose name is in use.
     """
-    effects = _check_compatible(effects)
-    space = space or discretise(anatomy.mesh, "p1")
-    skin = skin or ContactSurface(space.nodes, space.surface, device)
+    effects, space = _check_compatible(effects), space or discretise(anatomy.mesh, "p1")
+    surface = surface or ContactSurface(space.nodes, space.surface, device)
     terms: list[Term] = []
     own: list[Term] = []
     barriers: list[Barrier] = []
@@ -108,21 +107,21 @@ def compile_problem(
             case ToolForce():
                 from .terms.dead_force import DeadForce, build_pushed_forces
 
-                terms.append(DeadForce("tool force", partial(build_pushed_forces, skin, device), device))
+                terms.append(DeadForce("tool force", partial(build_pushed_forces, surface, device), device))
             case NodalForce():
                 from .terms.dead_force import DeadForce, build_nodal_forces
 
                 build = partial(build_nodal_forces, len(anatomy.mesh.nodes), device)
                 terms.append(DeadForce("nodal force", build, device))
             case Gravity():
-                from .terms.gravity import change_of_weight
+                from .terms.gravity import build_gravity_term
 
-                terms.append(change_of_weight(effect, space, device))
+                terms.append(build_gravity_term(effect, space, device))
             case Inertia():
                 from .terms.inertia import InertiaTerm, compute_lumped_mass
 
                 mass = compute_lumped_mass(effect.density, space)
-                terms.append(InertiaTerm(mass, effect.damping, space.marks, device))
+                terms.append(InertiaTerm(mass, effect.damping, space.keys, device))
             case ToolContact() | Retraction():
                 from .terms.contact.tool_contact import build_tool_contact
 
@@ -136,7 +135,7 @@ def compile_problem(
             case Resection():
                 raise InputError("Resection changes the body: make its solver with `sim.build_fem`.")
             case OwnEffect():
-                own.append(effect.term(Body(anatomy, space, skin, device)))
+                own.append(effect.term(Body(anatomy, space, surface, device)))
             case _:
                 allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
                 raise InputError(
@@ -148,7 +147,7 @@ def compile_problem(
     constraint = Constraint(space.extend_fixed(fixed), space.extend_normals(normal, fixed), device)
     elastic = all(term.constant for term in own)
     return Problem(
-        (*terms, *own, *barriers), constraint, device, partial(_build_imposed, space, skin), tuple(barriers), elastic
+        (*terms, *own, *barriers), constraint, device, partial(_build_imposed, space, surface), tuple(barriers), elastic
     )
 
 
@@ -205,16 +204,16 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
             raise InputError(f"loads hold {type(cause).__name__}, which no effect uses: add the effect {needed}.")
 
 
-def _build_imposed(space: Discretisation, skin: ContactSurface, loads: Loads) -> Imposed:
+def _build_imposed(space: Discretisation, skin: ContactSurface, loads: Loads) -> ImposedMotion:
     prescribed, displaced = loads.get(Prescribed), loads.get(Displaced)
     value = None
     if prescribed is not None:
         check_field("Prescribed.displacement", prescribed.displacement, len(space.mesh.nodes))
         value = space.interpolate_field(prescribed.displacement).reshape(len(loads), 3 * space.count).T
     if displaced is None:
-        return Imposed(value)
-    weight = skin.press(displaced.point, displaced.footprint).to_matrix(space.count)
-    return Imposed(value, weight.toarray().T, displaced.displacement.T)
+        return ImposedMotion(value)
+    weight = skin.find_footprints(displaced.point, displaced.footprint).to_matrix(space.count)
+    return ImposedMotion(value, weight.toarray().T, displaced.displacement.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,16 +221,16 @@ class LocalProblem:
     """Problem on a subset of a body's nodes, and a function that sets or clears a force (3n, b) [N] on it."""
 
     problem: Problem
-    put: Callable[[wp.array | None], None]
+    set_force: Callable[[wp.array | None], None]
 
 
 def compile_part(
-    effects: Iterable[Effect], space: Discretisation, whole: Problem, chosen: np.ndarray, nodes: np.ndarray
+    effects: Iterable[Effect], space: Discretisation, problem: Problem, selected: np.ndarray, nodes: np.ndarray
 ) -> Problem:
-    """Compile the elasticity of the `chosen` tetrahedra (T,) bool alone, on their `nodes` (n,), ascending."""
+    """Compile the elasticity of the `selected` tetrahedra (T,) bool alone, on their `nodes` (n,), ascending."""
     effect = next(effect for effect in effects if isinstance(effect, Elasticity))
-    constraint = Constraint(whole.constraint.fixed[nodes], whole.constraint.normal[nodes], whole.device)
-    return Problem(tuple(_build_elasticity(effect, space, whole.device, chosen, nodes)), constraint, whole.device)
+    constraint = Constraint(problem.constraint.fixed[nodes], problem.constraint.normal[nodes], problem.device)
+    return Problem(tuple(_build_elasticity(effect, space, problem.device, selected, nodes)), constraint, problem.device)
 
 
 def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> LocalProblem:
@@ -242,27 +241,27 @@ def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.nda
 
 
 def compile_clamped_part(
-    effects: Iterable[Effect], space: Discretisation, whole: Problem, chosen: np.ndarray, nodes: np.ndarray
+    effects: Iterable[Effect], space: Discretisation, problem: Problem, selected: np.ndarray, nodes: np.ndarray
 ) -> tuple[LocalProblem, Callable[[], sp.csc_array]]:
     """Compile as `compile_part`, with nodes fixed that other tetrahedra share.
 
     Also return a function for its tangent stiffness (3n, 3n) [N/m] at the last linearisation of a single load case.
     """
-    effect, device = next(effect for effect in effects if isinstance(effect, Elasticity)), whole.device
-    terms = _build_elasticity(effect, space, device, chosen, nodes)
-    rim = np.isin(nodes, space.table[~chosen])[:, None]
-    fixed, normal = whole.constraint.fixed[nodes] | rim, np.where(rim, 0.0, whole.constraint.normal[nodes])
+    effect, device = next(effect for effect in effects if isinstance(effect, Elasticity)), problem.device
+    terms = _build_elasticity(effect, space, device, selected, nodes)
+    rim = np.isin(nodes, space.table[~selected])[:, None]
+    fixed, normal = problem.constraint.fixed[nodes] | rim, np.where(rim, 0.0, problem.constraint.normal[nodes])
     part = _build_local_problem(Problem(tuple(terms), Constraint(fixed, normal, device), device))
-    return part, lambda: reduce(add, [term.curvature() for term in terms])
+    return part, lambda: reduce(add, [term.assemble_stiffness() for term in terms])
 
 
 def _build_local_problem(problem: Problem) -> LocalProblem:
-    from .terms.dead_force import DeadForce, Forces
+    from .terms.dead_force import DeadForce, NodalForces
 
     device = problem.device
     load, nodes = DeadForce("load", lambda _: None, device), device.upload(np.arange(problem.rows // 3), wp.int32)
     problem = replace(problem, terms=(*problem.terms, load))
-    return LocalProblem(problem, lambda force: load.take(None if force is None else Forces(nodes, force)))
+    return LocalProblem(problem, lambda force: load.set_forces(None if force is None else NodalForces(nodes, force)))
 
 
 def _build_elasticity(
@@ -272,7 +271,7 @@ def _build_elasticity(
     within: np.ndarray | None = None,
     nodes: np.ndarray | None = None,
     pulsation: Pulsation | None = None,
-) -> list[Curved]:
+) -> list[AssembledTerm]:
     """Build one term per law and element part, over the elements of all regions with that law.
 
     `within` (T,) bool restricts it to these tetrahedra, on their own nodes (n,).
@@ -287,7 +286,7 @@ def _build_elasticity(
     if unknown:
         raise InputError(f"a law is given for {describe_region(unknown[0])}, but the mesh has the regions {labels}.")
     materials = collect_laws(effect, labels)
-    terms: list[Curved] = []
+    terms: list[AssembledTerm] = []
     for name, relaxes in sorted({(material.law, bool(material.prony)) for material in materials.values()}):
         obeying = {
             label: material
@@ -299,11 +298,11 @@ def _build_elasticity(
             chosen &= within
         if not chosen.any():
             continue
-        for part in space.split_elements(chosen):
+        for part in space.build_elements(chosen):
             which = np.searchsorted(list(obeying), mesh.region[part.elements.owner])
             elements = part.elements if nodes is None else part.elements.restrict(nodes)
             swelling = None if pulsation is None else (pulsation, swell[part.elements.owner])
-            terms.append(_build_law_term(list(obeying.values()), which, elements, part.carries, device, swelling))
+            terms.append(_build_law_term(list(obeying.values()), which, elements, part.portion, device, swelling))
     return terms
 
 
@@ -331,7 +330,7 @@ def _build_law_term(
     carries: str,
     device: Device,
     swelling: tuple[Pulsation, np.ndarray] | None,
-) -> Curved:
+) -> AssembledTerm:
     """Return the term of elements whose tissues, indexed by `which` (T,), have one law; all of them relax, or none.
 
     `swelling`: the effect, and a mask (T,) of elements that swell.
@@ -348,7 +347,7 @@ def _build_law_term(
         return ElasticTerm(
             f"springs for {law.name}", LAW, elements, compute_spring_coefficients(lame, elements.gradient), lame, device
         )
-    lame = np.array([get_portion(tissue, carries) for tissue in tissues])[which]
+    lame = np.array([get_lame(tissue, carries) for tissue in tissues])[which]
     coefficients = collect_coefficients(tissues, carries)[which]
     name = f"elasticity {law.name}" if carries == "whole" else f"elasticity {law.name} of {carries}"
     sources = []

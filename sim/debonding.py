@@ -10,7 +10,7 @@ import warp as wp
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
 from .deformation import Deformation
-from .diagnostics.bond_traction import Bond
+from .diagnostics.bond_traction import BondTraction
 from .discretisation.term import Cases
 from .effects import Bonded, Effect, Slide
 from .errors import InputError
@@ -19,7 +19,7 @@ from .loads import Loads
 
 
 @dataclass(frozen=True)
-class Tearing:
+class Debonding:
     """Patch size and convergence of debonding.
 
     Parameters
@@ -40,7 +40,7 @@ class Tearing:
     averaging_radius: float = 5e-3
 
 
-TEARING = Tearing()
+TEARING = Debonding()
 """Default debonding options."""
 
 
@@ -77,7 +77,7 @@ def solve_with_debonding(
     accuracy: Accuracy = TRAIN,
     device: str = "auto",
     element: str | None = None,
-    tearing: Tearing = TEARING,
+    tearing: Debonding = TEARING,
 ) -> DebondedSolution:
     """Solve one load with debonding: an active set iteration over bonded, sliding and separated vertices.
 
@@ -140,8 +140,7 @@ def solve_with_debonding(
         if converged or rounds == tearing.max_solves or not last.outcome[0].good:
             break
         bonded, sliding = holding, pressed
-    most = share[bonded].max(initial=0.0)
-    off = covered & ~bonded & ~sliding
+    most, off = share[bonded].max(initial=0.0), covered & ~bonded & ~sliding
     return DebondedSolution(
         replace(last, bond=np.array([most])), np.flatnonzero(sliding), np.flatnonzero(off), rounds, converged
     )
@@ -162,17 +161,15 @@ def _compute_traction_ratios(
     Means include intact bonds only.
     """
     body = replace(anatomy, slide_normal=np.where(bonded[:, None], anatomy.slide_normal, 0.0))
-    bond = Bond(skull, body, fem.space, fem.problem.device, around)
-    own = bond.nodes < len(bonded)
-    out = np.zeros(len(bonded))
-    out[bond.nodes[own]] = bond.compute_shares(force)[own, 0]
+    bond = BondTraction(skull, body, fem.space, fem.problem.device, around)
+    own, out = bond.nodes < len(bonded), np.zeros(len(bonded))
+    out[bond.nodes[own]] = bond.compute_ratios(force)[own, 0]
     return out
 
 
 def _sum_at_vertices(fem: Fem, force: wp.array) -> np.ndarray:
     """Return nodal forces (V, 3) [N], those of mid-edge nodes divided between the ends."""
-    whole = force.numpy().reshape(-1, 3).astype(np.float64)
-    count = len(fem.anatomy.mesh.nodes)
+    whole, count = force.numpy().reshape(-1, 3).astype(np.float64), len(fem.anatomy.mesh.nodes)
     out = whole[:count].copy()
     np.add.at(out, fem.space.edges, 0.5 * whole[count:, None])
     return out

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .anatomy import Anatomy
-from .arguments import as_array, check_numbers_array, check_whole_numbers, is_all_finite
+from .arguments import as_array, check_integers, check_numbers_array, is_all_finite
 from .errors import InputError
 from .loads import Loads
 
@@ -160,7 +160,7 @@ class Deformation:
         InputError
             A vertex that is not in `self.nodes`; values that are not integers.
         """
-        nodes = check_whole_numbers("the vertices", nodes)
+        nodes = check_integers("the vertices", nodes)
         if np.array_equal(nodes, self.nodes):
             return self
         missing = ~np.isin(nodes, self.nodes)
@@ -203,7 +203,7 @@ def join_deformations(parts: Sequence[Deformation]) -> Deformation:
     )
 
 
-def check_start(start: Deformation, count: int, vertices: int) -> None:
+def check_start(start: Deformation, count: int, vertex_count: int) -> None:
     """Reject a start that does not have `count` load cases at all vertices of the mesh.
 
     Raises
@@ -213,10 +213,10 @@ def check_start(start: Deformation, count: int, vertices: int) -> None:
     """
     if not isinstance(start, Deformation):
         raise InputError(f"the start is a {type(start).__name__}: give a Deformation, or none.")
-    if np.shape(start.displacement) != (count, vertices, 3):
+    if np.shape(start.displacement) != (count, vertex_count, 3):
         raise InputError(
             f"the start has displacements of shape {np.shape(start.displacement)}: give every vertex of {count} load "
-            f"cases, ({count}, {vertices}, 3)."
+            f"cases, ({count}, {vertex_count}, 3)."
         )
     # A term and a warm-start entry may share a name: each is checked by its own rule.
     needed = [(name, values, True) for name, values in {"time": start.time, **start.memory}.items()]
@@ -230,7 +230,7 @@ def check_start(start: Deformation, count: int, vertices: int) -> None:
             )
 
 
-def guess(displacement: np.ndarray) -> Deformation:
+def build_start(displacement: np.ndarray) -> Deformation:
     """Return a start for a deformation model from user-defined displacements (B, V, 3) [m] of all vertices.
 
     Raises

@@ -12,7 +12,7 @@ import numpy as np
 
 from .anatomy import NECROSIS_LABEL, TUMOUR_LABEL, Anatomy, describe_region
 from .errors import InputError
-from .material import BRAIN, Tissue, check_described
+from .material import BRAIN, Tissue, check_attributes
 from .skulls import Bonded, SkullContact, Slide, check_gap
 from .tools import Spatula, Tool, check_tool
 
@@ -44,7 +44,7 @@ class Elasticity:
     def __post_init__(self) -> None:
         for tissue in (self.default, *self.regions.values()):
             if tissue is not None:
-                check_described(tissue)
+                check_attributes(tissue)
 
     def get_law(self, label: int) -> Tissue | None:
         """Return the law of a region, or None."""
@@ -376,7 +376,7 @@ def build_push_effects(anatomy: Anatomy, tissue: Tissue | Elasticity, skull: str
     return (made, Held(), *covered, ToolForce())
 
 
-def remember(effects: Iterable[Effect]) -> bool:
+def has_history(effects: Iterable[Effect]) -> bool:
     """Return True if a solution depends on the previous one: tool path, velocities, relaxation or resection."""
     return any(map(_is_history_dependent, effects))
 

@@ -14,12 +14,12 @@ import scipy.sparse as sp
 
 from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
-from .arguments import check_at_least, check_vertex_numbers
+from .arguments import check_integer, check_vertex_numbers
 from .compile import check_causes, compile_problem
 from .deformation import Cost, Deformation, check_start, join_deformations
 from .diagnostics.deformed_tissue import Diagnostics
 from .discretisation.footprint import ContactSurface, compute_push_reactions
-from .discretisation.inverted_elements import Inversion
+from .discretisation.inverted_elements import InversionCounter
 from .discretisation.problem import Problem
 from .discretisation.space import discretise
 from .discretisation.term import Cases
@@ -30,19 +30,19 @@ from .linalg.preconditioner import choose_preconditioner
 from .linalg.rest_solver import RestStiffnessSolver
 from .loads import Displaced, Loads, Nodal, Pushed
 from .minimisers.lbfgs import MAX_CARRIED
-from .minimisers.power_series import SeriesReading, count_terms, expand_taylor, list_factors
+from .minimisers.power_series import OutputFunctionals, count_terms, expand_taylor, list_factors
 from .minimisers.residual import measure_residual
 from .runtime.columns import unstack_columns
 from .runtime.device import find_device
 from .runtime.memory import check_fits, choose_batch_size, measure_free_bytes
 from .runtime.method_lock import lock_method
 from .runtime.threads import limit_to_one_thread
-from .strategy.bone import solve_off_bone
+from .strategy.bone import solve_free_of_bone
 from .strategy.extrapolation import as_pushes, compute_directions, extrapolate_start
 from .strategy.frame_sequence import FrameSequence, build_frame_sequence
-from .strategy.plan import SolverPlan, SolverStep, build_local_solvers, plan_for
+from .strategy.plan import SolverPlan, SolverStep, build_local_solvers, choose_plan
 from .strategy.strategy import SolverResult, Strategy
-from .strategy.time_steps import MAX_PRECONDITIONERS, NoMotionStep, group_alike
+from .strategy.time_steps import MAX_PRECONDITIONERS, NoMotionStep, group_time_steps
 
 # Key in the memory: displacements (B, E, 3) [m] of mid-edge nodes relative to the centres of their edges.
 MID_EDGE_KEY = "mid-edge nodes"
@@ -122,12 +122,12 @@ class Fem:
         preconditioner = shared or choose_preconditioner(problem, self.space, self._build_linear_stiffness)
         if batch is None:
             batch = choose_batch_size(problem.rows, problem.device, measure_free_bytes(problem.device))
-        plan = plan_for(problem, preconditioner, self.space, accuracy, check_at_least("batch", batch, 1), live, avoid)
+        plan = choose_plan(problem, preconditioner, self.space, accuracy, check_integer("batch", batch, 1), live, avoid)
         parts = build_local_solvers(plan, problem, preconditioner, self.effects, self.space)
         if problem.device.on_cuda:
             parts[0]()  # prepare for batches on a GPU; on the CPU, parts are built when first used
         self._diagnostics = Diagnostics(anatomy, self.space, self.effects, problem.device, accuracy.limit_strain)
-        inversion = Inversion(self.space, problem.device, problem.bounded)
+        inversion = InversionCounter(self.space, problem.device, problem.prevents_inversion)
         self.strategy = Strategy(problem, preconditioner, inversion, accuracy, plan, *parts)
         """Solvers of the plan, applied in order."""
         self._paced = lru_cache(MAX_PRECONDITIONERS)(self._build_strategy)
@@ -183,9 +183,8 @@ class Fem:
         if start is not None and last is not None:
             before = last.T.reshape(len(loads), self.space.count, 3)
             cases = Cases(loads, start.time, start.memory, before, warm=start.warm)
-        some = group_alike(cases.steps, self.batch) if self.problem.paced else None
-        batches = some or [(math.inf, rows) for rows in self._iterate_batches(len(loads))]
-        parts = []
+        some = group_time_steps(cases.steps, self.batch) if self.problem.depends_on_step else None
+        batches, parts = some or [(math.inf, rows) for rows in self._iterate_batches(len(loads))], []
         for step, rows in batches:
             guess = None if last is None else last[:, rows]
             parts.append(self._solve(self._get_strategy(step), cases.select(rows), guess, at))
@@ -210,7 +209,7 @@ class Fem:
     @cached_property
     def following(self) -> FrameSequence | None:
         """Solver for frame sequences on CUDA; None if the plan has none, as on the CPU, where it saves no time."""
-        if not self.plan.frames:
+        if not self.plan.captures_frames:
             return None
         return build_frame_sequence(
             self.strategy, self.space, self._skin, self._diagnostics, self.lock, self.description
@@ -221,7 +220,7 @@ class Fem:
 
     def _check_static(self, loads: Loads) -> None:
         check_causes(self.effects, loads)
-        if self.problem.paced:
+        if self.problem.depends_on_step:
             raise InputError("solutions under Inertia are time steps without static equilibrium: remove Inertia.")
 
     def _build_linear_stiffness(self, step: float) -> sp.csc_array:
@@ -243,7 +242,7 @@ class Fem:
         return measure_residual(self.problem, self.problem.device.upload(self.guess(loads, answer)))
 
     @lock_method
-    def build_reading(self, nodes: np.ndarray, modes: np.ndarray) -> SeriesReading:
+    def build_reading(self, nodes: np.ndarray, modes: np.ndarray) -> OutputFunctionals:
         """Return the projection of the motion of vertices `nodes` (n,) on modes (r, n, 3), an argument of `series`.
 
         Raises
@@ -261,10 +260,10 @@ class Fem:
             on_device = device.upload(force)
             self.problem.constraint.project(on_device)
             answers[some] = self._resting.solve(on_device).numpy().T
-        return SeriesReading(answers, device)
+        return OutputFunctionals(answers, device)
 
     @lock_method
-    def compute_series(self, loads: Loads, orders: int, reading: SeriesReading, sizes: int = 1) -> np.ndarray:
+    def compute_series(self, loads: Loads, orders: int, reading: OutputFunctionals, sizes: int = 1) -> np.ndarray:
         """Return the power series (G, terms, r) of a projection of the solution in the magnitudes of the loads.
 
         Each `sizes` successive loads form one group of G. For a group whose loads, scaled by s_1 ... s_m, act
@@ -278,7 +277,7 @@ class Fem:
             A solver in float32, whose round-off would dominate the higher orders.
         """
         check_causes(self.effects, loads)
-        if not self.problem.plain:
+        if not self.problem.can_accelerate:
             raise InputError("a power series requires elastic bodies under forces only: remove the other effects.")
         if self.problem.device.precision != "float64":
             raise InputError("a power series requires float64: use an Accuracy of that precision.")
@@ -299,7 +298,7 @@ class Fem:
                 some = loads.select(slice(first * sizes, (first + groups) * sizes))
                 self.problem.begin(Cases(some, np.zeros(len(some))))
                 forces = expand_taylor(self.problem, self._resting.solve, len(some), sizes, edge, orders)
-                read = [reading.read(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
+                read = [reading.evaluate(force).reshape(len(some) // sizes, -1, reading.count) for force in forces]
                 found[first : first + groups] = np.concatenate(read, axis=1)
         return found
 
@@ -319,7 +318,7 @@ class Fem:
     ) -> Deformation:
         clock = time.perf_counter()
         guesses = () if last is None else (extrapolate_start(cases.loads, last, cases.warm), last)
-        found = solve_off_bone(strategy, cases, guesses)
+        found = solve_free_of_bone(strategy, cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
         way = compute_directions(as_pushes(cases.loads), last, cases.warm) if len(cases.loads) <= MAX_CARRIED else {}
         return self._build_deformation(cases, found, way, at, seconds)
@@ -335,8 +334,7 @@ class Fem:
         """Build the deformation from a solver result, with reactions, warm-start data `more` and `seconds` by stage."""
         solved = time.perf_counter()
         self.problem.begin(replace(cases, share=found.path_fraction, restarted=found.restarted))
-        memory = dict(self.problem.end(found.u))
-        displaced = cases.loads.get(Displaced) is not None
+        memory, displaced = dict(self.problem.end(found.u)), cases.loads.get(Displaced) is not None
         held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
         on_footprint = self.problem.constraint.compute_footprint_force(held) if displaced else None
         touching = [term.compute_reaction(found.u) for term in self.problem.barriers]

@@ -195,7 +195,7 @@ class Loads:
 
     def select(self, index: slice | np.ndarray) -> Loads:
         """Return a subset of the load cases."""
-        return Loads(tuple(select_rows(cause, index) for cause in self.causes), self.times[index])
+        return Loads(tuple(select_cases(cause, index) for cause in self.causes), self.times[index])
 
     def scale(self, fraction: float | np.ndarray) -> Loads:
         """Return the loads with all magnitudes multiplied by `fraction`, a scalar or (B,)."""
@@ -214,7 +214,7 @@ class Loads:
     of, every, without_kind, only, rows, scaled = get, get_all, drop, get_only, select, scale
 
 
-def select_rows(cause: C, index: slice | np.ndarray) -> C:
+def select_cases(cause: C, index: slice | np.ndarray) -> C:
     """Return a cause for a subset of the load cases, by number, slice, or mask (B,)."""
     return replace(cause, **{item.name: getattr(cause, item.name)[index] for item in fields(cause)})
 

@@ -209,7 +209,7 @@ class Tissue(Protocol):
         ...
 
 
-def check_described(tissue: object) -> None:
+def check_attributes(tissue: object) -> None:
     """Reject a value that lacks attributes of a `Tissue`.
 
     Raises
@@ -296,18 +296,18 @@ def read_tissue_json(text: str) -> Tissue:
 MAX_LAME_RATIO = 1.5
 
 
-def get_portion(tissue: Tissue, carries: str) -> tuple[float, float]:
+def get_lame(tissue: Tissue, portion: str) -> tuple[float, float]:
     """Return Lamé's (mu, lambda) [Pa] of the "whole" tissue, or of its "shape" or "volume" portion.
 
     The two portions add up to the whole; in every law lambda multiplies the square of a volume measure.
     """
     mu, lam = tissue.lame
     soft = min(lam, MAX_LAME_RATIO * mu)
-    return {"whole": (mu, lam), "shape": (mu, soft), "volume": (0.0, lam - soft)}[carries]
+    return {"whole": (mu, lam), "shape": (mu, soft), "volume": (0.0, lam - soft)}[portion]
 
 
-def collect_coefficients(tissues: Sequence[Tissue], carries: str = "whole") -> np.ndarray:
-    """Return the coefficients (n, k) of one portion (see `get_portion`) of n tissues with one law.
+def collect_coefficients(tissues: Sequence[Tissue], portion: str = "whole") -> np.ndarray:
+    """Return the coefficients (n, k) of one portion (see `get_lame`) of n tissues with one law.
 
     Shorter Ogden sums are padded with terms (0, 1), which are zero.
 
@@ -316,7 +316,7 @@ def collect_coefficients(tissues: Sequence[Tissue], carries: str = "whole") -> n
     InputError
         Tissues of another law with different numbers of coefficients.
     """
-    rows = [tuple(tissue.coefficients_at(*get_portion(tissue, carries))) for tissue in tissues]
+    rows = [tuple(tissue.coefficients_at(*get_lame(tissue, portion))) for tissue in tissues]
     lengths = sorted({len(row) for row in rows})
     if len(lengths) > 1 and tissues[0].law != Ogden.law:
         raise InputError(

@@ -11,7 +11,7 @@ from .accuracy import TRAIN, Accuracy
 from .anatomy import Anatomy
 from .deformation import Deformation, check_start, join_deformations
 from .discretisation.resected_body import RemainingBody, list_remaining_bodies
-from .discretisation.term import Remembering
+from .discretisation.term import HistoryTerm
 from .effects import Effect, Elasticity, Held, Pulsation, Resection
 from .errors import InputError
 from .fem import MID_EDGE_KEY, Fem
@@ -24,7 +24,7 @@ DONE_KEY = "resection"
 POSE_SHAPE = (4, 4)
 
 
-class OperatedFem:
+class ResectedFem:
     """FEM deformation model that solves each load case on the body that remains after its resection steps.
 
     Vertices without remaining tissue keep their undeformed position. Memories have the rows of the whole body; removed
@@ -58,9 +58,9 @@ class OperatedFem:
         """Anatomy of the whole body."""
         return self._bodies[0].anatomy
 
-    def get_remains(self, done: int) -> RemainingBody:
-        """Return the body that remains after `done` steps."""
-        return self._bodies[done]
+    def get_remaining_body(self, steps_done: int) -> RemainingBody:
+        """Return the body that remains after `steps_done` steps."""
+        return self._bodies[steps_done]
 
     @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
@@ -162,8 +162,8 @@ class OperatedFem:
 
 def _list_memory_rows(fem: Fem) -> dict[str, tuple[np.ndarray, int]]:
     """Return unique keys (n, k) and row length of each memory of elements or nodes, by name."""
-    terms = [term for term in fem.problem.terms if isinstance(term, Remembering)]
-    return {MID_EDGE_KEY: (fem.space.edges, 3)} | {term.name: (term.marks, term.width) for term in terms}
+    terms = [term for term in fem.problem.terms if isinstance(term, HistoryTerm)]
+    return {MID_EDGE_KEY: (fem.space.edges, 3)} | {term.name: (term.keys, term.width) for term in terms}
 
 
 def _find_rows(whole: np.ndarray, some: np.ndarray) -> np.ndarray:
@@ -182,7 +182,7 @@ def build_fem(
     batch: int | None = None,
     element: str | None = None,
     live: bool = False,
-) -> Fem | OperatedFem:
+) -> Fem | ResectedFem:
     """Return the FEM solver for effects, which may include `Resection`; arguments as `Fem`.
 
     Raises
@@ -200,7 +200,7 @@ def build_fem(
     def make(body: Anatomy) -> Fem:
         return Fem(body, (*_restrict_effects(others, anatomy, body), Held()), accuracy, device, batch, element, live)
 
-    return OperatedFem(list_remaining_bodies(anatomy, effects), make, ahead=live)
+    return ResectedFem(list_remaining_bodies(anatomy, effects), make, ahead=live)
 
 
 def _restrict_effects(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:

@@ -7,7 +7,7 @@ import numpy as np
 from sim.accuracy import Accuracy
 from sim.discretisation.problem import Problem
 from sim.minimisers.newton import Equilibrium, find_equilibrium
-from sim.minimisers.newton_cg import Descent
+from sim.minimisers.newton_cg import DescentMethod
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class Found:
     linear_iterations: int
 
 
-def equilibrium_of(problem: Problem, descent: Descent, start: np.ndarray, accuracy: Accuracy) -> Found:
+def equilibrium_of(problem: Problem, descent: DescentMethod, start: np.ndarray, accuracy: Accuracy) -> Found:
     """`find_equilibrium` from a start (3N, B) on the host."""
     found = find_equilibrium(problem, descent, problem.device.upload(start), accuracy)
     rest = {item.name: getattr(found, item.name) for item in fields(Equilibrium) if item.name != "u"}

@@ -44,7 +44,7 @@ GIVEN = set(
         r"\w+",
         """
     main readinto data_received isOpened astype argmin min max
-    energy gradient residual curvature slope rest_curvature curvature_at_pace second_order longest_step elements_on
+    energy gradient residual curvature slope rest_curvature second_order longest_step
     coefficients_at term pose state restored
 """,
     )

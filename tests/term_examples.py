@@ -126,9 +126,9 @@ def relaxing(law: str, element: str = "p1", *effects: object) -> Example:
     """A viscoelastic law amid its memory; the first case is a body at rest so far, at once."""
     space = discretise(MESH, element)
     tissues = replace(tissue(law), prony=SERIES)
-    part = space.split_elements(np.ones(len(MESH.tets), bool))[0]
+    part = space.build_elements(np.ones(len(MESH.tets), bool))[0]
     points = part.elements.weight.size
-    name = f"viscoelasticity {law}" + ("" if part.carries == "whole" else f" of {part.carries}")
+    name = f"viscoelasticity {law}" + ("" if part.portion == "whole" else f" of {part.portion}")
     past = 50.0 * np.random.default_rng(14).normal(size=(3, points, 18)) * np.array([0.0, 1.0, 1.0])[:, None, None]
 
     def build(device: Device) -> Term:

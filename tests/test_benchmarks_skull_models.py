@@ -14,7 +14,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, build_template_subject
-from sim.debonding import Tearing
+from sim.debonding import Debonding
 from sim.deformation import Outcome
 from sim.effects import Bonded, Slide, build_push_effects
 from sim.fem import Fem
@@ -63,7 +63,7 @@ def test_pressing_skull_allows_more_motion_than_bonded(brain, capsys):
 
 def test_unconverged_tearing_is_excluded_from_the_mean(brain, capsys, monkeypatch):
     path, anatomy = brain
-    (row,) = rows([anatomy], ["pressing"], [0.45], draw("palpation", anatomy, 1, 0), "cpu", Tearing(max_solves=1))
+    (row,) = rows([anatomy], ["pressing"], [0.45], draw("palpation", anatomy, 1, 0), "cpu", Debonding(max_solves=1))
     assert row.failed == 1 and row.bond is None
     monkeypatch.setattr("benchmarks.studies.skull_models.rows", lambda *words: iter([row]))
     assert main(["benchmarks", "skull", path, "--loads", "1", "--device", "cpu", "--json"]) == 1

@@ -22,13 +22,13 @@ from scenes.script.craniotomy_frame import HOLE_RATIO
 from scenes.script.scene import Bounds, find_scene
 from scenes.script.tool_paths import Touch
 from sim.accuracy import TRAIN
-from sim.deformation import guess
+from sim.deformation import build_start
 from sim.effects import Elasticity, Gravity, Held, Slide, ToolForce
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, build_posture, stack
 
 EFFECTS = (Elasticity(), Held(), Slide())
-STILL = guess(np.zeros((1, 3, 3)))
+STILL = build_start(np.zeros((1, 3, 3)))
 
 CAMERA = "camera tilt [deg]", "camera distance [mm]"
 

@@ -12,7 +12,7 @@ from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.scene import SCENES, find_scene
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
-from sim.deformation import Deformation, guess
+from sim.deformation import Deformation, build_start
 from sim.discretisation.resected_body import list_remaining_bodies
 from sim.discretisation.term import Cases
 from sim.effects import Effect, Elasticity, Held, Inertia, Pulsation, Resection, Wave
@@ -57,13 +57,13 @@ def posed(name: str) -> tuple[Anatomy, tuple[Effect, ...], Loads, Deformation]:
     effects = scene.get_effects_on(BODY)
     site = build_craniotomy_frame(BODY)
     loads = scene.build_loads(site, scene.path(time), time)
-    body, start = BODY, guess(np.zeros((1, len(BODY.mesh.nodes), 3)))
+    body, start = BODY, build_start(np.zeros((1, len(BODY.mesh.nodes), 3)))
     if scene.surgery is not None:  # as it was before the last cut
         stages, done = list_remaining_bodies(BODY, effects), scene.surgery.count_done(time)
         effects = (*(effect for effect in effects if not isinstance(effect, Held | Resection)), Held())
         loads, body = loads.drop(Resected), stages[done].anatomy
         before = Fem(stages[done - 1].anatomy, effects, TIGHT, "cpu", element="p1").deform(loads)
-        start = guess(np.where(body.orphaned[:, None], 0.0, before.displacement))
+        start = build_start(np.where(body.orphaned[:, None], 0.0, before.displacement))
     if any(isinstance(effect, Pulsation) for effect in effects):
         start = replace(start, time=np.array([LATE]))
     return body, tuple(map(stilled, effects)), loads, start

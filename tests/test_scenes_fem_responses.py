@@ -26,7 +26,7 @@ def test_cut_body_is_reliable_if_both_fluid_levels_converge(box, tmp_path):
         solved.append(answer if not solved else replace(answer, outcome=(Outcome.BUDGET,)))
         return solved[-1]
 
-    fem = SimpleNamespace(deform=deform, get_remains=setting.answers.fem.get_remains)
+    fem = SimpleNamespace(deform=deform, get_remaining_body=setting.answers.fem.get_remaining_body)
     pose = DEBULK.tool.pose(setting.site.origin, setting.site.axis, setting.site.right)
     for fluid, good in ((1.0, True), (0.95, False)):
         answers = CutElements(setting.site, fem, setting.answers.ball)

@@ -8,12 +8,12 @@ from theatres import short
 from scenes.page.text import report
 from scenes.script.tool_paths import Touch
 from scenes.script.uncertainty import TumourError
-from sim.deformation import Outcome, guess
+from sim.deformation import Outcome, build_start
 from surrogate.data.dataset import compute_loads_digest
 
 
 def answer(outcome: Outcome, bound: float = 1e-3):
-    return replace(guess(np.full((1, 3, 3), 1e-3)), outcome=(outcome,), bound=np.array([[bound], [2.0 * bound]]))
+    return replace(build_start(np.full((1, 3, 3), 1e-3)), outcome=(outcome,), bound=np.array([[bound], [2.0 * bound]]))
 
 
 class TestDigestOfLoads:

@@ -13,7 +13,7 @@ from scenes.warp.places import MIN_SPACING, SpacingSettings, compute_fields, fin
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.errors import InputError
-from sim.fields.warp_fields import warp_fields, warp_grid
+from sim.fields.warp_fields import build_warp_grid, compute_warp_fields
 from sim.geometry.tetmesh import compute_signed_volumes
 
 
@@ -31,7 +31,7 @@ def kinked(small_box):
 
 @pytest.fixture(scope="module")
 def fields(kinked):
-    return warp_fields(kinked.anatomy, kinked.displacement, 2e-3)
+    return compute_warp_fields(kinked.anatomy, kinked.displacement, 2e-3)
 
 
 def test_part_error_is_the_larger_of_both_field_errors(kinked, fields):
@@ -84,15 +84,15 @@ def dented(small_box):
 
 def test_dented_cortex_is_fitted_with_points_outside_the_mesh(dented):
     """With points inside tetrahedra alone the cortex has an error of 0.9 mm."""
-    fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
+    fields = compute_warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
     places = list_places(dented)
     errors = places.compute_errors(fields)
-    assert places.landmarks.sum() == 2 and not fields.folds
+    assert places.landmarks.sum() == 2 and not fields.has_folds
     assert errors[places.cortex].max() < 0.2e-3 and errors[places.landmarks].max() < 0.1e-3
 
 
 def test_finer_spacing_follows_from_the_landmark_error(dented):
-    fields = warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
+    fields = compute_warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
     places = list_places(dented)
     assert places.compute_errors(fields)[places.tumour].max() < SpacingSettings().tolerance / 10.0
     finer = find_finer_spacing(dented, fields)
@@ -108,7 +108,7 @@ def test_folds_of_fem_are_found_and_sorted_by_size(small_box):
         tet = mesh.tets[(mesh.tets == vertex).any(axis=1)][0]
         moved[vertex] = times * (mesh.nodes[tet[tet != vertex]].mean(axis=0) - mesh.nodes[vertex])
     moment = choose_moment(small_box, moved)
-    folds = find_folds(moment, warp_fields(small_box, moved, 2e-3))
+    folds = find_folds(moment, compute_warp_fields(small_box, moved, 2e-3))
     assert len(folds) == 2 and folds[0].volume >= folds[1].volume and folds[0].tetrahedra > folds[1].tetrahedra
     assert all(fold.off > 0.1e-3 for fold in folds)
 
@@ -126,9 +126,9 @@ def test_fields_avoid_folds_of_fem_and_report_them(small_box, tmp_path, capsys):
     moved[vertex] = [6.5e-3, 1e-3, 0.0]  # past its neighbours, 6 mm away
     bad = compute_signed_volumes(mesh.nodes + moved, mesh.tets) <= 0.0
     moment = choose_moment(small_box, moved)
-    fields = warp_fields(small_box, moved, 2e-3)
+    fields = compute_warp_fields(small_box, moved, 2e-3)
     (fold,) = find_folds(moment, fields)
-    assert not fields.folds and fields.least[2] < 0.0 and min(fields.least[:2]) > 0.0
+    assert not fields.has_folds and fields.min_determinants[2] < 0.0 and min(fields.min_determinants[:2]) > 0.0
     assert fold.tetrahedra == bad.sum() > 0 and fold.volume == pytest.approx(mesh.volumes[bad].sum())
     assert np.linalg.norm(fold.middle - mesh.nodes[vertex]) < 8e-3 and fold.off > 0.2e-3
     write_anatomy(tmp_path / "box.vtu", small_box)
@@ -146,7 +146,7 @@ def test_fields_avoid_folds_of_fem_and_report_them(small_box, tmp_path, capsys):
 
 def test_finer_spacing_keeps_grid_within_32_million_nodes(kinked):
     wide = choose_moment(kinked.anatomy, kinked.displacement + [40e-3, 0.0, 0.0])
-    finer = find_finer_spacing(wide, warp_fields(wide.anatomy, wide.displacement, 5e-3))
-    grids = (warp_grid(wide.anatomy, wide.displacement[None], spacing) for spacing in (finer, finer - 0.05e-3))
+    finer = find_finer_spacing(wide, compute_warp_fields(wide.anatomy, wide.displacement, 5e-3))
+    grids = (build_warp_grid(wide.anatomy, wide.displacement[None], spacing) for spacing in (finer, finer - 0.05e-3))
     fits, too_many = (np.prod(grid.shape) for grid in grids)
     assert fits <= 32e6 < too_many

@@ -195,9 +195,9 @@ def test_interpolated_pose_reports_remaining_error():
         time = times[-1 - late] + (share - 1.0) * STEP
         placed = at(heard, time)
         newest = replace(placed, T=heard.list_transforms(heard.names.camera)[-1].T)
-        assert off(placed, time) <= placed.moved < 0.2e-3 and off(placed, time) < 0.1 * off(newest, time)
+        assert off(placed, time) <= placed.movable < 0.2e-3 and off(placed, time) < 0.1 * off(newest, time)
     ahead = at(heard, times[-1] + 0.03)
-    assert off(ahead, times[-1] + 0.03) <= ahead.moved < 4e-3
+    assert off(ahead, times[-1] + 0.03) <= ahead.movable < 4e-3
 
 
 def test_newest_pose_has_camera_motion_as_error():
@@ -212,7 +212,7 @@ def test_newest_pose_has_camera_motion_as_error():
     ):
         placed = at(heard, time, stamped=stamped)
         assert np.allclose(placed.T[:3, :3], camera(times[-1])[:3, :3])
-        assert placed.moved == pytest.approx(way * apart / STEP, rel=1e-4)
+        assert placed.movable == pytest.approx(way * apart / STEP, rel=1e-4)
     assert at(heard_of(times), times[-1] + 1.0) == "no {name} within 0.3 s of the image's time"
     assert "alone" in at(heard_of(times[-1:]), times[-1])
 

@@ -25,7 +25,7 @@ from scenes.script.scene import SCENES, Scene, Viewpoint, find_scene
 from scenes.script.tool_paths import Touch, lay, press
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Outcome
-from sim.effects import Elasticity, Gravity, Held, Inertia, remember
+from sim.effects import Elasticity, Gravity, Held, Inertia, has_history
 from sim.material import Material
 
 # Forward, back, round, again, and far.
@@ -205,11 +205,11 @@ def test_static_scene_solves_each_frame_once(theatre, monkeypatch):
 
 
 def test_remember_is_true_for_history_dependent_scenes() -> None:
-    found = {name: remember(find_scene(name).effects) or bool(find_scene(name).surgery) for name in SCENES}
+    found = {name: has_history(find_scene(name).effects) or bool(find_scene(name).surgery) for name in SCENES}
     assert {name for name, does in found.items() if does} == {"spatula", "palpate", "retract", "resection", "pulsation"}
     relaxing = Material("neo-hookean", 3000.0, 0.45, prony=((0.4, 1.0),))
-    assert remember((Elasticity(None, {1: relaxing}), Held())) and not remember((Elasticity(None), Held()))
-    assert not remember(sinking().effects)
+    assert has_history((Elasticity(None, {1: relaxing}), Held())) and not has_history((Elasticity(None), Held()))
+    assert not has_history(sinking().effects)
 
 
 class TestPages:

@@ -18,7 +18,7 @@ from scenes.script.debulking import Debulking
 from scenes.script.head_pose import build_drainage
 from scenes.script.tool_paths import Touch
 from sim.anatomy import TUMOUR_LABEL
-from sim.deformation import guess
+from sim.deformation import build_start
 from sim.effects import Resection
 from sim.loads import Posture, Resected
 
@@ -59,7 +59,7 @@ def test_resection_scene_has_resection_effect_and_cause(theatre, scene):
     loads = scene.build_loads(theatre.site, Touch(), 0.12)
     assert [type(cause) for cause in loads.causes] == [Posture, Resected]
     assert loads.get(Resected).done.tolist() == [2] and "resection: 2 steps done" in format_acting(
-        loads, guess(np.zeros((1, 3, 3))), theatre.site.anatomy.mesh.nodes
+        loads, build_start(np.zeros((1, 3, 3))), theatre.site.anatomy.mesh.nodes
     )
     assert theatre.list_deformers(scene) == ("fem",)
 

@@ -23,7 +23,7 @@ from scenes.cli import main
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
-from sim.deformation import Outcome, guess
+from sim.deformation import Outcome, build_start
 from sim.discretisation.footprint import compute_footprint_weights
 from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.errors import InputError
@@ -151,7 +151,7 @@ def test_change_uses_loads_converged_in_variant_and_default(pretender):
 def test_change_has_percentiles_over_loads_and_vertices():
     """p95 over every load x vertex; worst95 over the loads, each by its farthest vertex."""
     field = np.random.default_rng(0).normal(size=(40, 7, 3))
-    default = replace(guess(np.ones((40, 7, 3))), outcome=40 * (Outcome.CONVERGED,))
+    default = replace(build_start(np.ones((40, 7, 3))), outcome=40 * (Outcome.CONVERGED,))
     found = change(replace(default, displacement=1.0 + 1e-3 * field), default, default.displacement)
     off = np.linalg.norm(field, axis=2)
     wanted = off.mean(), np.percentile(off, 95), np.percentile(off.max(axis=1), 95), off.max()

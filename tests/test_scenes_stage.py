@@ -10,7 +10,7 @@ from scenes.play.player import Player
 from scenes.play.stage import CORTEX, Stage
 from scenes.script.viewpoint import PLAIN_APPEARANCE
 from sim.bodies.intensity import Intensity
-from sim.deformation import Deformer, guess
+from sim.deformation import Deformer, build_start
 
 
 def seen(values, scene=None):
@@ -55,7 +55,7 @@ def test_constant_scan_gives_uniform_cortex_colour():
 
 def test_microscope_vignette_is_deterministic():
     theatre, scene = template_theatre(), small()
-    rest = guess(np.zeros((1, *theatre.anatomy.mesh.nodes.shape)))
+    rest = build_start(np.zeros((1, *theatre.anatomy.mesh.nodes.shape)))
     views = [replace(scene.viewpoint, field=field) for field in (None, 1.0, 1.0)]
     stages = [Stage(replace(scene, viewpoint=view), theatre.site, theatre.intensity) for view in views]
     # No deformer is asked.

@@ -13,7 +13,7 @@ from warped import BLOBS, GRIDS, LPS, MAPPED, WIDTH, bump, places
 from scenes.cli import main
 from scenes.warp.images import read_picture, warp_values, write_warped
 from sim.bodies.meshfile import write_anatomy, write_mesh
-from sim.fields.warp_fields import warp_fields
+from sim.fields.warp_fields import compute_warp_fields
 from sim.geometry.locate import locate
 from sim.geometry.tetmesh import compute_signed_volumes
 
@@ -26,7 +26,7 @@ def middles(box):
     found = []
     for blob in BLOBS:
         at = locate(box.mesh, np.concatenate([blob + offsets, blob - offsets]))
-        now = at.read((box.mesh.nodes + moved)[None])[0]
+        now = at.interpolate((box.mesh.nodes + moved)[None])[0]
         rest = compute_signed_volumes(box.mesh.nodes, at.vertices)
         found.append(
             np.average(now, axis=0, weights=compute_signed_volumes(box.mesh.nodes + moved, at.vertices) / rest)
@@ -83,7 +83,7 @@ def test_itk_moves_points_with_the_tissue(box, warp_out):
     field = sitk.ReadImage(str(warp_out / "field_modeling.nrrd"), sitk.sitkVectorFloat64)
     transform = sitk.DisplacementFieldTransform(field)
     now = 1e-3 * LPS * np.array([transform.TransformPoint((1e3 * blob * LPS).tolist()) for blob in BLOBS])
-    truth = locate(box.mesh, BLOBS).read((box.mesh.nodes + bump(box.mesh.nodes))[None])[0]
+    truth = locate(box.mesh, BLOBS).interpolate((box.mesh.nodes + bump(box.mesh.nodes))[None])[0]
     assert np.abs(now - truth).max() < 0.05e-3
 
 
@@ -112,7 +112,7 @@ def folder(tmp_path_factory, box):
 
 @pytest.fixture(scope="module")
 def fields(box):
-    return warp_fields(box, dimple(box.mesh.nodes), 2e-3)
+    return compute_warp_fields(box, dimple(box.mesh.nodes), 2e-3)
 
 
 def warp(folder, *words, out="out", anatomy="box.vtu"):
@@ -182,7 +182,9 @@ def test_voxels_from_outside_or_resection_are_zero_and_counted(box, fields):
     affine[:3, 3] = [-10e-3, -10e-3, -8e-3]  # its top lies below what is pushed into it
     out, counts = warp_values(np.full((20, 20, 6), 9, np.uint8), affine, fields, 1)
     assert counts.outside > 200 and (out[counts.blank] == 0).all() and (out[~counts.blank] == 9).all()
-    cut = warp_fields(box, dimple(box.mesh.nodes), 2e-3, box.remove_elements(np.flatnonzero(box.mesh.region == 2)))
+    cut = compute_warp_fields(
+        box, dimple(box.mesh.nodes), 2e-3, box.remove_elements(np.flatnonzero(box.mesh.region == 2))
+    )
     affine[2, 3] = -40e-3
     out, counts = warp_values(np.full((20, 20, 36), 9, np.uint8), affine, cut, 0)
     assert counts.resected > 1000 and (out == 0).sum() == counts.resected + counts.outside

@@ -8,7 +8,7 @@ from test_sim_head_masks import EDGE, TUMOUR, grid, head, nifti
 
 from scenes.script.debulking import Debulking
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
-from sim.bodies.head_masks import Sources, read_head_masks
+from sim.bodies.head_masks import MaskSources, read_head_masks
 from sim.bodies.label_volume import build_masked_subject
 from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.open_cortex import open_cortex
@@ -18,7 +18,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Resected, push
 from sim.material import BRAIN
-from sim.resected_fem import OperatedFem, build_fem
+from sim.resected_fem import ResectedFem, build_fem
 
 STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=300.0)
 
@@ -75,11 +75,11 @@ class TestLabels:
 
     def test_necrosis_mask_is_equal_from_every_label_source(self, files):
         found = [
-            read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)})),
-            read_head_masks(Sources(files / "own.nii", (1,), (3, 6), parts={"necrosis": (6,)})),
-            read_head_masks(Sources(files / "brats.nii", convention="brats", mask=files / "brain.nii")),
+            read_head_masks(MaskSources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)})),
+            read_head_masks(MaskSources(files / "own.nii", (1,), (3, 6), parts={"necrosis": (6,)})),
+            read_head_masks(MaskSources(files / "brats.nii", convention="brats", mask=files / "brain.nii")),
             read_head_masks(
-                Sources(files / "brain.nii", (1,), (4,), tumour_in=files / "brats.nii", parts={"necrosis": (1,)})
+                MaskSources(files / "brain.nii", (1,), (4,), tumour_file=files / "brats.nii", parts={"necrosis": (1,)})
             ),
         ]
         for masks in found:
@@ -89,12 +89,12 @@ class TestLabels:
 
     def test_necrosis_label_must_exist_and_differ_from_brain(self, files):
         with pytest.raises(InputError, match="label 1 is named by --brain and by --necrosis"):
-            read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (1,)}))
+            read_head_masks(MaskSources(files / "own.nii", (1,), (3,), parts={"necrosis": (1,)}))
         with pytest.raises(InputError, match="has no label 9"):
-            read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (9,)}))
+            read_head_masks(MaskSources(files / "own.nii", (1,), (3,), parts={"necrosis": (9,)}))
 
     def test_necrosis_region_has_mask_volume_and_keeps_tumour(self, files, tmp_path):
-        masks = read_head_masks(Sources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)}))
+        masks = read_head_masks(MaskSources(files / "own.nii", (1,), (3,), parts={"necrosis": (6,)}))
         subject = build_masked_subject(masks, regions=("necrosis",))
         (part,) = subject.parts
         assert part.volume == pytest.approx(masks.parts["necrosis"].sum() * (1e-3 * EDGE) ** 3)
@@ -140,8 +140,8 @@ def test_resected_tumour_remainder_keeps_its_law(small_box):
     cut = Resection((tuple(np.flatnonzero(halved.mark_elements(TUMOUR_LABEL)).tolist()),))
     effects = (*build_push_effects(small_box, Elasticity(BRAIN, {TUMOUR_LABEL: STIFF})), cut)
     operated = build_fem(replace(small_box, mesh=halved), effects, element="p1")
-    assert isinstance(operated, OperatedFem)
-    left = operated.get_remains(1).anatomy
+    assert isinstance(operated, ResectedFem)
+    left = operated.get_remaining_body(1).anatomy
     assert set(left.mesh.region.tolist()) == {1, NECROSIS_LABEL}
     place = open_cortex(small_box).find_nearest(np.zeros(3))
     loads = push(place.point, 0.1 * place.inward, footprint=7e-3)

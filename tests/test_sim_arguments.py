@@ -9,7 +9,7 @@ import pytest
 from boxes import base_held, box
 
 from sim.accuracy import LIVE, Accuracy
-from sim.deformation import Deformation, guess
+from sim.deformation import Deformation, build_start
 from sim.effects import Elasticity, Held, Inertia, Resection, ToolForce
 from sim.errors import InputError
 from sim.fem import MID_EDGE_KEY, Fem
@@ -220,8 +220,8 @@ def test_invalid_starts_are_rejected(fem: Fem, cut: Any) -> None:
         wrong: list[tuple[Any, str]] = [
             (5, "the start is a int"),
             (good.displacement, "the start is a ndarray"),
-            (guess(np.zeros((2, 64, 3))), r"shape \(2, 64, 3\): give every vertex of 1 load cases, \(1, 64, 3\)"),
-            (guess(np.zeros((1, 8, 3))), r"shape \(1, 8, 3\)"),
+            (build_start(np.zeros((2, 64, 3))), r"shape \(2, 64, 3\): give every vertex of 1 load cases, \(1, 64, 3\)"),
+            (build_start(np.zeros((1, 8, 3))), r"shape \(1, 8, 3\)"),
             (good.restrict(np.array([1, 2])), r"shape \(1, 2, 3\)"),
             (replace(good, time=np.array([np.nan])), "the start's 'time' are no 1 rows of finite numbers"),
             (replace(good, time=np.zeros(3)), "the start's 'time'"),
@@ -234,10 +234,10 @@ def test_invalid_starts_are_rejected(fem: Fem, cut: Any) -> None:
         for start, sentence in wrong:
             with pytest.raises(InputError, match=sentence):
                 body.deform(PUSH, start)
-        assert body.deform(PUSH, guess(own)).outcome[0].good
+        assert body.deform(PUSH, build_start(own)).outcome[0].good
     for values, sentence in ((np.full((1, 64, 3), np.nan), "finite"), (np.zeros((64, 3)), "shape"), ("x", "type")):
         with pytest.raises(InputError, match=f"a guessed displacement .*{sentence}"):
-            guess(values)  # pyright: ignore[reportArgumentType]
+            build_start(values)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -263,7 +263,7 @@ def test_start_with_wrong_mid_edge_nodes_is_rejected() -> None:
 def test_empty_load_batch_with_start_gives_empty_result() -> None:
     body = Fem(BODY, (Elasticity(), Held(), ToolForce(), Inertia()), LIVE, "cpu", element="p1")
     none = PUSH.select(np.arange(0))
-    assert len(body.deform(none, guess(np.zeros((0, 64, 3))))) == 0
+    assert len(body.deform(none, build_start(np.zeros((0, 64, 3))))) == 0
 
 
 def test_accuracy_beyond_float_precision_is_rejected() -> None:

@@ -9,7 +9,7 @@ from sim.geometry.tetmesh import (
     compute_dihedral_angles,
     compute_row_keys,
     compute_signed_volumes,
-    find_single_faces,
+    find_boundary_faces,
 )
 
 MIDDLE = np.array([0.03, 0.02, 0.01])
@@ -33,7 +33,7 @@ def test_lattice_tetrahedra_fit_and_have_good_angles(levels):
     _, count = np.unique(compute_row_keys(made.tets[:, FACES].reshape(-1, 3)), return_counts=True)
     assert count.max() == 2
     # Were two neighbours split differently, faces inside the box would be left over, and count as its surface.
-    surface = find_single_faces(made.tets)
+    surface = find_boundary_faces(made.tets)
     corners = made.nodes[surface]
     enclosed = np.einsum("ti,ti->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
     assert enclosed == pytest.approx(compute_signed_volumes(made.nodes, made.tets).sum(), rel=1e-12)
@@ -52,6 +52,6 @@ def test_short_lattice_edges_join_centres_with_corners():
     made = lattice(0)
     ends = made.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]]
     length = np.linalg.norm(np.diff(made.nodes[ends], axis=2)[:, :, 0], axis=2)
-    mixed = made.centre[ends[..., 0]] != made.centre[ends[..., 1]]
+    mixed = made.is_centre[ends[..., 0]] != made.is_centre[ends[..., 1]]
     np.testing.assert_allclose(length[mixed], 0.02 * np.sqrt(0.75))
     np.testing.assert_allclose(length[~mixed], 0.02)

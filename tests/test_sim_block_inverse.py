@@ -15,9 +15,11 @@ ACROSS = RANDOM.normal(size=(COUNT, BORDER))
 
 @pytest.mark.parametrize("block", [1, 5, 23, 100])
 def test_in_place_block_inverse_agrees_with_dense_inverse(block: int) -> None:
-    rows = block_inverse.to_half_rows(sp.csc_array(MATRIX), block_inverse.compute_block_cuts(COUNT, block), "cpu")
+    rows = block_inverse.to_lower_block_rows(
+        sp.csc_array(MATRIX), block_inverse.compute_block_bounds(COUNT, block), "cpu"
+    )
     assert len(rows) == -(-COUNT // block)
-    block_inverse.invert(rows)
+    block_inverse.invert_in_place(rows)
     expected, first = -np.linalg.inv(MATRIX), 0
     for row in rows:
         stop = first + len(row)
@@ -42,4 +44,4 @@ def test_block_elimination_rejects_indefinite_matrix() -> None:
 
 
 def test_measured_multiplication_rate_is_positive() -> None:
-    assert block_inverse.measure_rate_of_work("cpu", trial=8) > 0.0
+    assert block_inverse.measure_matmul_rate("cpu", size=8) > 0.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from sim.linalg.block_sparse import Sparse
+from sim.linalg.block_sparse import BlockSparse
 from sim.runtime.device import Precision, find_device
 
 
@@ -17,9 +17,9 @@ def test_block_product_matches_scipy(size: tuple[int, int], width: int, precisio
     there = random.random((7, 5)) < 0.4
     there[2], there[6] = False, True
     dense = np.kron(there, np.ones(size)) * random.normal(size=(7 * size[0], 5 * size[1]))
-    matrix = Sparse(sp.bsr_array(dense, blocksize=size), device)
+    matrix = BlockSparse(sp.bsr_array(dense, blocksize=size), device)
     x, out = random.normal(size=(5 * size[1], width)), random.normal(size=(7 * size[0], width))
     added = device.upload(out)
-    matrix.add_to(added, -0.5, device.upload(x))
+    matrix.add_product(added, -0.5, device.upload(x))
     np.testing.assert_allclose(added.numpy(), out - 0.5 * dense @ x, atol=tolerance * np.abs(dense @ x).max())
     np.testing.assert_allclose(matrix.multiply(device.upload(x)).numpy(), dense @ x, atol=tolerance * 20)

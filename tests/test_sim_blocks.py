@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim.runtime.blocks import before, get_block_shape, largest, launch, total
+from sim.runtime.blocks import get_block_shape, get_max, get_prefix, get_sum, launch
 from sim.runtime.device import Device, forward_kernel
 
 ON_A_CARD = pytest.param(
@@ -20,9 +20,9 @@ def test_block_scan_returns_sum_maximum_and_prefix(name: str) -> None:
     @forward_kernel(module="unique")
     def run(given: wp.array2d(dtype=wp.float64), out: wp.array3d(dtype=wp.float64)):
         c, me = wp.tid()
-        out[0, c, me] = total(given[c, me])
-        out[1, c, me] = largest(given[c, me])
-        out[2, c, me] = wp.float64(before(wp.int32(given[c, me])))
+        out[0, c, me] = get_sum(given[c, me])
+        out[1, c, me] = get_max(given[c, me])
+        out[2, c, me] = wp.float64(get_prefix(wp.int32(given[c, me])))
 
     given = np.random.default_rng(0).integers(1, 100, (count, threads)).astype(float)
     out = wp.zeros((3, count, threads), dtype=wp.float64, device=device.name)

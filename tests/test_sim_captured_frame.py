@@ -18,14 +18,14 @@ def fem() -> Fem:
 def test_interrupted_frame_start_leaves_no_state(fem, monkeypatch):
     first, middle, last = ride(fem, 3)
     expected, here = fem.deform(pushed(2.1e-3), last), fem.deform(pushed(1.4e-3), middle)
-    take = CapturedFrame.take
+    take = CapturedFrame.load_state
 
     def interrupted(frame, *given):
         take(frame, *given)
         raise MemoryError
 
     with monkeypatch.context() as patch, pytest.raises(MemoryError):
-        patch.setattr(CapturedFrame, "take", interrupted)
+        patch.setattr(CapturedFrame, "load_state", interrupted)
         fem.deform(pushed(2.1e-3), replace(first))
     np.testing.assert_array_equal(here.displacement, last.displacement)
     assert same(fem.deform(pushed(2.1e-3), here), expected)

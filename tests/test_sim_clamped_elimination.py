@@ -69,7 +69,7 @@ def test_assembled_curvature_agrees_with_curvature_product(law: str) -> None:
     problem.linearise(u, np.zeros(1, bool))
     expected = problem.device.allocate(problem.rows, 1)
     problem.add_curvature(p, expected)
-    found = sum(term.curvature() @ p.numpy() for term in problem.terms if isinstance(term, ElasticTerm))
+    found = sum(term.assemble_stiffness() @ p.numpy() for term in problem.terms if isinstance(term, ElasticTerm))
     np.testing.assert_allclose(found, expected.numpy(), atol=1e-10 * np.abs(expected.numpy()).max())
 
 

@@ -21,7 +21,7 @@ def test_clamped_part_reaches_equilibrium_with_fixed_rim() -> None:
     chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.08
     constant, _ = compute_constant_gradients(problem, u)
     part = ClampedPart(problem, EFFECTS, fem.space, chosen, constant, u)
-    settled = part.settle(u, 1e-9)
+    settled = part.solve_part(u, 1e-9)
     inside = np.setdiff1d(part.nodes, fem.space.table[~chosen])
     moved = (settled.numpy() != u.numpy()).reshape(-1, 3).any(axis=1)
     assert len(inside) and set(np.flatnonzero(moved)) <= set(inside.tolist())
@@ -37,4 +37,4 @@ def test_clamped_part_with_non_finite_forces_is_unchanged() -> None:
     folded = problem.device.upload(-2.0 * fem.space.nodes.reshape(-1, 1) * (fem.space.nodes[:, 2:] > 0.0).repeat(3, 0))
     chosen = BODY.mesh.nodes[BODY.mesh.tets, 2].max(axis=1) > 0.04
     part = ClampedPart(problem, fem.effects, fem.space, chosen, compute_constant_gradients(problem, rest)[0], rest)
-    np.testing.assert_array_equal(part.settle(folded, 1e-9).numpy(), folded.numpy())
+    np.testing.assert_array_equal(part.solve_part(folded, 1e-9).numpy(), folded.numpy())

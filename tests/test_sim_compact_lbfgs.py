@@ -51,7 +51,7 @@ def test_columns_of_curvature_pairs_are_independent() -> None:
         pairs.update_history(columns, s, y, begun @ y)
         for place, column in enumerate(columns):
             known[column].append((s[:, place], y[:, place]))
-    pairs.forget(np.array([3]))
+    pairs.clear(np.array([3]))
     pairs.keep(np.array([2, 1, 3]))
     force = rng.normal(size=(size, 3))
     learnt = pairs.get_history(np.arange(3))

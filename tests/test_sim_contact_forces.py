@@ -21,9 +21,9 @@ def test_contact_forces_satisfy_their_equation(drag: float, rough: float) -> Non
     A preconditioner in half precision rounds each of C's columns by itself.
     """
     fem, descent = parts()
-    whole, n = fem.strategy.preconditioner, len(descent.barrier.touchable)
+    whole, n = fem.strategy.preconditioner, len(descent.barrier.touchable_nodes)
 
-    soft = Compliance(fem.problem, cast(Preconditioner, Rough(whole, rough)), descent.barrier.touchable)
+    soft = Compliance(fem.problem, cast(Preconditioner, Rough(whole, rough)), descent.barrier.touchable_nodes)
     device = replace(fem.problem.device, precision="float64")
     shallow = (at(0.031, 0.028, HEIGHT - 3e-4), at(0.02, 0.02, HEIGHT - 2e-4), at(0.0, 0.0, 0.2))
     fem.problem.begin(Cases(touching(*shallow), np.zeros(3)))
@@ -37,7 +37,7 @@ def test_contact_forces_satisfy_their_equation(drag: float, rough: float) -> Non
     assert found.all() and not force[:, 2].any()
     between = soft.build_matrix(np.ones(n, bool))
     w = here + 1e-4 - 0.5 * (between + between.T) @ force
-    slope, touched = barrier.slope(w), (barrier.slope(here) != 0.0).reshape(n, 3, 3).any(axis=1)
+    slope, touched = barrier.compute_gradient(w), (barrier.compute_gradient(here) != 0.0).reshape(n, 3, 3).any(axis=1)
     for column in range(2):
         rows = np.repeat(touched[:, column], 3)
         stiff = drag / np.diag(between)[rows].mean()

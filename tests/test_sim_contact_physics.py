@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
-from sim.deformation import Deformation, Outcome, guess
+from sim.deformation import Deformation, Outcome, build_start
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, Retraction, ToolContact
 from sim.fem import Fem
@@ -253,7 +253,7 @@ def test_stored_result_is_an_equivalent_start(tmp_path: Path) -> None:
     np.savez(tmp_path / "frame.npz", displacement=straight[1].displacement, **straight[1].memory)  # pyright: ignore[reportArgumentType]
     with np.load(tmp_path / "frame.npz") as file:
         read = {name: file[name] for name in file.files}
-    again = replace(guess(read.pop("displacement")), memory=read)
+    again = replace(build_start(read.pop("displacement")), memory=read)
     size = np.abs(straight[-1].displacement).max()
     found = frames(fem, way[2:], again)[-1].displacement
     np.testing.assert_allclose(found, straight[-1].displacement, atol=1e-7 * size)

@@ -18,7 +18,7 @@ from sim.local_solvers.contact_limits import ContactLimits
 from sim.local_solvers.contact_steps import ContactSteps
 from sim.local_solvers.strained_part import StrainLimits
 from sim.material import Material
-from sim.minimisers.lbfgs import Descended
+from sim.minimisers.lbfgs import DescentResult
 from sim.tools import Ball
 
 HEIGHT, TOLERANCE = 0.03, 1e-7
@@ -42,7 +42,7 @@ def cases_at(number: int, memory: Mapping[str, Any]) -> Cases:
     return Cases(loads, np.full(1, float(number)), memory)
 
 
-def followed(fem: Fem, descent: ContactDescent, many: int) -> list[Descended]:
+def followed(fem: Fem, descent: ContactDescent, many: int) -> list[DescentResult]:
     """Along so much of the way, each from where the last one ended, with what is remembered of it."""
     u, out, memory = fem.problem.device.allocate(fem.problem.rows, 1), [], {}
     for number in range(many):
@@ -86,9 +86,9 @@ def test_replayed_contact_steps_agree_with_descent(
     found = fem.strategy.contact
     assert found is not None
     strains = StrainLimits(min_strain=least, max_omitted=np.inf)
-    ordinary, replayed = (replace(found, limits=limits, strains=strains, replays=which) for which in (False, True))
+    ordinary, replayed = (replace(found, limits=limits, strains=strains, uses_graphs=which) for which in (False, True))
     expected = followed(fem, ordinary, many)
-    taken = counted(monkeypatch, ContactSteps, "move_to_last_step")
+    taken = counted(monkeypatch, ContactSteps, "take_step")
     answers = followed(fem, replayed, many)
     for answer, other in zip(answers, expected, strict=True):
         assert answer.status[0] == other.status[0] and answer.steps[0] == other.steps[0]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_sim_head_masks import AXES, EDGE, MIDDLE, TUMOUR, grid, head, mgz, nifti
 
-from sim.bodies.head_masks import Sources, read_head_masks
+from sim.bodies.head_masks import MaskSources, read_head_masks
 from sim.bodies.label_map import read_labels
 from sim.bodies.label_volume import build_masked_subject
 from sim.errors import InputError
@@ -29,13 +29,13 @@ class TestConventions:
     @pytest.mark.parametrize("enhancing", [3, 4])
     def test_brats_labels_give_tumour_necrosis_and_oedema(self, tmp_path, enhancing):
         path = self.brats(tmp_path, enhancing)
-        masks = read_head_masks(Sources(path, convention="brats", mask=tmp_path / "t1.nii"))
+        masks = read_head_masks(MaskSources(path, convention="brats", mask=tmp_path / "t1.nii"))
         assert build_masked_subject(masks).tumour_volume == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.05)
         assert {name: int(mask.sum()) for name, mask in masks.parts.items()} == {
             "necrosis": (read_labels(path).layers == 1).sum(), "oedema": (read_labels(path).layers == 2).sum()
         }  # fmt: skip
         with pytest.raises(InputError, match="labels of brats do not mark the brain"):
-            read_head_masks(Sources(path, convention="brats"))
+            read_head_masks(MaskSources(path, convention="brats"))
 
     def test_cavity_label_is_not_part_of_tumour(self, tmp_path):
         affine, places = grid()
@@ -44,13 +44,13 @@ class TestConventions:
         nifti(tmp_path / "seg.nii", labels, affine)
         nifti(tmp_path / "t1.nii", head(places), affine)
         with pytest.raises(InputError, match=r"it has 3 and 4 together\. It looks like brats2015 or brats-post or"):
-            read_head_masks(Sources(tmp_path / "seg.nii", convention="brats", mask=tmp_path / "t1.nii"))
+            read_head_masks(MaskSources(tmp_path / "seg.nii", convention="brats", mask=tmp_path / "t1.nii"))
         masks = read_head_masks(
-            Sources(tmp_path / "seg.nii", tumour=(3,), convention="brats", mask=tmp_path / "t1.nii")
+            MaskSources(tmp_path / "seg.nii", tumour=(3,), convention="brats", mask=tmp_path / "t1.nii")
         )
         assert masks.tumour.sum() == (labels == 3).sum()
         for parts, noted in (({}, True), ({"ventricles": (4,)}, False)):
-            post = Sources(tmp_path / "seg.nii", convention="brats-post", mask=tmp_path / "t1.nii", parts=parts)
+            post = MaskSources(tmp_path / "seg.nii", convention="brats-post", mask=tmp_path / "t1.nii", parts=parts)
             notes = " ".join(read_head_masks(post).notes)
             assert ("1.7 ml are a cavity, label 4: " in notes and "--ventricles 4" in notes) == noted
 
@@ -73,17 +73,17 @@ class TestConventions:
         roles = ROLES[real]
         path = self.tumour(tmp_path, roles, **given)
         name = real.split()[0]
-        masks = read_head_masks(Sources(path, convention=name, mask=tmp_path / "t1.nii"))
+        masks = read_head_masks(MaskSources(path, convention=name, mask=tmp_path / "t1.nii"))
         assert masks.tumour.sum() == np.isin(read_labels(path).layers, [roles[0], roles[2]]).sum() > 0
         wrong = "brats" if name == "nnunet" else "nnunet"
         if name != "brats-ped":
             with pytest.raises(InputError, match=rf"is not labelled as {wrong} .* It looks like .*\b{name}\b"):
-                read_head_masks(Sources(path, convention=wrong, mask=tmp_path / "t1.nii"))
+                read_head_masks(MaskSources(path, convention=wrong, mask=tmp_path / "t1.nii"))
         if not given:  # numbers of one's own go before, with a note
             parts = {"oedema": (roles[0],)}
-            own = Sources(path, (), (roles[1], roles[2]), wrong, tmp_path / "t1.nii", parts=parts)
+            own = MaskSources(path, (), (roles[1], roles[2]), wrong, tmp_path / "t1.nii", parts=parts)
             assert "would be oedema and lies inside the tumour" in " ".join(read_head_masks(own).notes)
-            whole = read_head_masks(Sources(tmp_path / "t1.nii", brain=(1,), tumour_in=path))
+            whole = read_head_masks(MaskSources(tmp_path / "t1.nii", brain=(1,), tumour_file=path))
             assert "are all taken for tumour: name those of the core by --tumour" in " ".join(whole.notes)
 
     @pytest.mark.parametrize(("order", "fits"), [((1, 2, 3), True), ((3, 1, 2), False), ((3, 2, 1), False)])
@@ -93,7 +93,7 @@ class TestConventions:
         size = np.linalg.norm((places - MIDDLE) / [46.0, 55.0, 42.0], axis=-1)
         labels = np.select([size < 0.7, size < 0.9, size < 1.0], [order[2], order[1], order[0]], 0)
         labels[np.linalg.norm(places - TUMOUR, axis=-1) < 12.0] = 9
-        sources = Sources(nifti(tmp_path / "a.nii", labels.astype(np.int16), affine), tumour=(9,), convention="fsl")
+        sources = MaskSources(nifti(tmp_path / "a.nii", labels.astype(np.int16), affine), tumour=(9,), convention="fsl")
         with nullcontext() if fits else pytest.raises(InputError, match="label 3 lies outside of the others, "):
             read_head_masks(sources)
 
@@ -113,7 +113,7 @@ class TestConventions:
     @pytest.mark.parametrize("name", ["freesurfer", "synthseg"])
     def test_freesurfer_labels_give_brain_and_ventricles(self, tmp_path, name):
         path = self.aseg(tmp_path)
-        masks = read_head_masks(Sources(path, convention=name, tumour_in=tmp_path / "tumour.nii"))
+        masks = read_head_masks(MaskSources(path, convention=name, tumour_file=tmp_path / "tumour.nii"))
         subject = build_masked_subject(masks)
         assert masks.parts["ventricles"].any() and subject.notes == ()
         low, high = 1e3 * subject.cortex.min(axis=0), 1e3 * subject.cortex.max(axis=0)
@@ -122,21 +122,21 @@ class TestConventions:
     def test_mirrored_freesurfer_labels_are_rejected(self, tmp_path):
         path = self.aseg(tmp_path, mirrored=True)
         with pytest.raises(InputError, match=r"left half lie \d+ mm to the right of .* Its affine is mirrored, or"):
-            read_head_masks(Sources(path, convention="freesurfer", tumour_in=tmp_path / "tumour.nii"))
+            read_head_masks(MaskSources(path, convention="freesurfer", tumour_file=tmp_path / "tumour.nii"))
 
     def test_labels_of_another_program_are_rejected(self, tmp_path):
         aseg, brats, tumour = self.aseg(tmp_path), self.brats(tmp_path, 4), tmp_path / "tumour.nii"
         for sources, reason in (
             (
-                Sources(aseg, convention="brats", mask=tmp_path / "t1.nii"),
+                MaskSources(aseg, convention="brats", mask=tmp_path / "t1.nii"),
                 "it has 24, 41, 42 in addition. It looks like free",
             ),
             (
-                Sources(aseg, convention="fsl", tumour_in=tumour),
+                MaskSources(aseg, convention="fsl", tumour_file=tumour),
                 "it has 4, 24, 41, 42 in addition. It looks like freesurfer or",
             ),
-            (Sources(brats, convention="freesurfer", tumour_in=tumour), "it lacks 41. It looks like brats"),
-            (Sources(brats, convention="fsl", tumour_in=tumour), "it lacks 3. It looks like brats"),
+            (MaskSources(brats, convention="freesurfer", tumour_file=tumour), "it lacks 41. It looks like brats"),
+            (MaskSources(brats, convention="fsl", tumour_file=tumour), "it lacks 3. It looks like brats"),
         ):
             with pytest.raises(InputError, match=re.escape(reason)):
                 read_head_masks(sources)
@@ -146,7 +146,7 @@ class TestConventions:
         labels = head(places, brain=2, tumour=9)
         labels[(labels == 2) & (places[..., 2] > MIDDLE[2])] = 3
         path = nifti(tmp_path / "a.nii", labels, affine)
-        masks = read_head_masks(Sources(path, tumour=(9,), convention="fsl"))
+        masks = read_head_masks(MaskSources(path, tumour=(9,), convention="fsl"))
         assert masks.brain.sum() == np.isin(labels, (2, 3)).sum() and masks.tumour.sum() == (labels == 9).sum()
         with pytest.raises(InputError, match="no labels are called 'spm': choose one of brats, freesurfer"):
-            read_head_masks(Sources(path, convention="spm"))
+            read_head_masks(MaskSources(path, convention="spm"))

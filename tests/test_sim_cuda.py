@@ -27,7 +27,7 @@ from sim.fem import Fem
 from sim.linalg.pcg import BlockJacobi
 from sim.loads import Displaced, Loads, Touching, build_posture, push
 from sim.material import Material
-from sim.strategy.frame_sequence import Kept
+from sim.strategy.frame_sequence import DeviceWarmStart
 from sim.tools import Ball, Spatula
 from surrogate.data.tool_loads import draw
 
@@ -180,7 +180,7 @@ def test_cuda_block_jacobi_agrees_with_inverse(box):
     fem = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8), "cuda", element="p1")
     reference = fem.deform(pushes()).displacement
     plain = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8, inner=4000), "cuda", element="p1")
-    plan = replace(plain.plan, many=None)
+    plan = replace(plain.plan, batched=None)
     plain.strategy = replace(plain.strategy, preconditioner=BlockJacobi(plain.problem.device), plan=plan)
     np.testing.assert_allclose(plain.deform(pushes()).displacement, reference, atol=1e-6 * np.abs(reference).max())
 
@@ -191,9 +191,9 @@ def test_cuda_local_solution_agrees_with_whole_body():
     effects, loads = (Elasticity(), Held(), Slide(), ToolForce()), draw("mixed", anatomy, 150, 3)
     fem = Fem(anatomy, effects, replace(TRAIN, limit_strain=False), "cuda", element="p1")
     found = fem.deform(loads)
-    assert fem.strategy.near() is not None and all(outcome.good for outcome in found.outcome)
+    assert fem.strategy.build_batch_solver() is not None and all(outcome.good for outcome in found.outcome)
     assert (fem.residual(loads, found) <= 1.5 * TRAIN.tolerance).all()
-    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, many=None))
+    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, batched=None))
     plain = fem.deform(loads)
     assert np.median(found.iterations) < 0.7 * np.median(plain.iterations)
     largest = np.abs(plain.displacement).max(axis=(1, 2), keepdims=True)
@@ -209,7 +209,7 @@ def test_cuda_frame_sequence_agrees_with_cpu(box):
     for load in loads[1:]:
         answers.append(fem.deform(load, answers[-1]))
         other = host.deform(load, other)
-        assert isinstance(answers[-1].warm, Kept) and answers[-1].outcome == other.outcome
+        assert isinstance(answers[-1].warm, DeviceWarmStart) and answers[-1].outcome == other.outcome
         off = np.abs(answers[-1].displacement - other.displacement).max()
         assert off <= 0.02 * np.abs(other.displacement).max()  # both stop at LIVE's residual
     np.testing.assert_allclose(fem.residual(loads[-1], answers[-1]), answers[-1].residual, rtol=0.05)

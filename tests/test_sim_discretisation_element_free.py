@@ -10,7 +10,7 @@ from test_sim_smoothed import deflection
 from sim.accuracy import Accuracy
 from sim.deformation import Deformation
 from sim.discretisation.element import Elements
-from sim.discretisation.element_free import compute_shapes
+from sim.discretisation.element_free import compute_shape_functions
 from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held
 from sim.fem import Fem
@@ -28,7 +28,7 @@ TIGHT = Accuracy(tolerance=1e-6)
 
 
 def cells(mesh: TetMesh) -> Elements:
-    (part,) = discretise(mesh, ELEMENT).split_elements(np.ones(len(mesh.tets), bool))
+    (part,) = discretise(mesh, ELEMENT).build_elements(np.ones(len(mesh.tets), bool))
     return part.elements
 
 
@@ -62,8 +62,8 @@ def test_gradients_are_exact_for_linear_fields() -> None:
 
 def test_element_free_supports_cross_no_interface() -> None:
     elements = cells(TWO)
-    assert elements.size is not None and np.median(elements.size) >= 12 and elements.size.max() <= 40
-    used = np.arange(elements.table.shape[1]) < elements.size[:, None]
+    assert elements.sizes is not None and np.median(elements.sizes) >= 12 and elements.sizes.max() <= 40
+    used = np.arange(elements.table.shape[1]) < elements.sizes[:, None]
     for label in (0, 1):
         mine = TWO.region[elements.owner] == label
         assert np.isin(elements.table[mine][used[mine]], TWO.find_nodes(label)).all()
@@ -72,7 +72,7 @@ def test_element_free_supports_cross_no_interface() -> None:
 def test_element_free_shapes_interpolate_at_nodes() -> None:
     nodes = np.random.default_rng(0).uniform(size=(20, 14, 3))
     for a in range(14):
-        shape = compute_shapes(nodes[:, a], nodes, np.ones((20, 14), bool))
+        shape = compute_shape_functions(nodes[:, a], nodes, np.ones((20, 14), bool))
         np.testing.assert_allclose(shape, np.broadcast_to(np.eye(14)[a], shape.shape), atol=1e-4)
 
 

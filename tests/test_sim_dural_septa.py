@@ -12,7 +12,7 @@ from test_sim_head_masks import MIDDLE, grid, head, nifti
 from scenes.cli import main
 from sim.bodies.boundary_conditions import add_boundary_conditions
 from sim.bodies.dural_septa import Septum, find_fixed_vertices, synthesise_falx
-from sim.bodies.head_masks import Sources, read_head_masks
+from sim.bodies.head_masks import MaskSources, read_head_masks
 from sim.bodies.label_volume import build_masked_subject
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.open_cortex import open_cortex
@@ -37,7 +37,7 @@ def labels(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def subject(labels):
-    return build_masked_subject(read_head_masks(Sources(labels, (1,), (3,), parts={"falx": (7,)})))
+    return build_masked_subject(read_head_masks(MaskSources(labels, (1,), (3,), parts={"falx": (7,)})))
 
 
 @pytest.fixture(scope="module")
@@ -116,10 +116,10 @@ def test_craniotomy_over_falx_is_free(said, labels, subject):
 def test_falx_and_tentorium_labels_count_as_brain(labels, subject, tmp_path, capsys):
     assert subject.notes == () and [septum.name for septum in subject.septa] == ["falx"]
     with pytest.raises(InputError, match="label 3 is named by --tumour and by --tentorium"):
-        read_head_masks(Sources(labels, (1,), (3,), parts={"tentorium": (3,)}))
+        read_head_masks(MaskSources(labels, (1,), (3,), parts={"tentorium": (3,)}))
     for other in ("tentorium", "ventricles"):
         with pytest.raises(InputError, match=f"label 7 is named by --falx and by --{other}: give it to one of them"):
-            read_head_masks(Sources(labels, (1,), (3,), parts={"falx": (7,), other: (7,)}))
+            read_head_masks(MaskSources(labels, (1,), (3,), parts={"falx": (7,), other: (7,)}))
     assert main(["anatomy", "--falx", "7", "--out", str(tmp_path / "a.vtu")]) == 2
     assert "--falx belongs to a label volume" in capsys.readouterr().err
     words = ["patient", str(labels), "--tumour", "3", "--out", str(tmp_path / "a.vtu"), "--inspect"]

@@ -9,11 +9,11 @@ import pytest
 from conftest import make_box
 
 from sim.accuracy import LIVE
-from sim.deformation import guess
+from sim.deformation import build_start
 from sim.effects import Elasticity, Held, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, push
-from sim.strategy.extrapolation import BEFORE_KEY, PUSHES_KEY, as_pushes, compute_shares, extrapolate_start
+from sim.strategy.extrapolation import BEFORE_KEY, PUSHES_KEY, as_pushes, compute_factors, extrapolate_start
 
 EFFECTS = (Elasticity(), Held(), ToolForce())
 POINT, DOWN = np.array([2e-3, -1e-3, 0.0]), np.array([0.0, 0.0, -0.2])
@@ -39,7 +39,7 @@ def build_row(load: Loads) -> np.ndarray:
 
 
 def share_of(now: Loads, last: Loads, before: Loads) -> float:
-    return compute_shares(build_row(now), build_row(last), build_row(before))[0]
+    return compute_factors(build_row(now), build_row(last), build_row(before))[0]
 
 
 def test_extrapolation_share_follows_the_load():
@@ -100,7 +100,7 @@ def test_guessed_start_gives_no_extrapolation(body):
     fem = Fem(body, EFFECTS, LIVE, "cpu", element="p1")
     first = fem.deform(pushed(0.0))
     assert BEFORE_KEY not in first.warm
-    second = fem.deform(pushed(1e-3), guess(first.displacement))
+    second = fem.deform(pushed(1e-3), build_start(first.displacement))
     assert BEFORE_KEY not in second.warm
     np.testing.assert_allclose(fem.deform(pushed(2e-3), second).warm[BEFORE_KEY][0], second.displacement.ravel())
 

@@ -33,11 +33,11 @@ def build_block(cells=(4, 4, 4), share=1e-3, tissues=(BRAIN, STIFF), inner=True)
 def solve_fem(body, nodes, tissues):
     """Response (a, 3, n, 3) [m/N] of quadratic tetrahedra at small strain."""
     effects = [Elasticity(tissues[0], {2: tissues[1]}), Held(), NodalForce()]
-    force = np.zeros((len(body.acting), 3, len(body.fixed), 3))
-    force[np.arange(len(force)), :, body.acting] = 1e-6 * np.eye(3)
+    force = np.zeros((len(body.loaded), 3, len(body.fixed), 3))
+    force[np.arange(len(force)), :, body.loaded] = 1e-6 * np.eye(3)
     loads = Loads((Nodal(force.reshape(-1, *force.shape[2:])),))
     moved = Fem(body.anatomy, effects, REFERENCE, "cpu", element="p2").deform(loads, at=nodes)
-    return 1e6 * moved.displacement.reshape(len(body.acting), 3, -1, 3)
+    return 1e6 * moved.displacement.reshape(len(body.loaded), 3, -1, 3)
 
 
 def test_boundary_integrals_satisfy_somiglianas_identity() -> None:
@@ -84,7 +84,7 @@ def test_bar_under_uniform_traction_stretches_uniformly() -> None:
     top = np.flatnonzero(nodes[:, 2] > 0.1 - 1e-9)
     upper = body.anatomy.mesh.surface
     force = compute_vertex_areas(nodes, upper[np.isin(upper, top).all(axis=1)])[top]
-    moved = np.einsum("a,anj->nj", force, compute_response(replace(body, acting=top), np.arange(len(nodes)))[:, 2])
+    moved = np.einsum("a,anj->nj", force, compute_response(replace(body, loaded=top), np.arange(len(nodes)))[:, 2])
     low, high = (np.abs(nodes[:, 2] - level) < 1e-9 for level in (0.2 / 6, 0.4 / 6))
     strain = (moved[high] - moved[low]) / (0.2 / 6)
     np.testing.assert_allclose(strain * tissue.young, np.tile([0.0, 0.0, 1.0], (25, 1)), atol=0.05)
@@ -97,7 +97,7 @@ def test_response_converges_to_quadratic_tetrahedra(other: Material) -> None:
     for cells in (4, 8):
         body = build_block((cells,) * 3, tissues=tissues)
         nodes = body.anatomy.mesh.nodes
-        body = replace(body, acting=np.flatnonzero(np.linalg.norm(nodes - [0.05, 0.05, 0.1], axis=1) < 1e-9))
+        body = replace(body, loaded=np.flatnonzero(np.linalg.norm(nodes - [0.05, 0.05, 0.1], axis=1) < 1e-9))
         at = body.anatomy.tumour_nodes
         at = at[(np.abs(np.rint(nodes[at] / 0.025) - nodes[at] / 0.025) < 1e-6).all(axis=1)]
         response.append(compute_response(body, at))
@@ -109,8 +109,8 @@ def test_response_converges_to_quadratic_tetrahedra(other: Material) -> None:
 
 def test_response_is_nearly_reciprocal() -> None:
     body = build_block((6, 6, 6), share=0.99)
-    between = compute_response(body, body.acting).swapaxes(1, 2)
-    apart = ~np.eye(len(body.acting), dtype=bool)
+    between = compute_response(body, body.loaded).swapaxes(1, 2)
+    apart = ~np.eye(len(body.loaded), dtype=bool)
     difference = between - between.transpose(1, 0, 3, 2)
     assert 0.0 < np.linalg.norm(difference[apart]) < 0.05 * np.linalg.norm(between[apart])
 
@@ -124,7 +124,7 @@ def test_response_of_nearly_incompressible_pieces_is_finite() -> None:
     mesh = TetMesh(mesh.nodes, mesh.tets, np.where(pieces.all(axis=1), 2, 1))
     response = compute_response(replace(body, anatomy=hold(mesh, body.fixed)), np.arange(len(mesh.nodes)))
     assert np.isfinite(response).all() and (response[:, :, body.fixed] == 0.0).all()
-    work = np.einsum("aiai->a", response[:, :, body.acting])
+    work = np.einsum("aiai->a", response[:, :, body.loaded])
     assert (work > 0.0).all() and work.max() < 2.0 * work.min()
 
 
@@ -138,9 +138,9 @@ def test_boundary_elements_reject_unsupported_bodies() -> None:
         (replace(body, anatomy=hold(oedema, body.fixed), lame={**body.lame, 3: (1.0, 1.0)}), "different tissues"),
         (replace(body, fixed=body.fixed | middle), "fixed inside the body"),
         (replace(body, fixed=body.fixed & False), "no surface triangle"),
-        (replace(body, acting=np.flatnonzero(beside)), "acting has"),
-        (replace(body, acting=np.repeat(body.acting[:1], 2)), "acting has"),
-        (replace(body, acting=np.flatnonzero(body.fixed)[:1]), "acting has"),
+        (replace(body, loaded=np.flatnonzero(beside)), "acting has"),
+        (replace(body, loaded=np.repeat(body.loaded[:1], 2)), "acting has"),
+        (replace(body, loaded=np.flatnonzero(body.fixed)[:1]), "acting has"),
     ):
         with pytest.raises(InputError, match=message):
-            compute_response(other, body.acting)
+            compute_response(other, body.loaded)

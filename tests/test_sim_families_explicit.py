@@ -38,10 +38,10 @@ def test_condensed_table_is_limit_of_small_loads():
 def test_condensed_table_is_symmetric():
     """Maxwell's reciprocity: the response at b to a force at a is that at a to the same force at b."""
     from sim.families.condensed import compute_response
-    from sim.families.linear_body import build_body
+    from sim.families.linear_body import build_linear_body
 
-    body = build_body("here", BODY, EFFECTS)
-    table = compute_response(body, body.acting)
+    body = build_linear_body("here", BODY, EFFECTS)
+    table = compute_response(body, body.loaded)
     np.testing.assert_allclose(table, table.transpose(2, 3, 0, 1), atol=1e-9 * table.max())
 
 

@@ -10,7 +10,7 @@ from sim.accuracy import REFERENCE
 from sim.deformation import Outcome
 from sim.effects import build_push_effects
 from sim.families.models import RelaxationModel
-from sim.families.xpbd import XPBD, Substeps, group_tetrahedra, prepare
+from sim.families.xpbd import XPBD, Substeps, build_solver, group_tetrahedra
 from sim.fem import Fem
 from sim.loads import Loads, Pushed
 from sim.material import Material
@@ -21,13 +21,14 @@ PUSH = Loads((Pushed(np.zeros((1, 3)), np.array([[0.01, 0.0, -0.04]]), np.array(
 
 
 def solve(steps):
-    method = replace(XPBD, prepare=partial(prepare, settings=steps))
+    method = replace(XPBD, build_solver=partial(build_solver, settings=steps))
     return RelaxationModel("xpbd", BODY, EFFECTS, method, "cpu").deform(PUSH)
 
 
 def test_short_steps_reach_the_equilibrium_of_the_springs():
     exact = Fem(BODY, EFFECTS, REFERENCE, "cpu", element="springs").deform(PUSH).displacement
-    coarse, fine = solve(Substeps(count=100, step=4e-3, kept=0.9)), solve(Substeps(count=2000, step=2e-4, kept=0.99))
+    coarse = solve(Substeps(count=100, step=4e-3, velocity_factor=0.9))
+    fine = solve(Substeps(count=2000, step=2e-4, velocity_factor=0.99))
     errors = [np.abs(one.displacement - exact).max() / np.abs(exact).max() for one in (coarse, fine)]
     assert errors[1] < 0.02 < errors[0]
     assert fine.outcome[0] is Outcome.CONVERGED and fine.residual[0] < 0.01

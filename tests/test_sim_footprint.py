@@ -80,7 +80,7 @@ def test_last_footprint_is_reused_for_same_point_and_radius() -> None:
     nodes, triangles = sheet(300)
     skin = ContactSurface(nodes, triangles, find_device("cpu", "float64"))
     for point, radius in ((POINT, RADIUS), (POINT, 0.5 * RADIUS), (-POINT, 0.5 * RADIUS), (POINT, RADIUS)):
-        found = skin.press(point[None], np.array([radius])).to_matrix(len(nodes)).toarray()[0]
+        found = skin.find_footprints(point[None], np.array([radius])).to_matrix(len(nodes)).toarray()[0]
         np.testing.assert_allclose(found, weights(nodes, triangles, point, radius), atol=1e-15)
 
 
@@ -220,19 +220,21 @@ def test_finer_subdivision_changes_footprint_weights_little() -> None:
     device, point, radius = find_device("cpu", "float64"), np.zeros((1, 3)), np.array([5e-3])
     coarse, fine = (
         ContactSurface(nodes, triangles, device, division=EdgeSubdivision(max_edge_ratio=share))
-        .press(point, radius)
+        .find_footprints(point, radius)
         .to_matrix(len(nodes))
         for share in (0.12, 0.03)
     )
     assert 0.0 < np.abs((coarse - fine).toarray()).max() < 2e-3
     with pytest.raises(InputError, match="too small"):
-        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(max_subdivisions=1)).press(point, radius)
+        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(max_subdivisions=1)).find_footprints(
+            point, radius
+        )
 
 
 @pytest.mark.parametrize("mesh", [sheet(300), quadratic_sheet(60)], ids=["linear", "quadratic"])
 def test_footprint_centre_is_weighted_mean_of_nodes(mesh: tuple[np.ndarray, np.ndarray]) -> None:
     points, radii = np.array([POINT, [0.03, 0.0, 0.0]]), np.array([RADIUS, 0.007])
-    pressed = ContactSurface(*mesh, find_device("cpu", "float64")).press(points, radii)
+    pressed = ContactSurface(*mesh, find_device("cpu", "float64")).find_footprints(points, radii)
     np.testing.assert_allclose(pressed.compute_centres(), pressed.to_matrix(len(mesh[0])) @ mesh[0], atol=1e-16)
 
 
@@ -243,10 +245,10 @@ def test_footprint_follows_arrays_changed_in_place() -> None:
         POINT[None].copy(),
         np.array([RADIUS]),
     )
-    before = skin.press(points, radii)
-    assert skin.press(points.copy(), radii) is before  # nothing is integrated twice
+    before = skin.find_footprints(points, radii)
+    assert skin.find_footprints(points.copy(), radii) is before  # nothing is integrated twice
     points[0, 0] += 0.01
-    np.testing.assert_allclose(skin.press(points, radii).compute_centres(), points, atol=2e-3 * RADIUS)
+    np.testing.assert_allclose(skin.find_footprints(points, radii).compute_centres(), points, atol=2e-3 * RADIUS)
 
 
 @pytest.mark.gpu
@@ -256,7 +258,9 @@ def test_cuda_footprint_weights_agree_with_cpu(mesh: tuple[np.ndarray, np.ndarra
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-0.03, 0.03, (200, 2)), rng.uniform(-3e-4, 3e-4, 200)])
     radii = rng.uniform(5e-4, 0.016, 200)
-    here, there = (ContactSurface(*mesh, find_device(name, "float64")).press(points, radii) for name in ("cpu", "cuda"))
+    here, there = (
+        ContactSurface(*mesh, find_device(name, "float64")).find_footprints(points, radii) for name in ("cpu", "cuda")
+    )
     shares = (one.to_matrix(len(mesh[0])).toarray() for one in (there, here))
     np.testing.assert_allclose(*shares, atol=1e-12)
     np.testing.assert_allclose(there.compute_centres(), here.compute_centres(), atol=1e-14)

@@ -7,7 +7,7 @@ import pytest
 from conftest import make_box
 
 from sim.accuracy import LIVE, Accuracy
-from sim.deformation import Deformation, Outcome, guess
+from sim.deformation import Deformation, Outcome, build_start
 from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, ToolForce
 from sim.errors import InputError
@@ -16,8 +16,8 @@ from sim.loads import Loads, push, stack
 from sim.minimisers.lbfgs import HISTORY_KEYS
 from sim.strategy import frame_sequence
 from sim.strategy.captured_frame import MAX_FRAME_EVALUATIONS
-from sim.strategy.frame_sequence import Kept
-from sim.strategy.plan import can_follow
+from sim.strategy.frame_sequence import DeviceWarmStart
+from sim.strategy.plan import can_capture
 
 BODY = make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3)
 EFFECTS = (Elasticity(), Held(), ToolForce())
@@ -26,8 +26,8 @@ EFFECTS = (Elasticity(), Held(), ToolForce())
 def follower(accuracy: Accuracy = LIVE) -> Fem:
     """On the CPU, which by itself would not follow."""
     fem = Fem(BODY, EFFECTS, accuracy, "cpu", element="p1")
-    assert not fem.plan.frames
-    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, frames=True))
+    assert not fem.plan.captures_frames
+    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, captures_frames=True))
     return fem
 
 
@@ -58,7 +58,7 @@ def same(one: Deformation, other: Deformation) -> bool:
 def test_frame_sequence_agrees_with_standard_solver(fem):
     plain = Fem(BODY, EFFECTS, LIVE, "cpu", element="p1")
     for own, other in zip(ride(fem)[1:], ride(plain)[1:], strict=True):
-        assert isinstance(own.warm, Kept) and own.outcome == other.outcome == (Outcome.CONVERGED,)
+        assert isinstance(own.warm, DeviceWarmStart) and own.outcome == other.outcome == (Outcome.CONVERGED,)
         assert own.iterations[0] == other.iterations[0]
         np.testing.assert_allclose(own.displacement, other.displacement, atol=1e-4 * np.abs(other.displacement).max())
         np.testing.assert_allclose(own.reaction, other.reaction, rtol=1e-9, atol=1e-12)
@@ -109,21 +109,21 @@ def test_frame_that_fails_is_solved_by_standard_solver(fem):
     with pytest.raises(InputError, match="does not touch the surface"):
         fem.deform(pushed(0.5), last)
     lifted = fem.deform(pushed(4e-3, 0.0).scale(np.zeros(1)), last)
-    assert not lifted.displacement.any() and not isinstance(lifted.warm, Kept)
-    assert isinstance(fem.deform(pushed(4e-3), lifted).warm, Kept)
+    assert not lifted.displacement.any() and not isinstance(lifted.warm, DeviceWarmStart)
+    assert isinstance(fem.deform(pushed(4e-3), lifted).warm, DeviceWarmStart)
     vast = fem.deform(pushed(4e-3, 60.0), last)
-    assert not isinstance(vast.warm, Kept)
+    assert not isinstance(vast.warm, DeviceWarmStart)
     assert same(fem.deform(pushed(4e-3), last), fem.deform(pushed(4e-3), replace(last)))
 
 
 def test_unsuitable_start_is_solved_by_standard_solver(fem):
     rng, good = np.random.default_rng(0), ride(fem, 2)[-1]
-    torn = fem.deform(pushed(1e-3), guess(good.displacement + rng.normal(0.0, 0.1, good.displacement.shape)))
+    torn = fem.deform(pushed(1e-3), build_start(good.displacement + rng.normal(0.0, 0.1, good.displacement.shape)))
     assert torn.outcome == (Outcome.CONVERGED_ANEW,)
     loose = good.displacement.copy()
     loose[0, BODY.fixed.any(axis=1)] += 1e-4
-    assert not isinstance(fem.deform(pushed(1e-3), guess(loose)).warm, Kept)
-    assert isinstance(fem.deform(pushed(1e-3), guess(good.displacement)).warm, Kept)
+    assert not isinstance(fem.deform(pushed(1e-3), build_start(loose)).warm, DeviceWarmStart)
+    assert isinstance(fem.deform(pushed(1e-3), build_start(good.displacement)).warm, DeviceWarmStart)
 
 
 def test_start_may_list_its_vertices_in_any_order(fem):
@@ -145,5 +145,5 @@ def test_frame_at_selected_vertices_agrees_with_whole_frame(fem):
 
 def test_frame_sequence_requires_linear_elements_and_budget():
     linear, quadratic = (discretise(BODY.mesh, element) for element in ("p1", "p2"))
-    assert can_follow(linear, LIVE) and MAX_FRAME_EVALUATIONS > 20
-    assert not can_follow(linear, replace(LIVE, outer=5)) and not can_follow(quadratic, LIVE)
+    assert can_capture(linear, LIVE) and MAX_FRAME_EVALUATIONS > 20
+    assert not can_capture(linear, replace(LIVE, outer=5)) and not can_capture(quadratic, LIVE)

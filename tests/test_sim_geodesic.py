@@ -3,17 +3,17 @@
 import numpy as np
 
 from sim.bodies.bcc_lattice import build_graded_lattice
-from sim.bodies.isosurface_stuffing import build_whole, cut
+from sim.bodies.isosurface_stuffing import build_uncut_mesh, cut_mesh
 from sim.geometry.geodesic import compute_geodesic_distances
-from sim.geometry.tetmesh import find_single_faces
+from sim.geometry.tetmesh import find_boundary_faces
 
 
 def test_geodesic_distances_on_sphere_are_arcs():
     radius = 0.06
     lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
-    body = cut(build_whole(lattice), lambda points: np.linalg.norm(points, axis=1) - radius)
+    body = cut_mesh(build_uncut_mesh(lattice), lambda points: np.linalg.norm(points, axis=1) - radius)
     body = body.select(body.inside)
-    surface = find_single_faces(body.tets)
+    surface = find_boundary_faces(body.tets)
     source = radius * np.array([0.6, 0.0, 0.8])
     found = compute_geodesic_distances(body.nodes, surface, source, 0.08)
     outer = np.unique(surface)

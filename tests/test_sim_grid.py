@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sim.fields.folds import compute_jacobians, unfold
-from sim.fields.warp_fields import compute_faint_threshold, remove_faint, warp_fields
+from sim.fields.folds import compute_jacobians, unfold_field
+from sim.fields.warp_fields import compute_cutoff, compute_warp_fields, remove_negligible
 
 
 def bump(nodes, depth=5e-3, width=14e-3):
@@ -24,7 +24,7 @@ def moved(box):
 
 @pytest.fixture(scope="module")
 def fields(box, moved):
-    return warp_fields(box, moved, 1e-3)
+    return compute_warp_fields(box, moved, 1e-3)
 
 
 def errors(box, moved, fields):
@@ -43,16 +43,16 @@ def test_both_fields_map_vertices_to_their_positions(box, moved, fields):
 
 
 def test_faint_motion_is_set_to_zero_and_shrinks_the_grid(box, moved, fields):
-    rest = warp_fields(box, 1e-3 * moved, 1e-3)
-    faint = compute_faint_threshold(moved)
-    assert compute_faint_threshold(1e-3 * moved) == pytest.approx(2.5e-6 * np.linalg.norm(moved, axis=1).max())
-    assert compute_faint_threshold(1e-3 * moved) < faint <= 2e-5
-    size, left = np.linalg.norm(moved, axis=1), remove_faint(moved)
+    rest = compute_warp_fields(box, 1e-3 * moved, 1e-3)
+    faint = compute_cutoff(moved)
+    assert compute_cutoff(1e-3 * moved) == pytest.approx(2.5e-6 * np.linalg.norm(moved, axis=1).max())
+    assert compute_cutoff(1e-3 * moved) < faint <= 2e-5
+    size, left = np.linalg.norm(moved, axis=1), remove_negligible(moved)
     assert not left[size < faint].any() and np.array_equal(left[size > 2 * faint], moved[size > 2 * faint])
     assert np.linalg.norm(left - moved, axis=1).max() < 1.1 * faint
     assert np.prod(rest.grid.shape) < np.prod(fields.grid.shape) and rest.forward.any()
     still = np.where(box.mesh.nodes[:, :1] > 0.0, moved, 0.0)
-    half = warp_fields(box, still, 1e-3).grid
+    half = compute_warp_fields(box, still, 1e-3).grid
     assert half.shape[0] < fields.grid.shape[0]
 
 
@@ -94,7 +94,7 @@ def test_inverted_region_is_unfolded():
     field = np.stack([-4e-3 * x * core, 0.0 * y, 0.0 * z]).astype(np.float32)
     assert compute_jacobians(field, 1e-3).min() < -2.0
     inside = np.ones(field.shape[1:], bool)
-    assert unfold(field, inside, ~inside, 1e-3) == compute_jacobians(field, 1e-3).min() > 0.0
+    assert unfold_field(field, inside, ~inside, 1e-3) == compute_jacobians(field, 1e-3).min() > 0.0
 
 
 def test_unfolding_changes_field_outside_the_body_first():
@@ -104,15 +104,15 @@ def test_unfolding_changes_field_outside_the_body_first():
     assert compute_jacobians(field, 1e-3).min() < 0.0
     inside, collar = np.zeros((2, *field.shape[1:]), bool)
     free = field.copy()
-    assert unfold(free, inside, collar, 1e-3) == compute_jacobians(free, 1e-3).min() > 0.0
+    assert unfold_field(free, inside, collar, 1e-3) == compute_jacobians(free, 1e-3).min() > 0.0
     inside[:10] = True
     held = field.copy()
-    assert unfold(held, inside, collar, 1e-3) > 0.0
+    assert unfold_field(held, inside, collar, 1e-3) > 0.0
     moved = np.linalg.norm(held - field, axis=0)
     assert moved[10:].max() > 2.0 * moved[:10].max() and not moved[:4].any()
     collar[10] = True
     round_body = field.copy()
-    assert unfold(round_body, inside, collar, 1e-3) > 0.0
+    assert unfold_field(round_body, inside, collar, 1e-3) > 0.0
     assert np.linalg.norm(round_body - field, axis=0)[10].max() < 0.9 * moved[10].max()
 
 
@@ -125,8 +125,8 @@ def test_fold_at_any_corner_of_a_cell_is_found():
 
 def test_resected_tissue_is_marked_in_the_grid(box, moved):
     cut = np.flatnonzero(box.mesh.region == 2)
-    found = warp_fields(box, moved, 2e-3, box.remove_elements(cut))
+    found = compute_warp_fields(box, moved, 2e-3, box.remove_elements(cut))
     middle = box.mesh.nodes[box.mesh.tets[cut]].mean(axis=(0, 1))
-    place = tuple(np.rint(found.grid.index(middle)).astype(int))
-    assert found.resected[place] and not found.folds
-    assert not found.resected[tuple(np.rint(found.grid.index(middle + [0, 0, 14e-3])).astype(int))]
+    place = tuple(np.rint(found.grid.to_indices(middle)).astype(int))
+    assert found.resected[place] and not found.has_folds
+    assert not found.resected[tuple(np.rint(found.grid.to_indices(middle + [0, 0, 14e-3])).astype(int))]

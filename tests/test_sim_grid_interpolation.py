@@ -17,11 +17,11 @@ def moved(box):
 def test_grid_nodes_in_tetrahedra_interpolate_the_vertices(box, moved):
     grid = build_grid_around(box.mesh.nodes, 1.7e-3, 4e-3)
     field, inside = interpolate_in_tetrahedra(grid, box.mesh.nodes, box.mesh.tets, moved)
-    points = grid.compute_points(np.arange(inside.size))
+    points = grid.compute_positions(np.arange(inside.size))
     low, high = box.mesh.nodes.min(axis=0), box.mesh.nodes.max(axis=0)
     assert np.array_equal(inside.ravel(), ((points > low - 1e-9) & (points < high + 1e-9)).all(axis=1))
     some = np.flatnonzero(inside)[::37]
-    expected = locate(box.mesh, points[some]).read(moved[None])[0]
+    expected = locate(box.mesh, points[some]).interpolate(moved[None])[0]
     assert np.abs(field.reshape(3, -1)[:, some].T - expected).max() < 1e-8
     assert not field[:, ~inside].any()
 
@@ -32,7 +32,7 @@ def test_every_grid_node_on_a_shared_face_is_inside():
     tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
     grid = build_grid_around(nodes, 1e-3, 0.0)
     inside = interpolate_in_tetrahedra(grid, nodes, tets, nodes)[1]
-    points = 1e3 * grid.compute_points(np.arange(inside.size))
+    points = 1e3 * grid.compute_positions(np.arange(inside.size))
     x, y, z = points.T
     first = x + y + z <= 4 + 1e-9
     second = (x + y + z >= 4 - 1e-9) & (x - y + z <= 4 + 1e-9) & (x + y - z <= 4 + 1e-9) & (-x + y + z <= 4 + 1e-9)

@@ -16,7 +16,7 @@ from oracle import EVERY_LAW, internal_forces, tissue
 from sim.accuracy import TRAIN, Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
-from sim.deformation import Deformation, Outcome, guess
+from sim.deformation import Deformation, Outcome, build_start
 from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce
 from sim.errors import InputError
@@ -70,7 +70,7 @@ class Hard:
             element=self.element or ("p1" if self.mesh.middles is None else "p2"),
         )  # fmt: skip
         start = self.start if self.after is None else solved(self.after)
-        return fem.deform(Loads((Nodal(self.force[None]),)), None if start is None else guess(start[None]))
+        return fem.deform(Loads((Nodal(self.force[None]),)), None if start is None else build_start(start[None]))
 
     def residual(self, u: np.ndarray) -> float:
         """Of the whole load at u (V, 3) [m], against the larger of the load and the internal forces."""
@@ -323,7 +323,7 @@ REFUSED = {
     ),
     "a tolerance below double precision's floor": (lambda: Accuracy(tolerance=1e-15), "float64 reaches 1e-11"),
     "a start of another mesh": (
-        lambda: fem(base_held(BLOCK)).deform(Loads((Nodal(pressed()[None]),)), guess(np.zeros((1, 7, 3)))),
+        lambda: fem(base_held(BLOCK)).deform(Loads((Nodal(pressed()[None]),)), build_start(np.zeros((1, 7, 3)))),
         "start has displacements of shape",
     ),
     "more loads than memory holds": (lambda: _too_many(64), "at most"),

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim.bodies.head_masks import Sources, read_head_masks
+from sim.bodies.head_masks import MaskSources, read_head_masks
 from sim.bodies.label_volume import build_masked_subject, build_volume_subject
 from sim.bodies.subject import MeshPlan, SubjectPart, make_anatomy
 from sim.bodies.volume import read_volume
-from sim.bodies.voxels import Voxels
+from sim.bodies.voxels import VoxelSpec
 from sim.errors import InputError
 
 LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -181,7 +181,7 @@ def test_slicer_segmentation_agrees_with_reference_reader(name, layers):
 
     path = slicerio.get_testdata_file(f"{name}.seg.nrrd")
     values, header = reference.read(path)
-    found = read_volume(path, Voxels(max_edge=0.011), layered=True)
+    found = read_volume(path, VoxelSpec(max_edge=0.011), allow_layers=True)
     expected = np.moveaxis(values, 0, -1) if layers > 1 else values
     np.testing.assert_array_equal(found.values, expected)
     np.testing.assert_allclose(1e3 * found.affine[:3, 3], header["space origin"] * [-1, -1, 1])
@@ -194,7 +194,7 @@ def test_slicer_segmentation_agrees_with_reference_reader(name, layers):
     if layers > 1:
         assert (found.segments[7].name, found.segments[7].layer) == ("overlapping sphere", 1)
         with pytest.raises(InputError, match=r"its segments overlap, in 2 layers.*Export them as a label map"):
-            read_volume(path, Voxels(max_edge=0.011))
+            read_volume(path, VoxelSpec(max_edge=0.011))
 
 
 def test_segments_are_selected_by_their_names(tmp_path):
@@ -230,7 +230,7 @@ class TestSeveralFiles:
         return tmp_path
 
     def test_mask_on_another_grid_extends_the_labels(self, files):
-        sources = Sources(files / "tumour.nii.gz", tumour=(1,), mask=files / "brain.nii.gz")
+        sources = MaskSources(files / "tumour.nii.gz", tumour=(1,), mask=files / "brain.nii.gz")
         subject = build_masked_subject(read_head_masks(sources))
         assert subject.notes == ()
         assert np.linalg.norm(subject.pieces[0].centre - 1e-3 * TUMOUR) < 5e-4
@@ -240,7 +240,7 @@ class TestSeveralFiles:
     def test_tumour_is_read_from_another_file(self, files):
         affine, places = grid(AXES["oblique"])
         nrrd(files / "brain.nrrd", head(places, tumour=1), affine)
-        sources = Sources(files / "brain.nrrd", brain=(1,), tumour_in=files / "tumour.nii.gz")
+        sources = MaskSources(files / "brain.nrrd", brain=(1,), tumour_file=files / "tumour.nii.gz")
         subject = build_masked_subject(read_head_masks(sources))
         assert np.linalg.norm(subject.pieces[0].centre - 1e-3 * TUMOUR) < 5e-4
         assert subject.tumour_volume == pytest.approx(4 / 3 * np.pi * 0.012**3, rel=0.05)
@@ -258,7 +258,7 @@ class TestSeveralFiles:
         affine[:3, 3] += 0.0 if moved is None else moved
         nifti(files / "elsewhere.nii", np.asarray(image.dataobj), affine)
         with pytest.raises(InputError, match=reason) as caught:
-            read_head_masks(Sources(files / "elsewhere.nii", tumour=(1,), mask=files / "brain.nii.gz"))
+            read_head_masks(MaskSources(files / "elsewhere.nii", tumour=(1,), mask=files / "brain.nii.gz"))
         assert str(caught.value).count("(RAS)") == 2
 
     def test_grid_with_x_and_y_negated_is_rejected(self, tmp_path):
@@ -266,24 +266,24 @@ class TestSeveralFiles:
         brain = nifti(tmp_path / "brain.nii", (head(places + MIDDLE) > 0).astype(np.uint8), affine)
         tumour = nifti(tmp_path / "tumour.nii", (head(places + MIDDLE) == 3).astype(np.uint8), LPS @ affine)
         with pytest.raises(InputError, match=r"has the grid of .*, but with x and y negated"):
-            read_head_masks(Sources(tumour, tumour=(1,), mask=brain))
+            read_head_masks(MaskSources(tumour, tumour=(1,), mask=brain))
 
     def test_tumour_outside_the_mask_is_noted(self, tmp_path):
         affine, places = grid()
         brain = nifti(tmp_path / "brain.nii", (head(places, tumour=0) > 0).astype(np.uint8), affine)
         tumour = nifti(tmp_path / "tumour.nii", (head(places) == 3).astype(np.uint8), affine)
-        (note,) = read_head_masks(Sources(tumour, tumour=(1,), mask=brain)).notes
+        (note,) = read_head_masks(MaskSources(tumour, tumour=(1,), mask=brain)).notes
         assert re.fullmatch(r"7(\.\d)? ml of what is labelled lie outside of the mask: see that .*", note)
 
     def test_missing_or_contradicting_sources_are_rejected(self, files):
         tumour, brain = files / "tumour.nii.gz", files / "brain.nii.gz"
         nifti(files / "none.nii", np.zeros((5, 5, 5), np.uint8), np.eye(4))
         for sources, reason in (
-            (Sources(tumour, brain=(1,), mask=brain), "give only one of them"),
-            (Sources(tumour, mask=brain, tumour_in=tumour), "nothing is left"),
-            (Sources(tumour, tumour=(1,), mask=files / "none.nii"), "none.nii: is empty"),
-            (Sources(tumour, tumour=(1,)), "at least one label of the brain"),
-            (Sources(tumour, brain=(1,)), "at least one label of the tumour"),
+            (MaskSources(tumour, brain=(1,), mask=brain), "give only one of them"),
+            (MaskSources(tumour, mask=brain, tumour_file=tumour), "nothing is left"),
+            (MaskSources(tumour, tumour=(1,), mask=files / "none.nii"), "none.nii: is empty"),
+            (MaskSources(tumour, tumour=(1,)), "at least one label of the brain"),
+            (MaskSources(tumour, brain=(1,)), "at least one label of the tumour"),
         ):
             with pytest.raises(InputError, match=reason):
                 read_head_masks(sources)
@@ -297,7 +297,7 @@ def test_oedema_and_ventricles_become_regions(tmp_path):
     labels[(rim > 12.0) & (rim < 24.0) & (labels == 1)] = 5
     labels[np.linalg.norm(places - MIDDLE + [18.0, 0.0, 0.0], axis=-1) < 10.0] = 4
     path = nifti(tmp_path / "a.nii", labels, affine)
-    sources = Sources(path, (1,), (3,), parts={"oedema": (5,), "ventricles": (4,)})
+    sources = MaskSources(path, (1,), (3,), parts={"oedema": (5,), "ventricles": (4,)})
     masks = read_head_masks(sources)
     assert masks.brain.sum() == np.isin(labels, (1, 4, 5)).sum() and not build_masked_subject(masks).parts
     subject = build_masked_subject(masks, regions=("oedema", "ventricles"))
@@ -313,4 +313,4 @@ def test_oedema_and_ventricles_become_regions(tmp_path):
     ):
         build_masked_subject(masks, regions=("necrosis",))
     with pytest.raises(InputError, match="label 3 is named by --tumour and by --oedema"):
-        read_head_masks(Sources(path, (1,), (3,), parts={"oedema": (3,)}))
+        read_head_masks(MaskSources(path, (1,), (3,), parts={"oedema": (3,)}))

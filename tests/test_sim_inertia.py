@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
-from sim.deformation import Deformation, guess
+from sim.deformation import Deformation, build_start
 from sim.discretisation.problem import Problem
 from sim.discretisation.space import discretise
 from sim.discretisation.term import Cases
@@ -62,7 +62,7 @@ def test_rod_oscillates_with_its_analytic_period(element: str, cells: int) -> No
     fem = Fem(anatomy, effects, TIGHT, "cpu", element=element)
     x = anatomy.mesh.nodes[:, 0]
     end, step = x > LENGTH - 1e-9, period / 160
-    answer = guess(1e-4 * np.sin(np.pi * x / 2.0 / LENGTH)[None, :, None] * [1.0, 0.0, 0.0])
+    answer = build_start(1e-4 * np.sin(np.pi * x / 2.0 / LENGTH)[None, :, None] * [1.0, 0.0, 0.0])
     track = [1e-4]
     for _ in range(130):
         answer = after(fem, answer, 1, step)
@@ -90,7 +90,7 @@ def test_mode_decays_as_backward_euler_predicts(damping: float) -> None:
     fem = Fem(BLOCK, effects, TIGHT, "cpu", batch=2, element="p1")
     frequency, motion = mode(fem.problem, compute_lumped_mass(DENSITY, fem.space))
     steps = np.array([1e-4, 0.01, 1.1e-4, 1.0, 0.012])
-    answer = guess(np.repeat(motion[None], len(steps), axis=0))
+    answer = build_start(np.repeat(motion[None], len(steps), axis=0))
     q, speed = np.ones(len(steps)), np.zeros(len(steps))
     for number in range(1, 5):
         answer = fem.deform(at(*(number * steps)), answer)
@@ -106,7 +106,7 @@ def test_damped_free_flight_decays_exponentially() -> None:
     errors = []
     for steps in (10, 20):
         velocity = np.where(BLOCK.fixed, 0.0, 1.0)[None]
-        answer = guess(np.zeros_like(velocity))
+        answer = build_start(np.zeros_like(velocity))
         object.__setattr__(answer, "memory", {"inertia": velocity})
         answer = after(fem, answer, steps, 0.2 / steps)
         errors.append(answer.memory["inertia"][0, -1, 0] - np.exp(-1.0))
@@ -120,7 +120,7 @@ def plucked(poisson: float = 0.45) -> tuple[Fem, Deformation]:
     pull = Loads((Nodal(top_forces(BLOCK.mesh, np.array([1.0, 0.0, 0.5]))),))
     aside = Fem(BLOCK, effects, TIGHT, "cpu", element="p1").deform(pull)
     assert 0.01 < np.abs(aside.displacement).max() < 0.05
-    return Fem(BLOCK, [*effects, Inertia(DENSITY)], TIGHT, "cpu", element="p1"), guess(aside.displacement)
+    return Fem(BLOCK, [*effects, Inertia(DENSITY)], TIGHT, "cpu", element="p1"), build_start(aside.displacement)
 
 
 def test_inertia_is_first_order_in_the_time_step() -> None:
@@ -220,7 +220,7 @@ def asked(start: Deformation | None, time: float) -> Callable[[], object]:
 
 
 def strange() -> Deformation:
-    start = guess(np.zeros((1, len(BLOCK.mesh.nodes), 3)))
+    start = build_start(np.zeros((1, len(BLOCK.mesh.nodes), 3)))
     object.__setattr__(start, "memory", {"inertia": np.zeros((1, 5, 3))})
     return start
 
@@ -245,7 +245,7 @@ def test_preconditioner_includes_the_mass() -> None:
     force = top_forces(BLOCK.mesh, np.array([0.1, 0.0, 0.0]))
     assert after(fem, None, 1, 2.0**-13, force).iterations[0] <= 4
     device = find_device("cpu", "float64")
-    assert fem.problem.paced and not compile_problem([Elasticity(), Held()], BLOCK, device).paced
+    assert fem.problem.depends_on_step and not compile_problem([Elasticity(), Held()], BLOCK, device).depends_on_step
 
 
 def test_empty_batch_with_inertia_gives_empty_result() -> None:

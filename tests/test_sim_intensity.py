@@ -4,7 +4,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from sim.bodies.intensity import Intensity, Window, read_intensity, to_intensity_path, write_intensity
+from sim.bodies.intensity import GreyWindow, Intensity, read_intensity, to_intensity_path, write_intensity
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 
@@ -86,7 +86,9 @@ def test_non_finite_voxels_do_not_change_the_window():
         found = Intensity(np.where(wrong, value, grey), AFFINE).apply_window(brain())
         np.testing.assert_allclose(found[~wrong], usual[~wrong], atol=0.02)
         assert np.ptp(found[wrong]) == 0.0 and 0.3 < found[wrong][0] < 0.97
-    assert (Intensity(np.full(grey.shape, -7.0), AFFINE).apply_window(brain()) == np.float32(Window().flat_grey)).all()
+    assert (
+        Intensity(np.full(grey.shape, -7.0), AFFINE).apply_window(brain()) == np.float32(GreyWindow().flat_grey)
+    ).all()
 
 
 def test_intensity_without_cover_or_finite_values_is_rejected(tmp_path):

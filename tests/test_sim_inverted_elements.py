@@ -10,7 +10,7 @@ from test_sim_strategy import ACCURACY, MESH, fem, loads
 
 from sim.accuracy import Accuracy
 from sim.deformation import Outcome
-from sim.discretisation.inverted_elements import Inversion
+from sim.discretisation.inverted_elements import InversionCounter
 from sim.discretisation.space import discretise
 from sim.effects import Elasticity
 from sim.elements import ELEMENTS
@@ -56,7 +56,7 @@ def test_inverted_tetrahedra_are_counted(element: str, precision: str) -> None:
     through[alone] += 3.0 * (MESH.nodes.mean(axis=0) - MESH.nodes[alone])
     places = [MESH.nodes, turn, 1e-1 * MESH.nodes, MESH.nodes * [1.0, 1.0, -1.0], 0.0 * MESH.nodes, through]
     u = np.stack([space.interpolate_field(place - MESH.nodes).ravel() for place in places], axis=1)
-    count = Inversion(space, device).count(device.upload(u))
+    count = InversionCounter(space, device).count(device.upload(u))
     every = len(MESH.tets)
     np.testing.assert_array_equal(count[:5], [0, 0, 0, every, every])
     assert 1 <= count[5] <= touching.sum()

@@ -8,7 +8,7 @@ import pytest
 from test_sim_label_volume import AFFINES, ball, ellipsoid, grid
 
 from sim.bodies.label_map import read_labels
-from sim.bodies.voxels import Voxels
+from sim.bodies.voxels import VoxelSpec
 from sim.errors import InputError
 
 
@@ -17,11 +17,11 @@ def test_given_axes_of_oriented_file_are_ignored_with_note(tmp_path, form):
     image = nibabel.Nifti1Image(np.ones((4, 4, 4), np.int16), None)
     getattr(image, form)(np.eye(4), 1)
     nibabel.save(image, tmp_path / "l.nii")
-    read = read_labels(tmp_path / "l.nii", Voxels(axes="LPS"))
+    read = read_labels(tmp_path / "l.nii", VoxelSpec(axes="LPS"))
     assert read.notes == ("its own orientation is used: axes LPS are ignored",)
     np.testing.assert_array_equal(read.affine[:3, :3], 1e-3 * np.eye(3))
     nibabel.save(nibabel.MGHImage(np.ones((4, 4, 4), np.int16), np.eye(4)), tmp_path / "l.mgz")
-    assert read_labels(tmp_path / "l.mgz", Voxels(axes="LPS")).notes == read.notes
+    assert read_labels(tmp_path / "l.mgz", VoxelSpec(axes="LPS")).notes == read.notes
 
 
 def test_labels_with_round_off_are_rounded_with_a_note(tmp_path):

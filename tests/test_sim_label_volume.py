@@ -12,7 +12,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.label_volume import build_volume_subject
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.errors import InputError
-from sim.geometry.tetmesh import compute_dihedral_angles, compute_row_keys, find_single_faces
+from sim.geometry.tetmesh import compute_dihedral_angles, compute_row_keys, find_boundary_faces
 
 AXES = np.array([0.045, 0.055, 0.042])  # [m] half axes of the ellipsoid that stands for a brain
 MIDDLE = np.array([0.004, -0.020, 0.012])
@@ -68,7 +68,7 @@ def test_every_affine_gives_the_same_brain(tmp_path, kind):
     mesh = anatomy.mesh
     assert abs(len(mesh.nodes) - 3000) <= 300
     assert compute_dihedral_angles(mesh.nodes, mesh.tets).min() > 10.0
-    assert find_single_faces(mesh.tets).size and len(np.unique(mesh.tets)) == len(mesh.nodes)
+    assert find_boundary_faces(mesh.tets).size and len(np.unique(mesh.tets)) == len(mesh.nodes)
     for triangles in (mesh.surface, anatomy.tumour_surface):
         edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         assert set(np.unique(compute_row_keys(edges), return_counts=True)[1]) == {2}

@@ -15,7 +15,7 @@ from sim.effects import Effect, Elasticity, Held, NodalForce
 from sim.linalg.pcg import BlockJacobi
 from sim.linalg.preconditioner import build_rest_solver
 from sim.loads import Loads, Nodal
-from sim.minimisers.lbfgs import Descended, Lbfgs
+from sim.minimisers.lbfgs import DescentResult, Lbfgs
 from sim.minimisers.lbfgs_kernels import DONE, LIVE, NOT_FINITE, PAIRS, STOPPED
 from sim.minimisers.newton_cg import NewtonCG
 from sim.runtime.device import Device, find_device
@@ -35,7 +35,9 @@ def read_problem(device: Device, law: str = "stable-neo-hookean", total: np.ndar
     return problem
 
 
-def descended(problem: Problem, start: np.ndarray | None = None, tolerance: float = FINE, most: int = 300) -> Descended:
+def descended(
+    problem: Problem, start: np.ndarray | None = None, tolerance: float = FINE, most: int = 300
+) -> DescentResult:
     count = len(TOTAL) if start is None else start.shape[1]
     start = np.zeros((ROWS, count)) if start is None else start
     solver = build_rest_solver(problem)
@@ -117,11 +119,11 @@ def test_lbfgs_columns_are_independent(device: Device) -> None:
 
 def test_lbfgs_out_of_budget_returns_last_accepted_state(device: Device) -> None:
     found = descended(read_problem(device), most=6)
-    np.testing.assert_array_equal(found.left, np.flatnonzero(found.status != DONE))
-    assert len(found.left) >= 2
+    np.testing.assert_array_equal(found.unfinished, np.flatnonzero(found.status != DONE))
+    assert len(found.unfinished) >= 2
     _, free, scale = read_problem(device).residual(found.u)
     np.testing.assert_allclose(free[:-1] / scale[:-1], found.residual[:-1], rtol=1e-5)
-    assert (found.residual[found.left] > FINE).all()
+    assert (found.residual[found.unfinished] > FINE).all()
 
 
 def test_lbfgs_reports_non_finite_start(device: Device) -> None:
@@ -196,7 +198,7 @@ def test_lbfgs_column_also_ends_at_force_tolerance(device: Device) -> None:
     problem = read_problem(device)
     force = np.array([0.0, 1e-3, 0.0, 1e-4, 0.0, 0.0])
     start, count = device.allocate(ROWS, len(TOTAL)), len(TOTAL)
-    found = Lbfgs(problem, build_rest_solver(problem)).descend(start, np.full(count, FINE), 300, force=force)
+    found = Lbfgs(problem, build_rest_solver(problem)).descend(start, np.full(count, FINE), 300, force_tolerance=force)
     _, free, _ = read_problem(device).residual(found.u)
     assert (found.status == DONE).all() and (found.residual[[1, 3]] > 100.0 * FINE).all()
     assert (free[[1, 3]] <= force[[1, 3]]).all()
@@ -205,7 +207,7 @@ def test_lbfgs_column_also_ends_at_force_tolerance(device: Device) -> None:
 def test_lbfgs_stops_when_few_columns_remain(device: Device) -> None:
     problem = read_problem(device)
     start, count = device.allocate(ROWS, len(TOTAL)), len(TOTAL)
-    found = Lbfgs(problem, build_rest_solver(problem)).descend(start, np.full(count, FINE), 300, stragglers=0.4)
+    found = Lbfgs(problem, build_rest_solver(problem)).descend(start, np.full(count, FINE), 300, straggler_fraction=0.4)
     assert 1 <= (found.status == LIVE).sum() <= 2
     assert (found.residual[found.status == LIVE] < 1.0).all()
 
@@ -225,7 +227,7 @@ def test_known_gradient_replaces_the_first_evaluation(device: Device, law: str) 
     term = next(term for term in problem.terms if not term.constant)
     whole = term.add_gradient
     term.add_gradient = lambda u, out: (looks.append(1), whole(u, out))
-    found = Lbfgs(problem, solver).descend(start, tolerance, 300, ahead=(g, z))
+    found = Lbfgs(problem, solver).descend(start, tolerance, 300, initial_residual=(g, z))
     assert (found.steps[:-1] == plain.steps[:-1]).all()
     np.testing.assert_allclose(found.u.numpy(), plain.u.numpy(), atol=1e-9)
     assert len(looks) >= found.steps.max()

@@ -3,8 +3,8 @@
 import numpy as np
 
 from sim.bodies.bcc_lattice import build_graded_lattice
-from sim.bodies.manifold_repair import clean
-from sim.geometry.tetmesh import compute_row_keys, find_single_faces
+from sim.bodies.manifold_repair import select_manifold
+from sim.geometry.tetmesh import compute_row_keys, find_boundary_faces
 
 
 def test_bodies_that_share_only_an_edge_or_node_are_separated():
@@ -13,8 +13,8 @@ def test_bodies_that_share_only_an_edge_or_node_are_separated():
     for together in ((middle[:, :2] > 0).all(axis=1) | (middle[:, :2] < 0).all(axis=1), (middle > 0).all(axis=1)):
         other = together | (middle < 0).all(axis=1)
         tets = lattice.tets[other]
-        kept = tets[clean(tets)]
+        kept = tets[select_manifold(tets)]
         assert 0.2 * len(tets) < len(kept) < len(tets)
-        edges = find_single_faces(kept)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        edges = find_boundary_faces(kept)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         assert set(np.unique(compute_row_keys(edges), return_counts=True)[1]) == {2}
-    assert clean(lattice.tets).all()
+    assert select_manifold(lattice.tets).all()

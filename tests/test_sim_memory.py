@@ -16,7 +16,7 @@ ROWS = 3_000
 def group(folder: Path, most: str, used: int, cached: int) -> MemoryBudget:
     for name, text in (("max", most), ("current", str(used)), ("stat", f"anon 5\ninactive_file {cached}\nfile 9\n")):
         (folder / f"memory.{name}").write_text(f"{text}\n")
-    return MemoryBudget(group=folder)
+    return MemoryBudget(cgroup=folder)
 
 
 def test_control_group_limits_free_memory(tmp_path: Path) -> None:
@@ -24,7 +24,7 @@ def test_control_group_limits_free_memory(tmp_path: Path) -> None:
     plain = measure_host_bytes()
     assert measure_host_bytes(group(tmp_path, "50000000", 20_000_000, 3_000_000)) == 33_000_000
     assert measure_host_bytes(group(tmp_path, "max", 20_000_000, 0)) == pytest.approx(plain, rel=0.2)
-    assert measure_host_bytes(MemoryBudget(group=tmp_path / "none")) == pytest.approx(plain, rel=0.2)
+    assert measure_host_bytes(MemoryBudget(cgroup=tmp_path / "none")) == pytest.approx(plain, rel=0.2)
 
 
 @pytest.mark.parametrize(("batch", "count"), [(64, 2_000), (512, 400)])

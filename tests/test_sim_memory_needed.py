@@ -11,7 +11,7 @@ from sim.discretisation.space import discretise
 from sim.errors import InputError
 from sim.runtime.device import Device
 from sim.runtime.memory import estimate_column_bytes
-from sim.strategy.memory_needed import BYTES_PER_NODE, FIXED_BYTES, compute_needed, estimate_needed
+from sim.strategy.memory_needed import BYTES_PER_NODE, FIXED_BYTES, compute_memory, estimate_fem_memory
 
 SPACE = discretise(box((6, 6, 6)), "smoothed")
 TABLES = FIXED_BYTES + BYTES_PER_NODE["smoothed"] * SPACE.count
@@ -20,35 +20,35 @@ TABLES = FIXED_BYTES + BYTES_PER_NODE["smoothed"] * SPACE.count
 def test_gpu_memory_is_tables_inverse_and_loads() -> None:
     """An inverse takes half its square in double precision at first, and is kept in half precision."""
     rows, free = 3 * SPACE.count, 2**40
-    one = compute_needed(SPACE, CARD, 0, 1, 5, free)
-    assert one.peak == one.kept + one.column and one.kept == one.set_up == TABLES
-    assert one.column == estimate_column_bytes(rows, CARD)
-    many = compute_needed(SPACE, CARD, 0, 64, 5, free)
+    one = compute_memory(SPACE, CARD, 0, 1, 5, free)
+    assert one.peak == one.constant + one.per_load and one.constant == one.setup == TABLES
+    assert one.per_load == estimate_column_bytes(rows, CARD)
+    many = compute_memory(SPACE, CARD, 0, 64, 5, free)
     assert many.batch == 5  # no more than there are loads
-    assert many.peak - one.peak == 63 * one.column  # where 5 columns stand there is room for 64
-    assert compute_needed(SPACE, CARD, 0, 4, 5, free).peak - one.peak == 3 * one.column
-    inverted = compute_needed(SPACE, CARD, 50_000, 1, 1, free)
-    assert inverted.kept - TABLES == 2 * 50_000**2
-    assert 4 * 50_000**2 < inverted.set_up - inverted.kept < 7 * 50_000**2 and inverted.peak == inverted.set_up
-    wide = compute_needed(SPACE, Device("cuda:0", "float64"), 0, 1, 1, free)
-    assert wide.column == 2 * one.column and wide.kept - FIXED_BYTES == 2 * (one.kept - FIXED_BYTES)
+    assert many.peak - one.peak == 63 * one.per_load  # where 5 columns stand there is room for 64
+    assert compute_memory(SPACE, CARD, 0, 4, 5, free).peak - one.peak == 3 * one.per_load
+    inverted = compute_memory(SPACE, CARD, 50_000, 1, 1, free)
+    assert inverted.constant - TABLES == 2 * 50_000**2
+    assert 4 * 50_000**2 < inverted.setup - inverted.constant < 7 * 50_000**2 and inverted.peak == inverted.setup
+    wide = compute_memory(SPACE, Device("cuda:0", "float64"), 0, 1, 1, free)
+    assert wide.per_load == 2 * one.per_load and wide.constant - FIXED_BYTES == 2 * (one.constant - FIXED_BYTES)
 
 
 def test_gpu_overflow_is_rejected_with_fitting_batch() -> None:
     free = 2 * FIXED_BYTES
-    fits = compute_needed(SPACE, CARD, 0, None, 10**6, free).check_fits()
+    fits = compute_memory(SPACE, CARD, 0, None, 10**6, free).check_fits()
     assert fits.peak <= 0.9 * free and fits.batch > 100
     assert f"{fits.batch} loads together: about" in str(fits) and "of cuda:0, 2 GiB free" in str(fits)
     with pytest.raises(InputError, match=r"343 nodes .smoothed., 9999 loads together: .*: a --batch") as refusal:
-        compute_needed(SPACE, CARD, 0, 9999, 9999, free).check_fits()
+        compute_memory(SPACE, CARD, 0, 9999, 9999, free).check_fits()
     found = re.search(r"--batch of (\d+) fits", str(refusal.value))
     assert found
-    compute_needed(SPACE, CARD, 0, int(found[1]), 9999, free).check_fits()
+    compute_memory(SPACE, CARD, 0, int(found[1]), 9999, free).check_fits()
     with pytest.raises(InputError, match="--batch"):
-        compute_needed(SPACE, CARD, 0, int(found[1]) + 1, 9999, free).check_fits()
+        compute_memory(SPACE, CARD, 0, int(found[1]) + 1, 9999, free).check_fits()
     with pytest.raises(InputError, match=r"one load at a time.* free: take a coarser mesh, or a larger machine"):
-        compute_needed(SPACE, CARD, 50_000, 1, 1, free).check_fits()
+        compute_memory(SPACE, CARD, 50_000, 1, 1, free).check_fits()
 
 
 def test_needed_memory_is_not_estimated_on_cpu() -> None:
-    assert estimate_needed(base_held(SPACE.mesh), None, TRAIN, "cpu", None, 10**9) is None
+    assert estimate_fem_memory(base_held(SPACE.mesh), None, TRAIN, "cpu", None, 10**9) is None

@@ -10,7 +10,7 @@ from boxes import base_held, box
 
 from sim.bodies.meshfile import read_mesh
 from sim.errors import InputError
-from sim.runtime.file_limits import MeshBytes
+from sim.runtime.file_limits import MeshSizeLimits
 
 BODY = base_held(box((2, 2, 2), 0.02))
 
@@ -80,7 +80,7 @@ def test_hdf5_mesh_with_external_arrays_is_rejected(tmp_path: Path, name: str, w
 
 
 def test_hdf5_mesh_larger_than_allowed_ratio_is_rejected(tmp_path: Path) -> None:
-    path, few = tmp_path / "a.xdmf", MeshBytes(max_ratio=2, small=2**10)
+    path, few = tmp_path / "a.xdmf", MeshSizeLimits(max_ratio=2, min_limit=2**10)
     meshio.Mesh(BODY.mesh.nodes, [("tetra", BODY.mesh.tets)]).write(path)
     with h5py.File(path.with_suffix(".h5"), "r+") as file:
         file["more"] = np.random.default_rng(0).random(400_000)  # 3.2 MB, far more than the XML

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sim.bodies.bcc_lattice import build_graded_lattice
-from sim.bodies.isosurface_stuffing import build_whole, cut
-from sim.bodies.manifold_repair import clean, find_removable_tetrahedra
+from sim.bodies.isosurface_stuffing import build_uncut_mesh, cut_mesh
+from sim.bodies.manifold_repair import find_removable_tetrahedra, select_manifold
 from sim.bodies.mesh_smoothing import (
     Smoothing,
     compute_enclosed_volume,
@@ -15,7 +15,7 @@ from sim.bodies.mesh_smoothing import (
     prevent_folds,
 )
 from sim.bodies.signed_distance import project_onto_level
-from sim.geometry.tetmesh import compute_dihedral_angles, compute_signed_volumes, find_single_faces
+from sim.geometry.tetmesh import compute_dihedral_angles, compute_signed_volumes, find_boundary_faces
 
 RADIUS = 0.03
 
@@ -27,7 +27,7 @@ def ball(points):
 @pytest.fixture(scope="module")
 def body():
     lattice = build_graded_lattice(np.full(3, -0.04), np.full(3, 0.04), 0.008, 0, np.zeros_like)
-    made = cut(build_whole(lattice), ball)
+    made = cut_mesh(build_uncut_mesh(lattice), ball)
     return made.select(made.inside)
 
 
@@ -40,7 +40,7 @@ def test_smallest_sine_is_that_of_the_dihedral_angles(body):
 
 
 def test_surface_fit_reduces_distance_at_same_volume(body):
-    triangles = find_single_faces(body.tets)
+    triangles = find_boundary_faces(body.tets)
     movable = np.ones(len(body.nodes), bool)
     volume = 4 / 3 * np.pi * RADIUS**3
     moved = fit_nodes(body.nodes, triangles, ball, movable, volume)
@@ -56,7 +56,7 @@ def test_surface_fit_reduces_distance_at_same_volume(body):
 
 
 def test_nodes_that_would_invert_a_tetrahedron_are_not_moved(body):
-    inner = np.setdiff1d(np.arange(len(body.nodes)), find_single_faces(body.tets))
+    inner = np.setdiff1d(np.arange(len(body.nodes)), find_boundary_faces(body.tets))
     thrown, pushed = inner[0], np.setdiff1d(inner, body.tets[(body.tets == inner[0]).any(axis=1)])[0]
     moved = body.nodes.copy()
     moved[thrown] += 0.02
@@ -71,7 +71,7 @@ def test_nodes_that_would_invert_a_tetrahedron_are_not_moved(body):
 def test_smoothing_improves_angles_on_the_surface(body):
     rng = np.random.default_rng(1)
     surface = np.zeros(len(body.nodes), bool)
-    surface[find_single_faces(body.tets)] = True
+    surface[find_boundary_faces(body.tets)] = True
     nodes = body.nodes + rng.normal(scale=1.2e-3, size=body.nodes.shape)
     level = np.zeros(len(nodes))
 
@@ -91,9 +91,9 @@ def test_smoothing_improves_angles_on_the_surface(body):
 
 def test_removed_boundary_tetrahedra_leave_a_manifold(body):
     rough = body.tets[np.linalg.norm(body.nodes[body.tets].mean(axis=1), axis=1) < 0.7 * RADIUS]
-    rough = rough[clean(rough)]
+    rough = rough[select_manifold(rough)]
     everywhere = np.ones(len(rough), bool)
     gone = find_removable_tetrahedra(rough, everywhere)
     assert gone.any()
-    assert clean(rough[~gone]).all()
+    assert select_manifold(rough[~gone]).all()
     assert not find_removable_tetrahedra(rough, ~everywhere).any()

@@ -57,7 +57,7 @@ def test_mesh_without_tumour_detail_names_needed_nodes(tmp_path):
     enough = int(re.search(r"ask for (\d+)", str(caught.value))[1])
 
     def missed(nodes, most):
-        mesh = make_anatomy(subject, replace(plan, nodes=nodes, meshing=mesher.Meshing(largest_error=most))).mesh
+        mesh = make_anatomy(subject, replace(plan, nodes=nodes, meshing=mesher.Meshing(max_volume_error=most))).mesh
         return 1.0 - mesh.volumes[mesh.region == TUMOUR_LABEL].sum() / subject.tumour_volume
 
     assert missed(2000, 1.0) > 0.1 > abs(missed(enough, 0.1))

@@ -16,7 +16,7 @@ from sim.effects import Elasticity, Held, NodalForce, Resection, ToolForce
 from sim.fem import Fem
 from sim.loads import Loads, Resected, push
 from sim.resected_fem import build_fem
-from sim.strategy.frame_sequence import Kept
+from sim.strategy.frame_sequence import DeviceWarmStart
 
 BODY = base_held(box((4, 4, 4), 0.1))
 EFFECTS = Elasticity(), Held(), ToolForce(), NodalForce()
@@ -96,7 +96,7 @@ def test_resected_body_shared_by_threads_is_bit_identical() -> None:
 def test_results_on_device_are_kept_after_later_solves() -> None:
     """Frame after frame, each thread on its own path; warm data are read after others have moved on."""
     fem = Fem(BODY, (Elasticity(), Held(), ToolForce()), LIVE, "cpu", element="p1")
-    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, frames=True))
+    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, captures_frames=True))
 
     def work(thread: int) -> list[Deformation]:
         point, force = PLACES[thread], np.array([0.0, 0.05, -0.3])
@@ -108,7 +108,7 @@ def test_results_on_device_are_kept_after_later_solves() -> None:
         return answers
 
     found = together_and_alone(work)
-    assert isinstance(found[-1][1].warm, Kept)
+    assert isinstance(found[-1][1].warm, DeviceWarmStart)
     for one, other in found:
         same(one, other)
         assert all(np.array_equal(one.warm[name], other.warm[name]) for name in ("head", "known"))

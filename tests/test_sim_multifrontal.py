@@ -8,11 +8,11 @@ from boxes import base_held, box, hold
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
 from sim.effects import Elasticity, Held, Slide
-from sim.linalg.multifrontal import Factor, Factorisation, find_moved_nodes
+from sim.linalg.multifrontal import FactorSettings, SparseFactor, find_moved_nodes
 from sim.runtime.device import Precision, find_device
 
 CELLS = (6, 6, 6)
-FEW, STRIP = Factorisation().max_separate_sweeps, Factorisation().strip_size
+FEW, STRIP = FactorSettings().max_separate_sweeps, FactorSettings().strip_size
 EXACT = {"float32": 2e-5, "float64": 1e-12}
 
 
@@ -31,7 +31,7 @@ def system(anatomy: Anatomy) -> tuple[sp.csc_array, sp.csc_array]:
     return problem.rest_curvature(), problem.constraint.build_basis()
 
 
-def applied(factor: Factor, r: np.ndarray, precision: Precision, live: np.ndarray | None = None) -> np.ndarray:
+def applied(factor: SparseFactor, r: np.ndarray, precision: Precision, live: np.ndarray | None = None) -> np.ndarray:
     device = find_device("cpu", precision)
     out = device.allocate(*r.shape)
     factor.apply(device.upload(r), np.ones(r.shape[1], bool) if live is None else live, out)
@@ -41,7 +41,7 @@ def applied(factor: Factor, r: np.ndarray, precision: Precision, live: np.ndarra
 @pytest.mark.parametrize("precision", EXACT)
 def test_factor_is_inverse_over_free_motions(precision: Precision) -> None:
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
+    factor = SparseFactor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
     L, r = motions.toarray(), np.random.default_rng(0).normal(size=(stiffness.shape[0], FEW + 2))
     expected = L @ np.linalg.solve(L.T @ stiffness @ L, L.T @ r)
     for columns in (1, FEW, FEW + 2):  # sweeps, and products of matrices
@@ -53,7 +53,7 @@ def test_factor_is_inverse_over_free_motions(precision: Precision) -> None:
 @pytest.mark.parametrize("precision", EXACT)
 def test_compliance_agrees_with_solutions_of_unit_forces(precision: Precision) -> None:
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
+    factor = SparseFactor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
     rows = np.random.default_rng(1).choice(stiffness.shape[0], 2 * STRIP + 7, replace=False)
     unit = np.zeros((stiffness.shape[0], len(rows)))
     unit[rows, np.arange(len(rows))] = 1.0
@@ -68,7 +68,7 @@ def test_compliance_agrees_with_solutions_of_unit_forces(precision: Precision) -
 def test_factor_is_symmetric_in_single_precision(columns: int) -> None:
     """Conjugate gradients require it of every preconditioner, to round-off."""
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float32"))
+    factor = SparseFactor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float32"))
     r = np.random.default_rng(1).normal(size=(stiffness.shape[0], columns))
     gram = r.T @ applied(factor, r, "float32")
     np.testing.assert_allclose(gram, gram.T, atol=1e-6 * np.abs(gram).max())
@@ -77,7 +77,7 @@ def test_factor_is_symmetric_in_single_precision(columns: int) -> None:
 @pytest.mark.parametrize("count", [2, FEW + 3])
 def test_factor_solves_selected_columns(count: int) -> None:
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"), "float64")
+    factor = SparseFactor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"), "float64")
     r = np.random.default_rng(2).normal(size=(stiffness.shape[0], count))
     live = np.arange(count) != 1
     found, whole = applied(factor, r, "float64", live), applied(factor, r, "float64")
@@ -89,7 +89,7 @@ def test_factor_solves_selected_columns(count: int) -> None:
 def test_single_precision_factor_solves_forces_of_any_size(columns: int) -> None:
     """In a double-precision solver; a column without forces stays zero. Rounding depends on the processor."""
     stiffness, motions = system(sliding())
-    factor = Factor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"))
+    factor = SparseFactor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", "float64"))
     r = np.random.default_rng(4).normal(size=(stiffness.shape[0], columns)) * 10.0 ** (-60 * np.arange(1, columns + 1))
     r[:, 1:2] = 0.0
     found = motions.T @ stiffness @ applied(factor, r, "float64")
@@ -102,22 +102,24 @@ def test_single_precision_factor_is_positive_definite() -> None:
     stiff = np.where(np.arange(299) % 3 == 0, 1e10, 1.0)
     diagonal = np.append(stiff, 0.0) + np.append(1.0, stiff)
     matrix = sp.csc_array(sp.diags_array([-stiff, diagonal, -stiff], offsets=[-1, 0, 1]))
-    factor = Factor(matrix, sp.csc_array(sp.eye_array(300)), np.arange(300), find_device("cpu", "float64"))
+    factor = SparseFactor(matrix, sp.csc_array(sp.eye_array(300)), np.arange(300), find_device("cpu", "float64"))
     gram = applied(factor, np.eye(300), "float64")
     assert np.linalg.eigvalsh(gram / np.abs(gram).max())[0] > -1e-7
 
 
 def test_factor_solves_disconnected_blocks() -> None:
     matrix = sp.csc_array(sp.block_diag([np.array([[2.0, -1.0], [-1.0, 2.0]])] * 200))
-    factor = Factor(matrix, sp.csc_array(sp.eye_array(400)), np.arange(400), find_device("cpu", "float64"), "float64")
+    factor = SparseFactor(
+        matrix, sp.csc_array(sp.eye_array(400)), np.arange(400), find_device("cpu", "float64"), "float64"
+    )
     r = np.random.default_rng(3).normal(size=(400, 1))
     np.testing.assert_allclose(matrix @ applied(factor, r, "float64"), r, rtol=1e-12)
 
 
 def test_factor_of_one_or_no_unknown_is_exact() -> None:
-    one = Factor(sp.csc_array([[4.0]]), sp.csc_array([[1.0]]), np.zeros(1, int), find_device("cpu", "float64"))
+    one = SparseFactor(sp.csc_array([[4.0]]), sp.csc_array([[1.0]]), np.zeros(1, int), find_device("cpu", "float64"))
     assert applied(one, np.array([[2.0, 6.0]]), "float64").tolist() == [[0.5, 1.5]]
-    none = Factor(sp.csc_array(np.eye(3)), sp.csc_array((3, 0)), np.zeros(0, int), find_device("cpu", "float64"))
+    none = SparseFactor(sp.csc_array(np.eye(3)), sp.csc_array((3, 0)), np.zeros(0, int), find_device("cpu", "float64"))
     for columns in (1, FEW + 1):
         assert not applied(none, np.ones((3, columns)), "float64").any()
 
@@ -128,9 +130,9 @@ def test_singular_stiffness_is_rejected() -> None:
     stiffness, _ = system(anatomy)
     every = sp.csc_array(sp.eye_array(stiffness.shape[0]))
     with pytest.raises(RuntimeError, match="positive definite"):
-        Factor(stiffness, every, find_moved_nodes(every), find_device("cpu", "float32"))
+        SparseFactor(stiffness, every, find_moved_nodes(every), find_device("cpu", "float32"))
     with pytest.raises(RuntimeError, match="positive definite"):
-        Factor(sp.csc_array(-stiffness), every, find_moved_nodes(every), find_device("cpu", "float64"))
+        SparseFactor(sp.csc_array(-stiffness), every, find_moved_nodes(every), find_device("cpu", "float64"))
     nothing = sp.csc_array((3, 3))
     with pytest.raises(RuntimeError, match="positive definite"):
-        Factor(nothing, sp.csc_array(sp.eye_array(3)), np.zeros(3, int), find_device("cpu", "float64"))
+        SparseFactor(nothing, sp.csc_array(sp.eye_array(3)), np.zeros(3, int), find_device("cpu", "float64"))

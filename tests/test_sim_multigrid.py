@@ -10,9 +10,9 @@ from sim.compile import compile_problem
 from sim.discretisation.problem import Problem
 from sim.discretisation.space import discretise
 from sim.effects import Elasticity, Held, Slide
-from sim.linalg.multigrid import TwoLevel
+from sim.linalg.multigrid import TwoLevelCycle
 from sim.linalg.pcg import BlockJacobi, Preconditioner
-from sim.linalg.preconditioner import Preconditioning, choose_preconditioner, explain_no_factor
+from sim.linalg.preconditioner import Preconditioning, choose_preconditioner, explain_factor_failure
 from sim.material import Material
 from sim.runtime.device import Precision, find_device
 
@@ -70,7 +70,7 @@ def spread(K: np.ndarray, M: np.ndarray) -> float:
 @pytest.mark.parametrize("kind", ["p2", "tetra10", "smoothed"])
 def test_two_level_is_symmetric_positive_and_close(kind: str, poisson: float) -> None:
     problem, preconditioner = built(kind, poisson, (2, 2, 3))
-    assert isinstance(preconditioner, TwoLevel)
+    assert isinstance(preconditioner, TwoLevelCycle)
     K, M = matrices(problem, preconditioner)
     assert np.abs(M - M.T).max() < 1e-6 * np.abs(M).max()  # the coarse factor is kept in single precision
     assert np.linalg.eigvalsh((M + M.T) / 2.0).min() > 0.0
@@ -115,7 +115,9 @@ def test_converged_columns_do_not_change_live_ones(kind: str) -> None:
 
 def test_out_of_memory_and_free_body_have_separate_messages():
     full = RuntimeError("Failed to allocate 21322944 bytes on device 'cuda:0'")
-    assert explain_no_factor(full, "cuda:0").startswith(
+    assert explain_factor_failure(full, "cuda:0").startswith(
         "cuda:0 has too little free memory for this mesh: end what else runs"
     )
-    assert explain_no_factor(RuntimeError("a pivot is 0"), "cpu").endswith("(a pivot is 0): fix or support every part.")
+    assert explain_factor_failure(RuntimeError("a pivot is 0"), "cpu").endswith(
+        "(a pivot is 0): fix or support every part."
+    )

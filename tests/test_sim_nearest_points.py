@@ -35,7 +35,7 @@ def test_triangle_through_blade_has_negative_distance() -> None:
     )
     np.testing.assert_allclose(near.distance, [-0.5, -0.7, 0.5, np.hypot(3.0, 0.5)])
     np.testing.assert_allclose(near.normal[:3], [[0.0, 0.0, -1.0]] * 3, atol=1e-12)
-    np.testing.assert_allclose(near.share[1], [0.0, 1.0, 0.0])
+    np.testing.assert_allclose(near.barycentric[1], [0.0, 1.0, 0.0])
     distance, normal = blade.compute_distances(np.array([tilted] * 2), np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
     np.testing.assert_allclose(distance, [-0.7, 0.2])
     np.testing.assert_allclose(normal, [[0.0, 0.0, -1.0]] * 2, atol=1e-12)

@@ -40,7 +40,7 @@ def read_problem(device: Device, law: str = "stable-neo-hookean") -> Problem:
     material = tissue(law)
     plain = compile_problem([Elasticity(material), Held(), NodalForce()], ANATOMY, device)
     extra = Spring(device, ROWS, 0.5), Wall(device, MESH.nodes, CEILING, 1.5e-3, 1e4)
-    return Problem((*plain.terms, *extra), plain.constraint, device, plain.impose)
+    return Problem((*plain.terms, *extra), plain.constraint, device, plain.build_imposed)
 
 
 # From nothing through a hair to a press, and pulls into the wall: they are done at different steps.
@@ -263,10 +263,10 @@ class Scaled:
     def keep(self, device: Device, columns: np.ndarray) -> None:
         self.plain.keep(device, columns)
 
-    def find(
+    def find_direction(
         self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
     ) -> Direction:
-        found = self.plain.find(problem, u, g, gap, forcing, taken)
+        found = self.plain.find_direction(problem, u, g, gap, forcing, taken)
         return replace(found, d=problem.device.upload(self.times(taken) * found.d.numpy()))
 
 

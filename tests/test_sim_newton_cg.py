@@ -11,9 +11,9 @@ from sim.discretisation.term import Cases
 from sim.effects import Elasticity, Held, NodalForce
 from sim.linalg.preconditioner import build_rest_solver
 from sim.loads import Loads, Nodal, Prescribed
-from sim.minimisers.line_search import search
+from sim.minimisers.line_search import search_line
 from sim.minimisers.newton import find_equilibrium
-from sim.minimisers.newton_cg import Descent, Direction, NewtonCG
+from sim.minimisers.newton_cg import DescentMethod, Direction, NewtonCG
 from sim.runtime.device import Device
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
@@ -27,7 +27,7 @@ def read_problem(device: Device, law: str = "stable-neo-hookean") -> Problem:
     return compile_problem([Elasticity(tissue(law)), Held(), NodalForce()], ANATOMY, device)
 
 
-def descent_of(problem: Problem) -> Descent:
+def descent_of(problem: Problem) -> DescentMethod:
     return NewtonCG(build_rest_solver(problem), 400)
 
 
@@ -36,15 +36,15 @@ def begun(problem: Problem, loads: Loads = LOADS) -> Problem:
     return problem
 
 
-def walk(problem: Problem, descent: Descent, steps: int) -> list[tuple[np.ndarray, np.ndarray, Direction]]:
+def walk(problem: Problem, descent: DescentMethod, steps: int) -> list[tuple[np.ndarray, np.ndarray, Direction]]:
     """(u, g, direction) of the first steps of all columns from rest."""
     u, taken, path = problem.device.allocate(ROWS, len(TOTAL)), np.ones(len(TOTAL)), []
     descent.begin()
     for _ in range(steps):
         g, _, _ = problem.residual(u)
-        found = descent.find(problem, u, g, None, np.full(len(TOTAL), 1e-9), taken)
+        found = descent.find_direction(problem, u, g, None, np.full(len(TOTAL), 1e-9), taken)
         path.append((u.numpy().copy(), g.numpy().copy(), found))
-        taken = search(problem, u, found)
+        taken = search_line(problem, u, found)
         u = problem.device.upload(u.numpy() + taken * found.d.numpy())
     return path
 
@@ -54,7 +54,7 @@ def test_newton_cg_directions_are_downhill_and_predict_slope(device: Device) -> 
     for _, g, found in walk(problem, descent_of(problem), 8):
         slope = (g * found.d.numpy()).sum(axis=0)
         assert (slope < 0.0).all()
-        np.testing.assert_allclose(found.predicted, -slope, rtol=1e-9)
+        np.testing.assert_allclose(found.decrease, -slope, rtol=1e-9)
 
 
 def test_newton_cg_forgets_memory_of_removed_columns(device: Device) -> None:
@@ -69,18 +69,18 @@ def test_newton_cg_forgets_memory_of_removed_columns(device: Device) -> None:
     apart.begin()
     for step in range(4):
         g, _, _ = alone.residual(u)
-        found = apart.find(alone, u, g, None, np.full(3, 1e-9), taken)
+        found = apart.find_direction(alone, u, g, None, np.full(3, 1e-9), taken)
         np.testing.assert_allclose(
             found.d.numpy(), path[step][2].d.numpy()[:, rows], atol=1e-8 * np.abs(found.d.numpy()).max()
         )
-        taken = search(alone, u, found)
+        taken = search_line(alone, u, found)
         u = device.upload(u.numpy() + taken * found.d.numpy())
     whole.keep(device, rows)
     problem.keep(rows)
     g, _, _ = problem.residual(u)
-    kept = whole.find(problem, u, g, None, np.full(3, 1e-9), taken).d.numpy()
+    kept = whole.find_direction(problem, u, g, None, np.full(3, 1e-9), taken).d.numpy()
     np.testing.assert_allclose(
-        kept, apart.find(alone, u, g, None, np.full(3, 1e-9), taken).d.numpy(), atol=1e-8 * np.abs(kept).max()
+        kept, apart.find_direction(alone, u, g, None, np.full(3, 1e-9), taken).d.numpy(), atol=1e-8 * np.abs(kept).max()
     )
 
 
@@ -107,10 +107,10 @@ def test_trust_radius_follows_accepted_steps(device: Device) -> None:
 
     descent, u = NewtonCG(build_rest_solver(problem), 400), device.allocate(ROWS, 5)
     g, _, _ = problem.residual(u)
-    first = descent.find(problem, u, g, None, np.full(5, 1e-9), np.ones(5)).d.numpy()
-    second = descent.find(problem, u, g, None, np.full(5, 1e-9), np.full(5, 0.1)).d.numpy()
+    first = descent.find_direction(problem, u, g, None, np.full(5, 1e-9), np.ones(5)).d.numpy()
+    second = descent.find_direction(problem, u, g, None, np.full(5, 1e-9), np.full(5, 0.1)).d.numpy()
     np.testing.assert_allclose(size(second), 0.2 * size(first), rtol=1e-8)
-    third = descent.find(problem, u, g, None, np.full(5, 1e-9), np.ones(5)).d.numpy()
+    third = descent.find_direction(problem, u, g, None, np.full(5, 1e-9), np.ones(5)).d.numpy()
     np.testing.assert_allclose(size(third), 0.4 * size(first), rtol=1e-8)
-    misled = descent.find(problem, u, g, None, np.full(5, 1e-9), np.zeros(5)).d.numpy()
+    misled = descent.find_direction(problem, u, g, None, np.full(5, 1e-9), np.zeros(5)).d.numpy()
     np.testing.assert_allclose(misled, first, atol=1e-8 * np.abs(first).max())

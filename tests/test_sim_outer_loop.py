@@ -35,8 +35,8 @@ def test_batch_solver_passes_on_unconverged_columns() -> None:
     near = build_batch_elimination(fem.problem, build_rest_solver(fem.problem), effects, space)
     assert near is not None
     for cycles in (12, 3):
-        some = replace(near, limits=CycleLimits(cycles=cycles))
-        fem.strategy = replace(fem.strategy, near=lambda some=some: some)
+        some = replace(near, limits=CycleLimits(max_cycles=cycles))
+        fem.strategy = replace(fem.strategy, build_batch_solver=lambda some=some: some)
         found = fem.deform(loads_of(many))
         assert all(outcome.good for outcome in found.outcome)
         assert (found.iterations != plain.iterations).any()
@@ -68,4 +68,4 @@ def test_stagnating_cycle_is_passed_on_to_next_solver() -> None:
         problem.device.allocate(problem.rows, 1), np.zeros(1), 100
     )
     assert found.status[0] == LIVE and found.residual[0] < 1e-12
-    assert found.steps[0] <= CycleLimits().cycles and found.steps[0] < 20 + CycleLimits().patience
+    assert found.steps[0] <= CycleLimits().max_cycles and found.steps[0] < 20 + CycleLimits().patience

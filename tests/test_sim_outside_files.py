@@ -21,11 +21,11 @@ from sim.bodies.vtu_size import check_vtu_size
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 from sim.material import BRAIN, read_tissue_json, to_tissue_json
-from sim.runtime.file_limits import MeshBytes
-from sim.runtime.outside_files import read_as
+from sim.runtime.file_limits import MeshSizeLimits
+from sim.runtime.outside_files import wrap_errors
 
 BODY = base_held(box((2, 2, 2), 0.02))
-FEW = MeshBytes(max_bytes=2**22)
+FEW = MeshSizeLimits(max_bytes=2**22)
 
 
 def fattened(path: Path, megabytes: int) -> Path:
@@ -100,7 +100,7 @@ class TestMeshes:
         fattened(tmp_path / "a.vtu", 64)
         with memory_below(2**24), pytest.raises(InputError, match=r"take more than 0\.00419 GB"):
             read_mesh(tmp_path / "a.vtu", limits=FEW)
-        assert MeshBytes().max_bytes > 2**31
+        assert MeshSizeLimits().max_bytes > 2**31
 
     def test_mesh_file_above_size_limit_is_rejected(self, tmp_path: Path) -> None:
         for name in ("a.vtu", "a.inp"):
@@ -108,7 +108,7 @@ class TestMeshes:
             os.truncate(tmp_path / name, 60 * 10**9)  # of which the disk holds nothing
             with pytest.raises(InputError, match=r"size is 60 GB: at most 4\.29 GB are allowed\. Mesh coarser"):
                 read_mesh(tmp_path / name)
-        assert MeshBytes().limit_bytes(10) == 2**28 and MeshBytes().limit_bytes(2**23) == 100 * 2**23
+        assert MeshSizeLimits().limit_bytes(10) == 2**28 and MeshSizeLimits().limit_bytes(2**23) == 100 * 2**23
 
     @pytest.mark.parametrize("packing", ["zlib", "lzma"])
     def test_a_bomb_is_refused_before_it_is_inflated(self, tmp_path: Path, packing: str) -> None:
@@ -249,11 +249,11 @@ def test_invalid_tissue_json_is_rejected(text: str) -> None:
 )
 def test_exceptions_of_libraries_become_input_errors(error: BaseException, reason: str) -> None:
     sentence = rf"a\.x: cannot be read as a thing: .*{reason}.*\. Make one\."
-    with pytest.raises(InputError, match=sentence) as caught, read_as("a.x", "a thing", "Make one."):
+    with pytest.raises(InputError, match=sentence) as caught, wrap_errors("a.x", "a thing", "Make one."):
         raise error
     assert not re.search(r"4 GiB|depth|-3|99|encrypted|library", str(caught.value))
 
 
 def test_keyboard_interrupt_is_not_converted() -> None:
-    with pytest.raises(KeyboardInterrupt), read_as("a.x", "a thing", "Make one."):
+    with pytest.raises(KeyboardInterrupt), wrap_errors("a.x", "a thing", "Make one."):
         raise KeyboardInterrupt

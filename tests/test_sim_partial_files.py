@@ -10,7 +10,7 @@ from tiny_work import tiny_run
 from scenes.episodes.engine import find_still_missing
 from scenes.episodes.run_folder import RunSettings, begin, list_finished, read_run, to_episode_name
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.partial_files import remove_left_overs
+from sim.runtime.partial_files import remove_partial_files
 
 
 def test_leftovers_of_dead_processes_only_are_removed(tmp_path):
@@ -33,7 +33,7 @@ def test_leftovers_of_dead_processes_only_are_removed(tmp_path):
         (tmp_path / f".sulcus-{machine}-{dead.pid}-0003" / "body.vtu").touch()
         begin(tmp_path, tiny_run(), PLAN)
         assert {name for name, stays in names.items() if stays} == {p.name for p in tmp_path.glob(".*")}
-    remove_left_overs(tmp_path, stale=-1.0)
+    remove_partial_files(tmp_path, max_age=-1.0)
     assert [path.name for path in tmp_path.glob(".*")] == [".sulcus-notes"]
 
 
@@ -52,6 +52,6 @@ def test_leftovers_are_identified_without_file_times(tmp_path, monkeypatch):
     ):
         path.touch()
         os.utime(path, (time, time))
-    remove_left_overs(tmp_path)
+    remove_partial_files(tmp_path)
     tally, missing = find_still_missing(tmp_path, list_finished(tmp_path), range(3), True)
     assert (tally.skipped, missing) == (2, [1]) and left.exists()

@@ -13,7 +13,7 @@ from sim.linalg.pcg import BlockJacobi, Preconditioner, solve_conjugate_gradient
 from sim.linalg.preconditioner import build_rest_solver
 from sim.loads import Loads, Nodal
 from sim.material import Material
-from sim.minimisers.line_search import search
+from sim.minimisers.line_search import search_line
 from sim.minimisers.newton_cg import Direction
 from sim.runtime.device import Device
 
@@ -133,7 +133,7 @@ def downhill(problem: Problem, sign: np.ndarray) -> tuple[wp.array, Direction]:
 
 def test_line_search_lowers_the_energy(problem: Problem) -> None:
     u, direction = downhill(problem, np.ones(2))
-    length = search(problem, u, direction)
+    length = search_line(problem, u, direction)
     assert ((length > 0.0) & (length <= 1.0)).all()
     before = problem.energy(u)
     moved = problem.device.upload(length * direction.d.numpy())
@@ -142,7 +142,7 @@ def test_line_search_lowers_the_energy(problem: Problem) -> None:
 
 def test_line_search_returns_zero_only_for_uphill_direction(problem: Problem) -> None:
     u, direction = downhill(problem, np.array([1.0, -1.0]))
-    length = search(problem, u, direction)
+    length = search_line(problem, u, direction)
     assert length[0] > 0.0
     assert length[1] == 0.0
 
@@ -150,7 +150,7 @@ def test_line_search_returns_zero_only_for_uphill_direction(problem: Problem) ->
 def test_line_search_does_not_change_its_arguments(problem: Problem) -> None:
     u, direction = downhill(problem, np.ones(2))
     before = direction.d.numpy().copy()
-    search(problem, u, direction)
+    search_line(problem, u, direction)
     assert not u.numpy().any()
     np.testing.assert_array_equal(direction.d.numpy(), before)
 
@@ -169,14 +169,14 @@ def test_trust_radius_bounds_solution_in_preconditioner_norm(problem: Problem) -
         return solve_conjugate_gradients(problem, solver, problem.device.upload(r), tolerance, 400, radius)
 
     whole = solution(1e-2 * CRUSHED, None)
-    np.testing.assert_allclose(whole.size, size(whole.x.numpy()), rtol=1e-9)
-    same = solution(1e-2 * CRUSHED, 2.0 * whole.size)
+    np.testing.assert_allclose(whole.norm, size(whole.x.numpy()), rtol=1e-9)
+    same = solution(1e-2 * CRUSHED, 2.0 * whole.norm)
     np.testing.assert_array_equal(same.x.numpy(), whole.x.numpy())
-    half = solution(1e-2 * CRUSHED, 0.5 * whole.size)
+    half = solution(1e-2 * CRUSHED, 0.5 * whole.norm)
     assert half.truncated.all()
-    np.testing.assert_allclose(size(half.x.numpy()), 0.5 * whole.size, rtol=1e-9)
-    negative = solution(CRUSHED, 0.1 * whole.size)
-    np.testing.assert_allclose(size(negative.x.numpy()), 0.1 * whole.size, rtol=1e-9)
+    np.testing.assert_allclose(size(half.x.numpy()), 0.5 * whole.norm, rtol=1e-9)
+    negative = solution(CRUSHED, 0.1 * whole.norm)
+    np.testing.assert_allclose(size(negative.x.numpy()), 0.1 * whole.norm, rtol=1e-9)
     assert ((negative.x.numpy() * r).sum(axis=0) > 0.0).all()
     # Within the ball the model falls with every iteration: the shorter solution is the worse one.
     model = [0.5 * np.einsum("ic,ij,jc->c", x[FREE], K, x[FREE]) - (x * r).sum(axis=0) for x in
@@ -187,22 +187,22 @@ def test_trust_radius_bounds_solution_in_preconditioner_norm(problem: Problem) -
 def test_line_search_extends_a_step_that_was_cut_too_much(problem: Problem) -> None:
     """Along a direction that is far too long it ends near the minimum."""
     u, direction = downhill(problem, np.ones(2))
-    far = 37.0 / search(problem, u, direction)
-    long = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.predicted, 0)
-    length = search(problem, u, long)
+    far = 37.0 / search_line(problem, u, direction)
+    long = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.decrease, 0)
+    length = search_line(problem, u, long)
 
     def slope(t: np.ndarray) -> np.ndarray:
         g = problem.gradient(problem.device.upload(t * long.d.numpy()))
         problem.constraint.project(g)
         return (g.numpy() * long.d.numpy()).sum(axis=0)
 
-    assert (np.abs(slope(length)) <= 0.5 * long.predicted).all()
+    assert (np.abs(slope(length)) <= 0.5 * long.decrease).all()
 
 
 def test_line_search_rejects_negligible_step(problem: Problem) -> None:
     """Only a step of 1e-10 of the direction lowers the energy."""
     u, direction = downhill(problem, np.ones(2))
-    length = search(problem, u, direction)
+    length = search_line(problem, u, direction)
     far = 1e10 * length
-    endless = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.predicted, 0)
-    assert not search(problem, u, endless).any()
+    endless = Direction(problem.device.upload(far * direction.d.numpy()), far * direction.decrease, 0)
+    assert not search_line(problem, u, endless).any()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim.bodies.mesher import INTRICATE, Meshing, build_too_few_error
+from sim.bodies.mesher import INTRICATE, Meshing, build_count_error
 from sim.bodies.placement import Placement, describe_side, find_opening_at, find_opening_over, find_reachable_site
 from sim.errors import InputError
 
@@ -27,7 +27,7 @@ def test_craniotomy_is_centred_on_reachable_cortex(cortex):
     assert np.linalg.norm(site - asked) == pytest.approx(np.linalg.norm(cortex - asked, axis=1).min())
     # From a point in the fissure the skull is reached over it, not in it.
     site = find_opening_over(cortex, np.array([0.005, 0.0, 0.035]), 0.01)
-    assert abs(np.linalg.norm(site / [0.07, 0.09, 0.07]) - 1.0) < Placement().hull_depth / 0.07 and site[2] > 0.06
+    assert abs(np.linalg.norm(site / [0.07, 0.09, 0.07]) - 1.0) < Placement().max_hull_depth / 0.07 and site[2] > 0.06
 
 
 @pytest.mark.parametrize(
@@ -80,6 +80,6 @@ def test_too_few_nodes_are_rejected_with_sufficient_number():
         asked.append(count)
         return count >= 4000
 
-    message = str(build_too_few_error(3000, INTRICATE, Meshing().factors, would_do))
+    message = str(build_count_error(3000, INTRICATE, Meshing().factors, would_do))
     assert "too intricate for 3000 nodes: ask for 4800, or smooth" in message and asked == [3800, 4800]
-    assert "for 1000 nodes: smooth the labels" in str(build_too_few_error(1000, INTRICATE, Meshing().factors, would_do))
+    assert "for 1000 nodes: smooth the labels" in str(build_count_error(1000, INTRICATE, Meshing().factors, would_do))

@@ -51,13 +51,13 @@ def planned(anatomy=BODY, effects: tuple[Effect, ...] = PUSHED, accuracy: Accura
 def test_planned_solver_steps_agree_with_the_table(more, one, few, many):
     plan = planned(**more)
     assert [plan.list_steps(count) for count in (1, 2, MANY)] == [one, few, many]
-    assert plan.list_steps(MANY, imposed=True) == (SolverStep.NEWTON,) and not plan.frames
+    assert plan.list_steps(MANY, imposed=True) == (SolverStep.NEWTON,) and not plan.captures_frames
 
 
 def test_contact_descent_requires_exactly_one_tool_effect():
-    assert planned(**POSED).contact is SolverStep.CONTACT and planned().contact is None
+    assert planned(**POSED).contact_solver is SolverStep.CONTACT and planned().contact_solver is None
     both = (*POSED["effects"], Retraction(Spatula(12e-3, 20e-3, 1e-3)))
-    assert planned(**{**POSED, "effects": both}).contact is SolverStep.NEWTON
+    assert planned(**{**POSED, "effects": both}).contact_solver is SolverStep.NEWTON
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_contact_descent_requires_exactly_one_tool_effect():
 def test_avoided_solver_step_is_not_planned(avoid, steps):
     plan = planned(live=True, element="smoothed", avoid=(avoid,))
     assert {count: plan.list_steps(count) for count in steps} == steps
-    assert planned(**POSED, avoid=(SolverStep.CONTACT,)).contact is SolverStep.NEWTON
+    assert planned(**POSED, avoid=(SolverStep.CONTACT,)).contact_solver is SolverStep.NEWTON
     assert planned(element="p2", avoid=(SolverStep.CLAMPED,)).single is None
 
 

@@ -14,7 +14,7 @@ from sim.material import LAWS, Material
 from sim.minimisers.power_series import (
     build_mixing_kernel,
     choose_unit_directions,
-    compute_products,
+    compute_monomials,
     count_terms,
     mix_columns,
 )
@@ -72,7 +72,7 @@ def test_series_of_several_loads_has_fourth_order_error(box):
     assert terms.shape == (19, 1, len(nodes), 3) and count_terms(3, 3) == 19
     sizes, left = np.array([[-0.9, 0.3, -0.5], [-0.5, -0.8, 0.2]]), []
     for share in (0.4, 0.2):
-        factor = np.concatenate([compute_products(share * sizes, order) for order in (1, 2, 3)])
+        factor = np.concatenate([compute_monomials(share * sizes, order) for order in (1, 2, 3)])
         predicted = np.einsum("tb,tnk->bnk", factor, terms[:, 0])
         shares = share * sizes
         nodal = np.einsum("bs,snk->bnk", shares, _nodal(box, point, force, radius))
@@ -93,14 +93,14 @@ def test_series_along_one_direction_agrees_with_single_load(box):
     terms = series(fem, Loads((three,)), 3, nodes, 3)[:, 0]
     single = series(fem, Loads((Pushed(POINT[:1], direction, RADIUS[:1]),)), 3, nodes)[:, 0]
     for order, (rows, wanted) in enumerate(zip(np.split(terms, [3, 9]), single, strict=True), start=1):
-        predicted = np.einsum("tb,tnk->nk", compute_products(direction, order), rows)
+        predicted = np.einsum("tb,tnk->nk", compute_monomials(direction, order), rows)
         assert np.linalg.norm(predicted - wanted) < 2e-3 * np.linalg.norm(wanted)
 
 
 @pytest.mark.parametrize("sizes", [1, 2, 3])
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_unit_directions_determine_every_product(sizes, order):
-    values = compute_products(choose_unit_directions(sizes, order), order)
+    values = compute_monomials(choose_unit_directions(sizes, order), order)
     assert values.shape[0] == values.shape[1] and np.linalg.cond(values) < 14.0
 
 

@@ -13,7 +13,7 @@ from on_devices import doing, gone, named, refusing
 
 from sim.errors import InputError
 from sim.runtime.device import find_device, parse_device_names
-from sim.runtime.processes import LostError, map_unordered, process_pool, run_on_each
+from sim.runtime.processes import LostProcessError, map_unordered, process_pool, run_on_each
 
 NO_CARD = pytest.mark.skipif(wp.is_cuda_available(), reason="there is a card here")
 
@@ -97,7 +97,9 @@ def test_error_in_process_names_its_device():
         assert "in doing" in failure.value.__notes__[0]
     with (
         process_pool(["cpu", "cuda:0"], named) as children,
-        pytest.raises(LostError, match=r"cuda:0 failed: out of memory\. If that happens again, give --device one"),
+        pytest.raises(
+            LostProcessError, match=r"cuda:0 failed: out of memory\. If that happens again, give --device one"
+        ),
     ):
         run_on_each(children, doing, [1, "fail"])
 
@@ -105,7 +107,7 @@ def test_error_in_process_names_its_device():
 def test_results_are_returned_before_a_lost_process_is_reported():
     """One process dies and the other has finished before the next read; tasks that were not started stay so."""
     given = []
-    with process_pool(["cpu", "cpu"], named) as children, pytest.raises(LostError) as lost:
+    with process_pool(["cpu", "cpu"], named) as children, pytest.raises(LostProcessError) as lost:
         for task, _ in map_unordered(children, doing, ["doze and die", 0, "nap", 9]):
             given.append(task)
             time.sleep(1.5)

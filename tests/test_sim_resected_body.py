@@ -10,8 +10,8 @@ from cuts import BODY, DOWN, EFFECTS, MESH, NEXT, SOFT, STEPS, TIGHT, TOP, lying
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.compile import compile_problem
-from sim.deformation import guess
-from sim.discretisation.resected_body import compute_remains, list_remaining_bodies
+from sim.deformation import build_start
+from sim.discretisation.resected_body import compute_remaining_bodies, list_remaining_bodies
 from sim.effects import Elasticity, Gravity, Held, Inertia, NodalForce, Resection, SkullContact, Slide, ToolContact
 from sim.elements import ELEMENTS
 from sim.errors import InputError
@@ -19,7 +19,7 @@ from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal, Posture, Resected, Touching, build_posture, push
 from sim.material import Material
-from sim.resected_fem import OperatedFem, build_fem
+from sim.resected_fem import ResectedFem, build_fem
 from sim.runtime.device import find_device
 from sim.tools import Ball
 
@@ -33,14 +33,14 @@ def compact(anatomy: Anatomy) -> tuple[Anatomy, np.ndarray]:
     return Anatomy(fresh, anatomy.fixed[used], anatomy.slide_normal[used], anatomy.craniotomy[used]), used
 
 
-def solver(steps: Resection = STEPS, element: str | None = "p1", **values: object) -> OperatedFem:
+def solver(steps: Resection = STEPS, element: str | None = "p1", **values: object) -> ResectedFem:
     made = build_fem(BODY, (*EFFECTS, steps), TIGHT, "cpu", element=element, **values)  # type: ignore
-    assert isinstance(made, OperatedFem)
+    assert isinstance(made, ResectedFem)
     return made
 
 
 @pytest.fixture(scope="module")
-def operated() -> OperatedFem:
+def operated() -> ResectedFem:
     return solver()
 
 
@@ -50,7 +50,7 @@ def test_resected_body_agrees_with_mesh_of_the_remainder(element: str) -> None:
     loads = Loads((*lying([2, 1]).causes, *push([0.005, 0.05, 0.06], [0.0, 0.02, -0.1], 0.012).select([0, 0]).causes))
     answer = made.deform(loads)
     for row, done in enumerate((2, 1)):
-        body, used = compact(made.get_remains(done).anatomy)
+        body, used = compact(made.get_remaining_body(done).anatomy)
         alone = Fem(body, EFFECTS, TIGHT, "cpu", element=element).deform(loads.drop(Resected).select(np.array([row])))
         assert alone.outcome[0].good and answer.outcome[row].good
         size = np.abs(alone.displacement).max()
@@ -64,8 +64,8 @@ def test_resection_removes_own_mid_edge_nodes() -> None:
     curved = quadratic(box((2, 2, 2), 0.04, distortion=0.1), curved=0.05)
     body, effects = base_held(curved), EFFECTS[:3]
     made = build_fem(body, (*effects, Resection((within((1, 1, 1), (2, 2, 2), curved),))), TIGHT, "cpu")
-    assert isinstance(made, OperatedFem)
-    left, used = compact(made.get_remains(1).anatomy)
+    assert isinstance(made, ResectedFem)
+    left, used = compact(made.get_remaining_body(1).anatomy)
     alone = Fem(left, effects, TIGHT, "cpu").deform(build_posture(DOWN, -1.0))
     answer = made.deform(build_posture(DOWN, -1.0))
     assert 0 < len(used) < len(curved.nodes)
@@ -74,18 +74,18 @@ def test_resection_removes_own_mid_edge_nodes() -> None:
     )
 
 
-def test_loads_without_resected_cause_apply_all_steps(operated: OperatedFem) -> None:
+def test_loads_without_resected_cause_apply_all_steps(operated: ResectedFem) -> None:
     silent = operated.deform(build_posture(DOWN, -1.0))
     said = operated.deform(lying([2]))
     np.testing.assert_array_equal(silent.displacement, said.displacement)
 
 
-def test_zero_resection_steps_give_the_whole_body(operated: OperatedFem) -> None:
+def test_zero_resection_steps_give_the_whole_body(operated: ResectedFem) -> None:
     plain = Fem(BODY, EFFECTS, TIGHT, "cpu", element="p1").deform(build_posture(DOWN, -1.0))
     np.testing.assert_array_equal(operated.deform(lying([0])).displacement, plain.displacement)
 
 
-def test_load_cases_have_separate_resection_steps(operated: OperatedFem) -> None:
+def test_load_cases_have_separate_resection_steps(operated: ResectedFem) -> None:
     done = [2, 0, 1, 0, 2]
     together = operated.deform(lying(done))
     for row, one in enumerate(done):
@@ -94,14 +94,14 @@ def test_load_cases_have_separate_resection_steps(operated: OperatedFem) -> None
     assert together.time.shape == (5,) and len(together.outcome) == 5
 
 
-def test_resection_without_weight_causes_no_displacement(operated: OperatedFem) -> None:
+def test_resection_without_weight_causes_no_displacement(operated: ResectedFem) -> None:
     at_rest = Loads((Posture(np.array([[0.0, 0.0, -1.0]]), np.array([1.0]), np.ones(1)), Resected(np.array([1]))))
     assert not operated.deform(at_rest).displacement.any()
 
 
-def test_forces_on_wall_of_resection_cavity_move_tissue(operated: OperatedFem) -> None:
+def test_forces_on_wall_of_resection_cavity_move_tissue(operated: ResectedFem) -> None:
     """The wall of the cavity is part of the surface."""
-    wall = np.setdiff1d(np.unique(operated.get_remains(2).anatomy.mesh.surface), np.unique(MESH.surface))
+    wall = np.setdiff1d(np.unique(operated.get_remaining_body(2).anatomy.mesh.surface), np.unique(MESH.surface))
     force = np.zeros((1, len(MESH.nodes), 3))
     force[0, wall, 2] = -0.01
     effects = (Elasticity(SOFT), Held(), NodalForce(), STEPS)
@@ -121,7 +121,7 @@ class TestAcrossCuts:
             size = np.abs(cold[done].displacement).max()
             np.testing.assert_allclose(last.displacement, cold[done].displacement, atol=1e-7 * size)
 
-    def test_resected_results_are_deterministic(self, operated: OperatedFem) -> None:
+    def test_resected_results_are_deterministic(self, operated: ResectedFem) -> None:
         start = operated.deform(lying([1]))
         first = operated.deform(lying([2]), start)
         operated.deform(lying([0]))
@@ -129,16 +129,16 @@ class TestAcrossCuts:
         np.testing.assert_array_equal(first.displacement, again.displacement)
         np.testing.assert_array_equal(start.displacement, operated.deform(lying([1])).displacement)
 
-    def test_rows_start_from_their_own_resection_step(self, operated: OperatedFem) -> None:
+    def test_rows_start_from_their_own_resection_step(self, operated: ResectedFem) -> None:
         start = operated.deform(lying([0, 1, 2]))
         answer = operated.deform(lying([1, 1, 0]), start)
         for row, done in enumerate((1, 1, 0)):
             alone = operated.deform(lying([done]))
             np.testing.assert_allclose(answer.displacement[row], alone.displacement[0], atol=1e-10)
 
-    def test_guess_is_a_valid_start_of_a_resected_body(self, operated: OperatedFem) -> None:
+    def test_guess_is_a_valid_start_of_a_resected_body(self, operated: ResectedFem) -> None:
         """It also moves vertices without remaining tissue."""
-        wild = guess(1e-4 * np.random.default_rng(1).normal(size=(1, len(MESH.nodes), 3)))
+        wild = build_start(1e-4 * np.random.default_rng(1).normal(size=(1, len(MESH.nodes), 3)))
         answer = operated.deform(lying([2]), wild)
         exact = operated.deform(lying([2])).displacement
         np.testing.assert_allclose(answer.displacement, exact, atol=1e-8 * np.abs(exact).max())
@@ -165,9 +165,9 @@ class TestWhatComesLoose:
 
     def test_loose_piece_is_removed_and_reported(self) -> None:
         """A slice through the box separates its upper third."""
-        _, left = compute_remains(BODY, Resection((self.SLICE,)))
+        _, left = compute_remaining_bodies(BODY, Resection((self.SLICE,)))
         above = within((0, 0, 2), (3, 3, 4))
-        assert tuple(left.loose.tolist()) == above
+        assert tuple(left.loose_tetrahedra.tolist()) == above
         assert f"{len(above)} tetrahedra that nothing held any more went too" in str(left)
         np.testing.assert_array_equal(left.anatomy.orphaned, MESH.nodes[:, 2] > 0.03)
 
@@ -178,16 +178,16 @@ class TestWhatComesLoose:
         np.testing.assert_array_equal(answers[0], answers[1])
 
     def test_loose_piece_may_be_resected_in_a_later_step(self) -> None:
-        left = compute_remains(BODY, Resection((self.SLICE, within((0, 0, 2), (3, 3, 4)))))
-        assert len(left[1].loose) and not len(left[2].loose)
+        left = compute_remaining_bodies(BODY, Resection((self.SLICE, within((0, 0, 2), (3, 3, 4)))))
+        assert len(left[1].loose_tetrahedra) and not len(left[2].loose_tetrahedra)
         np.testing.assert_array_equal(left[1].anatomy.mesh.tets, left[2].anatomy.mesh.tets)
 
     def test_piece_connected_by_an_edge_only_is_removed(self) -> None:
         """Two cubes of the top layer that share an edge only with the rest."""
         keep = set(within((0, 0, 1), (1, 1, 2)) + within((1, 1, 2), (2, 2, 4)))
         above = [number for number in within((0, 0, 1), (3, 3, 4)) if number not in keep]
-        _, left = compute_remains(BODY, Resection((tuple(above),)))
-        assert set(left.loose.tolist()) == set(within((1, 1, 2), (2, 2, 4)))
+        _, left = compute_remaining_bodies(BODY, Resection((tuple(above),)))
+        assert set(left.loose_tetrahedra.tolist()) == set(within((1, 1, 2), (2, 2, 4)))
 
     def test_piece_held_by_three_sliding_planes_stays(self) -> None:
         """A box that only slides on three planes."""
@@ -195,14 +195,14 @@ class TestWhatComesLoose:
         for axis in range(3):
             normal[(MESH.nodes[:, axis] < 1e-9) & ~normal.any(axis=1), axis] = -1.0
         corner = hold(MESH, np.zeros(len(MESH.nodes), bool), normal)
-        assert [len(one.loose) for one in compute_remains(corner, Resection((TOP,)))] == [0, 0]
+        assert [len(one.loose_tetrahedra) for one in compute_remaining_bodies(corner, Resection((TOP,)))] == [0, 0]
 
     def test_piece_that_only_slides_on_the_skull_is_removed(self) -> None:
         """The skull prevents no tangential motion."""
         wall = np.where((MESH.nodes[:, :1] > 0.06 - 1e-9) & (MESH.nodes[:, 2:] > 1e-9), [1.0, 0.0, 0.0], 0.0)
         sliding = hold(MESH, MESH.nodes[:, 2] < 1e-9, wall)
-        _, left = compute_remains(sliding, Resection((self.SLICE,)))
-        assert tuple(left.loose.tolist()) == within((0, 0, 2), (3, 3, 4))
+        _, left = compute_remaining_bodies(sliding, Resection((self.SLICE,)))
+        assert tuple(left.loose_tetrahedra.tolist()) == within((0, 0, 2), (3, 3, 4))
 
 
 class TestHardCases:
@@ -214,8 +214,8 @@ class TestHardCases:
         cut = Resection((within((0, 0, 0), (1, 1, 4)),))
         effects = (Elasticity(SOFT), Held(), Slide(), Gravity(direction=(0.0, 0.0, -1.0)))
         made = build_fem(body, (*effects, cut), TIGHT, "cpu", element="p1")
-        assert isinstance(made, OperatedFem)
-        left = made.get_remains(1).anatomy
+        assert isinstance(made, ResectedFem)
+        left = made.get_remaining_body(1).anatomy
         gone = left.orphaned
         assert (gone & BODY.fixed[:, 0]).any() and (gone & normal.any(axis=1)).any() and (gone & opened).any()
         assert left.fixed[gone].all() and not left.slide_normal[gone].any() and not left.craniotomy[gone].any()
@@ -257,7 +257,7 @@ class TestHardCases:
     )
     def test_resection_steps_that_do_not_fit_body_are_rejected(self, step: tuple[int, ...], sentence: str) -> None:
         with pytest.raises(InputError, match=sentence):
-            compute_remains(BODY, Resection((TOP, step)))
+            compute_remaining_bodies(BODY, Resection((TOP, step)))
 
     def test_remainder_on_a_hinge_is_rejected(self) -> None:
         """One held edge: the piece can rotate about it."""
@@ -274,7 +274,7 @@ class TestHardCases:
         with pytest.raises(InputError, match="integers >= 0"):
             Loads((Resected(np.array([done])),))
 
-    def test_more_resection_steps_than_defined_are_rejected(self, operated: OperatedFem) -> None:
+    def test_more_resection_steps_than_defined_are_rejected(self, operated: ResectedFem) -> None:
         with pytest.raises(InputError, match="done is 3, but Resection has 2 steps"):
             operated.deform(lying([1, 3]))
 
@@ -309,7 +309,7 @@ def test_piece_touching_only_contact_skull_is_removed() -> None:
     np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-9)
     assert 1e-6 < answer.displacement[0, left.slide_normal.any(axis=1), 0].max() < 1.1e-4  # the gap of the bone
     slice_ = Resection((TestWhatComesLoose.SLICE,))
-    assert len(list_remaining_bodies(body, (*effects, slice_))[1].loose) == len(within((0, 0, 2), (3, 3, 4)))
+    assert len(list_remaining_bodies(body, (*effects, slice_))[1].loose_tetrahedra) == len(within((0, 0, 2), (3, 3, 4)))
 
 
 def test_vertices_are_free_without_effects_that_hold_them() -> None:
@@ -321,7 +321,9 @@ def test_vertices_are_free_without_effects_that_hold_them() -> None:
     sliding = (Elasticity(SOFT), Slide(), Gravity(direction=(0.0, 0.0, -1.0)))
     corner = Resection((within((2, 2, 2), (3, 3, 4)),))
     answer = build_fem(body, (*sliding, corner), TIGHT, "cpu", element="p1").deform(lying([1]))
-    bare, used = compact(compute_remains(hold(MESH, np.zeros(len(MESH.nodes), bool), normal), corner)[1].anatomy)
+    bare, used = compact(
+        compute_remaining_bodies(hold(MESH, np.zeros(len(MESH.nodes), bool), normal), corner)[1].anatomy
+    )
     assert len(used) == len(MESH.nodes) - 1
     alone = Fem(bare, sliding, TIGHT, "cpu", element="p1").deform(build_posture(DOWN, -1.0))
     np.testing.assert_allclose(answer.displacement[0, used], alone.displacement[0], atol=1e-12)

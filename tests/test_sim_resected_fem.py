@@ -7,7 +7,7 @@ import pytest
 from boxes import base_held, box, hold, quadratic
 from cuts import BODY, EFFECTS, MESH, STEPS, TIGHT, lying
 
-from sim.deformation import Deformation, guess
+from sim.deformation import Deformation, build_start
 from sim.effects import Elasticity, Gravity, Held, Inertia, Resection
 from sim.elements import ELEMENTS
 from sim.errors import InputError
@@ -125,7 +125,7 @@ class TestMemory:
     def test_history_of_another_body_is_rejected(self) -> None:
         made = build_fem(BODY, (Elasticity(RELAXING), Held(), STEPS), TIGHT, "cpu", element="p1")
         strange = replace(
-            guess(np.zeros((1, len(MESH.nodes), 3))), memory={"viscoelasticity neo-hookean": np.ones((1, 7, 18))}
+            build_start(np.zeros((1, len(MESH.nodes), 3))), memory={"viscoelasticity neo-hookean": np.ones((1, 7, 18))}
         )
         with pytest.raises(InputError, match="start from a solution of the same mesh"):
             made.deform(Loads((Resected(np.array([1])),)), strange)

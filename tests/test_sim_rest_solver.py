@@ -16,8 +16,8 @@ def test_linear_solution_without_factorisation_agrees():
     free = problem.constraint.build_basis()
     force = free @ np.random.default_rng(0).normal(size=(len(free.indptr) - 1, 3))
     direct, iterated = (RestStiffnessSolver(problem, preconditioner, 400, max_factorised=most) for most in (10**6, 0))
-    assert direct.exact is not None and iterated.exact is None
+    assert direct.exact_inverse is not None and iterated.exact_inverse is None
     one, other = (resting.solve(problem.device.upload(force)).numpy() for resting in (direct, iterated))
     np.testing.assert_allclose(one, other, atol=1e-7 * np.abs(one).max())
     with pytest.raises(InputError, match="did not reach 1e-09 in 1 iterations"):
-        replace(iterated, inner=1).solve(problem.device.upload(force))
+        replace(iterated, max_iterations=1).solve(problem.device.upload(force))

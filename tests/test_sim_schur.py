@@ -27,4 +27,4 @@ def test_condensed_stiffness_is_the_schur_complement() -> None:
     expected = np.zeros_like(schur)
     expected[np.ix_(around.rows, around.rows)] = around.stiffness
     np.testing.assert_allclose(expected, schur, atol=1e-6 * np.abs(whole).max())
-    np.testing.assert_allclose(around.follow, moved[:, around.rows], atol=1e-5)
+    np.testing.assert_allclose(around.extension, moved[:, around.rows], atol=1e-5)

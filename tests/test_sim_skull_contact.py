@@ -17,7 +17,7 @@ from sim.loads import Loads, Nodal
 from sim.material import Material
 from sim.runtime.device import find_device
 from sim.terms.contact.skull_contact import Skull
-from sim.terms.contact.skull_surface import BONE_SETTINGS, Bone, compute_bend
+from sim.terms.contact.skull_surface import BONE_SETTINGS, Bone, compute_curvature
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 MESH = box((4, 4, 4), 0.05)
@@ -92,7 +92,7 @@ def test_start_at_rest_does_not_limit_skull_distance() -> None:
 
     def far(displacement: np.ndarray | None, restarted: np.ndarray | None = None) -> float:
         cases = Cases(lifted(1.0), np.zeros(1), displacement=displacement, restarted=restarted)
-        return float(skull.count_gaps(cases)[0])
+        return float(skull.compute_path_in_gaps(cases)[0])
 
     assert far(None) == far(rest) == far(rest + 1e-4, np.ones(1, bool)) > 10.0 * far(rest + 1e-4)
 
@@ -102,11 +102,11 @@ def test_skull_curvature_agrees_with_sphere_and_plane() -> None:
     normal = rng.normal(size=(800, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     exact = (np.eye(3) - normal[:, :, None] * normal[:, None, :]) / 0.07
-    assert np.abs(compute_bend(0.07 * normal, normal) - exact).max() < 0.1 / 0.07
-    hollow = compute_bend(-0.07 * normal, normal)
+    assert np.abs(compute_curvature(0.07 * normal, normal) - exact).max() < 0.1 / 0.07
+    hollow = compute_curvature(-0.07 * normal, normal)
     np.testing.assert_allclose(hollow, 0.0, atol=1e-9)
     flat = np.column_stack([rng.uniform(size=(50, 2)), np.zeros(50)])
-    np.testing.assert_allclose(compute_bend(flat, np.tile([0.0, 0.0, 1.0], (50, 1))), 0.0, atol=1e-12)
+    np.testing.assert_allclose(compute_curvature(flat, np.tile([0.0, 0.0, 1.0], (50, 1))), 0.0, atol=1e-12)
 
 
 def test_rotating_body_slides_along_a_round_skull() -> None:
@@ -123,8 +123,8 @@ def test_rotating_body_slides_along_a_round_skull() -> None:
             Bone(
                 nodes=np.array([0]),
                 normal=n[None],
-                bend=bend[None],
-                inside=-one,
+                curvature=bend[None],
+                inside_distance=-one,
                 inward=none,
                 activation=5e-5 * one,
                 area=1e-4 * one,

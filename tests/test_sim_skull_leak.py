@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay
 
 from sim.accuracy import TRAIN
 from sim.anatomy import Anatomy
-from sim.diagnostics.skull_leak import Leak
+from sim.diagnostics.skull_leak import SkullLeak
 from sim.discretisation.element import build_quadratic_elements
 from sim.discretisation.space import discretise
 from sim.effects import build_push_effects
@@ -98,7 +98,8 @@ def test_leak_shrinks_with_its_averaging_radius(egg, element):
         assert swept[egg.slide_normal.any(axis=1)].max() < 1e-5 * np.abs(swept[egg.craniotomy]).sum()
     device = find_device("cpu", "float64")
     shares = [
-        Leak(egg, space, device, around).share(device.upload(u.reshape(-1, 1)))[0] for around in (1e-6, 12e-3, 0.05)
+        SkullLeak(egg, space, device, around).compute_fraction(device.upload(u.reshape(-1, 1)))[0]
+        for around in (1e-6, 12e-3, 0.05)
     ]
     assert shares[0] > 1.5 * shares[1] > 1.5 * shares[2] > 0.0
 
@@ -109,7 +110,7 @@ def test_leak_includes_mid_edge_nodes(egg):
     u = space.interpolate_field(answer.displacement[0])
     u[len(egg.mesh.nodes) :] += answer.memory[MID_EDGE_KEY][0]
     device = find_device("cpu", "float64")
-    assert Leak(egg, space, device).share(device.upload(u.reshape(-1, 1)))[0] == pytest.approx(
+    assert SkullLeak(egg, space, device).compute_fraction(device.upload(u.reshape(-1, 1)))[0] == pytest.approx(
         answer.leaked[0], rel=1e-3
     )
     swept = np.einsum("ni,ni->n", integrate_surface_normals(space.nodes, space.surface), u)
@@ -118,8 +119,8 @@ def test_leak_includes_mid_edge_nodes(egg):
 
 def test_body_at_rest_has_no_leak(egg):
     device = find_device("cpu", "float64")
-    leak = Leak(egg, discretise(egg.mesh, "p1"), device)
-    assert leak.share(device.allocate(3 * len(egg.mesh.nodes), 2)).tolist() == [0.0, 0.0]
+    leak = SkullLeak(egg, discretise(egg.mesh, "p1"), device)
+    assert leak.compute_fraction(device.allocate(3 * len(egg.mesh.nodes), 2)).tolist() == [0.0, 0.0]
 
 
 def test_leak_of_skull_without_opening_is_nan(egg):
@@ -130,5 +131,8 @@ def test_leak_of_skull_without_opening_is_nan(egg):
     closed = Anatomy(egg.mesh, egg.fixed, normal, np.zeros(len(normal), bool))
     device, space = find_device("cpu", "float64"), discretise(egg.mesh, "p1")
     grown = device.upload((0.01 * egg.mesh.nodes).reshape(-1, 1))
-    leak = Leak(closed, space, device)
-    assert np.isnan(leak.share(grown)).all() and (leak.share(device.allocate(*grown.shape)) == 0.0).all()
+    leak = SkullLeak(closed, space, device)
+    assert (
+        np.isnan(leak.compute_fraction(grown)).all()
+        and (leak.compute_fraction(device.allocate(*grown.shape)) == 0.0).all()
+    )

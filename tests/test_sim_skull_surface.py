@@ -72,7 +72,7 @@ def test_body_without_an_opening_has_only_bone() -> None:
     bone = build_bone(body, discretise(MESH, "p1"), GAP)
     np.testing.assert_array_equal(bone.nodes, np.flatnonzero(TOP & ~OPEN))
     np.testing.assert_array_equal(bone.activation, BONE_SETTINGS.activation)
-    assert (bone.inside < 0.0).all()
+    assert (bone.inside_distance < 0.0).all()
 
 
 def dragged(body: Anatomy, element: str) -> np.ndarray:

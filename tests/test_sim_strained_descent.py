@@ -15,7 +15,7 @@ from sim.discretisation.problem import Problem
 from sim.discretisation.space import Discretisation
 from sim.effects import Elasticity
 from sim.fem import Fem
-from sim.linalg.multifrontal import Factor
+from sim.linalg.multifrontal import SparseFactor
 from sim.linalg.preconditioner import build_rest_solver
 from sim.local_solvers.strained_descent import (
     SINGLE_LIMITS,
@@ -37,9 +37,9 @@ RENEWAL = Renewal()
 EVERY = StrainLimits(min_strain=0.0, max_nodes=10**4, max_omitted=np.inf, max_candidates=10**4)
 
 
-def factor_of(problem: Problem) -> Factor:
+def factor_of(problem: Problem) -> SparseFactor:
     found = build_rest_solver(problem)
-    assert isinstance(found, Factor)
+    assert isinstance(found, SparseFactor)
     return found
 
 
@@ -110,11 +110,11 @@ def test_next_frame_reuses_the_stiffness_update() -> None:
     problem, space, rest = hard()
     descent = descent_on(problem, space)
     there = descent.descend(rest, np.full(1, 1e-6), 400, {})
-    assert there.steps[0] > RENEWAL.max_served and there.warm_start == {}
+    assert there.steps[0] > RENEWAL.max_reused_steps and there.warm_start == {}
     first = descent.descend(there.u, np.full(1, 1e-8), 400, {})
     assert (
         first.status[0] == DONE
-        and first.steps[0] <= RENEWAL.max_served
+        and first.steps[0] <= RENEWAL.max_reused_steps
         and set(first.warm_start) == set(UPDATE_KEYS.values())
     )
     again = descent.descend(there.u, np.full(1, 1e-8), 400, first.warm_start)
@@ -177,7 +177,7 @@ def test_strained_descent_out_of_budget_is_finite() -> None:
     problem, space, rest = hard()
     descent = descent_on(problem, space)
     found = descent.descend(rest, np.full(1, 1e-12), 3)
-    assert found.status[0] == GOING and found.steps[0] <= 3 and found.left.tolist() == [0]
+    assert found.status[0] == GOING and found.steps[0] <= 3 and found.unfinished.tolist() == [0]
     _, free, scale = problem.residual(found.u)
     np.testing.assert_allclose(found.residual, free / scale, rtol=1e-6)
     broken = descent.descend(problem.device.upload(np.full((problem.rows, 1), np.nan)), np.full(1, 1e-12), 20)
@@ -211,7 +211,7 @@ def test_live_frames_take_fewer_steps_to_same_result() -> None:
 
 def test_update_has_nodes_nearest_to_the_opening() -> None:
     problem, space, rest = hard()
-    strains, kept = replace(SINGLE_LIMITS, max_candidates=200, max_nodes=30), Renewal(max_served=400)
+    strains, kept = replace(SINGLE_LIMITS, max_candidates=200, max_nodes=30), Renewal(max_reused_steps=400)
     descent = descent_on(problem, space, strains, kept)
     rows = descent.descend(rest, np.full(1, 1e-6), 400, {}).warm_start[UPDATE_KEYS["rows"]][0]
     assert len(np.unique(rows)) == len(rows) == 90

@@ -12,7 +12,7 @@ from sim.accuracy import LIVE
 from sim.deformation import Deformation, Outcome
 from sim.discretisation.term import Cases
 from sim.fem import Fem
-from sim.linalg.multifrontal import Factor
+from sim.linalg.multifrontal import SparseFactor
 from sim.loads import Loads, push
 from sim.local_solvers.strained_descent import (
     SINGLE_LIMITS,
@@ -23,7 +23,7 @@ from sim.local_solvers.strained_descent import (
 )
 from sim.local_solvers.strained_frame import MATRIX_KEY, NODES_KEY, UpdatedPreconditioner, update_model_at
 from sim.strategy.captured_frame import MAX_SERVED_STEPS
-from sim.strategy.frame_sequence import Kept
+from sim.strategy.frame_sequence import DeviceWarmStart
 
 BODY = make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, opening=40e-3)
 
@@ -31,7 +31,7 @@ BODY = make_box(cells=(6, 6, 3), spacing=12e-3, tumour=15e-3, depth=20e-3, openi
 def follower(strained: bool) -> Fem:
     """On the CPU, which by itself would not follow."""
     fem = Fem(BODY, EFFECTS, replace(LIVE, limit_strain=False), "cpu", element="smoothed")
-    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, frames=True, strained=strained))
+    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, captures_frames=True, updates_model=strained))
     return fem
 
 
@@ -54,7 +54,7 @@ def ride(fem: Fem, count: int = 7) -> list[Deformation]:
 def test_strained_frames_take_fewer_steps_to_same_result(fem: Fem) -> None:
     own, plain = ride(fem), ride(follower(False))
     for one, other in zip(own[1:], plain[1:], strict=True):
-        assert isinstance(one.warm, Kept) and one.outcome == other.outcome == (Outcome.CONVERGED,)
+        assert isinstance(one.warm, DeviceWarmStart) and one.outcome == other.outcome == (Outcome.CONVERGED,)
         assert one.residual[0] <= LIVE.tolerance
         size = np.abs(other.displacement).max()
         np.testing.assert_allclose(one.displacement, other.displacement, atol=5e-3 * size)
@@ -65,7 +65,7 @@ def test_strained_frames_take_fewer_steps_to_same_result(fem: Fem) -> None:
 
 def test_update_is_renewed_only_after_slow_frames(fem: Fem) -> None:
     answers = ride(fem)[1:]
-    models = [answer.warm.bent for answer in answers if isinstance(answer.warm, Kept)]
+    models = [answer.warm.bent for answer in answers if isinstance(answer.warm, DeviceWarmStart)]
     assert models[0] is not None
     anew = [after is not before for before, after in pairwise(models)]
     assert anew == [int(answer.iterations[0]) > MAX_SERVED_STEPS for answer in answers[1:]]
@@ -110,14 +110,14 @@ def test_inconsistent_update_of_a_frame_is_ignored(fem: Fem, fault: str) -> None
 def test_update_matrix_agrees_with_update_by_factors(fem: Fem) -> None:
     """The update of live loads on the CPU is tested against the inverse itself."""
     problem, factor = fem.problem, fem.strategy.preconditioner
-    assert isinstance(factor, Factor)
+    assert isinstance(factor, SparseFactor)
     last = ride(fem)[-1]
     u = problem.device.upload(fem.guess(pressed(6), last))
     part = build_strained_part(problem, factor, fem.space, SINGLE_LIMITS)
     part.prepare()
     bent = update_model_at(part, problem.device, u)
     problem.begin(Cases(pressed(6.5), np.zeros(1)))
-    single = StrainedDescent(problem, factor, part, Renewal(max_served=8)).descend(u, np.full(1, 1e-2), 8, {})
+    single = StrainedDescent(problem, factor, part, Renewal(max_reused_steps=8)).descend(u, np.full(1, 1e-2), 8, {})
     assert bent is not None and set(single.warm_start)
     force = np.zeros((problem.rows, 1))
     force[-30:] = np.random.default_rng(1).normal(size=(30, 1))
@@ -126,7 +126,7 @@ def test_update_matrix_agrees_with_update_by_factors(fem: Fem) -> None:
     mine, plain, other = (problem.device.allocate(problem.rows, 1) for _ in range(3))
     knowing = UpdatedPreconditioner(factor, problem, part.size)
     knowing.apply(g, np.ones(1, bool), plain)
-    knowing.load(bent)
+    knowing.load_model(bent)
     knowing.apply(g, np.ones(1, bool), mine)
     stiffened = StiffenedPreconditioner(factor, problem)
     stiffened.stiffening = StrainedDescent(problem, factor, part).get_warm_start(single.warm_start)
@@ -134,6 +134,6 @@ def test_update_matrix_agrees_with_update_by_factors(fem: Fem) -> None:
     size = np.abs(other.numpy()).max()
     np.testing.assert_allclose(mine.numpy(), other.numpy(), atol=2e-3 * size)
     assert np.abs(plain.numpy() - other.numpy()).max() > 0.05 * size
-    knowing.load(None)
+    knowing.load_model(None)
     knowing.apply(g, np.ones(1, bool), mine)
     np.testing.assert_array_equal(mine.numpy(), plain.numpy())

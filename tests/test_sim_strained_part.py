@@ -10,7 +10,7 @@ from boxes import base_held, box
 
 from sim.accuracy import Accuracy
 from sim.discretisation.problem import Problem
-from sim.discretisation.term import Cases, Strained
+from sim.discretisation.term import Cases, StrainTerm
 from sim.effects import Elasticity, Held, ToolContact
 from sim.fem import Fem
 from sim.loads import Loads, Touching
@@ -85,10 +85,10 @@ def test_update_curvature_is_excess_over_rest_curvature(element: str, tissue: st
     every, first = np.ones(count, bool), problem.device.upload(np.zeros(1), wp.int32)
     place = problem.device.upload(np.arange(count)[:, None], wp.int32)
     out = wp.zeros((1, 3 * count, 3 * count), dtype=wp.float64, device="cpu")
-    terms = [term for term in problem.terms if isinstance(term, Strained)]
+    terms = [term for term in problem.terms if isinstance(term, StrainTerm)]
     assert terms
     for term in terms:
-        some = problem.device.upload(term.elements_on(every), wp.int32)
+        some = problem.device.upload(term.find_elements_on(every), wp.int32)
         term.add_stiffening(some, u, first, problem.device.allocate(1), place, out)
     np.testing.assert_allclose(out.numpy()[0], expected, atol=1e-9 * np.abs(expected).max())
 
@@ -109,9 +109,9 @@ def test_node_strain_is_maximum_over_its_elements() -> None:
     np.maximum.at(expected, table[inside].ravel(), np.repeat(size[inside], 4))
     found = problem.device.allocate(fem.space.count, 1)
     for term in problem.terms:
-        if isinstance(term, Strained):
-            some = problem.device.upload(term.elements_on(nodes), wp.int32)
-            term.raise_strain(some, u, problem.device.upload(np.zeros(1), wp.int32), found)
+        if isinstance(term, StrainTerm):
+            some = problem.device.upload(term.find_elements_on(nodes), wp.int32)
+            term.update_max_strain(some, u, problem.device.upload(np.zeros(1), wp.int32), found)
     assert expected.max() > 0.1
     np.testing.assert_allclose(found.numpy()[:, 0], expected, rtol=1e-9)
 
@@ -120,7 +120,7 @@ def find_model(strains: StrainLimits) -> tuple[Fem, ContactDescent, wp.array, St
     """Of two columns that are bent."""
     fem, descent = solver(strains=strains)
     u = bent(fem.problem, 4e-4)
-    part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable), strains)
+    part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable_nodes), strains)
     model = part.build_model(u, BOTH)
     assert model is not None
     return fem, descent, u, model
@@ -136,14 +136,14 @@ def test_updated_inverse_agrees_with_strained_stiffness() -> None:
     own = np.zeros_like(force)
     own[descent.compliance.rows] = model.apply_stiffness(problem.device, problem.device.upload(near)).numpy()
     found = rest + descent.compliance.apply(own)
-    touched = descent.compliance.rows[: 3 * len(descent.barrier.touchable)]
+    touched = descent.compliance.rows[: 3 * len(descent.barrier.touchable_nodes)]
     for column in range(2):
         whole = problem.rest_curvature().toarray() + stiffer(fem, u, column)
         inverse = basis @ np.linalg.solve(basis.T @ whole @ basis, basis.T.toarray())
         expected = inverse @ force[:, column]
         np.testing.assert_allclose(found[:, column], expected, atol=2e-5 * np.abs(expected).max())
         at_rest = descent.compliance.build_matrix(np.ones(len(descent.compliance.nodes), bool))[: len(touched)]
-        now = at_rest[:, : len(touched)] + model.own[column, :-1, :-1]
+        now = at_rest[:, : len(touched)] + model.change[column, :-1, :-1]
         np.testing.assert_allclose(now, inverse[np.ix_(touched, touched)], atol=2e-5 * np.abs(inverse).max())
 
 
@@ -153,9 +153,9 @@ def test_update_selects_the_most_strained_nodes() -> None:
     strain = fem.problem.device.allocate(fem.space.count, 2)
     every, columns = np.ones(fem.space.count, bool), fem.problem.device.upload(BOTH, wp.int32)
     for term in fem.problem.terms:
-        if isinstance(term, Strained):
-            some = fem.problem.device.upload(term.elements_on(every), wp.int32)
-            term.raise_strain(some, u, columns, strain)
+        if isinstance(term, StrainTerm):
+            some = fem.problem.device.upload(term.find_elements_on(every), wp.int32)
+            term.update_max_strain(some, u, columns, strain)
     assert model.nodes.shape[1] <= 20
     for column in range(2):
         own = model.matrix[column].any(axis=1).reshape(-1, 3).any(axis=1)
@@ -174,16 +174,16 @@ def test_updates_of_different_width_are_merged() -> None:
     np.testing.assert_array_equal(both.matrix[0, :size, :size], narrow.matrix[0])
     assert not both.matrix[0, size:].any() and not both.matrix[0, :, size:].any()
     np.testing.assert_array_equal(both.matrix[1], wide.matrix[0])
-    np.testing.assert_array_equal(both.own[1], wide.own[0])
-    both.forget(np.array([1]))
-    assert both.bent.tolist() == [True, False] and not both.own[1].any()
+    np.testing.assert_array_equal(both.change[1], wide.change[0])
+    both.reset_columns(np.array([1]))
+    assert both.is_strained.tolist() == [True, False] and not both.change[1].any()
 
 
 def test_update_is_discarded_if_it_omits_strained_tissue() -> None:
     """Its nodes leave out tissue with far more strain than the threshold."""
     fem, descent = solver()
     u, few = bent(fem.problem, 4e-4), StrainLimits(min_strain=0.08, max_nodes=5, max_omitted=0.1)
-    part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable), few)
+    part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable_nodes), few)
     assert part.build_model(u, BOTH) is None and part.build_model(u, BOTH[1:]) is not None
 
 

@@ -9,7 +9,7 @@ from boxes import base_held, box, top_forces
 from oracle import internal_forces, tissue
 
 from sim.accuracy import DRAFT, Accuracy
-from sim.deformation import Deformation, Outcome, guess
+from sim.deformation import Deformation, Outcome, build_start
 from sim.effects import Elasticity, Held, NodalForce
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
@@ -82,7 +82,7 @@ def test_inverted_start_is_replaced_with_rest(steps: int) -> None:
     start = np.zeros((5, *MESH.nodes.shape))
     start[[0, 4]] = CRUSHED
     cold = fem(replace(ACCURACY, steps=steps)).deform(loads(TOTAL[[0, 2, 0, 3, 2]]))
-    found = fem(replace(ACCURACY, steps=steps)).deform(loads(TOTAL[[0, 2, 0, 3, 2]]), guess(start))
+    found = fem(replace(ACCURACY, steps=steps)).deform(loads(TOTAL[[0, 2, 0, 3, 2]]), build_start(start))
     assert found.outcome == (Outcome.CONVERGED_ANEW, *[Outcome.CONVERGED] * 3, Outcome.CONVERGED_ANEW)
     assert all(outcome.good for outcome in found.outcome)
     np.testing.assert_array_equal(found.displacement, cold.displacement)
@@ -97,7 +97,7 @@ def test_start_that_leads_to_inversion_is_not_used() -> None:
     twisted[:, 0] = middle[0] + np.cos(angle) * x - np.sin(angle) * y
     twisted[:, 1] = middle[1] + np.sin(angle) * x + np.cos(angle) * y
     body = fem()
-    found = body.deform(loads(TOTAL[[0]]), guess(np.where(FREE, twisted - MESH.nodes, 0.0)[None]))
+    found = body.deform(loads(TOTAL[[0]]), build_start(np.where(FREE, twisted - MESH.nodes, 0.0)[None]))
     assert found.outcome[0].good
     assert found.inverted[0] == 0
 
@@ -107,6 +107,6 @@ def test_start_with_inverted_averages_is_replaced_with_rest() -> None:
     solver = Fem(openings.body()[0], effects, ACCURACY, "cpu", element="smoothed")
     mesh, load = openings.MESH, openings.loads_of(openings.TOTAL[1:2])
     rest = solver.deform(load)
-    found = solver.deform(load, guess((mesh.nodes * [0.0, 0.0, -1.5])[None]))
+    found = solver.deform(load, build_start((mesh.nodes * [0.0, 0.0, -1.5])[None]))
     assert found.outcome[0] is Outcome.CONVERGED_ANEW
     np.testing.assert_array_equal(found.displacement, rest.displacement)

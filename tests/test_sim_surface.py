@@ -82,5 +82,5 @@ def test_blurred_normals_of_coarse_ball_point_outward():
 
 def test_chunked_sum_of_many_points_agrees_with_whole():
     whole = compute_blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3)
-    parts = compute_blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3, BlurRange(together=7))
+    parts = compute_blurred_normals(BALL.vertices, BALL.faces, BALL.vertices[:50], 6e-3, BlurRange(block_size=7))
     np.testing.assert_array_equal(parts, whole)

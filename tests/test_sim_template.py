@@ -7,8 +7,8 @@ from scipy.spatial import KDTree
 
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.mesher import Meshing
-from sim.bodies.subject import MeshPlan, choose_craniotomy, make_anatomy
-from sim.bodies.template import Head, Tumour, build_template_subject
+from sim.bodies.subject import MeshPlan, choose_diameter, make_anatomy
+from sim.bodies.template import HeadScaling, Tumour, build_template_subject
 from sim.errors import InputError
 from sim.geometry.geodesic import compute_geodesic_distances
 from sim.geometry.tetmesh import compute_dihedral_angles
@@ -70,7 +70,7 @@ def test_mesh_search_stops_at_the_number_of_trials_of_the_plan(subject):
 
 
 def test_template_has_the_volume_of_a_human_brain(anatomy):
-    assert anatomy.mesh.volumes.sum() == pytest.approx(Head().volume, rel=0.005)
+    assert anatomy.mesh.volumes.sum() == pytest.approx(HeadScaling().volume, rel=0.005)
     assert abs(len(anatomy.mesh.nodes) - 5300) <= 530
 
 
@@ -108,10 +108,8 @@ def test_seeds_vary_the_lobed_shape_but_not_its_volume():
 
 
 def test_craniotomy_is_wider_than_the_tumour(subject):
-    assert (
-        choose_craniotomy(subject, MeshPlan()) == 0.05 and choose_craniotomy(subject, MeshPlan(craniotomy=0.03)) == 0.03
-    )
-    sizes = [choose_craniotomy(build_template_subject(Tumour(radius=each)), MeshPlan()) for each in (0.02, 0.03)]
+    assert choose_diameter(subject, MeshPlan()) == 0.05 and choose_diameter(subject, MeshPlan(craniotomy=0.03)) == 0.03
+    sizes = [choose_diameter(build_template_subject(Tumour(radius=each)), MeshPlan()) for each in (0.02, 0.03)]
     assert sizes == pytest.approx([0.06, 0.08], abs=1e-3)
 
 

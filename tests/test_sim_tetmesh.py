@@ -13,7 +13,7 @@ from sim.geometry.tetmesh import (
     TetMesh,
     compute_dihedral_angles,
     compute_signed_volumes,
-    find_single_faces,
+    find_boundary_faces,
     orient_tetrahedra,
 )
 
@@ -97,7 +97,7 @@ def test_boundary_of_an_inner_region_is_found() -> None:
     assert len(mesh.find_boundary(2)) == 2 * 6 * 4
     assert len(mesh.find_nodes(2)) == 27
     np.testing.assert_array_equal(np.unique(mesh.find_boundary(2)), np.setdiff1d(mesh.find_nodes(2), _centre(mesh)))
-    assert len(find_single_faces(mesh.tets)) == len(mesh.surface)
+    assert len(find_boundary_faces(mesh.tets)) == len(mesh.surface)
 
 
 def _centre(mesh: TetMesh) -> np.ndarray:

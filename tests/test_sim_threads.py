@@ -8,12 +8,12 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from sim.runtime.device import find_device
 from sim.runtime.threads import (
-    Sharing,
+    ThreadLimits,
     choose_threads,
     enter_background,
     limit_to_one_thread,
+    run_concurrently,
     run_in_foreground,
-    run_together,
     wait_for_foreground,
 )
 
@@ -37,13 +37,13 @@ def test_thread_limit_lasts_until_last_context_exits() -> None:
 def test_run_together_returns_after_every_task():
     done: list[int] = []
     for _ in range(50):
-        run_together([lambda number=number: done.append(number) for number in range(3)])
+        run_concurrently([lambda number=number: done.append(number) for number in range(3)])
     assert sorted(done) == sorted([0, 1, 2] * 50)
 
 
 def test_run_together_runs_tasks_concurrently():
     meeting = threading.Barrier(2, timeout=5.0)
-    run_together([meeting.wait, meeting.wait])
+    run_concurrently([meeting.wait, meeting.wait])
 
 
 @pytest.mark.parametrize("bad", [0, 1])
@@ -55,16 +55,16 @@ def test_error_of_a_task_is_raised_after_the_others(bad: int):
     tasks = [lambda: done.append(1), lambda: done.append(1)]
     tasks[bad] = fail
     with pytest.raises(ValueError, match="no"):
-        run_together(tasks)
+        run_concurrently(tasks)
     assert done == [1]
-    run_together([lambda: done.append(2)] * 2)
+    run_concurrently([lambda: done.append(2)] * 2)
     assert done == [1, 2, 2]
 
 
 def test_thread_count_is_positive_and_one_for_small_work() -> None:
     assert choose_threads(10**6) >= 1
-    assert choose_threads(Sharing().min_size - 1) == 1
-    assert choose_threads(10**6, Sharing(max_threads=1)) == 1
+    assert choose_threads(ThreadLimits().min_size - 1) == 1
+    assert choose_threads(10**6, ThreadLimits(max_threads=1)) == 1
 
 
 def test_background_thread_waits_for_foreground_work() -> None:

@@ -11,7 +11,7 @@ from boxes import base_held, box
 from sim.accuracy import REFERENCE, TRAIN
 from sim.compile import compile_problem
 from sim.discretisation.footprint import compute_footprint_weights
-from sim.effects import BuiltIn, Elasticity, Held, NodalForce, ToolForce, remember
+from sim.effects import BuiltIn, Elasticity, Held, NodalForce, ToolForce, has_history
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Pushed, push
@@ -75,7 +75,7 @@ class TestEffect:
         def problem(*effects):
             return compile_problem((Elasticity(), Held(), *effects), BODY, find_device("cpu", "float64"))
 
-        assert problem().plain and not problem(VEINS.Veins((5,))).plain
+        assert problem().can_accelerate and not problem(VEINS.Veins((5,))).can_accelerate
         names = [term.name for term in problem(VEINS.Veins((5,)), ToolForce()).terms]
         assert names[-1] == "veins" and "tool force" in names
 
@@ -119,7 +119,7 @@ class TestEffect:
 
         loads = Loads((*PRESS.causes, Pull(np.array([1.0, 2.0]))))
         answer(Elasticity(), Pulled((5,)), loads=loads)
-        assert seen[0].tolist() == [1.0, 2.0] and remember((Pulled((5,)),)) and not remember((VEINS.Veins((5,)),))
+        assert seen[0].tolist() == [1.0, 2.0] and has_history((Pulled((5,)),)) and not has_history((VEINS.Veins((5,)),))
         assert loads.scale(0.5).get(Pull).share.tolist() == [0.5, 1.0]
         with pytest.raises(InputError, match=r"loads hold Pull, which no effect uses: add the effect that it is for"):
             answer(Elasticity(), loads=loads)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from test_sim_label_volume import AFFINES, ball, ellipsoid, grid
 
-from sim.bodies.head_masks import Sources, read_head_masks
+from sim.bodies.head_masks import MaskSources, read_head_masks
 from sim.bodies.label_map import read_labels
 from sim.bodies.label_volume import build_masked_subject, build_volume_subject
-from sim.bodies.voxels import Voxels
+from sim.bodies.voxels import VoxelSpec
 from sim.errors import InputError
 
 
@@ -25,10 +25,10 @@ def test_volume_without_orientation_requires_axes(tmp_path):
     with pytest.raises(InputError, match=r"neither sform nor qform, so its left side is unknown.* --axes RAS"):
         build_volume_subject(path, (1,), (3,))
     with pytest.raises(InputError, match="axes 'RAR' are no directions"):
-        read_labels(path, Voxels(axes="RAR"))
+        read_labels(path, VoxelSpec(axes="RAR"))
     where = {}
     for axes in ("RAS", "LPS", "PIR"):
-        masks = read_head_masks(Sources(path, (1,), (3,), axes=axes))
+        masks = read_head_masks(MaskSources(path, (1,), (3,), axes=axes))
         where[axes] = build_masked_subject(masks, path).pieces[0].centre  # the scan's axes are the same
     np.testing.assert_allclose(where["LPS"], where["RAS"] * [-1.0, -1.0, 1.0], atol=1e-6)
     np.testing.assert_allclose(where["PIR"], (where["RAS"] * [-1.0, -1.0, 1.0])[[2, 0, 1]], atol=1e-6)

@@ -7,7 +7,7 @@ import pytest
 from conftest import make_box
 from scipy.stats import multivariate_normal
 
-from sim.geometry.locate import Located
+from sim.geometry.locate import LocatedPoints
 from surrogate.locating.causes import SWELLING, TOOL
 from surrogate.locating.evidence import SHIFT_ERROR, SIGMA, SLIPPED_ERROR, TURN_PER_SHIFT, build_motion_evidence
 from surrogate.locating.observation import Observation, to_moved_evidence
@@ -35,7 +35,7 @@ def prior():
 def seen(prior, motion, count=POINTS):
     """Some vertices as points that are seen to move."""
     some = np.random.default_rng(9).permutation(len(motion))[:count]
-    place = Located(np.repeat(some[:, None], 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
+    place = LocatedPoints(np.repeat(some[:, None], 4, axis=1), np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
     return build_motion_evidence(place, prior.anatomy.mesh.nodes[some], motion[some], np.full(count, SIGMA))
 
 
@@ -154,7 +154,7 @@ def test_block_rows_match_products_of_all_points(prior, count):
     """Fewer and more points than vertices, with whole motions and single rows."""
     box, random = prior.anatomy, np.random.default_rng(0)
     some = random.integers(40, size=(count, 4))
-    place = Located(box.mesh.tets[some[:, 0]], random.dirichlet(np.ones(4), count))
+    place = LocatedPoints(box.mesh.tets[some[:, 0]], random.dirichlet(np.ones(4), count))
     at = np.einsum("nc,nci->ni", place.weights, box.mesh.nodes[place.vertices])
     whole = build_motion_evidence(place, at, 1e-3 * random.standard_normal((count, 3)), np.full(count, SIGMA))
     for evidence in (whole, whole.select(random.permutation(len(whole)))):

@@ -10,7 +10,7 @@ from scenes.script.scene import find_scene
 from scenes.script.tool import Probe
 from sim.accuracy import REFERENCE
 from sim.anatomy import Anatomy
-from sim.deformation import Deformation, Outcome, guess
+from sim.deformation import Deformation, Outcome, build_start
 from sim.effects import Elasticity, Held, ToolContact, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
@@ -52,7 +52,7 @@ def pressed(depth: float, x: float = 0.0) -> Pushed:
 
 
 def start_of(past: Relaxed, time: float) -> Deformation:
-    return replace(guess(np.zeros((1, 1, 3))), memory={MEMORY_KEY: past.memory}, time=np.array([time]))
+    return replace(build_start(np.zeros((1, 1, 3))), memory={MEMORY_KEY: past.memory}, time=np.array([time]))
 
 
 def played(depths: list[float], times: list[float], x: list[float] | None = None) -> list[Relaxed]:

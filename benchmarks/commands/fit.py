@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 
 from .locate import bar, check_finer, finer_of, locator_of
 
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from ..studies.locate_study import PointsSeen
 
     for name, least in (("twins", 1), ("presses", 1), ("drained", 0), ("forces", 0), ("points", 6), ("cover", 1)):
-        check_at_least(f"--{name}", getattr(args, name), least)
+        check_integer(f"--{name}", getattr(args, name), least)
     check_finer(args)
     body, finer = read_anatomy(args.anatomy or get_template_path()), finer_of(args)
     with bar("patients") as heard:

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 
 from scenes.options.shared_options import add_json
 from scenes.options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,9 +36,9 @@ def run(args: argparse.Namespace) -> int:
 
     from ..studies.frame import batch_rate, frames_of, measure_size, table
 
-    check_at_least("--frames", args.frames, 1)
+    check_integer("--frames", args.frames, 1)
     if args.batch is not None:
-        check_at_least("--batch", args.batch, 1)
+        check_integer("--batch", args.batch, 1)
     width, height = measure_size(args.size)
     theatre = build_requested_theatre(args, args.scene)
     scene = build_requested_scene(args, args.scene, theatre)

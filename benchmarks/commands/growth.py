@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from scenes.options.outputs import add_force, check_output_path
 from scenes.options.shared_options import add_device, add_json
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.elements import ELEMENTS, RECOMMENDED
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..studies.scaling import Row, Trial, panels, rows
 
-    check_at_least("--batch", min(args.batch), 1)
+    check_integer("--batch", min(args.batch), 1)
     for size in args.sizes:
         MeshPlan(size)
     find_device(args.device, "float32")

@@ -5,7 +5,7 @@ import sys
 from dataclasses import asdict
 
 from scenes.options.shared_options import add_device, add_json, to_json_line
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 
 # The tasks of scenes.gym, which loads Gymnasium and is imported only as this runs.
 TASKS = ("palpate", "retract", "debulk")
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from ..studies.gym_rates import measure_rate
 
     for name in ("envs", "steps", "repeats"):
-        check_at_least(f"--{name}", getattr(args, name), 1)
+        check_integer(f"--{name}", getattr(args, name), 1)
     size, rows = measure_size(args.size), []
     apart = ", each in a process of its own" if args.processes else ""
     where = f"{describe_machine(args.device)}; {args.envs} environments{apart}, pictures of {size[0]} x {size[1]}"

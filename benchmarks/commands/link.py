@@ -6,7 +6,7 @@ import os
 from dataclasses import asdict
 
 from scenes.options.shared_options import add_json
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.errors import InputError
 
 from .locate import bar
@@ -27,8 +27,8 @@ def run(args: argparse.Namespace) -> int:
 
     from ..studies.link_latency import CLIENTS, measured
 
-    check_at_least("--points", args.points, 3)
-    check_at_least("--runs", args.runs, 1)
+    check_integer("--points", args.points, 3)
+    check_integer("--runs", args.runs, 1)
     if not (0.0 < args.rate <= 1000.0 and 0.0 < args.seconds <= 3600.0):
         raise InputError("--rate and --seconds: give up to 1000 poses a second, and up to 3600 seconds, both above 0.")
     found = []

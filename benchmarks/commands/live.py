@@ -14,7 +14,7 @@ from tqdm import tqdm
 from scenes.options.shared_options import add_anatomy, add_device, add_json
 from scenes.options.tissue_options import add_tissue_arguments, parse_elasticity
 from scenes.script.shipped_files import get_template_path
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.bodies.meshfile import read_anatomy
 from sim.effects import build_push_effects
 from sim.elements import ELEMENTS, RECOMMENDED
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..studies.live import RIDES, errors, frames_of, live_fem, loads_of, tally
 
-    check_at_least("--frames", args.frames, 1)
+    check_integer("--frames", args.frames, 1)
     checked = min(CHECKED, args.frames) if args.checked is None else args.checked
     if not 1 <= checked <= args.frames:
         raise InputError(

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 
@@ -120,10 +120,10 @@ def _check(args: argparse.Namespace) -> None:
     InputError
         Counts, shares or a seed out of range; a user's brain without its finer mesh.
     """
-    check_at_least("--twins", args.twins, 1)
-    check_at_least("--seed", args.seed, 0)
+    check_integer("--twins", args.twins, 1)
+    check_integer("--seed", args.seed, 0)
     for count in args.points:
-        check_at_least("--points", count, 6)
+        check_integer("--points", count, 6)
     for cover in args.cover:
         if not 1 <= cover <= 100:
             raise InputError(f"--cover {cover}: give a share of the open cortex, from 1 to 100 [%].")

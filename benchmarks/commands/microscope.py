@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 
 from scenes.options.shared_options import add_json
 from scenes.options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 
 from .locate import bar
 
@@ -33,8 +33,8 @@ def run(args: argparse.Namespace) -> int:
 
     from ..studies.stereo_study import rows
 
-    check_at_least("--seeds", args.seeds, 1)
-    check_at_least("--every", args.every, 1)
+    check_integer("--seeds", args.seeds, 1)
+    check_integer("--every", args.every, 1)
     theatre = build_requested_theatre(args, args.scene)
     scene = build_requested_scene(args, args.scene, theatre)
     if isinstance(scene.observation_model, StereoObservation):

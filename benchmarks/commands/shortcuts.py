@@ -8,7 +8,7 @@ from dataclasses import asdict
 from scenes.options.shared_options import add_anatomy, add_device, add_json
 from scenes.script.shipped_files import get_template_path
 from sim.accuracy import LIVE
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.bodies.meshfile import read_anatomy
 
 
@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..studies.shortcuts import measure, works
 
-    check_at_least("--runs", args.runs, 1)
+    check_integer("--runs", args.runs, 1)
     site = build_craniotomy_frame(read_anatomy(args.anatomy or get_template_path()))
     table, where = sys.stderr if args.json else sys.stdout, describe_machine(args.device)
     print(f"{where}\n\n| shortcut | work | runs | with: median, p95 [ms] | without | ratio | of totals |", file=table)

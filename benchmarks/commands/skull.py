@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from scenes.options.shared_options import add_device, add_json
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, build_template_subject
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..studies.skull_models import rows
 
-    check_at_least("--loads", args.loads, 1)
+    check_integer("--loads", args.loads, 1)
     plans = [MeshPlan(count) for count in args.nodes]
     bodies = [read_anatomy(path) for path in args.anatomies]
     bodies = bodies or [make_anatomy(build_template_subject(Tumour()), plan) for plan in plans]

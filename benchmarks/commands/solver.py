@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from scenes.options.shared_options import add_json, add_seed, to_json_line
 from scenes.script.shipped_files import get_template_path
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
         ("--starts", args.starts, 1),
         ("--threads", args.threads, 1),
     ):
-        check_at_least(name, value, least)
+        check_integer(name, value, least)
     if wrong := [tolerance for tolerance in args.tolerance if not LEAST <= tolerance < 1.0]:
         raise InputError(f"--tolerance {wrong[0]:g} cannot be judged: give numbers from {LEAST:g} to below 1.")
     find_device(args.device, "float64")

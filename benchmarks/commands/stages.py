@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 from scenes.options.shared_options import add_json
 from scenes.options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.errors import InputError
 
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..studies.stages import rows
 
-    check_at_least("--batch", args.batch, 1)
+    check_integer("--batch", args.batch, 1)
     theatre = build_requested_theatre(args, args.scene)
     scene = build_requested_scene(args, args.scene, theatre)
     if not any(isinstance(effect, ToolForce) for effect in scene.effects):

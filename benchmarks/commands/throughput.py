@@ -14,7 +14,7 @@ from tqdm import tqdm
 from scenes.options.shared_options import add_anatomy, add_devices, add_json
 from scenes.script.shipped_files import get_template_path
 from sim.accuracy import TRAIN
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.bodies.meshfile import read_anatomy
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.material import LAWS, Material
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     count = args.count if args.count is not None else (CUDA_COUNT if on_cuda else CPU_COUNT)
     batch = args.batch if args.batch is not None else (count if on_cuda else CPU_BATCH)
     for name, value in (("--count", count), ("--batch", batch), ("--repeats", args.repeats)):
-        check_at_least(name, value, 1)
+        check_integer(name, value, 1)
     materials = [Material(law, YOUNG, poisson) for law in args.laws for poisson in args.poisson]
     anatomy = read_anatomy(args.anatomy or get_template_path())
     trial = Trial(anatomy, (), args.element, devices[0], batch)

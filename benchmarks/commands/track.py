@@ -6,7 +6,7 @@ import sys
 from dataclasses import asdict
 
 from scenes.options.shared_options import add_json, add_seed
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 
 from .locate import bar
 
@@ -26,8 +26,8 @@ def run(args: argparse.Namespace) -> int:
     """Measure; return 1 if a wrong pose was reported as certain."""
     from ..studies.track_study import studied
 
-    check_at_least("--pictures", args.pictures, 2)
-    check_at_least("--seed", args.seed, 0)
+    check_integer("--pictures", args.pictures, 2)
+    check_integer("--seed", args.seed, 0)
     with bar("pictures") as heard:
         rows = studied(args.pictures, args.seed, heard)
     if args.json:

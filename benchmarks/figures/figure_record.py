@@ -10,7 +10,7 @@ from typing import Literal
 import msgspec
 
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 
 from .figure_readings import Better
 from .figures import PROGRAM
@@ -90,7 +90,9 @@ def read_record(path: Path) -> Record:
     InputError
         A file that is missing, damaged or of another kind.
     """
-    with read_as(path, KIND, "Choose another file, or measure anew by `python -m benchmarks all --json FILE.json`."):
+    with wrap_errors(
+        path, KIND, "Choose another file, or measure anew by `python -m benchmarks all --json FILE.json`."
+    ):
         record = msgspec.json.decode(path.read_bytes(), type=Record)
     now = f"{shlex.join(PROGRAM)} "
     return replace(record, rows=tuple(replace(row, command=row.command.replace(FORMER, now, 1)) for row in record.rows))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 
 from .figure_record import Entry, Record
 from .figures import NAMED, command_of
@@ -56,7 +56,7 @@ def read_page(path: Path) -> str:
     InputError
         A page without marks, with a mark that has no end, or with unknown figures.
     """
-    with read_as(path, "a page in Markdown", "Give a page of the documentation, such as docs/notes/figures.md."):
+    with wrap_errors(path, "a page in Markdown", "Give a page of the documentation, such as docs/notes/figures.md."):
         text = path.read_bytes().decode()
         if path.suffix != ".md":
             raise InputError("is no page in Markdown: give a name that ends in .md.")

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.deformation import guess
+from sim.deformation import build_start
 from sim.discretisation.footprint import compute_footprint_weights
 from sim.fem import Fem
 from sim.loads import Loads, Nodal, Pushed
@@ -223,7 +223,7 @@ def _judged(judge: Judge, case: Case, fields: np.ndarray, said: Sequence[tuple[f
     there = np.isfinite(fields).all(axis=(1, 2))
     residual, apart = np.full(len(fields), np.inf), np.full(len(fields), np.nan)
     if there.any():
-        residual[there] = judge.fem.residual(Loads((Nodal(case.force[there]),)), guess(fields[there]))
+        residual[there] = judge.fem.residual(Loads((Nodal(case.force[there]),)), build_start(fields[there]))
         apart[there] = 1e3 * np.linalg.norm(fields[there] - judge.fields[there], axis=2).max(axis=1)
     return tuple(
         Answer(seconds, float(left), float(far), reason, case.tolerance)

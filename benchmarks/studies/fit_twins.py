@@ -144,7 +144,7 @@ def patients(
         one = patient(tools, seed, number, presses, drainages)
         motion = _kept(finer, loads_of(finer, tools, one), one, device, folder)
         progress(number + 1, count)
-        yield Seen(one, place.read(motion.astype(float))) if len(motion) else None
+        yield Seen(one, place.interpolate(motion.astype(float))) if len(motion) else None
 
 
 def _kept(finer: Anatomy, loads: Loads, patient: Patient, device: str, folder: Path | None) -> np.ndarray:

@@ -167,7 +167,7 @@ def twins(
         draw = drawn(seed, number)
         motion = _kept(finer, draw, device, element, folder)
         progress(number + 1, count)
-        yield None if motion is None else Twin(draw, place.read(motion[None].astype(float))[0])
+        yield None if motion is None else Twin(draw, place.interpolate(motion[None].astype(float))[0])
 
 
 def check_same(body: Anatomy, finer: Anatomy) -> None:

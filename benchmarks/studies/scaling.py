@@ -19,8 +19,8 @@ from sim.effects import build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN
-from sim.runtime.processes import LostError, map_apart
-from sim.strategy.memory_needed import estimate_needed
+from sim.runtime.processes import LostProcessError, map_parallel
+from sim.strategy.memory_needed import estimate_fem_memory
 from surrogate.data.tool_loads import draw
 
 # Number of loads, or of seconds, after which no further batch is solved.
@@ -84,7 +84,7 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
         See `Fem`; a GPU with too little memory.
     """
     anatomy = read_anatomy(build_template_mesh(trial.folder, size))
-    needed = estimate_needed(anatomy, trial.element, TRAIN, trial.device, batch, batch)
+    needed = estimate_fem_memory(anatomy, trial.element, TRAIN, trial.device, batch, batch)
     if needed is not None:
         print(f"{needed}.", file=sys.stderr)
         needed.check_fits()
@@ -128,8 +128,8 @@ def rows(
             build_template_mesh(trial.folder, size)
             said(f"{size} nodes, batch of {batch}")
             try:
-                yield from (row for _, row in map_apart(partial(measured, trial, size), [batch]))
-            except LostError:
+                yield from (row for _, row in map_parallel(partial(measured, trial, size), [batch]))
+            except LostProcessError:
                 raise InputError(
                     f"{size} nodes with --batch {batch}: the process was ended, for want of memory most likely; "
                     "leave this size out, or give a smaller batch."

@@ -114,12 +114,12 @@ def works(site: CraniotomyFrame, runs: int, on_cuda: bool) -> Iterator[Work]:
 def tried(fem: Fem, step: SolverStep | None) -> bool:
     """Return True if a solver uses an acceleration on its device, with its element and effects."""
     plan = fem.plan
-    own = {plan.many, plan.single, plan.contact}
+    own = {plan.batched, plan.single, plan.contact_solver}
     return (
         step is None
         or step in own
         or (plan.uses_lbfgs and step is SolverStep.LBFGS)
-        or (plan.frames and step is SolverStep.FRAME)
+        or (plan.captures_frames and step is SolverStep.FRAME)
     )
 
 

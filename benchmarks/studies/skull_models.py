@@ -8,7 +8,7 @@ import numpy as np
 from scenes.analysis.measurement import time_work
 from sim.accuracy import NO_STRAIN_LIMIT
 from sim.anatomy import Anatomy
-from sim.debonding import TEARING, Tearing, solve_with_debonding
+from sim.debonding import TEARING, Debonding, solve_with_debonding
 from sim.deformation import Deformation, join_deformations
 from sim.effects import Bonded, build_push_effects
 from sim.fem import Fem
@@ -54,7 +54,7 @@ def rows(
     poissons: Sequence[float],
     loads: Loads,
     device: str,
-    tearing: Tearing = TEARING,
+    tearing: Debonding = TEARING,
 ) -> Iterator[Row]:
     """Yield a row for each mesh, Poisson's ratio and skull, of the same loads; 3 kPa, neo-Hookean, default element."""
     for poisson in poissons:
@@ -63,7 +63,7 @@ def rows(
                 yield _measured(anatomy, skull, poisson, loads, device, tearing)
 
 
-def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device: str, tearing: Tearing) -> Row:
+def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device: str, tearing: Debonding) -> Row:
     mesh, tissue = anatomy.mesh, Material("neo-hookean", 3000.0, poisson)
     weak = loads.select(slice(0, 1)).scale(1e-3)
     _answered(anatomy, skull, tissue, weak, device, tearing)  # kernels are compiled or loaded
@@ -79,7 +79,7 @@ def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device
 
 
 def _answered(
-    anatomy: Anatomy, skull: str, tissue: Material, loads: Loads, device: str, tearing: Tearing
+    anatomy: Anatomy, skull: str, tissue: Material, loads: Loads, device: str, tearing: Debonding
 ) -> tuple[Deformation, np.ndarray, float]:
     """Solve; return results, mask (B,) of good ones, and time per load [s], with set-up for debonding only."""
     if skull in TORN:

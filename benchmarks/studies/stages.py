@@ -10,7 +10,7 @@ from scenes.play.deformers import PatientSetup
 from scenes.play.player import Player
 from sim.accuracy import LIVE, TRAIN
 from sim.fem import Fem
-from sim.resected_fem import OperatedFem
+from sim.resected_fem import ResectedFem
 from surrogate.data.tool_loads import draw
 
 WARM_UP = 3
@@ -40,7 +40,7 @@ def rows(
     deformer: str,
     solves: int,
     batch: int,
-    made: Callable[[Fem | OperatedFem], object] = lambda fem: None,
+    made: Callable[[Fem | ResectedFem], object] = lambda fem: None,
 ) -> Iterator[Row]:
     """Yield the rows of a patient setup: FEM, trained models, and images of a player with a `deformer`.
 

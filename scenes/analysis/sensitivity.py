@@ -7,7 +7,7 @@ import numpy as np
 
 from sim.accuracy import NO_STRAIN_LIMIT, Accuracy
 from sim.anatomy import TUMOUR_LABEL, Anatomy
-from sim.deformation import Deformation, guess
+from sim.deformation import Deformation, build_start
 from sim.discretisation.footprint import compute_footprint_weights
 from sim.effects import SKULLS, Elasticity, ToolDisplacement, build_push_effects
 from sim.errors import InputError
@@ -180,7 +180,7 @@ def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Ite
     body, fem = study.body, study.build_fem(study.body)
     pushed = fem.deform(study.loads)
     matched = match_motion(study.anatomy, study.loads, pushed)
-    defaults = ((study.loads, pushed), (matched, fem.deform(matched, guess(pushed.displacement))))
+    defaults = ((study.loads, pushed), (matched, fem.deform(matched, build_start(pushed.displacement))))
     rest = np.zeros((len(study.loads), len(nodes), 3))
     whole = [change(default.restrict(nodes), default.restrict(nodes), rest) for _, default in defaults]
     yield SensitivityRow(Variant("motion itself", "", "", body), *whole)
@@ -192,7 +192,7 @@ def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Ite
             asked = apply_aim(loads, variant.aim, patch)
             start = np.tile(default.displacement, (len(asked) // len(loads), 1, 1))
             of_default = default.restrict(nodes)
-            found.append(change(fem.deform(asked, guess(start), nodes), of_default, of_default.displacement))
+            found.append(change(fem.deform(asked, build_start(start), nodes), of_default, of_default.displacement))
         yield SensitivityRow(variant, *found)
 
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.errors import InputError
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 
 from ..options.camera_options import add_camera, add_targets
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
@@ -94,9 +94,9 @@ def run(args: argparse.Namespace) -> int:
     from ..tracked.filming import place_reference
     from ..tracked.registration_file import describe_other_mesh, read_registration
 
-    check_at_least("--draws", args.draws, MIN_BODIES)
-    check_at_least("--samples", args.samples, MIN_SAMPLES)
-    check_at_least("--twins", args.twins, 0)
+    check_integer("--draws", args.draws, MIN_BODIES)
+    check_integer("--samples", args.samples, MIN_SAMPLES)
+    check_integer("--twins", args.twins, 0)
     for name, value in (
         ("--corner-noise", args.corner_noise),
         ("--latency", args.latency),
@@ -184,7 +184,7 @@ def _read_intrinsic_covariance(args: argparse.Namespace, calibration: Calibratio
     if args.camera is None:
         raise InputError("--intrinsics belongs to a camera: give it by --camera.")
     wanted = "Give the K.json that `sulcus calibrate` wrote next to the camera."
-    with read_as(path, "a covariance of intrinsics", wanted):
+    with wrap_errors(path, "a covariance of intrinsics", wanted):
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
         covariance, values = np.array(stored["covariance"], float), np.array(stored["values"], float)
         if covariance.shape != (9, 9) or not np.isfinite(covariance).all() or not (np.diag(covariance) >= 0.0).all():

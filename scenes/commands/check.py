@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, TextIO
 
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 
 from ..options.camera_options import add_camera, apply_camera_options
 from ..options.shared_options import add_json, add_style
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.reference import solve_reference_frames
     from ..script.scene import SCENES
 
-    check_at_least("--every", args.every, 1)
+    check_integer("--every", args.every, 1)
     asked = args.scenes or [*SCENES, TRACKING]
     names = [name for name in asked if name != TRACKING]
     theatre = build_requested_theatre(args, *names)

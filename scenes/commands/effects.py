@@ -5,7 +5,7 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.errors import InputError
 from sim.runtime.threads import choose_threads
 
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from ..play.effect_record import format_unphysical, read_effect_records, write_effect_record
     from ..script.scene import SCENES
 
-    check_at_least("--every", args.every, 1)
+    check_integer("--every", args.every, 1)
     names = args.scenes or SCENES
     theatre = open_theatre(args.anatomy, device=args.device, scenes=names)
     scenes = [build_requested_scene(args, name, theatre) for name in names]

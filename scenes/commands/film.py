@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, explain_error
 
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     from ..tracked.tracked_tool import write_tool
     from ..tracked.truth import VideoGroundTruth, write_table, write_truth
 
-    check_at_least("--every", args.every, 1)
+    check_integer("--every", args.every, 1)
     for name, value in (
         ("--blur", args.blur),
         ("--noise", args.noise),

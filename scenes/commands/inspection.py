@@ -11,7 +11,7 @@ from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL, name_region
 from sim.bodies.dural_septa import SEPTA
 from sim.bodies.head_masks import NECROSIS, HeadMasks
 from sim.bodies.placement import describe_side
-from sim.bodies.space_consistency import share_on
+from sim.bodies.space_consistency import compute_inside_fraction
 from sim.bodies.subject import Subject
 from sim.effects import Elasticity
 from sim.material import Tissue
@@ -202,6 +202,6 @@ def _find_warnings(found: Inspection, subject: Subject, limits: InspectionLimits
     if max(found.voxel) > limits.max_voxel_ratio * min(found.voxel):
         yield f"voxels are up to {max(found.voxel):.1f} mm long: surfaces have steps of that size"
     if subject.intensity is not None:
-        covered = share_on(subject.intensity.values.shape, subject.intensity.affine, subject.cortex)
+        covered = compute_inside_fraction(subject.intensity.values.shape, subject.intensity.affine, subject.cortex)
         if covered < limits.min_t1_coverage:
             yield f"the T1 holds {100.0 * covered:.0f} % of the brain's surface: is it of the same space?"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.anatomy import name_region
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 
 from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.locating.observed_files import read_observation
 
     out = None if args.out is None else check_output_path(args.out, ".vtu", args.force, [args.anatomy])
-    check_at_least("--seed", args.seed, 0)
+    check_integer("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
     observation = replace(

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.errors import InputError
 from sim.material import BRAIN
 
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from surrogate.locating.regions import describe_regions
 
     path = check_output_path(args.out or to_locator_path(args.anatomy), ".npz", args.force, [args.anatomy])
-    check_at_least("--seed", args.seed, 0)
+    check_integer("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
     locator = make_with_progress(path, anatomy, args.seed, args.device, list_regions_known(args, anatomy))

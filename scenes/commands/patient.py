@@ -16,7 +16,7 @@ from sim.bodies.intensity import encode_intensity
 from sim.bodies.label_volume import build_masked_subject
 from sim.bodies.meshfile import read_anatomy
 from sim.bodies.sample_head import build_sample_head
-from sim.bodies.subject import MeshPlan, choose_craniotomy, find_opened_cortex
+from sim.bodies.subject import MeshPlan, choose_diameter, find_exposed_cortex
 from sim.elements import RECOMMENDED
 from sim.errors import InputError
 from sim.material import BRAIN, LAWS, Tissue
@@ -199,7 +199,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
     masks = read_head_masks(parse_sources(args))
     subject = place_craniotomy(build_masked_subject(masks, args.t1, regions=parse_regions(args)), args)
     found = inspect_subject(masks, subject, regions)
-    opened = find_opened_cortex(subject, choose_craniotomy(subject, plan))
+    opened = find_exposed_cortex(subject, choose_diameter(subject, plan))
     with write_atomically(picture, ".png") as partial:
         write_png(partial, draw_inspection_sheet(found, masks, subject, opened))
     took = round(time.perf_counter() - began, 2)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ar.screen import Film, read_png, write_film
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, explain_error
 
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
 
     from ..play.scene_costs import add_cost_label
 
-    check_at_least("--every", args.every, 1)
+    check_integer("--every", args.every, 1)
     check_output_folder(args.out, "frames")
     if args.film is not None:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):

@@ -9,7 +9,7 @@ import numpy as np
 from sim.accuracy import MIN_TOLERANCE, Accuracy
 from sim.anatomy import Anatomy
 from sim.bodies.meshfile import UNITS, MeshFile, read_mesh, write_mesh
-from sim.deformation import Deformation, guess
+from sim.deformation import Deformation, build_start
 from sim.diagnostics.stretch import MAX_STRETCH, MIN_STRETCH
 from sim.effects import SKULLS, Effect, Held, NodalForce
 from sim.errors import InputError
@@ -133,7 +133,7 @@ def read_start(file: MeshFile, name: str, metre: float) -> Deformation | None:
     """
     if "start" not in file.point_data:
         return None
-    return guess(metre * _check_field(name, "start", file.point_data["start"], {(len(file.mesh.nodes), 3)})[None])
+    return build_start(metre * _check_field(name, "start", file.point_data["start"], {(len(file.mesh.nodes), 3)})[None])
 
 
 def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads, list[str]]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 
 from ..options.outputs import check_output_path
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
@@ -79,8 +79,8 @@ def run(args: argparse.Namespace) -> int:
     from ..script.shipped_files import get_template_path
     from ..script.uncertainty import read_uncertainties, to_uncertainty_path, write_uncertainties
 
-    check_at_least("--draws", args.draws, MIN_BODIES)
-    check_at_least("--twins", args.twins, 2 if args.twins else 0)
+    check_integer("--draws", args.draws, MIN_BODIES)
+    check_integer("--twins", args.twins, 2 if args.twins else 0)
     names = args.scenes or SCENES
     theatre = open_theatre(args.anatomy, args.model, args.device, names)
     scenes = [build_requested_scene(args, name, theatre) for name in names]

@@ -23,7 +23,7 @@ from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import Loads, Posture, Pushed, Resected, Retracted, Touching
-from sim.resected_fem import OperatedFem
+from sim.resected_fem import ResectedFem
 from sim.runtime.atomic_files import check_disk_space, write_stream_atomically
 from sim.runtime.versions import get_version
 from surrogate.data.solution_rows import describe_tissue_source
@@ -131,7 +131,7 @@ class EpisodeRecording:
     grain: Callable[[int, np.ndarray], np.ndarray] = lambda number, colour: colour
     sensed: Callable[[Mapping[str, Any]], Mapping[str, np.ndarray]] = lambda columns: {}
     stated: Mapping[str, str | int] = field(default_factory=dict)
-    fem: Fem | OperatedFem | None = None
+    fem: Fem | ResectedFem | None = None
 
 
 FULL_RECORDING = EpisodeRecording()
@@ -159,7 +159,7 @@ def collect(
     total = len(player.scene.times)
     check_disk_space(path, int(total * PIXEL_BYTES * player.camera.width * player.camera.height))
     right = replace(player.stage) if player.scene.viewpoint.eye == "left" else None
-    with write_stream_atomically(path, ".h5", sweep=False) as stream, h5py.File(stream, "w") as file:
+    with write_stream_atomically(path, ".h5", clean=False) as stream, h5py.File(stream, "w") as file:
         pictures = file.create_group("pictures")
         stores: dict[str, h5py.Dataset] = {}
         rows, loads = [], []  # a frame itself holds seven megabytes

@@ -37,7 +37,7 @@ def check_resumed(data: Path, stated: Mapping[str, str], others: Sequence[Path])
     said = json.dumps(dict(stated), sort_keys=True)
     if not _is_of(data, said):
         forget(data)
-        with write_atomically(data.with_suffix(NOTE), NOTE, sweep=False) as partial:
+        with write_atomically(data.with_suffix(NOTE), NOTE, clean=False) as partial:
             partial.write_text(said, encoding="utf-8")
     alike = [data, *(each for other in others if _is_of(each := other / data.name, said))]
     *_, (whole, size, best) = sorted(max(_find_kept_files(each), default=(False, 0, each)) for each in alike)
@@ -55,7 +55,7 @@ def _copy(source: Path, target: Path) -> None:
     with (
         suppress(FileNotFoundError),  # from a process that has finished with it
         source.open("rb") as file,
-        write_atomically(target, target.suffix, sweep=False) as partial,
+        write_atomically(target, target.suffix, clean=False) as partial,
         partial.open("wb") as copy,
     ):
         shutil.copyfileobj(file, copy)

@@ -14,7 +14,7 @@ from scipy.special import ndtri
 
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.resected_fem import OperatedFem
+from sim.resected_fem import ResectedFem
 from sim.runtime.atomic_files import write_folder_atomically
 from sim.runtime.partial_files import list_partials, to_partial_path
 
@@ -107,7 +107,7 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
         return MadeEpisode(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
     resumed = False
     try:
-        with write_folder_atomically(path, kept=is_begun) as partial:
+        with write_folder_atomically(path, is_kept=is_begun) as partial:
             clear_folder(partial)
             resumed = write_body(partial, plan, seed, number, device, list_partials(path))
     except InputError as error:
@@ -146,9 +146,9 @@ class OpenedEpisode:
 
     body: EpisodeBody
     theatre: PatientSetup
-    made: dict[str, Fem | OperatedFem] = field(default_factory=dict)
+    made: dict[str, Fem | ResectedFem] = field(default_factory=dict)
 
-    def get_fem(self, scene: Scene) -> Fem | OperatedFem:
+    def get_fem(self, scene: Scene) -> Fem | ResectedFem:
         """Return the FEM solver of a scene; a few are cached, because building one takes as long as some frames."""
         asked = repr(scene.get_effects_on(self.theatre.anatomy))
         if asked not in self.made:

@@ -16,7 +16,7 @@ from sim.bodies.template import SITES
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.material import LAWS
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 from surrogate.training.train import LEARNERS, check_learners
 
 from ..script.camera_paths import PATHS
@@ -216,7 +216,7 @@ def load_plan(name: str) -> EpisodePlan:
         raise InputError(
             f"there is no plan {name!r}: choose {', '.join(list_shipped())}, or give the path of a .toml file."
         )
-    with read_as(path, "a plan", "A plan is text in UTF-8."):
+    with wrap_errors(path, "a plan", "A plan is text in UTF-8."):
         if path.stat().st_size > MAX_PLAN_BYTES:
             raise InputError(f"is longer than a plan may be, {MAX_PLAN_BYTES:,} bytes. Leave out what is no plan.")
         text = path.read_text(encoding="utf-8-sig")
@@ -233,7 +233,7 @@ def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
         A missing or unreadable file.
     """
     found, path = sha256(), plan.folder / anatomy
-    with read_as(path, "an anatomy", "Put it next to the plan."):
+    with wrap_errors(path, "an anatomy", "Put it next to the plan."):
         for file in (path, *filter(Path.is_file, [to_intensity_path(path)])):
             found.update(sha256(file.read_bytes()).digest())
     return found.hexdigest()[:16]

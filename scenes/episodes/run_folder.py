@@ -15,7 +15,7 @@ from pathlib import Path
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import explain_error, write_atomically
-from sim.runtime.partial_files import remove_left_overs
+from sim.runtime.partial_files import remove_partial_files
 from sim.runtime.versions import get_version
 
 FORMAT = "sulcus run 1"  # Name and version of the folder format.
@@ -85,8 +85,8 @@ def begin(folder: Path, run: RunSettings, text: str, force: bool = False) -> boo
         A folder of another plan, seed or device; without `force`, of other versions, or with files but no run.
     """
     for inner in (folder, folder / FAILED, folder / RATES):
-        remove_left_overs(inner)
-    remove_left_overs(folder / BODIES, kept=lambda name: not (folder / BODIES / name).exists())
+        remove_partial_files(inner)
+    remove_partial_files(folder / BODIES, is_kept=lambda name: not (folder / BODIES / name).exists())
     found = read_run(folder)
     if found is None:
         _check_empty(folder, force)

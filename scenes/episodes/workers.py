@@ -18,7 +18,7 @@ from dask import config
 from distributed import Client, Scheduler, Security, SpecCluster, Worker
 
 from sim.errors import InputError
-from sim.runtime.processes import start_process, to_gpu_variables
+from sim.runtime.processes import build_gpu_environment, start_process
 
 LOCAL_HOST = "127.0.0.1"
 """Address of the scheduler and workers: not reachable from outside this machine."""
@@ -90,7 +90,7 @@ def silence_dask() -> None:
 
 def _start(address: str, security: Security, device: str, times: int) -> _Started:
     ours, theirs = Pipe(duplex=False)
-    card = to_gpu_variables(device)
+    card = build_gpu_environment(device)
     resources = {GPU_RESOURCE: 1.0} if card else None
     process = start_process(
         _serve, address, security, resources, theirs, name="worker", variables={**ONE_THREAD_VARIABLES, **card}

@@ -11,7 +11,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sim.arguments import check_at_least
+from sim.arguments import check_integer
 from sim.errors import InputError
 
 from .episode import Episode, EpisodeStep
@@ -166,8 +166,8 @@ class Operations(VectorEnv):
         model: str | Path | None = None,
         together: bool | None = None,
     ):
-        self.num_envs = check_at_least("num_envs", num_envs, 1)
-        self.steps = check_at_least("max_episode_steps", max_episode_steps, 1)
+        self.num_envs = check_integer("num_envs", num_envs, 1)
+        self.steps = check_integer("max_episode_steps", max_episode_steps, 1)
         given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
         self.setting = open_environment_setting(task, observation, render_mode, given, together)
         self.observation, self.render_mode = observation, render_mode

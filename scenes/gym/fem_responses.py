@@ -13,7 +13,7 @@ from sim.geometry.closest_point import find_closest_points
 from sim.geometry.surface import compute_vertex_normals
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Resected, Touching
-from sim.resected_fem import OperatedFem
+from sim.resected_fem import ResectedFem
 
 from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.head_pose import HeadPose
@@ -100,7 +100,7 @@ class CutElements:
     """
 
     site: CraniotomyFrame
-    fem: OperatedFem
+    fem: ResectedFem
     ball: Hertz
     _solved: dict[tuple[int, int], Deformation] = field(default_factory=dict)
     _surfaces: dict[int, HealthySurface] = field(default_factory=dict)
@@ -157,7 +157,7 @@ class CutElements:
         return self._surfaces[done]
 
     def _build_healthy(self, done: int) -> HealthySurface:
-        body = self.fem.get_remains(done).anatomy
+        body = self.fem.get_remaining_body(done).anatomy
         left, brain = body.mesh, ~body.in_tumour
         surface = TetMesh(left.nodes, left.tets[brain], left.region[brain]).surface
         tumour = self.site.anatomy.tumour_nodes

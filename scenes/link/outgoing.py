@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ar.overlay.hud import bound_words, format_millimetres
 from sim.geometry.closest_point import find_closest_points
-from sim.geometry.locate import Located, locate
+from sim.geometry.locate import LocatedPoints, locate
 
 from ..play.stage import Stage
 from ..tracked.follower import TrackingResult, TumourState
@@ -143,7 +143,7 @@ class Outgoing:
             raise BadMessageError(f"{UNTRACKED_POINTS}: {strange}")
         return SentPlaces(tuple(names[row] for row in good), at[good], vertices[good], weights[good], strange)
 
-    def _is_in_tumour(self, held: Located, at: np.ndarray) -> np.ndarray:
+    def _is_in_tumour(self, held: LocatedPoints, at: np.ndarray) -> np.ndarray:
         """Return True for each point (n, 3) [m] in tetrahedra of the tumour."""
         there = np.linalg.norm(np.einsum("nk,nkd->nd", held.weights, self._rest[held.vertices]) - at, axis=1)
         known = np.isin(held.vertices, self.stage.anatomy.tumour_nodes) | (held.weights <= 0.0)

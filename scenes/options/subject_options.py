@@ -8,11 +8,11 @@ from typing import Any
 from sim.anatomy import PART_LABELS
 from sim.bodies.conventions import CONVENTIONS
 from sim.bodies.dural_septa import SEPTA, synthesise_falx
-from sim.bodies.head_masks import Sources
+from sim.bodies.head_masks import MaskSources
 from sim.bodies.healthy_heads import build_masked_head, read_fsaverage_head
 from sim.bodies.label_map import Label
 from sim.bodies.subject import Subject
-from sim.bodies.template import SITES, Head, Tumour, build_synthetic_subject, build_template_subject
+from sim.bodies.template import SITES, HeadScaling, Tumour, build_synthetic_subject, build_template_subject
 from sim.errors import InputError
 
 from .placement_options import point
@@ -68,9 +68,9 @@ def parse_labels(text: str) -> tuple[Label, ...]:
     return found
 
 
-def parse_sources(args: argparse.Namespace) -> Sources:
+def parse_sources(args: argparse.Namespace) -> MaskSources:
     """Return the files and labels named by the options."""
-    return Sources(
+    return MaskSources(
         args.labels,
         args.brain or (),
         args.tumour or (),
@@ -194,7 +194,7 @@ def _place_in_head(tumour: Tumour, args: argparse.Namespace) -> Subject:
     volume = None if args.brain_volume is None else 1e-6 * args.brain_volume
     if args.mask is not None:
         return build_synthetic_subject(tumour, build_masked_head(args.mask, args.t1, volume))
-    head = Head() if volume is None else Head(volume)
+    head = HeadScaling() if volume is None else HeadScaling(volume)
     if args.head == "fsaverage":
         return build_synthetic_subject(tumour, read_fsaverage_head(head.volume), head)
     return build_template_subject(tumour, head)

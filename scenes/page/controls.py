@@ -8,7 +8,7 @@ from ar.overlay.hud import name_bearings
 from ar.overlay.styles import STYLES, Style
 from ar.page.elements import STYLE_KEY
 from ar.page.parts import Dropdown, Fold, Note, Slider, Toggle
-from sim.effects import Elasticity, Gravity, Inertia, Pulsation, Resection, remember
+from sim.effects import Elasticity, Gravity, Inertia, Pulsation, Resection, has_history
 
 from ..script.camera_paths import PATHS
 from ..script.craniotomy_frame import CraniotomyFrame
@@ -137,7 +137,7 @@ def build_camera_sliders(scene: Scene, site: CraniotomyFrame, requests: Requests
 def is_animated(scene: Scene, site: CraniotomyFrame) -> bool:
     """Return True if the scene evolves without tool input."""
     effects = scene.get_effects_on(site.anatomy)
-    relaxing = remember(effect for effect in effects if isinstance(effect, Elasticity))
+    relaxing = has_history(effect for effect in effects if isinstance(effect, Elasticity))
     return relaxing or any(isinstance(effect, Gravity | Inertia | Pulsation | Resection) for effect in effects)
 
 

@@ -227,8 +227,8 @@ def report(
         parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
     details = [format_trust(frame.deformation, name), format_tumour_trust(frame.tumour_error), *estimate_texts]
     details.append(f"<p>{escape('; '.join(facts))}</p>")
-    if remaining is not None and len(remaining.loose):
-        details.append(f"<p>{len(remaining.loose)} loose elements were removed with the resection.</p>")
+    if remaining is not None and len(remaining.loose_tetrahedra):
+        details.append(f"<p>{len(remaining.loose_tetrahedra)} loose elements were removed with the resection.</p>")
     labels = {"deform": "deformation", "render": "rendering", "overlay": "overlay"}
     times = ", ".join(f"{labels.get(task, task)} {1e3 * seconds:.1f}" for task, seconds in frame.seconds.items())
     details += [verdict, f'<p class="dim">time [ms]: {times}</p></div>']

@@ -11,14 +11,14 @@ from sim.accuracy import LIVE, Accuracy
 from sim.anatomy import Anatomy, describe_region
 from sim.bodies.intensity import Intensity, read_intensity, to_intensity_path
 from sim.bodies.meshfile import read_anatomy
-from sim.deformation import Deformation, Deformer, guess
+from sim.deformation import Deformation, Deformer, build_start
 from sim.discretisation.space import recommend_element
 from sim.effects import Bonded, Elasticity, Held, ToolForce
 from sim.errors import InputError
 from sim.families.registry import FAMILIES, build_family
 from sim.fem import Fem, describe_solver
 from sim.loads import Loads
-from sim.resected_fem import OperatedFem, build_fem
+from sim.resected_fem import ResectedFem, build_fem
 from sim.runtime.device import find_device
 from surrogate.data.solution_rows import find_first_tissue
 from surrogate.locating.locator import Locator
@@ -200,7 +200,7 @@ class PatientSetup:
             return f"{model.source}; where its error may exceed {limit:g} mm, {solver}"
         return solver if name == "fem" else FAMILIES[name] if name in FAMILIES else self.models[name].source
 
-    def build_fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | OperatedFem:
+    def build_fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | ResectedFem:
         """Build FEM for a scene's effects, tissue and element; for `live` see `Fem`."""
         effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
         return build_fem(self.anatomy, effects, accuracy, self.device, batch, element, live)
@@ -309,7 +309,7 @@ class AtRest:
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         """Return zero displacement under any loads, as `guess` marks it."""
-        rest = guess(np.zeros((len(loads), *self.anatomy.mesh.nodes.shape)))
+        rest = build_start(np.zeros((len(loads), *self.anatomy.mesh.nodes.shape)))
         return rest if at is None else rest.restrict(at)
 
 

@@ -10,7 +10,7 @@ import msgspec
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import parse_json, read_as
+from sim.runtime.outside_files import parse_json, wrap_errors
 
 FORMAT = "sulcus effects 1"  # Name and version of the file format.
 SUFFIX = ".effects.json"  # Ending of the file, next to the anatomy.
@@ -54,7 +54,7 @@ def read_effect_records(path: Path) -> dict[str, EffectRecord]:
     """
     if not path.is_file():
         return {}
-    with read_as(path, "costs of effects", REMEDY):
+    with wrap_errors(path, "costs of effects", REMEDY):
         parse_json(path, FORMAT, REMEDY)
         stored = msgspec.json.decode(path.read_text(encoding="utf-8-sig"))  # unlike `json`, rejects NaN
         rows = msgspec.convert(stored["scenes"], list[EffectRecord])

@@ -7,7 +7,7 @@ import msgspec
 
 from ar.overlay.hud import bound_words
 from sim.families.registry import FAMILIES
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 
 # Sentence that says how the file is made.
 REMEDY = "`sulcus report --anatomy MESH.vtu` measures them under forces: copy its report.json to MESH.report.json."
@@ -44,7 +44,7 @@ def read_family_figures(mesh: Path, digest: str) -> dict[str, FamilyFigures]:
     """
     if not (path := mesh.with_suffix(".report.json")).is_file():
         return {}
-    with read_as(path, "a report", f"Delete it. {REMEDY}"):
+    with wrap_errors(path, "a report", f"Delete it. {REMEDY}"):
         report = msgspec.json.decode(path.read_bytes())
         found = {}
         for part in report["sections"]:

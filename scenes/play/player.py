@@ -16,7 +16,7 @@ from ar.overlay.styles import Style
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Picture
 from sim.deformation import Deformation, Deformer
-from sim.effects import remember
+from sim.effects import has_history
 from sim.families.models import LinearModel
 from sim.geometry.closest_point import find_closest_points
 from sim.geometry.first_contact import find_resting_tip
@@ -192,7 +192,7 @@ class Player:
     def remembers(self) -> bool:
         """True if a solution depends on the previous one."""
         solved = not isinstance(self.deformer, Learned)
-        return self.follows or (solved and remember(self.scene.get_effects_on(self.site.anatomy)))
+        return self.follows or (solved and has_history(self.scene.get_effects_on(self.site.anatomy)))
 
     @cached_property
     def follows(self) -> bool:

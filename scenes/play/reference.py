@@ -7,7 +7,7 @@ from sim.accuracy import TRAIN
 from sim.deformation import Deformation, Deformer, join_deformations
 from sim.fem import Fem
 from sim.loads import Loads, stack
-from sim.resected_fem import OperatedFem
+from sim.resected_fem import ResectedFem
 from sim.runtime.device import find_device
 
 from ..script.scene import Scene
@@ -16,7 +16,7 @@ from .deformers import PatientSetup
 BATCH_FRAMES = 16  # Number of frames that are solved together: small enough for regular progress reports.
 
 
-def build_reference_fem(theatre: PatientSetup, scene: Scene) -> Fem | OperatedFem:
+def build_reference_fem(theatre: PatientSetup, scene: Scene) -> Fem | ResectedFem:
     """Build FEM for reference solutions of a scene: batches of frames on a GPU, frame after frame on the CPU.
 
     A frame that starts from the last one takes a quarter of the time of a frame solved alone.
@@ -31,7 +31,7 @@ def is_history_dependent(fem: Deformer) -> bool:
 
     No history is needed if only forces act on an elastic intact body. A deformer that is not FEM needs no history.
     """
-    return isinstance(fem, OperatedFem) or (isinstance(fem, Fem) and not fem.problem.plain)
+    return isinstance(fem, ResectedFem) or (isinstance(fem, Fem) and not fem.problem.can_accelerate)
 
 
 def solve_reference_frames(
@@ -39,7 +39,7 @@ def solve_reference_frames(
     scene: Scene,
     loads: Sequence[Loads],
     progress: Callable[[int], object] = lambda more: None,
-    fem: Fem | OperatedFem | None = None,
+    fem: Fem | ResectedFem | None = None,
 ) -> Deformation:
     """Solve the loads of each frame for all vertices at training accuracy; in sequence if solutions depend on the past.
 

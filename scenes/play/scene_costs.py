@@ -81,7 +81,7 @@ def render_thumbnail(player: Player, name: str) -> Thumbnail:
 
 def _count_cuts(player: Player, frame: Frame) -> int:
     left = player.stage.select_stage(frame.loads).left
-    return 0 if left is None else left.done
+    return 0 if left is None else left.steps_done
 
 
 def _compute_medians(frames: list[Frame]) -> dict[str, float]:

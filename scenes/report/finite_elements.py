@@ -133,7 +133,7 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
     (pushed,) = loads.get_all(Pushed)
 
     def read(result: Deformation) -> np.ndarray:
-        return result.displacement if located is None else located.read(result.displacement)
+        return result.displacement if located is None else located.interpolate(result.displacement)
 
     def solve(rows: np.ndarray, force: np.ndarray) -> np.ndarray:
         pushes = Pushed(pushed.point[rows], force, pushed.footprint[rows])

@@ -10,10 +10,10 @@ from sim.accuracy import REFERENCE, TRAIN, Accuracy
 from sim.bodies.refine import refine
 from sim.effects import build_push_effects
 from sim.fem import Fem
-from sim.geometry.locate import Located, locate
+from sim.geometry.locate import LocatedPoints, locate
 from sim.loads import Loads
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 from surrogate.model.kept_arrays import REMEDY
 from surrogate.model.npz_archive import Archive
 
@@ -40,7 +40,7 @@ def solve_reference(study: ReportStudy, progress: Callable[[int], object], accur
     `progress` receives the number of newly solved loads. Stored solutions are not solved again.
     """
 
-    def made() -> tuple[Fem, Located]:
+    def made() -> tuple[Fem, LocatedPoints]:
         body = refine(study.anatomy) if study.fine else study.anatomy
         fem = Fem(
             body,
@@ -58,7 +58,7 @@ def solve_reference(study: ReportStudy, progress: Callable[[int], object], accur
 def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
     """Solve the loads beyond the training range like the data's own loads, and store each at the tumour."""
 
-    def made() -> tuple[Fem, Located]:
+    def made() -> tuple[Fem, LocatedPoints]:
         body = study.anatomy
         fem = Fem(body, build_push_effects(body, study.get_tissue_on(body)), TRAIN, study.device, None, study.element)
         return fem, locate(body.mesh, body.mesh.nodes[body.tumour_nodes])
@@ -80,7 +80,7 @@ def _solve(
     study: ReportStudy,
     kind: str,
     loads: Loads,
-    made: Callable[[], tuple[Fem, Located]],
+    made: Callable[[], tuple[Fem, LocatedPoints]],
     progress: Callable[[int], object],
 ) -> None:
     missing = np.array([row for row in range(len(loads)) if not _to_answers_path(study, kind, row).exists()], int)
@@ -90,7 +90,7 @@ def _solve(
     fem, located = made()
     for rows in np.array_split(missing, -(-len(missing) // min(fem.batch, BATCH_LOADS))):
         result = fem.deform(loads.select(rows))
-        for row, field, outcome in zip(rows, located.read(result.displacement), result.outcome, strict=True):
+        for row, field, outcome in zip(rows, located.interpolate(result.displacement), result.outcome, strict=True):
             with write_atomically(_to_answers_path(study, kind, row), ".npz") as partial:
                 np.savez(partial, displacement=field, good=outcome.good, seconds=result.cost.total / len(rows))
         progress(len(rows))
@@ -100,7 +100,7 @@ def _read(study: ReportStudy, kind: str, count: int) -> ReferenceSolutions:
     kept = []
     for row in range(count):
         path = _to_answers_path(study, kind, row)
-        with read_as(path, "a solution of the reference", REMEDY), path.open("rb") as raw:
+        with wrap_errors(path, "a solution of the reference", REMEDY), path.open("rb") as raw:
             names = "displacement", "good", "seconds"
             arrays = Archive(raw, REMEDY).read_arrays(names)
             kept.append([arrays[name] for name in names])

@@ -23,7 +23,7 @@ from sim.geometry.tetmesh import compute_digest
 from sim.material import LAWS
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
-from sim.runtime.processes import LostError, process_pool, run_on_each
+from sim.runtime.processes import LostProcessError, process_pool, run_on_each
 from sim.runtime.threads import limit_to_one_thread
 from surrogate.training.expansion import SERIES_MODELS
 from surrogate.training.train import LEARNERS
@@ -138,7 +138,7 @@ def measure_in_process(slot: AbstractContextManager[object], study: ReportStudy,
         # Data that the study has already read are not copied to the process.
         with process_pool(["cpu"], prepare_rows, replace(study)) as children, slot:
             return run_on_each(children, measure_row, [spec])[0]
-    except LostError:
+    except LostProcessError:
         return ReportRow(spec.name, FAMILY_NAMES[type(spec)], state="its process was killed, probably out of memory")
 
 

@@ -13,7 +13,7 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads
 from sim.material import Ogden
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.tool_loads import PublishedSettings, build_published_loads, draw
 from surrogate.model.npz_archive import Archive
@@ -45,7 +45,7 @@ def read_seed_mesh(path: Path, count: int) -> tuple[Anatomy, Loads]:
     InputError
         A file that cannot be read, arrays that are missing or do not belong together, a mesh that `TetMesh` rejects.
     """
-    with read_as(path, "a mesh of the seed's protocol", REMEDY), path.open("rb") as file:
+    with wrap_errors(path, "a mesh of the seed's protocol", REMEDY), path.open("rb") as file:
         arrays = Archive(file, REMEDY, MAX_SEED_BYTES).read_arrays(SEED_ARRAYS)
         for name, (kinds, dimensions) in SEED_ARRAYS.items():
             if arrays[name].dtype.kind not in kinds or arrays[name].ndim != dimensions:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import parse_json, read_as
+from sim.runtime.outside_files import parse_json, wrap_errors
 
 from .craniotomy_frame import CraniotomyFrame
 from .priors import PRIORS, REGISTRATION, SEGMENTATION
@@ -218,7 +218,7 @@ def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
     """
     if not path.is_file():
         return {}
-    with read_as(path, "uncertainties", REMEDY):
+    with wrap_errors(path, "uncertainties", REMEDY):
         return {name: _read(row) for name, row in parse_json(path, FORMAT, REMEDY)["scenes"].items()}
 
 

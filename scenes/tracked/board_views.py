@@ -7,7 +7,7 @@ from ar.tracking.image_sequences import REMEDY, read_images
 from ar.tracking.intrinsics import BoardView, find_board
 from ar.tracking.targets import Detector, Target
 from sim.errors import InputError
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def detect_board(path: Path, board: Target, size: tuple[int, int] | None = None)
         Unreadable input, images of different sizes or of another one than given, or no visible board.
     """
     views, count, first, detector = [], 0, "", Detector([board])
-    with read_as(path, "images of a board", REMEDY):
+    with wrap_errors(path, "images of a board", REMEDY):
         try:
             for picture in read_images(path):
                 count += 1

@@ -9,7 +9,7 @@ import numpy as np
 from ar.optics.calibration import MAX_TEXT_LENGTH, REMEDY, Calibration, parse_calibration, to_opencv_text, to_ros_text
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.outside_files import to_path, wrap_errors
 
 SUFFIXES = (".yaml", ".yml")  # Endings of calibration files.
 INTRINSICS = "sulcus intrinsics"
@@ -33,7 +33,7 @@ def read_calibration(path: str | Path) -> Calibration:
         rejects.
     """
     path = to_path(path)
-    with read_as(path, "a camera's calibration", REMEDY):
+    with wrap_errors(path, "a camera's calibration", REMEDY):
         if path.exists() and not path.is_file():
             raise InputError(f"is no file. {REMEDY}")
         with path.open("rb") as file:
@@ -55,7 +55,7 @@ def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
     beside = to_path(path).with_suffix(".json")
     if not beside.is_file() or beside.stat().st_size > MAX_TEXT_LENGTH:
         return None
-    with read_as(beside, "a covariance of `sulcus calibrate`", "Remove it, or calibrate the camera again."):
+    with wrap_errors(beside, "a covariance of `sulcus calibrate`", "Remove it, or calibrate the camera again."):
         stored = json.loads(beside.read_text(encoding="utf-8-sig"))
         if not isinstance(stored, dict) or not str(stored.get("format", "")).startswith(INTRINSICS):
             return None
@@ -122,7 +122,7 @@ def read_hand_eye(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     from ar.tracking.rigid import is_rigid
 
     path = to_path(path)
-    with read_as(path, "a hand-eye calibration", HAND_EYE_REMEDY):
+    with wrap_errors(path, "a hand-eye calibration", HAND_EYE_REMEDY):
         with path.open("rb") as file:
             stored = json.loads(file.read(MAX_HAND_EYE_BYTES))
         X = np.eye(4)

@@ -17,7 +17,7 @@ from ar.tracking.rigid import build_cross_matrices, turn_vectors
 from ar.tracking.synthetic_images import read_stamp
 from ar.tracking.targets import build_patient_reference, build_tool_cube, list_targets
 from sim.errors import InputError
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 
 from .agreement import Agreement
 from .pose_file import TrackedRow
@@ -60,7 +60,7 @@ def follow_body(path: Path, calibration: Calibration, body: str, frame: str, rat
         Unreadable input, or images of another size than the camera was calibrated at.
     """
     count = 0
-    with read_as(path, "a video", REMEDY):
+    with wrap_errors(path, "a video", REMEDY):
         try:
             for row in track_rows(map(_set_stamped_time, read_video(path, rate)), calibration, body, frame):
                 count += 1

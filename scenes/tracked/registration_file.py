@@ -11,7 +11,7 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.file_limits import MAX_COORDINATE
-from sim.runtime.outside_files import parse_json, read_as, to_path
+from sim.runtime.outside_files import parse_json, to_path, wrap_errors
 
 FORMAT = "sulcus registration 1"  # Name and version of the file format.
 REMEDY = "Make one by `sulcus register`."  # Remedy in error messages.
@@ -37,7 +37,7 @@ def read_registration(path: str | Path) -> Registration:
     path = to_path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file. {REMEDY}")
-    with read_as(path, "a registration", REMEDY):
+    with wrap_errors(path, "a registration", REMEDY):
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError(f"is larger than a registration. {REMEDY}")
         stored = parse_json(path, FORMAT, REMEDY)

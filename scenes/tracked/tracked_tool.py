@@ -11,7 +11,7 @@ from ar.tracking.rigid import is_rigid
 from ar.tracking.targets import TIP_DISTANCE, build_tool_cube
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.outside_files import to_path, wrap_errors
 from sim.tools import BuiltIn, parse_tool
 
 from ..script.tool import add_shaft
@@ -89,7 +89,7 @@ def read_tool(path: str | Path) -> TrackedTool:
         A missing or invalid file; an invalid shape, or a transform that is not rigid.
     """
     path = to_path(path)
-    with read_as(path, "a tracked tool", REMEDY):
+    with wrap_errors(path, "a tracked tool", REMEDY):
         with path.open("rb") as file:
             stored = json.loads(file.read(MAX_FILE_BYTES))
         if stored["format"] != FORMAT:

@@ -14,7 +14,7 @@ from ar.overlay.outlines import compute_iou, compute_silhouette
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.file_limits import MAX_TRUTH_BYTES
-from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.outside_files import to_path, wrap_errors
 from surrogate.model.npz_archive import Archive
 
 from ..play.stage import Stage
@@ -79,7 +79,7 @@ def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = MAX
         A missing or invalid file, or ground truth of another anatomy.
     """
     path = to_path(path)
-    with read_as(path, "the ground truth of a video", REMEDY), path.open("rb") as raw:
+    with wrap_errors(path, "the ground truth of a video", REMEDY), path.open("rb") as raw:
         archive = Archive(raw, REMEDY, largest)
         header = json.loads(archive.read_text("header"))
         if header["format"] != FORMAT:

@@ -11,7 +11,7 @@ from ar.tracking.image_sequences import REMEDY, read_video
 from ar.tracking.pose import check_image_size
 from ar.tracking.targets import Detector, list_targets
 from sim.errors import InputError
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 
 FIRST_IMAGES = 120  # Number of first images of a video among which some are examined.
 IMAGE_STRIDE = 10  # Stride of the examined images.
@@ -37,7 +37,7 @@ def check_video(film: Path, rate: float, calibration: Calibration, camera: str) 
     """
     targets = {target.name: target for target in list_targets()}
     detector, seen, count = Detector(tuple(targets.values())), [], 0
-    with read_as(film, "a video", REMEDY):
+    with wrap_errors(film, "a video", REMEDY):
         try:
             for picture in islice(read_video(film, rate), 0, FIRST_IMAGES, IMAGE_STRIDE):
                 check_image_size(picture.grey, calibration.width, calibration.height)

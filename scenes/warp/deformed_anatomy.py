@@ -16,7 +16,7 @@ from sim.fem import Fem
 from sim.geometry.closest_point import find_closest_points
 from sim.geometry.surface import is_enclosing
 from sim.loads import Loads, Pushed
-from sim.resected_fem import OperatedFem
+from sim.resected_fem import ResectedFem
 from surrogate.locating.calibration import RADIUS_SQUARED
 
 from ..play.deformers import AtRest, PatientSetup
@@ -139,7 +139,7 @@ class Played:
         scene, time = self.scene, float(self.scene.times[number])
         return scene.build_loads(self.theatre.site, scene.path(time), time)
 
-    def _build_moment(self, number: int, result: Deformation, fem: Fem | OperatedFem) -> DeformedAnatomy:
+    def _build_moment(self, number: int, result: Deformation, fem: Fem | ResectedFem) -> DeformedAnatomy:
         scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
         moved = result.displacement[0]
         # Nothing is located here, so that no locator is needed.

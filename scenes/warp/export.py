@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sim.errors import InputError
-from sim.fields.warp_fields import WarpFields, compute_faint_threshold, forward_on, remove_faint, warp_grid
+from sim.fields.warp_fields import WarpFields, build_warp_grid, compute_cutoff, compute_forward, remove_negligible
 
 from .deformed_anatomy import DeformedAnatomy
 from .images import PatientImage, Warped, write_field_nifti, write_warped
@@ -134,12 +134,12 @@ def name_points(moment: DeformedAnatomy, marks: Sequence[Landmark]) -> dict[str,
 
 def _write_sequence(path: Path, sequence: Sequence[tuple[float, DeformedAnatomy]]) -> None:
     anatomy = sequence[0][1].anatomy
-    moved = np.stack([remove_faint(moment.displacement) for _, moment in sequence])
-    grid = warp_grid(anatomy, moved, SEQUENCE_SPACING)
+    moved = np.stack([remove_negligible(moment.displacement) for _, moment in sequence])
+    grid = build_warp_grid(anatomy, moved, SEQUENCE_SPACING)
     if 3 * np.prod(grid.shape) * len(sequence) > MAX_VALUES:
         raise InputError(f"--sequence: {len(sequence)} moments are too many. Give a larger step.")
     pairs = zip(sequence, moved, strict=True)
-    fields = [forward_on(grid, moment.left, displacement)[0] for (_, moment), displacement in pairs]
+    fields = [compute_forward(grid, moment.left, displacement)[0] for (_, moment), displacement in pairs]
     write_field_sequence(path, grid, fields, [time for time, _ in sequence])
 
 
@@ -170,9 +170,9 @@ def collect_figures(
         "bound_of": moment.bound_words,
         "spacing_mm": round(1e3 * fields.grid.spacing, 6),
         "nodes": list(fields.grid.shape),
-        "reach_mm": 1e3 * fields.reach,
-        "faint_mm": 1e3 * compute_faint_threshold(moment.displacement),
-        "least_jacobian": dict(zip(("modeling", "resampling", "tetrahedra"), fields.least, strict=True)),
+        "reach_mm": 1e3 * fields.fade_distance,
+        "faint_mm": 1e3 * compute_cutoff(moment.displacement),
+        "least_jacobian": dict(zip(("modeling", "resampling", "tetrahedra"), fields.min_determinants, strict=True)),
         "grid_error_mm": {
             "median": float(np.median(error)),
             "moved_p95": _summarise_errors(error[moving])["p95"],
@@ -184,7 +184,7 @@ def collect_figures(
         "landmarks": [one.name for one in places.marks],
         "images": [vars(one) for one in warped],
         "sequence_frames": frames,
-        "fields_fold": fields.folds,
+        "fields_fold": fields.has_folds,
         "folds": [_summarise_fold(fold) for fold in folds],
         "warnings": _list_warnings(largest, of_tumour["worst"], folds),
     }

@@ -9,10 +9,10 @@ from nibabel.arrayproxy import ArrayProxy
 from scipy import ndimage
 
 from sim.anatomy import Anatomy
-from sim.bodies.label_map import has_whole_numbers
+from sim.bodies.label_map import has_integers
 from sim.bodies.nifti import load_nifti
 from sim.bodies.volume import READERS, Volume, read_volume
-from sim.bodies.voxels import LPS, Voxels
+from sim.bodies.voxels import LPS, VoxelSpec
 from sim.errors import InputError
 from sim.fields.grid import Grid
 from sim.fields.warp_fields import WarpFields
@@ -164,10 +164,10 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> 
     InputError
         See `read_volume`; an image that does not overlap this brain; non-integer labels.
     """
-    volume = read_volume(path, Voxels(axes=axes), finite=False)
+    volume = read_volume(path, VoxelSpec(axes=axes), require_finite=False)
     image = _as_nifti(path, volume)
     values = volume.values
-    if labels and not has_whole_numbers(values):
+    if labels and not has_integers(values):
         raise InputError(f"{path}: holds values that are not whole, so it is no label map. Give it by --image.")
     if measure_shown_share(volume.affine, values.shape, anatomy) == 0.0:
         low, high = (1e3 * end for end in (anatomy.mesh.nodes.min(axis=0), anatomy.mesh.nodes.max(axis=0)))
@@ -263,7 +263,7 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
         off = ((place < -0.5) | (place > last + 0.5)).any(axis=1)
         cut = np.zeros(len(rows), bool)
         if fields.resected.any():
-            held = ndimage.map_coordinates(fields.resected, fields.grid.index(then).T, order=0)
+            held = ndimage.map_coordinates(fields.resected, fields.grid.to_indices(then).T, order=0)
             cut = np.asarray(held, bool) & ~off
         read = ndimage.map_coordinates(
             source, np.clip(place, 0, last).T, order=order, mode="nearest", prefilter=False, output=source.dtype
@@ -277,9 +277,9 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
 
 def _find_moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the nonzero backward displacements (m, 3) [m] at points (n, 3) [m], and their rows (m,)."""
-    index = fields.grid.index(now)
+    index = fields.grid.to_indices(now)
     held = np.flatnonzero(((index > 0.0) & (index < np.array(fields.grid.shape) - 1)).all(axis=1))
-    went = fields.grid.read(fields.backward, now[held])
+    went = fields.grid.interpolate(fields.backward, now[held])
     moves = np.abs(went).max(axis=1) > MOTION_TOLERANCE
     return went[moves], held[moves]
 

@@ -42,8 +42,8 @@ def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, .
     if body.in_tumour.any():
         point = compute_tumour_share(body) @ mesh.nodes
         at = locate(mesh, point[None])
-        if np.linalg.norm(at.read(mesh.nodes[None])[0, 0] - point) < INSIDE_TOLERANCE:
-            found.append(Landmark(TUMOUR, point, point + at.read(displacement[None])[0, 0]))
+        if np.linalg.norm(at.interpolate(mesh.nodes[None])[0, 0] - point) < INSIDE_TOLERANCE:
+            found.append(Landmark(TUMOUR, point, point + at.interpolate(displacement[None])[0, 0]))
         else:
             triangles = body.tumour_surface
             (rest,), (triangle,), (weights,) = find_closest_points(point[None], mesh.nodes[triangles])

@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sim.errors import InputError
-from sim.fields.warp_fields import WarpFields, warp_fields, warp_grid
+from sim.fields.warp_fields import WarpFields, build_warp_grid, compute_warp_fields
 from sim.geometry.tetmesh import compute_signed_volumes
 
 from .deformed_anatomy import DeformedAnatomy
@@ -60,8 +60,8 @@ class SamplePlaces:
     def compute_errors(self, fields: WarpFields) -> np.ndarray:
         """Return the distance [m] between fields and FEM at each place (n,): the larger one of the two fields."""
         grid, now = fields.grid, self.rest + self.moved
-        forward = grid.read(fields.forward, self.rest) - self.moved
-        backward = grid.read(fields.backward, now) + self.moved
+        forward = grid.interpolate(fields.forward, self.rest) - self.moved
+        backward = grid.interpolate(fields.backward, now) + self.moved
         return np.maximum(np.linalg.norm(forward, axis=1), np.linalg.norm(backward, axis=1))
 
 
@@ -174,8 +174,8 @@ def find_finer_spacing(
 
 
 def _count_nodes(moment: DeformedAnatomy, spacing: float) -> float:
-    return float(np.prod(warp_grid(moment.anatomy, moment.displacement[None], spacing).shape, dtype=float))
+    return float(np.prod(build_warp_grid(moment.anatomy, moment.displacement[None], spacing).shape, dtype=float))
 
 
 def _compute_fields(moment: DeformedAnatomy, spacing: float, step: Callable[[int], object]) -> WarpFields:
-    return warp_fields(moment.anatomy, moment.displacement, spacing, moment.left, lambda: step(1))
+    return compute_warp_fields(moment.anatomy, moment.displacement, spacing, moment.left, lambda: step(1))

@@ -22,7 +22,7 @@ GENERATORS = "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class CellBlock:
     """Elements of one type: node indices (n, k) of tetrahedra, (n, 0) of other elements."""
 
     type: str
@@ -34,7 +34,7 @@ class AbaqusMesh:
     """File contents with the field names of a meshio mesh; each set lists its row indices per block."""
 
     points: np.ndarray
-    cells: list[Block]
+    cells: list[CellBlock]
     cell_sets: Mapping[str, list[np.ndarray]]
     point_data: Mapping[str, Any] = field(default_factory=dict)
     cell_data: Mapping[str, Any] = field(default_factory=dict)
@@ -73,7 +73,7 @@ def read_abaqus(path: Path) -> AbaqusMesh:
                 sets.setdefault(options["ELSET"], []).extend(_parse_set_members(rows, "GENERATE" in options, sets))
     try:
         cells = [
-            Block(kind, np.array([[index[n] for n in row[1:]] for row in table.tolist()])) for kind, table in blocks
+            CellBlock(kind, np.array([[index[n] for n in row[1:]] for row in table.tolist()])) for kind, table in blocks
         ]
     except KeyError as error:
         raise InputError(f"an element names node {error}, which no *NODE lists: list it there.") from error

@@ -30,36 +30,36 @@ class Lattice:
 
     nodes: np.ndarray
     tets: np.ndarray
-    centre: np.ndarray
+    is_centre: np.ndarray
 
 
-def build_graded_lattice(low: np.ndarray, high: np.ndarray, coarsest: float, levels: int, size: Sizing) -> Lattice:
+def build_graded_lattice(low: np.ndarray, high: np.ndarray, max_edge: float, halvings: int, sizing: Sizing) -> Lattice:
     """Return the lattice over the box from `low` (3,) to `high` (3,) [m].
 
-    Cells of edge `coarsest` [m] are halved up to `levels` times until they are no larger than `size`. Neighbouring
+    Cells of edge `max_edge` [m] are halved up to `halvings` times until they are no larger than `sizing`. Neighbouring
     cells, including diagonal ones, differ by at most one halving.
     """
-    count = np.ceil((high - low) / coarsest).astype(int)
-    origin = 0.5 * (low + high) - 0.5 * coarsest * count
-    exists, split = _build_octree(origin, count, coarsest, levels, size)
-    unit = coarsest / 2 ** (levels + 1)  # half the finest cell: every node has whole coordinates
-    span = count * 2 ** (levels + 1) + 1
+    count = np.ceil((high - low) / max_edge).astype(int)
+    origin = 0.5 * (low + high) - 0.5 * max_edge * count
+    exists, split = _build_octree(origin, count, max_edge, halvings, sizing)
+    unit = max_edge / 2 ** (halvings + 1)  # half the finest cell: every node has whole coordinates
+    span = count * 2 ** (halvings + 1) + 1
 
     leaves = [there & ~halved for there, halved in zip(exists, split, strict=True)]
-    corners = [np.argwhere(leaf) * 2 ** (levels + 1 - level) for level, leaf in enumerate(leaves)]
+    corners = [np.argwhere(leaf) * 2 ** (halvings + 1 - level) for level, leaf in enumerate(leaves)]
     known = np.unique(
         np.concatenate(
             [
                 _compute_keys(
-                    (at[:, None] + 2 ** (levels + 1 - level) * np.indices((2, 2, 2)).reshape(3, 8).T), span
+                    (at[:, None] + 2 ** (halvings + 1 - level) * np.indices((2, 2, 2)).reshape(3, 8).T), span
                 ).ravel()
                 for level, at in enumerate(corners)
             ]
         )
     )
     cells: list[np.ndarray] = []
-    for level in range(levels + 1):
-        edge = 2 ** (levels + 1 - level)
+    for level in range(halvings + 1):
+        edge = 2 ** (halvings + 1 - level)
         for axis in range(3):
             cells += _build_tets_between_equals(leaves[level], axis, edge, known, span)
             cells += _build_tets_between_unequals(leaves[level], exists[level], axis, edge)
@@ -73,11 +73,9 @@ def _build_octree(
     origin: np.ndarray, count: np.ndarray, coarsest: float, levels: int, size: Sizing
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return two boolean grids per level: existing cells, and those of them that are halved."""
-    split = []
-    there = np.ones(count, bool)
+    split, there = [], np.ones(count, bool)
     for level in range(levels):
-        edge = coarsest / 2**level
-        index = np.argwhere(there)
+        edge, index = coarsest / 2**level, np.argwhere(there)
         halved = np.zeros(there.shape, bool)
         halved[tuple(index.T)] = size(origin + edge * (index + 0.5)) < edge
         split.append(halved)
@@ -114,8 +112,7 @@ def _build_tets_between_equals(
     corner = np.argwhere(np.delete(leaf, -1, axis) & ahead) * edge
     below = corner + edge // 2
     above = below + edge * np.eye(3, dtype=int)[axis]
-    square = _compute_face_corners(corner, axis, edge, upper=True)
-    tets = []
+    square, tets = _compute_face_corners(corner, axis, edge, upper=True), []
     for k in range(4):
         start, end = square[:, k], square[:, (k + 1) % 4]
         middle = (start + end) // 2
@@ -130,8 +127,7 @@ def _build_tets_between_unequals(leaf: np.ndarray, exists: np.ndarray, axis: int
     """Return the split pyramids on both sides of each face between a leaf and a leaf of twice its size."""
     tets = []
     for step in (-1, 1):
-        neighbour = np.roll(exists, -step, axis)
-        rim = [slice(None)] * 3
+        neighbour, rim = np.roll(exists, -step, axis), [slice(None)] * 3
         rim[axis] = slice(-1, None) if step > 0 else slice(0, 1)
         neighbour[tuple(rim)] = True  # no cell exists beyond the box
         index = np.argwhere(leaf & ~neighbour)

@@ -40,10 +40,9 @@ def add_boundary_conditions(
     """
     surface = mesh.surface
     outer = np.unique(surface)
-    lowest = outer[mesh.nodes[outer, 2].argmin()]
-    height = np.ptp(mesh.nodes[outer, 2])
+    lowest, height = outer[mesh.nodes[outer, 2].argmin()], np.ptp(mesh.nodes[outer, 2])
     stem = np.zeros(len(mesh.nodes), bool)
-    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= settings.stem_radius * height
+    stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= settings.brainstem_radius * height
     said = f"a craniotomy of {craniotomy * 1e3:g} mm" if outline is None else "the outlined opening"
     if outline is None:
         opened = compute_geodesic_distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy

@@ -18,7 +18,7 @@ class Convention:
         Description of the programs that write such labels.
     brain
         Labels of all tissue between the meninges and of the ventricles, without free fluid.
-    needed
+    required
         Labels of `brain` that a file must contain.
     tumour
         Labels of the tumour core; () if another file or the user's own numbers must mark it.
@@ -26,20 +26,20 @@ class Convention:
         Labels of parts of the core, of the brain, and of the brain, respectively.
     left, right
         Labels that occur in one hemisphere only.
-    only
+    is_exhaustive
         True if a file has no other labels than these.
-    mask
+    needs_brain_mask
         True if the brain is marked in another file.
-    apart
+    exclusive
         Labels of which a file lacks at least one.
-    deepest
+    innermost
         Labels of the innermost tissue.
     """
 
     name: str
     source: str
     brain: tuple[int, ...] = ()
-    needed: tuple[int, ...] = ()
+    required: tuple[int, ...] = ()
     tumour: tuple[int, ...] = ()
     necrosis: tuple[int, ...] = ()
     oedema: tuple[int, ...] = ()
@@ -47,22 +47,22 @@ class Convention:
     csf: tuple[int, ...] = ()
     left: tuple[int, ...] = ()
     right: tuple[int, ...] = ()
-    only: bool = False
-    mask: bool = False
-    apart: tuple[int, ...] = ()
-    deepest: tuple[int, ...] = ()
+    is_exhaustive: bool = False
+    needs_brain_mask: bool = False
+    exclusive: tuple[int, ...] = ()
+    innermost: tuple[int, ...] = ()
 
     @property
-    def known(self) -> frozenset[int]:
+    def labels(self) -> frozenset[int]:
         """All label numbers of the convention except `necrosis`, which is part of `tumour`."""
         return frozenset(self.brain + self.tumour + self.oedema + self.ventricles + self.csf)
 
-    def is_compatible(self, present: Collection[int]) -> bool:
+    def is_compatible(self, file_labels: Collection[int]) -> bool:
         """Return True if a file with these labels can follow the convention."""
-        labels = set(present) - {0}
-        if (self.tumour and not labels & set(self.tumour)) or (self.apart and labels >= set(self.apart)):
+        labels = set(file_labels) - {0}
+        if (self.tumour and not labels & set(self.tumour)) or (self.exclusive and labels >= set(self.exclusive)):
             return False
-        return set(self.needed) <= labels and (not self.only or labels <= self.known)
+        return set(self.required) <= labels and (not self.is_exhaustive or labels <= self.labels)
 
 
 def _add_right(*left: int) -> tuple[int, ...]:
@@ -88,7 +88,7 @@ FREESURFER = Convention(
         *_add_right(2, 3, 7, 8, 9, 10, 11, 12, 13, 17, 18, 26, 28, 30, 31, 78, 81),
         *DEEP, *VENTRICLES, *(parcel for side in PARCELS for parcel in side),
     ),
-    needed=(2, 41),
+    required=(2, 41),
     ventricles=VENTRICLES,
     csf=(24,),
     left=(2, 3, 7, 8, *PARCELS[0], *PARCELS[2]),
@@ -100,9 +100,9 @@ BRATS = Convention(
     tumour=(1, 3, 4),
     necrosis=(1,),
     oedema=(2,),
-    only=True,
-    mask=True,
-    apart=(3, 4),
+    is_exhaustive=True,
+    needs_brain_mask=True,
+    exclusive=(3, 4),
 )
 TUMOURS = (
     replace(
@@ -113,13 +113,13 @@ TUMOURS = (
         tumour=(2, 3),
         necrosis=(2,),
         oedema=(1,),
-        apart=(),
+        exclusive=(),
     ),
     replace(
         BRATS,
         name="brats2015",
         source="BraTS until 2016: 1 necrosis, 2 oedema, 3 non-enhancing and 4 enhancing tumour",
-        apart=(),
+        exclusive=(),
     ),
     replace(
         BRATS,
@@ -128,7 +128,7 @@ TUMOURS = (
         "resection",
         tumour=(1, 3),
         csf=(4,),
-        apart=(),
+        exclusive=(),
     ),
     replace(
         BRATS,
@@ -137,17 +137,17 @@ TUMOURS = (
         tumour=(1, 2, 3),
         necrosis=(),
         oedema=(4,),
-        apart=(),
+        exclusive=(),
     ),
 )
 FSL = Convention(
     "fsl",
     "FSL FAST with three classes of a T1: 1 fluid, 2 grey, 3 white matter",
     brain=(2, 3),
-    needed=(2, 3),
+    required=(2, 3),
     csf=(1,),
-    only=True,
-    deepest=(3,),
+    is_exhaustive=True,
+    innermost=(3,),
 )
 CONVENTIONS = {
     one.name: one
@@ -165,43 +165,43 @@ CONVENTIONS = {
 def check_labels_fit(
     path: object,
     convention: Convention,
-    present: Collection[int],
-    own: Collection[int] = (),
-    against: Callable[[Convention], str] = lambda _: "",
+    file_labels: Collection[int],
+    user_labels: Collection[int] = (),
+    find_reason: Callable[[Convention], str] = lambda _: "",
 ) -> None:
-    """Reject a file whose labels `present` do not follow a convention, apart from the user's `own` labels.
+    """Reject a file whose `file_labels` do not follow a convention, apart from the `user_labels`.
 
-    `against` returns the reason why a convention with matching numbers is not that of the file; empty if it may be.
+    `find_reason` returns the reason why a convention with matching numbers is not that of the file; empty if it may be.
 
     Raises
     ------
     InputError
         With the labels that are missing, unknown or contradictory, and the conventions that would fit.
     """
-    labels = set(present) - {0} - set(own)
-    missing = [label for label in convention.needed if label not in labels]
-    kin = convention.is_compatible(labels) or (own and not missing)
+    labels = set(file_labels) - {0} - set(user_labels)
+    missing = [label for label in convention.required if label not in labels]
+    kin = convention.is_compatible(labels) or (user_labels and not missing)
     if kin:
-        why = against(convention)
+        why = find_reason(convention)
         if not why:
             return
     elif missing:
         why = f"it lacks {_format_labels(missing)}"
-    elif convention.only and not labels <= convention.known:
-        why = f"it has {_format_labels(sorted(labels - convention.known))} in addition"
-    elif convention.apart and labels >= set(convention.apart):
-        why = f"it has {' and '.join(map(str, convention.apart))} together"
+    elif convention.is_exhaustive and not labels <= convention.labels:
+        why = f"it has {_format_labels(sorted(labels - convention.labels))} in addition"
+    elif convention.exclusive and labels >= set(convention.exclusive):
+        why = f"it has {' and '.join(map(str, convention.exclusive))} together"
     else:
-        why = f"it has none of {_format_labels([label for label in convention.tumour if label not in own])}"
+        why = f"it has none of {_format_labels([label for label in convention.tumour if label not in user_labels])}"
     others: dict[object, str] = {}
     for one in CONVENTIONS.values():
         if kin and bool(one.tumour) != bool(convention.tumour):
             continue
-        if one is not convention and one.is_compatible(labels) and not against(one):
+        if one is not convention and one.is_compatible(labels) and not find_reason(one):
             meant = [labels.intersection(of) for of in (one.tumour, one.oedema, one.necrosis)]
             others.setdefault(str(meant) if one.tumour else one.name, one.name)
     looks = f"It looks like {' or '.join(others.values())}" if others else "Name its labels: --brain 1,2 --tumour 3"
-    core = ",".join(str(label) for label in convention.tumour if label in present)
+    core = ",".join(str(label) for label in convention.tumour if label in file_labels)
     sure = f"; if it is not, name the core: --tumour {core}" if others and core else ""
     raise InputError(f"{path}: is not labelled as {convention.name} ({convention.source}): {why}. {looks}{sure}.")
 

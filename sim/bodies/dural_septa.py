@@ -26,11 +26,11 @@ SPACING = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Septum:
-    """Sheet of dura as voxel centres (n, 3) [m]; balls with radius `reach` [m], half a voxel diagonal, cover it."""
+    """Sheet of dura as voxel centres (n, 3) [m]; balls with radius `radius` [m], half a voxel diagonal, cover it."""
 
     name: str
     points: np.ndarray
-    reach: float
+    radius: float
 
 
 def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
@@ -52,8 +52,7 @@ def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
     low, high = cortex.min(axis=0), cortex.max(axis=0)
     middle = 0.5 * (low + high)
     y, z = np.meshgrid(np.arange(low[1], high[1], SPACING), np.arange(middle[2], high[2], SPACING), indexing="ij")
-    side = np.column_stack([y.ravel(), z.ravel()])
-    outline = ConvexHull(cortex[:, 1:]).equations
+    side, outline = np.column_stack([y.ravel(), z.ravel()]), ConvexHull(cortex[:, 1:]).equations
     under = -(side @ outline[:, :2].T + outline[:, 2]).max(axis=1)
     sheet = side[(under >= 0.0) & (under <= depth)]
     return Septum("falx", np.column_stack([np.full(len(sheet), middle[0]), sheet]), np.sqrt(0.5) * SPACING)
@@ -69,16 +68,15 @@ def find_fixed_vertices(mesh: TetMesh, septum: Septum) -> np.ndarray:
     ends = ends[first]
     tree, corners = KDTree(septum.points), mesh.nodes[ends]
     length = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
-    near = tree.query(corners.mean(axis=1), distance_upper_bound=0.5 * length.max() + septum.reach)[0]
-    close = near <= 0.5 * length + septum.reach
-    fixed = np.zeros(len(mesh.nodes), bool)
+    near = tree.query(corners.mean(axis=1), distance_upper_bound=0.5 * length.max() + septum.radius)[0]
+    close, fixed = near <= 0.5 * length + septum.radius, np.zeros(len(mesh.nodes), bool)
     if not close.any():
         return fixed
     ends, corners = ends[close], corners[close]
-    count = int(np.clip(np.ceil(length[close].max() / septum.reach), MIN_SAMPLES, MAX_SAMPLES))
+    count = int(np.clip(np.ceil(length[close].max() / septum.radius), MIN_SAMPLES, MAX_SAMPLES))
     along = np.linspace(0.0, 1.0, count)
     places = corners[:, :1] + along[:, None] * (corners[:, 1:] - corners[:, :1])
-    distance = tree.query(places.reshape(-1, 3), distance_upper_bound=septum.reach)[0].reshape(places.shape[:2])
+    distance = tree.query(places.reshape(-1, 3), distance_upper_bound=septum.radius)[0].reshape(places.shape[:2])
     inside = np.isfinite(distance)
     meets = inside.any(axis=1)
     where = (inside[meets] * along).sum(axis=1) / inside[meets].sum(axis=1)

@@ -8,8 +8,8 @@ RAY_OFFSET = np.array([3.37e-5, 7.13e-5])
 """Offset of the rays from the lattice [voxels], so that no ray hits an edge of triangles aligned with the lattice."""
 
 
-def fill_enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return voxels (I, J, K) bool of an `edge` [m] with centres inside a surface, and their affine (4, 4) to metres.
+def rasterise_interior(points: np.ndarray, triangles: np.ndarray, voxel_size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return voxels (I, J, K) bool of edge `voxel_size` [m] with centres inside a surface, and their affine (4, 4).
 
     The surface has vertices (n, 3) [m] and triangles (m, 3) of either orientation. A centre is inside if
     a ray to it along z crosses the surface an odd number of times.
@@ -22,16 +22,15 @@ def fill_enclosed(points: np.ndarray, triangles: np.ndarray, edge: float) -> tup
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     if (np.unique(edges, axis=0, return_counts=True)[1] != 2).any():
         raise InputError("the surface is not closed: give one without holes.")
-    low = np.floor(points.min(axis=0) / edge) - 1.0
-    shape = (np.ceil(points.max(axis=0) / edge) - low + 2.0).astype(int)
-    corners = (points / edge - low)[triangles]
+    low = np.floor(points.min(axis=0) / voxel_size) - 1.0
+    shape = (np.ceil(points.max(axis=0) / voxel_size) - low + 2.0).astype(int)
+    corners = (points / voxel_size - low)[triangles]
     corners[..., :2] += RAY_OFFSET
     column, height = _find_crossings(corners)
-    first = np.clip(np.ceil(height).astype(int), 0, shape[2] - 1)
-    changes = np.zeros(shape, np.int32)
+    first, changes = np.clip(np.ceil(height).astype(int), 0, shape[2] - 1), np.zeros(shape, np.int32)
     np.add.at(changes, (column[:, 0], column[:, 1], first), 1)
-    affine = np.diag([edge, edge, edge, 1.0])
-    affine[:3, 3] = edge * low
+    affine = np.diag([voxel_size, voxel_size, voxel_size, 1.0])
+    affine[:3, 3] = voxel_size * low
     return np.cumsum(changes, axis=2) % 2 == 1, affine
 
 

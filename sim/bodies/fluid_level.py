@@ -6,11 +6,11 @@ import numpy as np
 LEVEL_MARGIN = 1e-3
 
 
-def compute_fluid_level(nodes: np.ndarray, down: np.ndarray, share: float) -> float:
+def compute_fluid_level(nodes: np.ndarray, down: np.ndarray, fill_fraction: float) -> float:
     """Return the level [m] above the origin, against the unit vector `down` (3,), for nodes (V, 3) [m].
 
-    `share` ranges from 0 (drained) to 1 (above the highest vertex).
+    `fill_fraction` ranges from 0 (drained) to 1 (above the highest vertex).
     """
     height = -nodes @ down
     low, high = height.min() - LEVEL_MARGIN, height.max() + LEVEL_MARGIN
-    return float(low + share * (high - low))
+    return float(low + fill_fraction * (high - low))

@@ -10,11 +10,11 @@ import numpy as np
 from ..errors import InputError
 from .conventions import CONVENTIONS, Convention, check_labels_fit
 from .label_contacts import build_contradiction_check, count_label_contacts, find_contradiction
-from .label_map import Label, LabelMap, Mask, count_on_border, format_labels, read_labels, widen_grid
+from .label_map import Label, LabelMap, Mask, count_border, format_labels, read_labels, widen_grid
 from .placement import describe_side
-from .space_consistency import has_one_space
+from .space_consistency import is_mirroring_ambiguous
 from .volume import read_volume
-from .voxels import DEFAULT_VOXELS, VoxelGrid, Voxels
+from .voxels import DEFAULT_VOXELS, VoxelGrid, VoxelSpec
 
 # Fraction of labelled voxels that may lie outside the mask without a note.
 MAX_OUTSIDE_FRACTION = 0.01
@@ -25,7 +25,7 @@ CROP_MARGIN = 10
 
 
 @dataclass(frozen=True)
-class Sources:
+class MaskSources:
     """Files and labels that define brain and tumour.
 
     Parameters
@@ -38,7 +38,7 @@ class Sources:
         Name in `CONVENTIONS`, or None.
     mask
         Volume whose nonzero voxels are brain; replaces `brain`.
-    tumour_in
+    tumour_file
         Label map that the labels `tumour` (all of its labels if empty) and those of necrosis refer to.
     parts
         Labels of other tissues by name in `PART_LABELS` or `SEPTA`; they replace the convention's. Necrosis counts as
@@ -52,14 +52,14 @@ class Sources:
     tumour: tuple[Label, ...] = ()
     convention: str | None = None
     mask: Path | None = None
-    tumour_in: Path | None = None
+    tumour_file: Path | None = None
     parts: Mapping[str, tuple[Label, ...]] = field(default_factory=dict)
     axes: str = ""
 
     @property
-    def voxels(self) -> Voxels:
+    def voxel_spec(self) -> VoxelSpec:
         """Reading options for the files."""
-        return Voxels(axes=self.axes)
+        return VoxelSpec(axes=self.axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,18 +70,18 @@ class HeadMasks:
     ----------
     name
         File name or names, for error messages.
-    meant
+    brain_source
         Description of the brain's source.
     brain, tumour
         Labelled voxels; the brain mask need not include the tumour.
-    cut
+    border_voxels
         Number of brain voxels on the border of their file's grid.
     grids
         Grids of the files.
-    voxels
+    voxel_spec
         Reading options for further scans of the head.
     parts
-        Masks of other tissues by name, as in `Sources.parts` or from the convention.
+        Masks of other tissues by name, as in `MaskSources.parts` or from the convention.
     affine
         (4, 4) from indices to metres (RAS).
     notes
@@ -89,18 +89,18 @@ class HeadMasks:
     """
 
     name: str
-    meant: str
+    brain_source: str
     brain: np.ndarray
     tumour: np.ndarray
     affine: np.ndarray
     notes: tuple[str, ...] = ()
-    cut: int = 0
+    border_voxels: int = 0
     parts: dict[str, np.ndarray] = field(default_factory=dict)
     grids: tuple[VoxelGrid, ...] = ()
-    voxels: Voxels = DEFAULT_VOXELS
+    voxel_spec: VoxelSpec = DEFAULT_VOXELS
 
 
-def read_head_masks(sources: Sources) -> HeadMasks:
+def read_head_masks(sources: MaskSources) -> HeadMasks:
     """Read brain and tumour masks on the label map's grid, extended to contain the other files.
 
     Raises
@@ -112,22 +112,21 @@ def read_head_masks(sources: Sources) -> HeadMasks:
     """
     convention = _get_convention(sources)
     _check_sources(sources, convention)
-    whole = read_labels(sources.labels, sources.voxels)
+    whole = read_labels(sources.labels, sources.voxel_spec)
     brain, tumour = _select_labels(whole, sources, convention)
     marked = {} if sources.mask else {"brain": whole.mask(brain)}
-    marked |= {} if sources.tumour_in else {"tumour": whole.mask(tumour)}
+    marked |= {} if sources.tumour_file else {"tumour": whole.mask(tumour)}
     parts = {} if convention is None else _build_part_masks(whole, convention)
-    named = {name: labels for name, labels in sources.parts.items() if name != NECROSIS or not sources.tumour_in}
+    named = {name: labels for name, labels in sources.parts.items() if name != NECROSIS or not sources.tumour_file}
     parts |= {name: whole.mask(labels) for name, labels in named.items()}
     for name in named:
         if (around := _get_enclosing_mask(name)) in marked:
             marked[around] = marked[around] | parts[name]
     marked |= parts
-    others = _read_other_masks(sources, tumour)
-    either = False
+    others, either = _read_other_masks(sources, tumour), False
     if others:
         ours = {name: Mask(Path(sources.labels), mask, whole.affine) for name, mask in marked.items()}
-        either = has_one_space((ours | others)["brain"], (ours | others)["tumour"])
+        either = is_mirroring_ambiguous((ours | others)["brain"], (ours | others)["tumour"])
     shape, affine = whole.layers.shape[:3], whole.affine
     for other in others.values():
         lacking, affine = widen_grid(shape, affine, other)
@@ -135,11 +134,11 @@ def read_head_masks(sources: Sources) -> HeadMasks:
         shape = tuple((np.array(shape) + lacking.sum(axis=1)).tolist())
     marked |= {name: other.resample(shape, affine) for name, other in others.items()}
     notes = whole.notes + tuple(f"{one.path}: {note}" for one in others.values() for note in one.notes)
-    if convention is None and not sources.mask and not sources.tumour_in:
+    if convention is None and not sources.mask and not sources.tumour_file:
         notes += _note_unassigned_labels(
             whole, (*brain, *tumour, *(label for labels in named.values() for label in labels))
         )
-    if not sources.tumour_in:
+    if not sources.tumour_file:
         notes += _note_contradictions(whole, tumour, sources.parts)
     if sources.mask:
         notes += _note_voxels_outside(marked, affine) + _note_cavity(whole, convention, named)
@@ -147,26 +146,26 @@ def read_head_masks(sources: Sources) -> HeadMasks:
         notes += (_note_tumour_side(marked, affine, next(iter(others.values())).path),)
     marked, affine = _crop_masks(marked, affine)
     return HeadMasks(
-        name=" and ".join(str(path) for path in (sources.labels, sources.mask, sources.tumour_in) if path),
-        meant=f"the mask {sources.mask}" if sources.mask else f"the labels {format_labels(brain)}",
+        name=" and ".join(str(path) for path in (sources.labels, sources.mask, sources.tumour_file) if path),
+        brain_source=f"the mask {sources.mask}" if sources.mask else f"the labels {format_labels(brain)}",
         brain=marked.pop("brain"),
         tumour=marked.pop("tumour"),
         affine=affine,
         notes=notes,
-        cut=count_on_border(others["brain"].marked if sources.mask else whole.mask(brain)),
+        border_voxels=count_border(others["brain"].voxels if sources.mask else whole.mask(brain)),
         parts=marked,
         grids=(
             VoxelGrid(Path(sources.labels), whole.layers.shape[:3], whole.affine),
             *(one.grid for name, one in others.items() if name != NECROSIS),
         ),
-        voxels=sources.voxels,
+        voxel_spec=sources.voxel_spec,
     )
 
 
 def _note_unassigned_labels(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
     """Return a note on labels of the file that have no assigned meaning."""
     names = {(one.layer, one.value): one.name for one in whole.segments}
-    found = {(layer, value) for layer, present in enumerate(whole.present) for value in present}
+    found = {(layer, value) for layer, present in enumerate(whole.labels_by_layer) for value in present}
     left = [names.get(place, place[1]) for place in sorted(found - set(whole.find_layers(named)))]
     return (f"neither brain nor tumour: what is labelled {format_labels(left)}",) if left else ()
 
@@ -230,26 +229,26 @@ def _crop_masks(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict
 
 
 def _select_labels(
-    whole: LabelMap, sources: Sources, convention: Convention | None
+    whole: LabelMap, sources: MaskSources, convention: Convention | None
 ) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
     """Return the labels of brain and tumour: the user's, or those of the convention that occur."""
     brain, tumour = sources.brain, sources.tumour
     if convention is not None:
         necrosis = sources.parts.get(NECROSIS, ())
         parts = tuple(label for name, labels in sources.parts.items() if name != NECROSIS for label in labels)
-        given = brain + parts + (() if sources.tumour_in else tumour + necrosis)
+        given = brain + parts + (() if sources.tumour_file else tumour + necrosis)
         named = {value for _, value in whole.find_layers(given)}
-        checked = convention.deepest or (convention.tumour and not sources.tumour and not sources.parts)
+        checked = convention.innermost or (convention.tumour and not sources.tumour and not sources.parts)
         doubts = (build_contradiction_check(whole, convention),) if checked else ()
         check_labels_fit(sources.labels, convention, whole.labels, named, *doubts)
         _check_hemispheres(whole, convention)
         if not brain and not sources.mask:
             brain = _select_present(convention.brain, whole)
-        if not tumour and not sources.tumour_in:
+        if not tumour and not sources.tumour_file:
             tumour = _select_present(convention.tumour, whole)
     options = {"brain": "--brain" if sources.brain else "--convention", "tumour": "--tumour"}
     own = {"brain": brain, "tumour": tumour, **sources.parts}
-    elsewhere = ("tumour", NECROSIS) if sources.tumour_in else ()
+    elsewhere = ("tumour", NECROSIS) if sources.tumour_file else ()
     _check_labels_unique(
         whole, {name: (options.get(name, f"--{name}"), of) for name, of in own.items() if name not in elsewhere}
     )
@@ -266,26 +265,25 @@ def _build_part_masks(whole: LabelMap, convention: Convention) -> dict[str, np.n
     return {name: whole.mask(found) for name, of in groups.items() if (found := _select_present(of, whole))}
 
 
-def _read_other_masks(sources: Sources, tumour: Sequence[Label]) -> dict[str, Mask]:
+def _read_other_masks(sources: MaskSources, tumour: Sequence[Label]) -> dict[str, Mask]:
     """Read the masks that other files define, by name."""
     others = {}
     if sources.mask:
-        volume = read_volume(sources.mask, sources.voxels)
+        volume = read_volume(sources.mask, sources.voxel_spec)
         others["brain"] = Mask(Path(sources.mask), volume.values != 0, volume.affine, volume.notes)
-    if sources.tumour_in:
-        second, necrosis = read_labels(sources.tumour_in, sources.voxels), sources.parts.get(NECROSIS, ())
+    if sources.tumour_file:
+        second, necrosis = read_labels(sources.tumour_file, sources.voxel_spec), sources.parts.get(NECROSIS, ())
         whole = second.mask((*tumour, *necrosis) if tumour else ())
-        several = not tumour and len(second.labels) > 1
-        said = format_labels(sorted(second.labels))
+        several, said = not tumour and len(second.labels) > 1, format_labels(sorted(second.labels))
         all_of = f"its labels {said} are all taken for tumour: name those of the core by --tumour"
         notes = (*second.notes, all_of) if several else second.notes
-        others["tumour"] = Mask(Path(sources.tumour_in), whole, second.affine, notes)
+        others["tumour"] = Mask(Path(sources.tumour_file), whole, second.affine, notes)
         if necrosis:
-            others[NECROSIS] = Mask(Path(sources.tumour_in), second.mask(necrosis), second.affine)
+            others[NECROSIS] = Mask(Path(sources.tumour_file), second.mask(necrosis), second.affine)
     return others
 
 
-def _get_convention(sources: Sources) -> Convention | None:
+def _get_convention(sources: MaskSources) -> Convention | None:
     if sources.convention is None:
         return None
     if sources.convention not in CONVENTIONS:
@@ -293,23 +291,23 @@ def _get_convention(sources: Sources) -> Convention | None:
     return CONVENTIONS[sources.convention]
 
 
-def _check_sources(sources: Sources, convention: Convention | None) -> None:
+def _check_sources(sources: MaskSources, convention: Convention | None) -> None:
     """Reject sources that do not define the brain and the tumour exactly once."""
     if sources.mask and sources.brain:
         raise InputError("--mask and --brain both define the brain: give only one of them.")
-    if sources.mask and sources.tumour_in:
+    if sources.mask and sources.tumour_file:
         raise InputError(
             "--mask says what is brain and --tumour-in what is tumour: of the labels nothing is left. Give the "
             "tumour's file as labels, and --mask."
         )
-    if convention is not None and convention.mask and not (sources.mask or sources.brain):
+    if convention is not None and convention.needs_brain_mask and not (sources.mask or sources.brain):
         raise InputError(
             f"{sources.labels}: labels of {convention.name} do not mark the brain. Give --mask BRAIN.nii.gz; "
             "a skull-stripped image is accepted."
         )
     if not (sources.brain or sources.mask or (convention and convention.brain)):
         raise InputError("name at least one label of the brain: --brain 1,2, or give --mask BRAIN.nii.gz.")
-    if not (sources.tumour or sources.tumour_in or (convention and convention.tumour)):
+    if not (sources.tumour or sources.tumour_file or (convention and convention.tumour)):
         raise InputError(
             "name at least one label of the tumour: --tumour 3, or give --tumour-in FILE, in which it is marked."
         )

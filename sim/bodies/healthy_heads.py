@@ -9,13 +9,13 @@ import numpy as np
 
 from ..errors import InputError
 from ..runtime.optional_packages import install_hint
-from ..runtime.outside_files import read_as
-from .enclosed_voxels import fill_enclosed
+from ..runtime.outside_files import wrap_errors
+from .enclosed_voxels import rasterise_interior
 from .head_masks import HeadMasks
 from .intensity import Intensity, read_intensity
-from .label_map import count_on_border
+from .label_map import count_border
 from .label_volume import fill_brain
-from .template import MNI_CENTRE, HealthyHead, measure_size, scale_affine
+from .template import MNI_CENTRE, HealthyHead, measure_centroid_and_volume, scale_affine
 from .volume import read_volume
 
 VIEW_CENTRE = (1e-3 * MNI_CENTRE[0], 1e-3 * MNI_CENTRE[1], 1e-3 * MNI_CENTRE[2])  # centre of the view [m]
@@ -41,7 +41,9 @@ def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None =
     if not brain.any():
         raise InputError(f"{mask}: all voxels are 0: give a mask of the brain.")
     notes = list(read.notes)
-    masks = HeadMasks(str(mask), "its voxels", brain, np.zeros_like(brain), read.affine, cut=count_on_border(brain))
+    masks = HeadMasks(
+        str(mask), "its voxels", brain, np.zeros_like(brain), read.affine, border_voxels=count_border(brain)
+    )
     solid = fill_brain(masks, notes)
     healthy = HealthyHead(solid, read.affine, t1 and read_intensity(t1), VIEW_CENTRE, tuple(notes))
     return healthy if volume is None else _scale_head(healthy, volume)
@@ -58,13 +60,13 @@ def read_fsaverage_head(volume: float) -> HealthyHead:
         The package mne is missing, or does not contain the skull as one closed surface.
     """
     path = _find_skull_path()
-    with read_as(path, "one surface in FIF", "Reinstall its package."):
+    with wrap_errors(path, "one surface in FIF", "Reinstall its package."):
         (surface,) = import_module("mne").read_bem_surfaces(path, verbose="error")
     try:
-        mask, affine = fill_enclosed(surface["rr"], surface["tris"], VOXEL_SIZE)
+        mask, affine = rasterise_interior(surface["rr"], surface["tris"], VOXEL_SIZE)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    return _scale_head(HealthyHead(mask, affine, middle=VIEW_CENTRE), volume)
+    return _scale_head(HealthyHead(mask, affine, origin=VIEW_CENTRE), volume)
 
 
 def _find_skull_path() -> Path:
@@ -78,9 +80,8 @@ def _find_skull_path() -> Path:
 
 
 def _scale_head(healthy: HealthyHead, volume: float) -> HealthyHead:
-    centre, own = measure_size(healthy.mask, healthy.affine)
-    factor = (volume / own) ** (1.0 / 3.0)
-    grey = healthy.intensity
+    centre, own = measure_centroid_and_volume(healthy.mask, healthy.affine)
+    factor, grey = (volume / own) ** (1.0 / 3.0), healthy.intensity
     if grey is not None:
         grey = Intensity(grey.values, scale_affine(grey.affine, centre, factor, centre))
     return replace(healthy, affine=scale_affine(healthy.affine, centre, factor, centre), intensity=grey)

@@ -13,38 +13,38 @@ from ..errors import InputError
 from ..geometry.tetmesh import TetMesh
 from ..runtime.atomic_files import write_atomically
 from .volume import read_volume
-from .voxels import DEFAULT_VOXELS, Voxels
+from .voxels import DEFAULT_VOXELS, VoxelSpec
 
 # Relative difference below which grey values count as equal.
 GREY_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
-class Window:
+class GreyWindow:
     """Mapping of a scan's grey values to 0 .. 1, independent of the scanner's scale and offset.
 
     Parameters
     ----------
-    low, high
+    low_percent, high_percent
         Percentiles of the brain by volume, robust against a few voxels such as vessels.
-    dark, light
+    low_grey, high_grey
         Grey values in 0 .. 1 of these percentiles; values outside are extrapolated linearly and clipped to 0 .. 1.
     max_excess
-        Excess over `high`, in units of high - low, above which a voxel is not tissue: a vessel with contrast
+        Excess over `high_percent`, in units of high - low, above which a voxel is not tissue: a vessel with contrast
         agent, fat, or a wrong value.
     flat_grey
         Grey value if the brain is uniform.
     """
 
-    low: float = 5.0
-    high: float = 90.0
-    dark: float = 0.3
-    light: float = 0.97
+    low_percent: float = 5.0
+    high_percent: float = 90.0
+    low_grey: float = 0.3
+    high_grey: float = 0.97
     max_excess: float = 1.0
     flat_grey: float = 0.8
 
 
-STORED_WINDOW = Window(dark=0.25, light=0.75)
+STORED_WINDOW = GreyWindow(low_grey=0.25, high_grey=0.75)
 """Window of the file stored with a mesh: it preserves values darker and lighter than nearly all of the brain."""
 
 
@@ -81,7 +81,7 @@ class Intensity:
         part = Intensity(self.values[tuple(slice(a, b) for a, b in zip(low, high, strict=True))], affine)
         return Intensity(np.rint(255.0 * part.apply_window(mesh, STORED_WINDOW)).astype(np.uint8), affine)
 
-    def apply_window(self, mesh: TetMesh, window: Window = Window()) -> np.ndarray:
+    def apply_window(self, mesh: TetMesh, window: GreyWindow = GreyWindow()) -> np.ndarray:
         """Return the values (I, J, K) float32 in 0 .. 1 by a window on the brain, a mesh in the same coordinates.
 
         Values that are not finite or far too bright for tissue are replaced by the brain's median.
@@ -91,8 +91,7 @@ class Intensity:
         InputError
             A volume without finite values in the brain.
         """
-        corners = mesh.nodes[mesh.tets]
-        inverse = np.linalg.inv(self.affine)
+        corners, inverse = mesh.nodes[mesh.tets], np.linalg.inv(self.affine)
         index = np.rint(corners.mean(axis=1) @ inverse[:3, :3].T + inverse[:3, 3])
         there = ((index >= 0) & (index < self.values.shape)).all(axis=1)
         found = self.values[tuple(index[there].astype(int).T)].astype(np.float64)
@@ -102,12 +101,12 @@ class Intensity:
         found, size = found[known], mesh.volumes[there][known]
         order = np.argsort(found, kind="stable")
         share = (np.cumsum(size[order]) - 0.5 * size[order]) / size.sum()
-        low, middle, high = np.interp([0.01 * window.low, 0.5, 0.01 * window.high], share, found[order])
+        low, middle, high = np.interp([0.01 * window.low_percent, 0.5, 0.01 * window.high_percent], share, found[order])
         values = self.values.astype(np.float64)
         values[~(np.isfinite(values) & (values <= high + window.max_excess * (high - low)))] = middle
         if high - low <= GREY_TOLERANCE * max(abs(low), abs(high)):
             return np.full(values.shape, window.flat_grey, np.float32)
-        grey = window.dark + (window.light - window.dark) * (values - low) / (high - low)
+        grey = window.low_grey + (window.high_grey - window.low_grey) * (values - low) / (high - low)
         return np.clip(grey, 0.0, 1.0).astype(np.float32)
 
 
@@ -138,7 +137,7 @@ def encode_intensity(intensity: Intensity) -> bytes:
     return gzip.compress(image.to_bytes(), mtime=0)
 
 
-def read_intensity(path: str | Path, voxels: Voxels = DEFAULT_VOXELS) -> Intensity:
+def read_intensity(path: str | Path, spec: VoxelSpec = DEFAULT_VOXELS) -> Intensity:
     """Read a grey value volume, from `write_intensity` or a patient's scan.
 
     Raises
@@ -146,5 +145,5 @@ def read_intensity(path: str | Path, voxels: Voxels = DEFAULT_VOXELS) -> Intensi
     InputError
         A file that is missing, unreadable, or not a volume. Non-finite voxels are kept.
     """
-    volume = read_volume(path, voxels, finite=False)
+    volume = read_volume(path, spec, require_finite=False)
     return Intensity(volume.values, volume.affine)

@@ -40,7 +40,7 @@ SPLIT_24 = np.array([[0, 1, 2, 4], [0, 4, 2, 5], [0, 4, 5, 3]])
 
 @dataclass(frozen=True)
 class IsosurfaceStuffingOptions:
-    """Snapping thresholds and edge intersection accuracy of `cut`.
+    """Snapping thresholds and edge intersection accuracy of `cut_mesh`.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class IsosurfaceStuffingOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class CutMesh:
     """Tetrahedra that do not cross any surface cut before.
 
     nodes (V, 3) [m]; kind (V,): CENTRE, CORNER or CUT; tets (T, 4), positively oriented; inside (T,) bool and
@@ -72,56 +72,55 @@ class Pieces:
     """
 
     nodes: np.ndarray
-    kind: np.ndarray
+    node_kinds: np.ndarray
     tets: np.ndarray
     inside: np.ndarray
-    surface: np.ndarray
+    on_surface: np.ndarray
 
-    def select(self, keep: np.ndarray) -> Pieces:
-        """Return the tetrahedra marked in `keep` (T,) and their nodes, renumbered in order."""
+    def select(self, mask: np.ndarray) -> CutMesh:
+        """Return the tetrahedra marked in `mask` (T,) and their nodes, renumbered in order."""
         used = np.zeros(len(self.nodes), bool)
-        used[self.tets[keep]] = True
-        tets = (np.cumsum(used) - 1)[self.tets[keep]]
-        return Pieces(self.nodes[used], self.kind[used], tets, self.inside[keep], self.surface[used])
+        used[self.tets[mask]] = True
+        tets = (np.cumsum(used) - 1)[self.tets[mask]]
+        return CutMesh(self.nodes[used], self.node_kinds[used], tets, self.inside[mask], self.on_surface[used])
 
 
-def build_whole(lattice: Lattice) -> Pieces:
+def build_uncut_mesh(lattice: Lattice) -> CutMesh:
     """Return an uncut lattice as pieces, all of it inside."""
-    kind = np.where(lattice.centre, CENTRE, CORNER)
-    everywhere = np.ones(len(lattice.tets), bool)
-    return Pieces(lattice.nodes, kind, lattice.tets, everywhere, np.zeros(len(kind), bool))
+    kind, everywhere = np.where(lattice.is_centre, CENTRE, CORNER), np.ones(len(lattice.tets), bool)
+    return CutMesh(lattice.nodes, kind, lattice.tets, everywhere, np.zeros(len(kind), bool))
 
 
-def cut(
-    pieces: Pieces,
+def cut_mesh(
+    mesh: CutMesh,
     field: Field,
-    pinned: np.ndarray | None = None,
+    fixed: np.ndarray | None = None,
     settings: IsosurfaceStuffingOptions = IsosurfaceStuffingOptions(),
-) -> Pieces:
-    """Split `pieces` along the zero level set of `field`.
+) -> CutMesh:
+    """Split `mesh` along the zero level set of `field`.
 
-    Nodes near the surface are moved onto it; `pinned` nodes (V,) stay in place and count as lying on it.
+    Nodes near the surface are moved onto it; `fixed` nodes (V,) stay in place and count as lying on it.
     """
-    nodes = pieces.nodes.copy()
+    nodes = mesh.nodes.copy()
     values = field(nodes)
-    edges = _find_crossed_edges(pieces.tets, values)
+    edges = _find_crossed_edges(mesh.tets, values)
     at = _find_crossings(field, nodes, edges, values, settings.bisections)
-    snapped, onto = _select_snapped_nodes(edges, at, _compute_snap_fractions(pieces, edges, settings))
+    snapped, onto = _select_snapped_nodes(edges, at, _compute_snap_fractions(mesh, edges, settings))
     values[snapped] = 0.0
-    loose = snapped if pinned is None else snapped[~pinned[snapped]]
-    onto = onto if pinned is None else onto[~pinned[snapped]]
+    loose = snapped if fixed is None else snapped[~fixed[snapped]]
+    onto = onto if fixed is None else onto[~fixed[snapped]]
     start, end = nodes[edges[onto, 0]], nodes[edges[onto, 1]]
     nodes[loose] = start + at[onto, None] * (end - start)
 
     crossed = values[edges[:, 0]] * values[edges[:, 1]] < 0.0
     edges, at = edges[crossed], at[crossed, None]
     added = nodes[edges[:, 0]] + at * (nodes[edges[:, 1]] - nodes[edges[:, 0]])
-    tets, inside = _split(pieces.tets, np.sign(values).astype(int), edges)
+    tets, inside = _split(mesh.tets, np.sign(values).astype(int), edges)
     nodes = np.concatenate([nodes, added])
     flat = (np.append(values, np.zeros(len(added)))[tets] == 0.0).all(axis=1)
     inside[flat] = field(nodes[tets[flat]].mean(axis=1)) < 0.0
     surface = np.append(values == 0.0, np.ones(len(added), bool))
-    return Pieces(nodes, np.append(pieces.kind, np.full(len(added), CUT)), tets, inside, surface)
+    return CutMesh(nodes, np.append(mesh.node_kinds, np.full(len(added), CUT)), tets, inside, surface)
 
 
 def _find_crossed_edges(tets: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -148,13 +147,12 @@ def _find_crossings(
     return 0.5 * (low + high)
 
 
-def _compute_snap_fractions(pieces: Pieces, edges: np.ndarray, settings: IsosurfaceStuffingOptions) -> np.ndarray:
+def _compute_snap_fractions(pieces: CutMesh, edges: np.ndarray, settings: IsosurfaceStuffingOptions) -> np.ndarray:
     """Return the fraction (E, 2) of each edge within which a crossing snaps either end."""
-    kinds = pieces.kind[edges]
+    kinds = pieces.node_kinds[edges]
     share = np.where(kinds[:, 0] == kinds[:, 1], settings.snap_long, settings.snap_short)
     share = np.where((kinds == CUT).any(axis=1), settings.snap_other, share)
-    ends = pieces.tets[:, EDGES].reshape(-1, 2)
-    shortest = np.full(len(pieces.nodes), np.inf)
+    ends, shortest = pieces.tets[:, EDGES].reshape(-1, 2), np.full(len(pieces.nodes), np.inf)
     np.minimum.at(shortest, ends.ravel(), np.repeat(_compute_lengths(pieces.nodes, ends), 2))
     farthest = settings.snap_shortest * shortest[edges]
     return np.minimum(share[:, None], farthest / _compute_lengths(pieces.nodes, edges)[:, None])
@@ -187,8 +185,7 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     sides = side[tets]
     inner, outer = (sides < 0).sum(axis=1), (sides > 0).sum(axis=1)
     mixed = (inner > 0) & (outer > 0)
-    lone = mixed & ((inner == 1) | (outer == 1))
-    keys = edges[:, 0] * len(side) + edges[:, 1]
+    lone, keys = mixed & ((inner == 1) | (outer == 1)), edges[:, 0] * len(side) + edges[:, 1]
 
     def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return the node on edge a-b: its crossing, or the end b if that lies on the surface."""

@@ -28,27 +28,27 @@ CONTRADICTION = ContradictionSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Contacts:
+class LabelContacts:
     """Labels (n,) of a volume including 0, contact areas (n, n) [m^2] between them, and voxel counts (n,)."""
 
     labels: np.ndarray
     areas: np.ndarray
     voxels: np.ndarray
 
-    def share(self, of: Collection[int], other: Collection[int]) -> float:
-        """Return the fraction of the surface of labels `of` that touches labels `other`; 0 without surface."""
-        inside, there = np.isin(self.labels, list(of)), np.isin(self.labels, list(other))
+    def measure_contact(self, labels: Collection[int], others: Collection[int]) -> float:
+        """Return the fraction of the surface of labels `labels` that touches labels `others`; 0 without surface."""
+        inside, there = np.isin(self.labels, list(labels)), np.isin(self.labels, list(others))
         surface = self.areas[inside][:, ~inside].sum()
         return float(self.areas[inside][:, there & ~inside].sum() / surface) if surface else 0.0
 
-    def compute_share(self, of: Collection[int]) -> float:
+    def compute_voxel_fraction(self, labels: Collection[int]) -> float:
         """Return the voxels of some labels as a fraction of all labelled voxels."""
-        return float(self.voxels[np.isin(self.labels, list(of))].sum() / self.voxels[self.labels != 0].sum())
+        return float(self.voxels[np.isin(self.labels, list(labels))].sum() / self.voxels[self.labels != 0].sum())
 
 
-def count_label_contacts(whole: LabelMap) -> Contacts:
+def count_label_contacts(label_map: LabelMap) -> LabelContacts:
     """Return contacts of the labels in the first layer; faces on the border of the volume do not count."""
-    layer, affine = whole.layers[..., 0], whole.affine[:3, :3]
+    layer, affine = label_map.layers[..., 0], label_map.affine[:3, :3]
     (box,) = ndimage.find_objects((layer != 0).astype(np.uint8))
     layer = layer[tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in box)]
     labels, number = np.unique(layer, return_inverse=True)
@@ -59,18 +59,18 @@ def count_label_contacts(whole: LabelMap) -> Contacts:
         one = np.moveaxis(number, axis, 0)
         pairs = np.bincount((one[:-1] * count + one[1:]).ravel(), minlength=count**2).reshape(count, count)
         areas += face * (pairs + pairs.T)
-    return Contacts(labels, areas, np.bincount(number.ravel(), minlength=count))
+    return LabelContacts(labels, areas, np.bincount(number.ravel(), minlength=count))
 
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Reason why labels do not follow a convention; not `certain` if rare tumours show it as well."""
+    """Reason why labels do not follow a convention; not `is_certain` if rare tumours show it as well."""
 
     reason: str
-    certain: bool = True
+    is_certain: bool = True
 
 
-def find_contradiction(contacts: Contacts, convention: Convention) -> Contradiction | None:
+def find_contradiction(contacts: LabelContacts, convention: Convention) -> Contradiction | None:
     """Return a contradiction of a convention with the anatomy, or None.
 
     Necrosis must lie inside enhancing tumour, oedema and cortex outside. Either may be missing or at the brain surface.
@@ -79,42 +79,45 @@ def find_contradiction(contacts: Contacts, convention: Convention) -> Contradict
     known = convention.tumour, convention.oedema, convention.necrosis
     tumour, oedema, necrosis = map(there.intersection, known)
     outside = {0, *there} - tumour - oedema
-    for label in there.intersection(convention.deepest):
-        least = min((contacts.share({one}, {0}) for one in there.intersection(convention.known) - {label}), default=1.0)
-        found = contacts.share({label}, {0})
+    for label in there.intersection(convention.innermost):
+        least = min(
+            (contacts.measure_contact({one}, {0}) for one in there.intersection(convention.labels) - {label}),
+            default=1.0,
+        )
+        found = contacts.measure_contact({label}, {0})
         if found > least + CONTRADICTION.min_difference:
             return Contradiction(f"label {label} lies outside of the others, {found:.0%} of its surface at no label")
-    if oedema and tumour and contacts.compute_share(oedema) >= CONTRADICTION.min_oedema_fraction:
-        found = contacts.share(oedema, outside)
-        least = contacts.share(necrosis, outside) - CONTRADICTION.min_difference
+    if oedema and tumour and contacts.compute_voxel_fraction(oedema) >= CONTRADICTION.min_oedema_fraction:
+        found = contacts.measure_contact(oedema, outside)
+        least = contacts.measure_contact(necrosis, outside) - CONTRADICTION.min_difference
         if found < max(CONTRADICTION.min_outer_fraction, min(CONTRADICTION.certain_outer_fraction, least)):
             return Contradiction(
                 f"label {_to_text(oedema)} would be oedema and lies inside the tumour, {found:.0%} of its surface at "
                 "healthy tissue"
             )
-    found = contacts.share(tumour - necrosis, necrosis)
-    if found > max(CONTRADICTION.max_wrapped_fraction, contacts.share(necrosis, tumour)):
+    found = contacts.measure_contact(tumour - necrosis, necrosis)
+    if found > max(CONTRADICTION.max_wrapped_fraction, contacts.measure_contact(necrosis, tumour)):
         return Contradiction(
             f"label {_to_text(necrosis)} would be necrosis and lies round the enhancing tumour, of whose surface it "
             f"covers {found:.0%}",
-            certain=False,
+            is_certain=False,
         )
     return None
 
 
-def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
+def build_contradiction_check(label_map: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
     """Return a function that gives the reason why the anatomy contradicts a convention; empty if it does not.
 
     A contradiction that rare tumours show counts against the `chosen` convention only if another convention fits.
     """
-    if whole.layers.shape[-1] > 1:
+    if label_map.layers.shape[-1] > 1:
         return lambda _: ""
-    contacts = count_label_contacts(whole)
-    rivals = [one for one in CONVENTIONS.values() if one is not chosen and one.is_compatible(whole.labels)]
+    contacts = count_label_contacts(label_map)
+    rivals = [one for one in CONVENTIONS.values() if one is not chosen and one.is_compatible(label_map.labels)]
 
     def reason(one: Convention) -> str:
         found = find_contradiction(contacts, one)
-        if found is None or not (found.certain or one is not chosen or any(map(shown, rivals))):
+        if found is None or not (found.is_certain or one is not chosen or any(map(shown, rivals))):
             return ""
         return found.reason
 
@@ -124,10 +127,12 @@ def build_contradiction_check(whole: LabelMap, chosen: Convention) -> Callable[[
     return reason
 
 
-def _has_oedema_outside(contacts: Contacts, convention: Convention) -> bool:
+def _has_oedema_outside(contacts: LabelContacts, convention: Convention) -> bool:
     there = set(contacts.labels.tolist())
     outside = there.difference(convention.tumour, convention.oedema)
-    return contacts.share(there.intersection(convention.oedema), outside) >= CONTRADICTION.certain_outer_fraction
+    return (
+        contacts.measure_contact(there.intersection(convention.oedema), outside) >= CONTRADICTION.certain_outer_fraction
+    )
 
 
 def _to_text(labels: Collection[int]) -> str:

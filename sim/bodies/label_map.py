@@ -12,7 +12,7 @@ from scipy import ndimage
 from ..errors import InputError
 from ..runtime.file_limits import MAX_VOXELS
 from .volume import read_volume
-from .voxels import DEFAULT_VOXELS, Segment, VoxelGrid, Voxels
+from .voxels import DEFAULT_VOXELS, Segment, VoxelGrid, VoxelSpec
 
 # Maximum distance of a label from an integer, as left by scaling or resampling.
 LABEL_TOLERANCE = 1e-3
@@ -46,7 +46,7 @@ class LabelMap:
     segments: tuple[Segment, ...]
 
     @cached_property
-    def present(self) -> tuple[frozenset[int], ...]:
+    def labels_by_layer(self) -> tuple[frozenset[int], ...]:
         """Labels that occur in each layer, without 0."""
         layers = np.moveaxis(self.layers, -1, 0)
         return tuple(frozenset(np.unique(layer.T).astype(int).tolist()) - {0} for layer in layers)
@@ -54,7 +54,7 @@ class LabelMap:
     @property
     def labels(self) -> frozenset[int]:
         """Labels of all layers, without 0."""
-        return frozenset().union(*self.present)
+        return frozenset().union(*self.labels_by_layer)
 
     def mask(self, labels: Sequence[Label]) -> np.ndarray:
         """Return a mask (I, J, K) of voxels with one of these labels; of any label if the list is empty.
@@ -93,12 +93,12 @@ class LabelMap:
 
     def _place(self, label: Label) -> list[tuple[int, int]]:
         if isinstance(label, int):
-            return [(layer, label) for layer, present in enumerate(self.present) if label in present]
+            return [(layer, label) for layer, present in enumerate(self.labels_by_layer) if label in present]
         composed = {one: unicodedata.normalize("NFC", one.name) for one in self.segments}
         wanted = unicodedata.normalize("NFC", label)
         alike = [one for one, name in composed.items() if name == wanted]
         alike = alike or [one for one, name in composed.items() if name.casefold() == wanted.casefold()]
-        return [(one.layer, one.value) for one in alike if one.value in self.present[one.layer]]
+        return [(one.layer, one.value) for one in alike if one.value in self.labels_by_layer[one.layer]]
 
     def _format_conflict(self, label: Label, at: list[tuple[int, int]]) -> str:
         """Format the conflict of several segments that match one label, and the remedy."""
@@ -112,11 +112,11 @@ class LabelMap:
 
     def _format_labels(self) -> str:
         if self.segments:
-            return format_labels([one.name for one in self.segments if one.value in self.present[one.layer]])
+            return format_labels([one.name for one in self.segments if one.value in self.labels_by_layer[one.layer]])
         return format_labels(sorted(self.labels))
 
 
-def read_labels(path: str | Path, voxels: Voxels = DEFAULT_VOXELS) -> LabelMap:
+def read_labels(path: str | Path, spec: VoxelSpec = DEFAULT_VOXELS) -> LabelMap:
     """Return the label map in a file; values within 1e-3 of integers are rounded, with a note.
 
     Raises
@@ -124,11 +124,11 @@ def read_labels(path: str | Path, voxels: Voxels = DEFAULT_VOXELS) -> LabelMap:
     InputError
         Input that `read_volume` rejects; values that are not integers, or all 0.
     """
-    volume = read_volume(path, voxels, layered=True)
+    volume = read_volume(path, spec, allow_layers=True)
     values, notes = volume.values, volume.notes
     if values.dtype.kind == "f":
         whole = np.rint(values)
-        if not has_whole_numbers(values) or np.abs(whole).max() > 2**31 - 1:
+        if not has_integers(values) or np.abs(whole).max() > 2**31 - 1:
             raise InputError(f"{path}: holds fractions, so it is no label volume. Give whole-number labels.")
         if not np.array_equal(values, whole):
             notes = (*notes, f"its labels are rounded by up to {np.abs(values - whole).max():.1g}")
@@ -139,7 +139,7 @@ def read_labels(path: str | Path, voxels: Voxels = DEFAULT_VOXELS) -> LabelMap:
     return LabelMap(Path(path), layers, volume.affine, notes, volume.segments)
 
 
-def has_whole_numbers(values: np.ndarray) -> bool:
+def has_integers(values: np.ndarray) -> bool:
     """Return True if all values are integers up to the round-off of a scale."""
     return bool((np.abs(values - np.rint(values)) <= LABEL_TOLERANCE).all())
 
@@ -155,7 +155,7 @@ class Mask:
     """Marked voxels (I, J, K) bool of a file, the affine (4, 4) from their indices to metres (RAS), and notes."""
 
     path: Path
-    marked: np.ndarray
+    voxels: np.ndarray
     affine: np.ndarray
     notes: tuple[str, ...] = ()
 
@@ -168,18 +168,18 @@ class Mask:
         InputError
             An empty mask.
         """
-        rows = np.argwhere(self.marked.any(axis=2))
+        rows = np.argwhere(self.voxels.any(axis=2))
         if not len(rows):
             raise InputError(f"{self.path}: is empty, every voxel is 0. Export it again.")
-        first = self.marked.argmax(axis=2)
-        last = self.marked.shape[2] - 1 - self.marked[..., ::-1].argmax(axis=2)
+        first = self.voxels.argmax(axis=2)
+        last = self.voxels.shape[2] - 1 - self.voxels[..., ::-1].argmax(axis=2)
         ends = np.concatenate([np.column_stack([rows, end[tuple(rows.T)]]) for end in (first, last)])
         return ends @ self.affine[:3, :3].T + self.affine[:3, 3]
 
     @property
     def grid(self) -> VoxelGrid:
         """Voxel grid of the mask."""
-        return VoxelGrid(self.path, self.marked.shape, self.affine)
+        return VoxelGrid(self.path, self.voxels.shape, self.affine)
 
     @property
     def box(self) -> np.ndarray:
@@ -189,10 +189,10 @@ class Mask:
     def resample(self, shape: tuple[int, ...], affine: np.ndarray) -> np.ndarray:
         """Return the mask (I, J, K) resampled to another grid by nearest neighbour."""
         if _is_same_grid(shape, affine, self):
-            return self.marked
+            return self.voxels
         matrix = np.linalg.inv(self.affine) @ affine
         found = ndimage.affine_transform(
-            self.marked.view(np.uint8), matrix, output_shape=shape, order=0, mode="constant"
+            self.voxels.view(np.uint8), matrix, output_shape=shape, order=0, mode="constant"
         )
         return found.view(bool)
 
@@ -225,9 +225,9 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
 
 def _is_same_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> bool:
     """Return True if the grid is that of the mask."""
-    return shape == other.marked.shape and np.allclose(affine, other.affine, rtol=0.0, atol=1e-9)
+    return shape == other.voxels.shape and np.allclose(affine, other.affine, rtol=0.0, atol=1e-9)
 
 
-def count_on_border(mask: np.ndarray) -> int:
+def count_border(mask: np.ndarray) -> int:
     """Count marked voxels (I, J, K) on the volume's border."""
     return int(mask.sum() - mask[1:-1, 1:-1, 1:-1].sum())

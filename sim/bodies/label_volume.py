@@ -12,39 +12,39 @@ from ..anatomy import NECROSIS_LABEL, PART_LABELS
 from ..errors import InputError
 from ..runtime.outside_files import to_path
 from .dural_septa import SEPTA, Septum
-from .head_masks import HeadMasks, Sources, read_head_masks
+from .head_masks import HeadMasks, MaskSources, read_head_masks
 from .intensity import read_intensity
-from .label_map import Label, Mask, count_on_border
-from .placement import Piece, find_reachable_site
-from .signed_distance import Blur, mask_field
+from .label_map import Label, Mask, count_border
+from .placement import TumourPiece, find_reachable_site
+from .signed_distance import Blur, compute_level_set
 from .space_consistency import check_scan_space
-from .subject import Subject, SubjectPart, find_rim
+from .subject import Subject, SubjectPart, find_boundary_voxels
 from .voxels import VoxelGrid
 
 
 @dataclass(frozen=True)
-class Labelling:
+class MaskSettings:
     """Acceptance limits and smoothing of brain and tumour masks.
 
     Parameters
     ----------
-    smallest_brain, largest_brain
+    min_brain_volume, max_brain_volume
         Volume limits [m^3]: they cover all mammals on which neurosurgery is performed, but not wrong labels or units.
-    fewest_voxels
+    min_tumour_voxels
         Minimum voxels of a tumour component, to resolve its shape.
-    speck
+    min_component_fraction
         Minimum volume of a component, as a fraction of the tumour; smaller ones are noise.
-    extension
+    tumour_extension
         Extension of a tumour beyond the cortex [voxels]; more than the range of `blur`.
     blur
         Smoothing of both masks.
     """
 
-    smallest_brain: float = 20e-6
-    largest_brain: float = 5000e-6
-    fewest_voxels: int = 27
-    speck: float = 1e-3
-    extension: int = 8
+    min_brain_volume: float = 20e-6
+    max_brain_volume: float = 5000e-6
+    min_tumour_voxels: int = 27
+    min_component_fraction: float = 1e-3
+    tumour_extension: int = 8
     blur: Blur = field(default_factory=Blur)
 
 
@@ -53,7 +53,7 @@ def build_volume_subject(
     brain: Sequence[Label],
     tumour: Sequence[Label],
     t1: str | Path | None = None,
-    settings: Labelling = Labelling(),
+    settings: MaskSettings = MaskSettings(),
 ) -> Subject:
     """Return the subject in an integer label file, given its `brain` and `tumour` labels.
 
@@ -62,11 +62,11 @@ def build_volume_subject(
     InputError
         Input that `read_head_masks` or `build_masked_subject` rejects.
     """
-    return build_masked_subject(read_head_masks(Sources(to_path(path), tuple(brain), tuple(tumour))), t1, settings)
+    return build_masked_subject(read_head_masks(MaskSources(to_path(path), tuple(brain), tuple(tumour))), t1, settings)
 
 
 def build_masked_subject(
-    masks: HeadMasks, t1: str | Path | None = None, settings: Labelling = Labelling(), regions: Sequence[str] = ()
+    masks: HeadMasks, t1: str | Path | None = None, settings: MaskSettings = MaskSettings(), regions: Sequence[str] = ()
 ) -> Subject:
     """Return the subject whose brain and tumour are voxel masks.
 
@@ -86,7 +86,7 @@ def build_masked_subject(
             known = ", ".join(one for one in PART_LABELS if one in masks.parts) or "none"
             own = f", or name its labels by --{name}" if name in PART_LABELS else ""
             raise InputError(f"{masks.name}: marks no {name}, so it is no region. Choose from {known}{own}.")
-    intensity = None if t1 is None else read_intensity(t1, masks.voxels)
+    intensity = None if t1 is None else read_intensity(t1, masks.voxel_spec)
     if t1 is not None and intensity is not None:
         scan = VoxelGrid(to_path(t1), intensity.values.shape, intensity.affine)
         check_scan_space(Mask(Path(masks.name), masks.brain, masks.affine), scan, masks.grids)
@@ -94,11 +94,11 @@ def build_masked_subject(
     notes = list(masks.notes)
     solid = fill_brain(masks, notes, settings)
     inside = _extract_tumour(masks.name, solid, masks.tumour, voxel, notes, settings)
-    cortex, interface = find_rim(solid, affine), find_rim(inside, affine)
+    cortex, interface = find_boundary_voxels(solid, affine), find_boundary_voxels(inside, affine)
     pieces = _list_pieces(inside, affine)
     return Subject(
-        brain=mask_field(solid, affine, settings.blur),
-        tumour=mask_field(_extend_tumour(inside, solid, settings.extension), affine, settings.blur),
+        brain=compute_level_set(solid, affine, settings.blur),
+        tumour=compute_level_set(_extend_tumour(inside, solid, settings.tumour_extension), affine, settings.blur),
         cortex=cortex,
         interface=interface,
         tumour_volume=float(inside.sum() * voxel),
@@ -119,7 +119,7 @@ def _build_septum(name: str, masks: HeadMasks) -> Septum:
 
 
 def _build_parts(
-    masks: HeadMasks, solid: np.ndarray, tumour: np.ndarray, regions: Sequence[str], settings: Labelling
+    masks: HeadMasks, solid: np.ndarray, tumour: np.ndarray, regions: Sequence[str], settings: MaskSettings
 ) -> tuple[SubjectPart, ...]:
     """Return the parts that become regions; each volume counts only voxels that the mesh will assign to it."""
     voxel, parts = abs(float(np.linalg.det(masks.affine[:3, :3]))), []
@@ -128,11 +128,11 @@ def _build_parts(
         mask, label = masks.parts[name], PART_LABELS[name]
         own = mask & (tumour if label == NECROSIS_LABEL else solid & ~tumour) & ~taken
         taken |= own
-        parts.append(SubjectPart(label, mask_field(mask, masks.affine, settings.blur), float(own.sum() * voxel)))
+        parts.append(SubjectPart(label, compute_level_set(mask, masks.affine, settings.blur), float(own.sum() * voxel)))
     return tuple(reversed(parts))
 
 
-def fill_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelling()) -> np.ndarray:
+def fill_brain(masks: HeadMasks, notes: list[str], settings: MaskSettings = MaskSettings()) -> np.ndarray:
     """Return the mask (I, J, K) of a head's brain and tumour as one component without holes; changes are noted.
 
     Raises
@@ -142,13 +142,13 @@ def fill_brain(masks: HeadMasks, notes: list[str], settings: Labelling = Labelli
     """
     voxel = abs(float(np.linalg.det(masks.affine[:3, :3])))
     solid = _extract_brain(masks.brain, masks.tumour, voxel, notes)
-    smallest, largest = settings.smallest_brain, settings.largest_brain
+    smallest, largest = settings.min_brain_volume, settings.max_brain_volume
     if not smallest <= solid.sum() * voxel <= largest:
         raise InputError(
-            f"{masks.name}: {masks.meant} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
+            f"{masks.name}: {masks.brain_source} make a brain of {solid.sum() * voxel * 1e6:.3g} ml; expected "
             f"{smallest * 1e6:g} to {largest * 1e6:g} ml. Check the labels and the voxel size."
         )
-    edge = max(count_on_border(solid), masks.cut)
+    edge = max(count_border(solid), masks.border_voxels)
     if edge:
         notes.append(
             f"{edge} voxels of the brain lie on the volume's border: where it is cut there is no cortex, so see that "
@@ -172,7 +172,7 @@ def _extract_brain(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: l
 
 
 def _extract_tumour(
-    name: str, solid: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str], settings: Labelling
+    name: str, solid: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str], settings: MaskSettings
 ) -> np.ndarray:
     """Return the tumour's components in the solid, without specks."""
     inside = tumour & solid
@@ -186,9 +186,8 @@ def _extract_tumour(
             "several labels."
         )
     component, count = cast(tuple[np.ndarray, int], ndimage.label(inside, np.ones((3, 3, 3))))
-    size = np.bincount(component.ravel(), minlength=count + 1)
-    fewest = settings.fewest_voxels
-    kept = size >= max(settings.speck * inside.sum(), fewest)
+    size, fewest = np.bincount(component.ravel(), minlength=count + 1), settings.min_tumour_voxels
+    kept = size >= max(settings.min_component_fraction * inside.sum(), fewest)
     kept[0] = False
     if not kept.any():
         raise InputError(
@@ -217,13 +216,12 @@ def _extend_tumour(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray
     return extended
 
 
-def _list_pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[Piece, ...]:
+def _list_pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[TumourPiece, ...]:
     """Return the tumour's connected components, the largest first; the centre is the mean of the surface voxels."""
     component, count = cast(tuple[np.ndarray, int], ndimage.label(tumour, np.ones((3, 3, 3))))
-    voxel = abs(float(np.linalg.det(affine[:3, :3])))
-    pieces = []
+    voxel, pieces = abs(float(np.linalg.det(affine[:3, :3]))), []
     for number in range(1, count + 1):
         one = component == number
-        surface = find_rim(one, affine)
-        pieces.append(Piece(float(one.sum() * voxel), surface.mean(axis=0), surface))
+        surface = find_boundary_voxels(one, affine)
+        pieces.append(TumourPiece(float(one.sum() * voxel), surface.mean(axis=0), surface))
     return tuple(sorted(pieces, key=lambda piece: -piece.volume))

@@ -6,20 +6,19 @@ from scipy.sparse import coo_array, csgraph
 from ..geometry.tetmesh import FACES, compute_row_keys
 
 
-def find_largest_piece(tets: np.ndarray) -> np.ndarray:
+def find_largest_component(tets: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of the tetrahedra in the largest face-connected component."""
     _, number, count = np.unique(
         compute_row_keys(tets[:, FACES].reshape(-1, 3)), return_inverse=True, return_counts=True
     )
-    owner = np.repeat(np.arange(len(tets)), 4)
-    order = np.argsort(number, kind="stable")
+    owner, order = np.repeat(np.arange(len(tets)), 4), np.argsort(number, kind="stable")
     pairs = owner[order[np.flatnonzero(count[number[order]] == 2)]].reshape(-1, 2)
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(tets), len(tets)))
     _, label = csgraph.connected_components(graph, directed=False)
     return label == np.bincount(label).argmax()
 
 
-def clean(tets: np.ndarray) -> np.ndarray:
+def select_manifold(tets: np.ndarray) -> np.ndarray:
     """Return a mask (T,) of tetrahedra to keep, so that they are one component with a 2-manifold surface.
 
     The surface touches itself at an edge of more than two triangles, or at a node with more than one triangle fan. The
@@ -27,7 +26,7 @@ def clean(tets: np.ndarray) -> np.ndarray:
     """
     keep = np.ones(len(tets), bool)
     while True:
-        keep[keep] = find_largest_piece(tets[keep])
+        keep[keep] = find_largest_component(tets[keep])
         offending = _find_pinching_tets(tets[keep])
         if len(offending) == 0:
             return keep
@@ -54,27 +53,24 @@ def _find_pinching_tets(tets: np.ndarray) -> np.ndarray:
     _, fan = csgraph.connected_components(graph, directed=False)
     size, node = np.bincount(fan), np.zeros(fan.max() + 1, int)
     node[fan] = surface.ravel()
-    order = np.lexsort((np.arange(len(size)), -size, node))
-    lesser = np.ones(len(size), bool)
+    order, lesser = np.lexsort((np.arange(len(size)), -size, node)), np.ones(len(size), bool)
     lesser[order[np.unique(node[order], return_index=True)[1]]] = False
     return np.unique(behind[lesser[fan.reshape(-1, 3)].any(axis=1)])
 
 
-def find_removable_tetrahedra(tets: np.ndarray, unwanted: np.ndarray) -> np.ndarray:
-    """Return a mask of the `unwanted` tetrahedra (T,) whose removal leaves the surface a 2-manifold.
+def find_removable_tetrahedra(tets: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """Return a mask of the `candidates` tetrahedra (T,) whose removal leaves the surface a 2-manifold.
 
     This holds for three faces on the surface, or two if the edge between the other two faces is an interior
     edge; of tetrahedra that share a node only one is removed.
     """
     faces = tets[:, FACES].reshape(-1, 3)
     _, number, count = np.unique(compute_row_keys(faces), return_inverse=True, return_counts=True)
-    outer = (count[number] == 1).reshape(-1, 4)
-    width = int(tets.max()) + 1
+    outer, width = (count[number] == 1).reshape(-1, 4), int(tets.max()) + 1
     edges = np.sort(faces[outer.ravel()][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    surface_edges = np.unique(edges @ [width, 1])
-    removed = np.zeros(len(tets), bool)
+    surface_edges, removed = np.unique(edges @ [width, 1]), np.zeros(len(tets), bool)
     taken = np.zeros(width, bool)
-    for tet in np.flatnonzero(unwanted & (outer.sum(axis=1) >= 2)):
+    for tet in np.flatnonzero(candidates & (outer.sum(axis=1) >= 2)):
         hidden = tets[tet][outer[tet]]  # corners opposite outer faces: if two, the ends of the inner edge
         inner = len(hidden) == 3 or not np.isin(np.sort(hidden) @ [width, 1], surface_edges)
         if len(hidden) < 4 and inner and not taken[tets[tet]].any():

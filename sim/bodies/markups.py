@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 
 from ..errors import InputError
 from ..runtime.file_limits import MAX_COORDINATE
-from ..runtime.outside_files import read_as, to_path
+from ..runtime.outside_files import to_path, wrap_errors
 
 SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
 """Sign of each coordinate in the conversion to RAS. Slicer writes LPS, the default of its files."""
@@ -61,7 +61,7 @@ def read_markup(path: str | Path) -> Markup:
         LPS or RAS. No placed points, or coordinates that are not finite.
     """
     path = to_path(path)
-    with read_as(path, "markups of 3D Slicer", REMEDY):
+    with wrap_errors(path, "markups of 3D Slicer", REMEDY):
         if path.stat().st_size > MAX_FILE_SIZE:
             raise InputError(f"{path}: is too large for markups. {REMEDY}")
         text = path.read_bytes().decode("utf-8-sig")

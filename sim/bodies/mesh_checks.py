@@ -27,24 +27,24 @@ SPELLINGS = {"tumor": "tumour", "edema": "oedema", "ventricle": "ventricles", **
 """Region names by alternative spelling."""
 
 
-def check_cell_types(raw: Any, read: set[str]) -> None:
-    """Reject a mesh that has volume cells of types other than `read`.
+def check_cell_types(mesh: Any, supported: set[str]) -> None:
+    """Reject a mesh that has volume cells of types other than `supported`.
 
     Raises
     ------
     InputError
         With the names of these types.
     """
-    others = {block.type for block in raw.cells if block.type.startswith(VOLUMES)} - read
-    if others and read:
-        counts = ", ".join(f"{sum(len(b.data) for b in raw.cells if b.type == one)} {one}" for one in sorted(others))
+    others = {block.type for block in mesh.cells if block.type.startswith(VOLUMES)} - supported
+    if others and supported:
+        counts = ", ".join(f"{sum(len(b.data) for b in mesh.cells if b.type == one)} {one}" for one in sorted(others))
         raise InputError(
             f"a part of its volume is {counts}: all of it must be tetrahedra. Split them, or mesh the volume again."
         )
 
 
 def merge_nodes(
-    points: np.ndarray, table: np.ndarray, data: Mapping[str, np.ndarray]
+    points: np.ndarray, cells: np.ndarray, data: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], int]:
     """Return points (V, 3), cells (T, n) and point data with coincident nodes merged, and the number of removed nodes.
 
@@ -53,12 +53,12 @@ def merge_nodes(
     InputError
         Coincident nodes with different data.
     """
-    used = np.unique(table)
+    used = np.unique(cells)
     whole = used[0] >= 0 and used[-1] < len(points)  # invalid node numbers are rejected with the mesh
     size = np.ptp(points[used], axis=0).max() if whole else 0.0
     pairs = KDTree(points[used]).query_pairs(MERGE_TOLERANCE * size, output_type="ndarray") if whole else used[:0]
     if not len(pairs):
-        return points, table, dict(data), 0
+        return points, cells, dict(data), 0
     first = np.arange(len(points))
     np.minimum.at(first, used[pairs.max(axis=1)], used[pairs.min(axis=1)])
     while (first != first[first]).any():
@@ -67,10 +67,15 @@ def merge_nodes(
         if not np.array_equal(field, field[first]):
             raise InputError(f"nodes that coincide have different `{name}`: give them one value, or merge them.")
     left = first == np.arange(len(points))
-    return points[left], (np.cumsum(left) - 1)[first[table]], {k: v[left] for k, v in data.items()}, int((~left).sum())
+    return (
+        points[left],
+        (np.cumsum(left) - 1)[first[cells]],
+        {k: v[left] for k, v in data.items()},
+        int((~left).sum()),
+    )
 
 
-def check_one_body(points: np.ndarray, tets: np.ndarray) -> None:
+def check_overlaps(points: np.ndarray, tets: np.ndarray) -> None:
     """Reject positively oriented tetrahedra (T, 4) that are listed twice or overlap.
 
     Raises
@@ -93,12 +98,11 @@ def check_one_body(points: np.ndarray, tets: np.ndarray) -> None:
         )
 
 
-def note_pieces(mesh: TetMesh) -> tuple[str, ...]:
+def note_components(mesh: TetMesh) -> tuple[str, ...]:
     """Return a note if the mesh consists of several components without common nodes, else ()."""
     links = mesh.tets[:, [0, 0, 0]].ravel(), mesh.tets[:, 1:].ravel()
     graph = coo_array((np.ones(len(links[0])), links), shape=(len(mesh.nodes),) * 2)
-    piece = connected_components(graph, directed=False)[1]
-    used = np.unique(mesh.tets)
+    piece, used = connected_components(graph, directed=False)[1], np.unique(mesh.tets)
     count = len(np.unique(piece[used]))
     if count == 1:
         return ()
@@ -126,7 +130,7 @@ def _count_overlaps(points: np.ndarray, tets: np.ndarray) -> int:
     return len(np.unique(probe[(least > MIN_INSIDE_WEIGHT) & (probe != which)]))
 
 
-def collect_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
+def collect_regions(mesh: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the region (T,) of each tetrahedron in the given cell blocks, and a note if it is not cell data `region`.
 
     Without such data, regions are the only integer cell array that varies, or the cell sets.
@@ -136,22 +140,22 @@ def collect_regions(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str,
     InputError
         `region` that is not one integer per tetrahedron, several arrays that differ, or sets that overlap.
     """
-    if "region" in raw.cell_data:
-        region = _to_integers(np.concatenate([raw.cell_data["region"][number] for number in blocks]))
+    if "region" in mesh.cell_data:
+        region = _to_integers(np.concatenate([mesh.cell_data["region"][number] for number in blocks]))
         if region is None:
             raise InputError("cell data `region` must be one whole number for each tetrahedron.")
         return region, ()
     stored = {
-        name: _to_integers(np.concatenate([on[number] for number in blocks])) for name, on in raw.cell_data.items()
+        name: _to_integers(np.concatenate([on[number] for number in blocks])) for name, on in mesh.cell_data.items()
     }
     varied = {name: one for name, one in stored.items() if one is not None and _is_partition(one)}
     if "gmsh:physical" in varied:
         varied.pop("gmsh:geometrical", None)  # geometrical entities of the physical groups
-    groups = {name: np.atleast_1d(value) for name, value in raw.field_data.items()}
+    groups = {name: np.atleast_1d(value) for name, value in mesh.field_data.items()}
     names = {int(v[0]): name for name, v in groups.items() if v.dtype.kind in "iu" and v.size == 2 and v[1] == 3}
-    names |= {number: ", ".join(said) for number, said in getattr(raw, "cell_tags", {}).items()}
+    names |= {number: ", ".join(said) for number, said in getattr(mesh, "cell_tags", {}).items()}
     if not varied:
-        return _from_sets(raw, blocks)
+        return _from_sets(mesh, blocks)
     name, region = next(iter(varied.items()))
     if any(not np.array_equal(region, other) for other in varied.values()):
         said = ", ".join(f"`{one}`" for one in varied)

@@ -4,7 +4,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from ..errors import InputError
-from ..runtime.file_limits import MAX_INFLATION, MeshBytes, build_too_large_error
+from ..runtime.file_limits import MAX_INFLATION, MeshSizeLimits, build_too_large_error
 
 # Formats of meshio whose readers terminate on truncated files (those of .mdpa, .tec and .node do not), and
 # whose files give their uncompressed size (.gz does not).
@@ -14,7 +14,7 @@ SUFFIXES = (
 )
 
 
-def check_mesh_references(path: Path, limits: MeshBytes) -> None:
+def check_mesh_references(path: Path, limits: MeshSizeLimits) -> None:
     """Reject formats other than `SUFFIXES`, numbers outside the file or its folder, and HDF5 beyond the limits.
 
     Raises
@@ -35,7 +35,7 @@ def check_mesh_references(path: Path, limits: MeshBytes) -> None:
         check_hdf5_storage(path, limits)
 
 
-def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
+def check_hdf5_storage(path: Path, limits: MeshSizeLimits) -> None:
     """Reject HDF5 files with external references, or with arrays larger than the limit or than the stored bytes.
 
     Raises
@@ -75,8 +75,7 @@ def check_hdf5_storage(path: Path, limits: MeshBytes) -> None:
 
 def _find_references(path: Path) -> set[Path]:
     """Return the HDF5 files, in the same folder, that an XDMF file refers to."""
-    folder = path.resolve().parent
-    named = set()
+    folder, named = path.resolve().parent, set()
     for item in ElementTree.parse(path).iter():
         kind = item.get("Format")
         if kind == "HDF":

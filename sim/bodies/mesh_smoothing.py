@@ -97,9 +97,9 @@ def fit_nodes(
     return nodes
 
 
-def prevent_folds(nodes: np.ndarray, moved: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Return the nodes `moved` (V, 3) [m], except at tetrahedra that this would invert: there they keep `nodes`."""
-    kept = moved.copy()
+def prevent_folds(nodes: np.ndarray, new_nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Return the nodes `new_nodes` (V, 3) [m], except at tetrahedra that this would invert: there they keep `nodes`."""
+    kept = new_nodes.copy()
     while True:
         folded = np.unique(tets[compute_smallest_sines(kept[tets]) <= 0.0])
         astray = folded[(kept[folded] != nodes[folded]).any(axis=1)]
@@ -130,8 +130,7 @@ def improve_mesh(
     nodes, good = nodes.copy(), settings.good_sine
     order = np.argsort(tets, axis=None, kind="stable")
     incident, begin = order // 4, np.searchsorted(tets.ravel()[order], np.arange(len(nodes) + 1))
-    step = np.full(len(nodes), settings.first_step)
-    sines = compute_smallest_sines(nodes[tets])
+    step, sines = np.full(len(nodes), settings.first_step), compute_smallest_sines(nodes[tets])
     for _ in range(settings.max_iterations):
         movers = _select_independent_nodes(tets, sines, step, settings)
         if len(movers) == 0:
@@ -166,15 +165,12 @@ def improve_mesh(
 
 def _select_independent_nodes(tets: np.ndarray, sines: np.ndarray, step: np.ndarray, settings: Smoothing) -> np.ndarray:
     """Return nodes of bad tetrahedra that may still move, worst first, no two in one tetrahedron."""
-    bad = np.flatnonzero(sines < settings.good_sine)
-    worst = np.full(len(step), np.inf)
+    bad, worst = np.flatnonzero(sines < settings.good_sine), np.full(len(step), np.inf)
     np.minimum.at(worst, tets[bad].ravel(), np.repeat(sines[bad], 4))
     worst[step < settings.min_step] = np.inf
-    movers = np.flatnonzero(np.isfinite(worst))
-    rank = np.full(len(step), len(step))
+    movers, rank = np.flatnonzero(np.isfinite(worst)), np.full(len(step), len(step))
     rank[movers[np.argsort(worst[movers], kind="stable")]] = np.arange(len(movers))
-    lowest = rank[tets].min(axis=1)
-    beaten = np.zeros(len(step), bool)
+    lowest, beaten = rank[tets].min(axis=1), np.zeros(len(step), bool)
     beaten[tets[rank[tets] > lowest[:, None]]] = True
     return movers[~beaten[movers]]
 

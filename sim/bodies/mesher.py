@@ -9,12 +9,12 @@ from scipy.spatial import KDTree
 from ..anatomy import BRAIN_LABEL, TUMOUR_LABEL
 from ..errors import InputError
 from ..geometry.surface import compute_areas
-from ..geometry.tetmesh import SLIVER_DEGREES, TetMesh, find_single_faces
+from ..geometry.tetmesh import SLIVER_DEGREES, TetMesh, find_boundary_faces
 from .bcc_lattice import build_graded_lattice
-from .isosurface_stuffing import IsosurfaceStuffingOptions, Pieces, build_whole, cut
-from .manifold_repair import clean, find_removable_tetrahedra
+from .isosurface_stuffing import CutMesh, IsosurfaceStuffingOptions, build_uncut_mesh, cut_mesh
+from .manifold_repair import find_removable_tetrahedra, select_manifold
 from .mesh_smoothing import Projection, Smoothing, compute_smallest_sines, fit_nodes, improve_mesh, prevent_folds
-from .placement import Piece
+from .placement import TumourPiece
 from .signed_distance import Field, project_onto_level
 
 INTRICATE = "the surfaces are too intricate", "smooth the labels"
@@ -37,7 +37,7 @@ class Meshing:
         Cell size at the tumour and the craniotomy, as a fraction of the coarsest: the regions of interest.
     cells_per_radius
         Minimum cells per tumour radius, to resolve its shape.
-    growth
+    edge_growth
         Growth of the cell edge per distance from those regions.
     rounding
         Cells up to this factor above the requested size are not halved, so that sizes are correct on average.
@@ -45,7 +45,7 @@ class Meshing:
         Maximum halvings of the coarsest cell: limits the lattice around a very small tumour.
     surface_tolerances
         Allowed distances of nodes from their surface for better angles, one per attempt [m].
-    largest_error
+    max_volume_error
         Maximum relative error of the tumour volume. Manual outlines of one glioma agree less: Dice 74 to 85 %,
         Menze et al. 2015.
     min_meshed_fraction
@@ -61,11 +61,11 @@ class Meshing:
     max_trials: int = 8
     fine_ratio: float = 0.5
     cells_per_radius: float = 2.5
-    growth: float = 0.5
+    edge_growth: float = 0.5
     rounding: float = 2.0**0.5
     max_halvings: int = 4
     surface_tolerances: tuple[float, ...] = (0.0, 3e-4, 6e-4, 1.2e-3, 2.4e-3)
-    largest_error: float = 0.1
+    max_volume_error: float = 0.1
     min_meshed_fraction: float = 0.1
     factors: tuple[float, ...] = (1.25, 1.6, 2.0, 2.5)
     stuffing: IsosurfaceStuffingOptions = field(default_factory=IsosurfaceStuffingOptions)
@@ -97,7 +97,7 @@ class Solids:
     tumour_volume: float
     interface: np.ndarray
     opening: np.ndarray
-    pieces: Sequence[Piece] = ()
+    pieces: Sequence[TumourPiece] = ()
 
 
 def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> TetMesh:
@@ -112,21 +112,21 @@ def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> Tet
     mesh = _build_mesh_or_reason(solids, count, settings)
     if isinstance(mesh, TetMesh):
         return mesh
-    raise build_too_few_error(count, mesh, settings.factors, lambda number: _can_build_mesh(solids, number, settings))
+    raise build_count_error(count, mesh, settings.factors, lambda number: _can_build_mesh(solids, number, settings))
 
 
-def build_too_few_error(
-    count: int, why: tuple[str, str], more: Sequence[float], would_do: Callable[[int], bool]
+def build_count_error(
+    count: int, why: tuple[str, str], factors: Sequence[float], is_sufficient: Callable[[int], bool]
 ) -> InputError:
-    """Build the error if `count` nodes do not resolve a solid, with the first multiple in `more` that `would_do`."""
+    """Build the error if `count` nodes do not resolve a solid, with the first of `factors` that `is_sufficient`."""
     reason, remedy = why
-    numbers = (int(round(count * times, -2)) for times in more)
-    enough = next(filter(would_do, numbers), None)
+    numbers = (int(round(count * times, -2)) for times in factors)
+    enough = next(filter(is_sufficient, numbers), None)
     return InputError(f"{reason} for {count} nodes: {'' if enough is None else f'ask for {enough}, or '}{remedy}.")
 
 
 def find_lost_pieces(
-    pieces: Sequence[Piece], nodes: np.ndarray, tets: np.ndarray, settings: Meshing = Meshing()
+    pieces: Sequence[TumourPiece], nodes: np.ndarray, tets: np.ndarray, settings: Meshing = Meshing()
 ) -> list[bool]:
     """Return True for each tumour piece that the tetrahedra (T, 4), assigned by nearest surface, do not resolve."""
     if len(pieces) < 2:
@@ -138,10 +138,10 @@ def find_lost_pieces(
     return [bool(one < settings.min_meshed_fraction * piece.volume) for one, piece in zip(shown, pieces, strict=True)]
 
 
-def describe_lost_pieces(pieces: Sequence[Piece], lost: Sequence[bool]) -> str:
+def describe_lost_pieces(pieces: Sequence[TumourPiece], is_lost: Sequence[bool]) -> str:
     """Format the number of lost pieces and their total volume."""
-    volume = sum(piece.volume for piece, missing in zip(pieces, lost, strict=True) if missing)
-    return f"{sum(lost)} of the tumour's {len(pieces)} pieces, {1e6 * volume:.2g} ml in all"
+    volume = sum(piece.volume for piece, missing in zip(pieces, is_lost, strict=True) if missing)
+    return f"{sum(is_lost)} of the tumour's {len(pieces)} pieces, {1e6 * volume:.2g} ml in all"
 
 
 def _can_build_mesh(solids: Solids, count: int, settings: Meshing) -> bool:
@@ -156,7 +156,7 @@ def _build_mesh_or_reason(solids: Solids, count: int, settings: Meshing) -> TetM
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
     for _ in range(settings.max_trials):
-        pieces = carve(solids, edge, settings)
+        pieces = cut_lattice(solids, edge, settings)
         reached = len(pieces.nodes)
         if best is None or abs(reached - count) < abs(len(best.nodes) - count):
             best = pieces
@@ -169,34 +169,34 @@ def _build_mesh_or_reason(solids: Solids, count: int, settings: Meshing) -> TetM
     return _fit_mesh_or_reason(solids, best, settings)
 
 
-def carve(solids: Solids, edge: float, settings: Meshing = Meshing()) -> Pieces:
-    """Return the solid on a lattice with coarsest cell `edge` [m], split along the tumour's surface."""
+def cut_lattice(solids: Solids, max_edge: float, settings: Meshing = Meshing()) -> CutMesh:
+    """Return the solid on a lattice with coarsest cell `max_edge` [m], split along the tumour's surface."""
     radius = (0.75 / np.pi * solids.tumour_volume) ** (1.0 / 3.0)
-    fine, growth = settings.fine_ratio * edge, settings.growth
+    fine, growth = settings.fine_ratio * max_edge, settings.edge_growth
     wanted = ((KDTree(solids.interface), min(fine, radius / settings.cells_per_radius)), (KDTree(solids.opening), fine))
-    levels = min(int(np.rint(np.log2(edge / wanted[0][1]))), settings.max_halvings)
+    levels = min(int(np.rint(np.log2(max_edge / wanted[0][1]))), settings.max_halvings)
 
     def size(points: np.ndarray) -> np.ndarray:
         return settings.rounding * np.min([least + growth * tree.query(points)[0] for tree, least in wanted], axis=0)
 
-    lattice = build_graded_lattice(solids.low - edge, solids.high + edge, edge, levels, size)
-    body = cut(build_whole(lattice), solids.brain, settings=settings.stuffing)
+    lattice = build_graded_lattice(solids.low - max_edge, solids.high + max_edge, max_edge, levels, size)
+    body = cut_mesh(build_uncut_mesh(lattice), solids.brain, settings=settings.stuffing)
     if not body.inside.any():
         raise InputError(TOO_COARSE)
     body = body.select(body.inside)
-    body = body.select(clean(body.tets))
+    body = body.select(select_manifold(body.tets))
     surface = np.zeros(len(body.nodes), bool)
-    surface[find_single_faces(body.tets)] = True
-    return cut(body, solids.tumour, surface, settings.stuffing)
+    surface[find_boundary_faces(body.tets)] = True
+    return cut_mesh(body, solids.tumour, surface, settings.stuffing)
 
 
-def _fit_mesh_or_reason(solids: Solids, pieces: Pieces, settings: Meshing) -> TetMesh | tuple[str, str]:
+def _fit_mesh_or_reason(solids: Solids, pieces: CutMesh, settings: Meshing) -> TetMesh | tuple[str, str]:
     """Return the fitted and improved mesh, on failure retried without inverting moves; else reason and remedy."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
     lost = find_lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)
     missing = sum(piece.volume for piece, one in zip(solids.pieces, lost, strict=True) if one)
-    if missing > settings.largest_error * solids.tumour_volume:
+    if missing > settings.max_volume_error * solids.tumour_volume:
         be = "is" if sum(lost) == 1 else "are"
         return f"{describe_lost_pieces(solids.pieces, lost)}, {be} too small", "leave what is small out of the labels"
     for fold in (True, False):
@@ -206,24 +206,24 @@ def _fit_mesh_or_reason(solids: Solids, pieces: Pieces, settings: Meshing) -> Te
         if compute_smallest_sines(found.nodes[found.tets]).min() >= np.sin(np.radians(SLIVER_DEGREES)):
             mesh = TetMesh(found.nodes, found.tets, np.where(found.inside, TUMOUR_LABEL, BRAIN_LABEL))
             volume = mesh.volumes[found.inside].sum()
-            return mesh if abs(volume / solids.tumour_volume - 1.0) <= settings.largest_error else INTRICATE
+            return mesh if abs(volume / solids.tumour_volume - 1.0) <= settings.max_volume_error else INTRICATE
     return INTRICATE
 
 
-def _fit_to_surfaces(solids: Solids, pieces: Pieces, volume: float, settings: Meshing, fold: bool) -> Pieces:
+def _fit_to_surfaces(solids: Solids, pieces: CutMesh, volume: float, settings: Meshing, fold: bool) -> CutMesh:
     """Fit nodes to the outer surface, then to the tumour's with a `volume` [m^3]; return the updated pieces.
 
     Unless `fold`, nodes keep their position where a tetrahedron would be inverted.
     """
     (surface, _), smoothing = _mark_surfaces(pieces), settings.smoothing
-    outer, inner = find_single_faces(pieces.tets), find_single_faces(pieces.tets[pieces.inside])
+    outer, inner = find_boundary_faces(pieces.tets), find_boundary_faces(pieces.tets[pieces.inside])
     nodes = fit_nodes(pieces.nodes, outer, solids.brain, surface, settings=smoothing)
     nodes = nodes if fold else prevent_folds(pieces.nodes, nodes, pieces.tets)
     moved = fit_nodes(nodes, inner, solids.tumour, ~surface, volume, smoothing)
     return replace(pieces, nodes=moved if fold else prevent_folds(nodes, moved, pieces.tets))
 
 
-def _improve_pieces(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces:
+def _improve_pieces(solids: Solids, pieces: CutMesh, settings: Meshing) -> CutMesh:
     """Remove flat tetrahedra on the surfaces and improve bad angles."""
     for slack in settings.surface_tolerances:
         bad = compute_smallest_sines(pieces.nodes[pieces.tets]) < settings.smoothing.good_sine
@@ -233,15 +233,15 @@ def _improve_pieces(solids: Solids, pieces: Pieces, settings: Meshing) -> Pieces
     return pieces
 
 
-def _mark_surfaces(pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
+def _mark_surfaces(pieces: CutMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return two masks (V,): nodes on the outer surface, and nodes on the tumour's surface."""
     marks = np.zeros((2, len(pieces.nodes)), bool)
-    marks[0, find_single_faces(pieces.tets)] = True
-    marks[1, find_single_faces(pieces.tets[pieces.inside])] = True
+    marks[0, find_boundary_faces(pieces.tets)] = True
+    marks[1, find_boundary_faces(pieces.tets[pieces.inside])] = True
     return marks[0], marks[1]
 
 
-def _build_projection(solids: Solids, pieces: Pieces, slack: float) -> Projection:
+def _build_projection(solids: Solids, pieces: CutMesh, slack: float) -> Projection:
     """Return a function that keeps each surface node within `slack` [m] of its current level of the fields."""
     surface, interface = _mark_surfaces(pieces)
     interface[np.setdiff1d(pieces.tets[pieces.inside], pieces.tets[~pieces.inside])] = False  # tumour cortex
@@ -264,6 +264,5 @@ def compute_surface_errors(nodes: np.ndarray, triangles: np.ndarray, field: Fiel
     """Return distances (15 S,) [m] of points on triangles (S, 3) from a field's surface, and their area weights."""
     spread = np.array([(i, j, 12 - i - j) for i in range(1, 12, 2) for j in range(1, 12 - i, 2)]) / 12.0
     corners = nodes[triangles]
-    area = compute_areas(corners)
-    points = np.einsum("pk,tki->tpi", spread, corners).reshape(-1, 3)
+    area, points = compute_areas(corners), np.einsum("pk,tki->tpi", spread, corners).reshape(-1, 3)
     return np.abs(field(points)), np.repeat(area / area.sum() / len(spread), len(spread))

@@ -18,11 +18,11 @@ from ..anatomy import Anatomy
 from ..errors import InputError
 from ..geometry.tetmesh import MeshWarning, TetMesh, orient_tetrahedra
 from ..runtime.atomic_files import write_atomically
-from ..runtime.file_limits import MESH_BYTES, MeshBytes, limit_memory
-from ..runtime.outside_files import read_as, to_path
+from ..runtime.file_limits import MESH_BYTES, MeshSizeLimits, limit_memory
+from ..runtime.outside_files import to_path, wrap_errors
 from .abaqus import AbaqusMesh, read_abaqus
 from .markups import SIGNS
-from .mesh_checks import check_cell_types, check_one_body, collect_regions, merge_nodes, note_pieces
+from .mesh_checks import check_cell_types, check_overlaps, collect_regions, merge_nodes, note_components
 from .mesh_references import check_mesh_references
 from .vtu_size import check_vtu_size
 
@@ -66,7 +66,7 @@ class MeshFile:
     notes: tuple[str, ...]
 
 
-def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES) -> MeshFile:
+def read_mesh(path: str | Path, unit: str = "m", limits: MeshSizeLimits = MESH_BYTES) -> MeshFile:
     """Read tetrahedra with cell data `region`, or else with a mesher's groups (default: one region 0).
 
     Quadratic ones (`tetra10`) keep their curved edges. Points, lines and surfaces are dropped, coincident
@@ -84,14 +84,14 @@ def read_mesh(path: str | Path, unit: str = "m", limits: MeshBytes = MESH_BYTES)
         raise InputError(f"{path}: no such file. Give a tetrahedral mesh, such as .vtu or .msh.")
     if unit not in UNITS:
         raise InputError(f"no unit is called {unit!r}: choose one of {', '.join(UNITS)}.")
-    with read_as(path, "a mesh", REMEDY):
+    with wrap_errors(path, "a mesh", REMEDY):
         most = limits.limit_bytes(path.stat().st_size)
         counted = path.suffix.lower() == ".vtu" and check_vtu_size(path, most)
         with warnings.catch_warnings(), nullcontext() if counted else limit_memory(limits.max_bytes):
             warnings.simplefilter("ignore")  # meshio warns about arrays that it skips
             check_mesh_references(path, limits)
             raw = read_abaqus(path) if path.suffix.lower() == ".inp" else _read_with_meshio(path)
-    with read_as(path, "a mesh", REMEDY):
+    with wrap_errors(path, "a mesh", REMEDY):
         return _build_mesh_file(path, raw, UNITS[unit])
 
 
@@ -136,8 +136,7 @@ def _build_mesh_file(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) ->
             f"{path}: holds {' and '.join(sorted(found))}, which do not conform: mesh it with one of them."
         )
     check_cell_types(raw, found)
-    blocks = [number for number, block in enumerate(raw.cells) if block.type in found]
-    notes = []
+    blocks, notes = [number for number, block in enumerate(raw.cells) if block.type in found], []
     dropped = sorted({f"{len(block.data)} {block.type}" for block in raw.cells if block.type not in found})
     if dropped:
         notes.append(f"dropped cells that are not tetrahedra: {', '.join(dropped)}")
@@ -154,10 +153,10 @@ def _build_mesh_file(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) ->
         notes.append(f"merged {merged} nodes with others at the same place: results are numbered without them")
     tets, middles = np.split(table, [4], axis=1)
     mesh = TetMesh(points * metre, tets, region, middles if middles.size else None)
-    check_one_body(points, tets)
+    check_overlaps(points, tets)
     if turned:
         notes.append(f"turned {turned} tetrahedra of negative orientation")
-    return MeshFile(mesh, data, (*notes, *said, *note_pieces(mesh)))
+    return MeshFile(mesh, data, (*notes, *said, *note_components(mesh)))
 
 
 def _read_space(path: Path) -> str:
@@ -236,7 +235,7 @@ def read_anatomy(path: str | Path) -> Anatomy:
             "anatomy. Make one with `sulcus anatomy`, or add them."
         )
     data = file.point_data
-    with read_as(path, "an anatomy", "Make one with `sulcus anatomy`."):
+    with wrap_errors(path, "an anatomy", "Make one with `sulcus anatomy`."):
         for name in ("held", "slide_normal", "craniotomy"):
             if data[name].dtype.kind not in "fiub" or not np.isfinite(data[name]).all():
                 raise InputError(f"`{name}` has values that are no finite numbers: give 0 or 1, or unit normals.")

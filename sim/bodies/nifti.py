@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..runtime.file_limits import MAX_VOXELS
-from .voxels import BLOCK, REMEDY, SURPLUS, Volume, Voxels, open_volume, unpack_file
+from .voxels import BLOCK, REMEDY, SURPLUS, Volume, VoxelSpec, open_volume, unpack_file
 
 if TYPE_CHECKING:
     from nibabel.fileholders import FileHolder
@@ -22,7 +22,7 @@ NORM_TOLERANCE = 1e-3
 METRES = {"mm": 1e-3, "unknown": 1e-3, "meter": 1.0, "micron": 1e-6}  # length units [m]
 
 
-def read_nifti(path: Path, voxels: Voxels) -> Volume:
+def read_nifti(path: Path, spec: VoxelSpec) -> Volume:
     """Return the volume in a single-file NIfTI.
 
     Raises
@@ -44,7 +44,7 @@ def read_nifti(path: Path, voxels: Voxels) -> Volume:
     needed = int(header["vox_offset"]) + math.prod(image.shape) * header.get_data_dtype().itemsize
     _check_file_length(path, needed)
     metre = METRES.get(str(image.header.get_xyzt_units()[0]), 1e-3)
-    affine, notes = _read_affine(path, image, metre, voxels)
+    affine, notes = _read_affine(path, image, metre, spec)
     size = np.asarray(header["pixdim"], np.float64)[1:4]
     if image.header["sform_code"] == 0 and not (size > 0.0).all():
         raise InputError(f"{path}: its voxel size is {size} (pixdim): every edge must be above 0.")
@@ -96,8 +96,8 @@ def _build_file_holder(path: Path) -> FileHolder:
     return FileHolder(given) if isinstance(given, str) else FileHolder(fileobj=given)
 
 
-def read_mgh(path: Path, voxels: Voxels) -> Volume:
-    """Return the volume in a FreeSurfer file, in millimetres; its options `voxels` are ignored.
+def read_mgh(path: Path, spec: VoxelSpec) -> Volume:
+    """Return the volume in a FreeSurfer file, in millimetres; its options `spec` are ignored.
 
     Raises
     ------
@@ -108,8 +108,7 @@ def read_mgh(path: Path, voxels: Voxels) -> Volume:
     import nibabel
 
     image = nibabel.MGHImage.from_file_map({"image": _build_file_holder(path)})
-    header = image.header
-    shape = tuple(map(int, image.shape))
+    header, shape = image.header, tuple(map(int, image.shape))
     _check_voxel_count(path, shape)
     needed = header.get_data_offset() + math.prod(shape) * header.get_data_bytespervox()
     _check_file_length(path, needed)
@@ -148,7 +147,7 @@ def _check_file_length(path: Path, needed: int) -> None:
         raise InputError(f"{path}: ends after {held:,} of {needed:,} bytes. Copy or export it again.")
 
 
-def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -> tuple[np.ndarray, tuple[str, ...]]:
+def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: VoxelSpec) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the affine (4, 4) to metres (RAS) of an image in units of `metre` [m], and notes on inconsistencies.
 
     Raises
@@ -164,7 +163,7 @@ def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -
     if sform is None and qform is None:
         return _build_centred_affine(path, image, metre, voxels.axes), ()
     if sform is None or qform is None:
-        return _scale_affine(image, metre), voxels.ignored_axes
+        return _scale_affine(image, metre), voxels.ignored_axes_note
     corners = np.stack([*np.ndindex(2, 2, 2)]) * (np.array(image.shape[:3]) - 1)
     apart = metre * np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1).max()
     note = f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken"
@@ -176,9 +175,9 @@ def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: Voxels) -
             "are swapped in one of them. The sform is taken"
         )
     return _scale_affine(image, metre), (
-        *voxels.ignored_axes,
+        *voxels.ignored_axes_note,
         note,
-    ) if apart > voxels.max_form_difference else voxels.ignored_axes
+    ) if apart > voxels.max_sform_difference else voxels.ignored_axes_note
 
 
 def _build_centred_affine(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:

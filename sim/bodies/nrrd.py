@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..runtime.file_limits import BZIP2_ALLOWANCE, MAX_INFLATION, MAX_VOXELS
-from .voxels import BLOCK, REMEDY, SURPLUS, Segment, Volume, Voxels
+from .voxels import BLOCK, REMEDY, SURPLUS, Segment, Volume, VoxelSpec
 
 SIGNS = {
     "right-anterior-superior": (1.0, 1.0, 1.0),
@@ -41,10 +41,10 @@ MAX_HEADER_LINES = 2**14  # maximum header lines; 100 segments take 1,000
 ONE_FILE = "Save it as one file (.nrrd), with its header and voxels together."
 
 
-def read_nrrd(path: Path, voxels: Voxels) -> Volume:
+def read_nrrd(path: Path, spec: VoxelSpec) -> Volume:
     """Return the volume in an NRRD file or in its detached data file; layers of segments are (I, J, K, L).
 
-    NRRD gives its unit, millimetres by default, and one affine: the options `voxels` are ignored.
+    NRRD gives its unit, millimetres by default, and one affine: the options `spec` are ignored.
 
     Raises
     ------
@@ -63,8 +63,7 @@ def read_nrrd(path: Path, voxels: Voxels) -> Volume:
                 f"{path}: has {math.prod(sizes):.3g} voxels; the maximum is {MAX_VOXELS:.3g}. Resample it."
             )
         dtype = _parse_dtype(path, fields)
-        needed = math.prod(sizes) * dtype.itemsize
-        beside = _find_data_file(path, fields)
+        needed, beside = math.prod(sizes) * dtype.itemsize, _find_data_file(path, fields)
         with nullcontext(file) if beside is None else beside.open("rb") as voxels_file:
             held = _read_voxels(beside or path, voxels_file, fields, needed)
         values = np.frombuffer(held, dtype, math.prod(sizes)).reshape(sizes, order="F")

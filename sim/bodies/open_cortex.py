@@ -77,7 +77,7 @@ class OpenCortex:
     def clearance(self) -> float:
         """Radius of the largest circle around the origin, perpendicular to the axis, inside the exposed cortex [m]."""
         rim = find_border_edges(self.anatomy.mesh.nodes, self.anatomy.open_surface) - self.origin
-        return float(compute_distances(rim - (rim @ self.axis)[..., None] * self.axis, np.zeros((1, 3)))[0])
+        return float(compute_edge_distances(rim - (rim @ self.axis)[..., None] * self.axis, np.zeros((1, 3)))[0])
 
     @cached_property
     def _inward(self) -> np.ndarray:
@@ -108,7 +108,7 @@ class OpenCortex:
                 raise InputError(f"{name} has shape {given.shape}: give one number, in millimetres.")
         found = self.find_nearest(self.origin + 1e-3 * (right_mm * self.right + up_mm * self.up))
         rim = find_border_edges(self.anatomy.mesh.nodes, self.anatomy.open_surface)
-        if not compute_distances(rim, found.point[None])[0] > EDGE_TOLERANCE:
+        if not compute_edge_distances(rim, found.point[None])[0] > EDGE_TOLERANCE:
             raise InputError(
                 f"the place {right_mm:g} mm right, {up_mm:g} mm up lies outside the open cortex: stay within "
                 f"{1e3 * self.clearance:.3g} mm of its middle, or open the skull wider with --craniotomy."
@@ -140,8 +140,7 @@ def open_cortex(anatomy: Anatomy) -> OpenCortex:
     corners = anatomy.mesh.nodes[triangles]
     a, b, c = np.moveaxis(corners, 1, 0)
     area = 0.5 * np.cross(b - a, c - a)
-    axis = -area.sum(axis=0) / np.linalg.norm(area.sum(axis=0))
-    size = np.linalg.norm(area, axis=1)
+    axis, size = -area.sum(axis=0) / np.linalg.norm(area.sum(axis=0)), np.linalg.norm(area, axis=1)
     middle = (size @ (a + b + c)) / (3.0 * size.sum())
     # superior, or anterior if the craniotomy faces up or down
     reference = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
@@ -157,11 +156,10 @@ def find_border_edges(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return points[edges[count == 1]]
 
 
-def compute_distances(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
+def compute_edge_distances(edges: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return distances (B,) [m] from `points` (B, 3) to the nearest of `edges` (E, 2, 3)."""
     start, along = edges[:, 0], edges[:, 1] - edges[:, 0]
-    offset = points[:, None] - start
-    square = np.einsum("ei,ei->e", along, along)
+    offset, square = points[:, None] - start, np.einsum("ei,ei->e", along, along)
     share = np.einsum("bei,ei->be", offset, along) / np.where(square > 0.0, square, 1.0)
     offset -= np.clip(share, 0.0, 1.0)[:, :, None] * along
     return np.sqrt(np.einsum("bei,bei->be", offset, offset).min(axis=1))

@@ -20,10 +20,10 @@ class Placement:
 
     Parameters
     ----------
-    stem_radius
+    brainstem_radius
         Radius of the brainstem around the lowest point, as a fraction of the brain's height: 21 mm in the template, the
         medulla and adjacent tissue.
-    hull_depth
+    max_hull_depth
         Maximum depth under the convex hull [m]: deeper cortex lies in a fissure, inaccessible through the skull.
     min_height
         Minimum height of an opening, as a fraction of the brain's height, unless the tumour is lower.
@@ -37,8 +37,8 @@ class Placement:
         Minimum nodes of a craniotomy, to support a tool.
     """
 
-    stem_radius: float = 0.15
-    hull_depth: float = 6e-3
+    brainstem_radius: float = 0.15
+    max_hull_depth: float = 6e-3
     min_height: float = 0.3
     max_surface_distance: float = 20e-3
     max_outside_distance: float = 5e-3
@@ -47,7 +47,7 @@ class Placement:
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class TumourPiece:
     """Connected component of a tumour: volume [m^3], centre (3,) [m], points (n, 3) [m] on its surface."""
 
     volume: float
@@ -60,8 +60,7 @@ def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings
 
     Left or right is given outside a midline strip; directions of the other axes in the outer thirds.
     """
-    share = (np.asarray(point) - low) / (high - low)
-    words = []
+    share, words = (np.asarray(point) - low) / (high - low), []
     for axis, names in enumerate(AXES):
         middle = settings.midline_half_width if axis == 0 else 1.0 / 6.0
         if abs(share[axis] - 0.5) > middle:
@@ -159,7 +158,7 @@ def _find_nearest_outer(points: np.ndarray, place: np.ndarray, cortex: np.ndarra
     hull = ConvexHull(cortex).equations
     order = np.argsort(np.linalg.norm(points - place, axis=1), kind="stable")
     parts = (points[order[first : first + BLOCK_SIZE]] for first in range(0, len(order), BLOCK_SIZE))
-    outer = (part[-(part @ hull[:, :3].T + hull[:, 3]).max(axis=1) <= settings.hull_depth] for part in parts)
+    outer = (part[-(part @ hull[:, :3].T + hull[:, 3]).max(axis=1) <= settings.max_hull_depth] for part in parts)
     return next(part[0] for part in outer if len(part))
 
 
@@ -170,7 +169,7 @@ def _check_finite(point: np.ndarray, option: str) -> None:
 
 def _check_not_over_stem(cortex: np.ndarray, site: np.ndarray, settings: Placement) -> np.ndarray:
     lowest, height = cortex[cortex[:, 2].argmin()], np.ptp(cortex[:, 2])
-    if np.linalg.norm(site - lowest) <= settings.stem_radius * height:
+    if np.linalg.norm(site - lowest) <= settings.brainstem_radius * height:
         raise InputError(
             f"the opening at {_to_mm(site)} mm lies over the brainstem, which is held: choose a point farther from the "
             f"brain's lowest one, {_to_mm(lowest)} mm."

@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from ..anatomy import BRAIN_LABEL, TUMOUR_LABEL
 from ..geometry.tetmesh import TetMesh
-from .enclosed_voxels import fill_enclosed
+from .enclosed_voxels import rasterise_interior
 from .intensity import Intensity
 from .template import HealthyHead, Lobes, Tumour, build_synthetic_subject
 
@@ -44,7 +44,7 @@ def build_sample_head(brain: TetMesh, head: SampleHead = SampleHead()) -> tuple[
     """
     (a, b), (c, d) = ((np.cos(angle), np.sin(angle)) for angle in head.angles)
     edges = np.array([[c, -d * a, d * b], [d, c * a, -c * b], [0.0, b, a]]) * head.voxel * [-1.0, -1.0, 1.0]
-    mask, affine = fill_enclosed((brain.nodes * head.stretch) @ np.linalg.inv(edges).T, brain.surface, 1.0)
+    mask, affine = rasterise_interior((brain.nodes * head.stretch) @ np.linalg.inv(edges).T, brain.surface, 1.0)
     affine[:3] = edges @ affine[:3]
     points = np.argwhere(np.ones_like(mask)) @ edges.T + affine[:3, 3]
     tumour = build_synthetic_subject(head.tumour, HealthyHead(mask, affine)).tumour(points).reshape(mask.shape)

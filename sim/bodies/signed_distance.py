@@ -17,16 +17,16 @@ class Blur:
 
     Parameters
     ----------
-    voxels
+    sigma
         Standard deviation [voxels]: smooths the steps of a mask and preserves features wider than two voxels.
-    reach
+    max_distance
         Distance from the surface [standard deviations] beyond which only the sign is accurate.
     margin
         Margin of a field around its mask [voxels]; larger than the range of the blur.
     """
 
-    voxels: float = 0.7
-    reach: float = 3.5
+    sigma: float = 0.7
+    max_distance: float = 3.5
     margin: int = 5
 
 
@@ -38,33 +38,32 @@ class LevelSet:
     """
 
     values: np.ndarray
-    inverse: np.ndarray
+    inverse_affine: np.ndarray
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Return the values (n,) [m] at points (n, 3) [m]."""
-        index = self.inverse[:3, :3] @ points.T + self.inverse[:3, 3:]
+        index = self.inverse_affine[:3, :3] @ points.T + self.inverse_affine[:3, 3:]
         return ndimage.map_coordinates(self.values, index, order=1, mode="nearest", output=np.float64)
 
 
-def mask_field(mask: np.ndarray, affine: np.ndarray, blur: Blur = Blur()) -> LevelSet:
+def compute_level_set(mask: np.ndarray, affine: np.ndarray, blur: Blur = Blur()) -> LevelSet:
     """Return the level set of the voxels `mask` (I, J, K) bool with an `affine` (4, 4) from indices to metres.
 
     The mask is blurred, and the blur of a half-space, P = Phi(-d / sigma), is solved for the distance d.
     For anisotropic voxels, sigma is the geometric mean of the three axes, so that distances have a scale error.
     """
-    mask, affine = crop_to(mask, affine, blur.margin)
-    sigma = blur.voxels * abs(np.linalg.det(affine[:3, :3])) ** (1.0 / 3.0)
-    share = ndimage.gaussian_filter(mask.astype(np.float32), blur.voxels, mode="nearest")
-    limit = special.ndtr(-blur.reach)
+    mask, affine = crop_to_mask(mask, affine, blur.margin)
+    sigma = blur.sigma * abs(np.linalg.det(affine[:3, :3])) ** (1.0 / 3.0)
+    share = ndimage.gaussian_filter(mask.astype(np.float32), blur.sigma, mode="nearest")
+    limit = special.ndtr(-blur.max_distance)
     distance = -sigma * special.ndtri(np.clip(share, limit, 1.0 - limit))
     return LevelSet(distance.astype(np.float32), np.linalg.inv(affine))
 
 
-def crop_to(mask: np.ndarray, affine: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
+def crop_to_mask(mask: np.ndarray, affine: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the part of a mask within `margin` voxels of marked ones, zero-padded, and its affine (4, 4)."""
     (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(mask.astype(np.uint8)))
-    low = np.array([part.start for part in box]) - margin
-    shifted = affine.copy()
+    low, shifted = np.array([part.start for part in box]) - margin, affine.copy()
     shifted[:3, 3] += affine[:3, :3] @ low
     return np.pad(mask[box], margin), shifted
 
@@ -78,15 +77,15 @@ def compute_gradient(field: Field, points: np.ndarray, probe: float = 2e-4) -> n
     return np.stack([field(points + step) - field(points - step) for step in steps], axis=1) / (2.0 * probe)
 
 
-def project_onto_level(field: Field, points: np.ndarray, level: np.ndarray, flat: float = 0.1) -> np.ndarray:
+def project_onto_level(field: Field, points: np.ndarray, level: np.ndarray, min_slope: float = 0.1) -> np.ndarray:
     """Return points (n, 3) [m] moved along the gradient to the level `level` (n,) of a field, by two Newton steps.
 
-    A distance field has slope 1. Slopes below `flat` occur between two surfaces or far from any, where the direction is
-    noise; there the step is shortened.
+    A distance field has slope 1. Slopes below `min_slope` occur between two surfaces or far from any, where the
+    direction is noise; there the step is shortened.
     """
     for _ in range(2):
         slope = compute_gradient(field, points)
         square = np.einsum("ni,ni->n", slope, slope)
-        excess = (field(points) - level) / np.maximum(square, flat**2)
+        excess = (field(points) - level) / np.maximum(square, min_slope**2)
         points = points - excess[:, None] * slope
     return points

@@ -15,7 +15,7 @@ TEST_POINTS = 500  # approximate number of tested points
 EXPORT_REMEDY = "one of the two states LPS as RAS. Export that one again."
 
 
-def has_one_space(brain: Mask, tumour: Mask) -> bool:
+def is_mirroring_ambiguous(brain: Mask, tumour: Mask) -> bool:
     """Return True if brain and tumour, on different grids, would also fit with x and y of one negated.
 
     Raises
@@ -26,7 +26,7 @@ def has_one_space(brain: Mask, tumour: Mask) -> bool:
     check_not_negated(brain.grid, tumour.grid)
     boxes = [mask.box for mask in (brain, tumour)]
     apart = (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any()
-    points = _compute_positions(tumour.grid, _thin_points(np.argwhere(tumour.marked)))
+    points = _compute_positions(tumour.grid, _thin_points(np.argwhere(tumour.voxels)))
     planes = ConvexHull(_widen_outline(brain)).equations
     within, turned = (_share_within(planes, points * signs) for signs in (np.ones(3), LPS))
     if within < MIN_INSIDE_FRACTION and turned > MIN_MIRRORED_FRACTION:
@@ -53,7 +53,7 @@ def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -
     for grid in grids:
         check_not_negated(grid, scan)
     points = _thin_points(brain.outline)
-    within, turned = (share_on(scan.shape, scan.affine, points * signs) for signs in (np.ones(3), LPS))
+    within, turned = (compute_inside_fraction(scan.shape, scan.affine, points * signs) for signs in (np.ones(3), LPS))
     if within < MIN_INSIDE_FRACTION and turned > MIN_MIRRORED_FRACTION:
         raise InputError(
             f"{scan.path}: holds {100.0 * within:.0f} % of the brain of {brain.path}. With x and y negated it would "
@@ -61,7 +61,7 @@ def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -
         )
 
 
-def check_not_negated(one: VoxelGrid, other: VoxelGrid) -> None:
+def check_not_negated(grid: VoxelGrid, other: VoxelGrid) -> None:
     """Reject two grids of which one equals the other with x and y negated.
 
     Raises
@@ -70,8 +70,8 @@ def check_not_negated(one: VoxelGrid, other: VoxelGrid) -> None:
         For such grids.
     """
     negated = np.array([*LPS, 1.0])[:, None] * other.affine
-    if _is_same_grid(one, VoxelGrid(other.path, other.shape, negated)):
-        raise InputError(f"{other.path}: has the grid of {one.path}, but with x and y negated: {EXPORT_REMEDY}")
+    if _is_same_grid(grid, VoxelGrid(other.path, other.shape, negated)):
+        raise InputError(f"{other.path}: has the grid of {grid.path}, but with x and y negated: {EXPORT_REMEDY}")
 
 
 def _is_same_grid(one: VoxelGrid, other: VoxelGrid) -> bool:
@@ -88,7 +88,7 @@ def _compute_positions(grid: VoxelGrid, index: np.ndarray) -> np.ndarray:
     return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
-def share_on(shape: tuple[int, ...], affine: np.ndarray, points: np.ndarray) -> float:
+def compute_inside_fraction(shape: tuple[int, ...], affine: np.ndarray, points: np.ndarray) -> float:
     """Return the fraction of points (n, 3) [m] that lie in a volume (I, J, K) with an affine (4, 4) to metres."""
     inverse = np.linalg.inv(affine)
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3])

@@ -14,7 +14,7 @@ from .boundary_conditions import add_boundary_conditions
 from .dural_septa import Septum
 from .intensity import Intensity
 from .mesher import Meshing, Solids, build_mesh
-from .placement import Piece, Placement, find_within_outline
+from .placement import Placement, TumourPiece, find_within_outline
 from .refine import refine
 from .signed_distance import Field
 
@@ -37,7 +37,7 @@ class MeshPlan:
     nodes
         Requested number of nodes.
     craniotomy
-        Diameter of the craniotomy along the cortex [m]. None: by the tumour, see `choose_craniotomy`.
+        Diameter of the craniotomy along the cortex [m]. None: by the tumour, see `choose_diameter`.
     meshing
         Mesh generation and smoothing.
     placement
@@ -75,7 +75,7 @@ class SubjectPart:
     """
 
     label: int
-    inside: Field
+    level_set: Field
     volume: float
 
 
@@ -115,7 +115,7 @@ class Subject:
     site: np.ndarray
     intensity: Intensity | None = None
     notes: tuple[str, ...] = ()
-    pieces: tuple[Piece, ...] = ()
+    pieces: tuple[TumourPiece, ...] = ()
     parts: tuple[SubjectPart, ...] = ()
     septa: tuple[Septum, ...] = ()
     outline: np.ndarray | None = None
@@ -129,8 +129,8 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     InputError
         Input that `build_mesh` or `add_boundary_conditions` rejects.
     """
-    craniotomy = choose_craniotomy(subject, plan)
-    opening = subject.cortex[find_opened_cortex(subject, craniotomy)]
+    craniotomy = choose_diameter(subject, plan)
+    opening = subject.cortex[find_exposed_cortex(subject, craniotomy)]
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     solids = Solids(
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
@@ -140,7 +140,7 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     return refine(made, near_opening=True) if plan.fine_opening else made
 
 
-def choose_craniotomy(subject: Subject, plan: MeshPlan) -> float:
+def choose_diameter(subject: Subject, plan: MeshPlan) -> float:
     """Return the plan's diameter of the craniotomy [m], or 10 mm more than the tumour on all sides; 50 to 120 mm."""
     if plan.craniotomy is not None:
         return plan.craniotomy
@@ -161,24 +161,24 @@ def _assign_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
         around = TUMOUR_LABEL if part.label == NECROSIS_LABEL else BRAIN_LABEL
         free = np.flatnonzero(region == around)
         points = np.einsum("pk,tki->tpi", SAMPLE_WEIGHTS, mesh.nodes[mesh.tets[free]])
-        share = (part.inside(points.reshape(-1, 3)) < 0.0).reshape(points.shape[:2]).mean(axis=1)
+        share = (part.level_set(points.reshape(-1, 3)) < 0.0).reshape(points.shape[:2]).mean(axis=1)
         touched = np.argsort(-share, kind="stable")[: np.count_nonzero(share)]
         taken = np.concatenate([[0.0], np.cumsum(mesh.volumes[free[touched]])])
         region[free[touched[: np.abs(taken - part.volume).argmin()]]] = part.label
     return TetMesh(mesh.nodes, mesh.tets, region) if subject.parts else mesh
 
 
-def find_opened_cortex(subject: Subject, craniotomy: float) -> np.ndarray:
+def find_exposed_cortex(subject: Subject, diameter: float) -> np.ndarray:
     """Return a mask (n,) of the subject's cortex points under its outlined opening, or under one of this diameter [m].
 
     Distances are Euclidean; those on the mesh are geodesic and slightly longer.
     """
     if subject.outline is not None:
         return find_within_outline(subject.cortex, subject.outline)
-    return np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * craniotomy
+    return np.linalg.norm(subject.cortex - subject.site, axis=1) <= 0.5 * diameter
 
 
-def find_rim(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
+def find_boundary_voxels(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
     """Return the centres (n, 3) [m] of boundary voxels of `mask` (I, J, K)."""
     padded = np.pad(mask, 1)
     index = np.argwhere(padded & ~cast(np.ndarray, ndimage.binary_erosion(padded))) - 1

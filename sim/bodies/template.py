@@ -10,9 +10,9 @@ from scipy import ndimage
 from ..errors import InputError
 from ..runtime.optional_packages import require_extra
 from .intensity import Intensity
-from .placement import Piece, find_reachable_site
-from .signed_distance import Field, mask_field
-from .subject import Subject, find_rim
+from .placement import TumourPiece, find_reachable_site
+from .signed_distance import Field, compute_level_set
+from .subject import Subject, find_boundary_voxels
 
 MNI_CENTRE = (0.0, -17.4, 5.4)
 """Centre of the template's bounding box, the origin of the directions in `SITES` [mm]."""
@@ -33,7 +33,7 @@ MAX_COVER = 60e-3  # maximum depth of the tumour's top under the cortex [m]
 
 
 @dataclass(frozen=True)
-class Head:
+class HeadScaling:
     """Scaling of the template and requirements of a synthetic tumour.
 
     Parameters
@@ -42,7 +42,7 @@ class Head:
         Volume of the scaled brain [m^3]; the mask has 1,883 ml, more than a typical brain.
     threshold
         Intensity threshold of brain voxels, as a fraction of the maximum: that of nilearn's own mask.
-    smooth
+    smoothing_length
         Length over which the cortex is averaged for its inward normal [m].
     clearance
         Minimum brain around the tumour [m].
@@ -50,7 +50,7 @@ class Head:
 
     volume: float = 1470e-6
     threshold: float = 0.2
-    smooth: float = 5e-3
+    smoothing_length: float = 5e-3
     clearance: float = 5e-4
 
 
@@ -142,7 +142,7 @@ class HealthyHead:
         Brain voxels (I, J, K) bool, and affine (4, 4) from their indices to metres (RAS).
     intensity
         Grey values in the same space, if any.
-    middle
+    origin
         Origin (3,) [m] of the directions in `SITES`; None for the centre of the brain's box.
     notes
         Notes on assumptions.
@@ -151,7 +151,7 @@ class HealthyHead:
     mask: np.ndarray
     affine: np.ndarray
     intensity: Intensity | None = None
-    middle: tuple[float, float, float] | None = None
+    origin: tuple[float, float, float] | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -182,7 +182,7 @@ class Lobed:
     radius = compute_radius  # Former names, for one release.
 
 
-def build_template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
+def build_template_subject(tumour: Tumour, head: HeadScaling = HeadScaling()) -> Subject:
     """Return the template with a tumour, in the template's RAS coordinates, scaled about the brain's centroid.
 
     Raises
@@ -200,7 +200,7 @@ def build_template_subject(tumour: Tumour, head: Head = Head()) -> Subject:
     return build_synthetic_subject(tumour, _load_scaled_template(head), head)
 
 
-def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = Head()) -> Subject:
+def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: HeadScaling = HeadScaling()) -> Subject:
     """Return a healthy head with a synthetic tumour; volume and threshold of `head` are ignored.
 
     Raises
@@ -208,9 +208,9 @@ def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = H
     InputError
         A tumour that would extend beyond the brain.
     """
-    brain, cortex = mask_field(healthy.mask, healthy.affine), find_rim(healthy.mask, healthy.affine)
+    brain, cortex = compute_level_set(healthy.mask, healthy.affine), find_boundary_voxels(healthy.mask, healthy.affine)
     if tumour.middle is None:
-        site, inward = _find_site(brain, cortex, healthy.middle, tumour.site, head.smooth)
+        site, inward = _find_site(brain, cortex, healthy.origin, tumour.site, head.smoothing_length)
         shape = _round(
             tumour, lambda unit, scale: site + (tumour.cover + scale * unit.compute_radius(-inward[None])[0]) * inward
         )
@@ -224,26 +224,26 @@ def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: Head = H
             "choose a smaller radius, or another place."
         )
     volume = 4.0 / 3.0 * np.pi * tumour.radius**3
-    pieces = (Piece(volume, shape.middle, interface),)
+    pieces = (TumourPiece(volume, shape.middle, interface),)
     return Subject(brain, shape, cortex, interface, volume, site, healthy.intensity, notes=healthy.notes, pieces=pieces)
 
 
-def scale_affine(affine: np.ndarray, centre: np.ndarray, factor: float, place: np.ndarray) -> np.ndarray:
-    """Return the affine (4, 4) scaled by a factor about a `centre` (3,), which is moved to `place` (3,)."""
+def scale_affine(affine: np.ndarray, centre: np.ndarray, factor: float, new_centre: np.ndarray) -> np.ndarray:
+    """Return the affine (4, 4) scaled by a factor about a `centre` (3,), which is moved to `new_centre` (3,)."""
     moved = affine.copy()
     moved[:3, 3] -= centre
     moved[:3] *= factor
-    moved[:3, 3] += place
+    moved[:3, 3] += new_centre
     return moved
 
 
-def measure_size(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, float]:
+def measure_centroid_and_volume(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, float]:
     """Return centroid (3,) and volume of the voxels `mask` (I, J, K), in the units of their affine (4, 4)."""
     centre = affine[:3, :3] @ np.argwhere(mask).mean(axis=0) + affine[:3, 3]
     return centre, float(mask.sum() * abs(np.linalg.det(affine[:3, :3])))
 
 
-def _load_scaled_template(head: Head) -> HealthyHead:
+def _load_scaled_template(head: HeadScaling) -> HealthyHead:
     with require_extra("heads", "an anatomy of the average brain needs"):
         from nilearn.datasets import load_mni152_template  # takes seconds
 
@@ -252,7 +252,7 @@ def _load_scaled_template(head: Head) -> HealthyHead:
     component, _ = cast(tuple[np.ndarray, int], ndimage.label(grey > head.threshold * grey.max()))
     mask = cast(np.ndarray, ndimage.binary_fill_holes(component == np.bincount(component.ravel())[1:].argmax() + 1))
     affine = np.array(image.affine, np.float64)
-    centre, volume = measure_size(mask, affine)
+    centre, volume = measure_centroid_and_volume(mask, affine)
     affine = scale_affine(affine, centre, (head.volume / volume) ** (1.0 / 3.0), 1e-3 * centre)
     return HealthyHead(mask, affine, Intensity(grey, affine))
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError
-from ..runtime.outside_files import read_as, to_path
+from ..runtime.outside_files import to_path, wrap_errors
 from .nifti import read_mgh, read_nifti
 from .nrrd import read_nrrd
-from .voxels import DEFAULT_VOXELS, REMEDY, Volume, Voxels, check_volume
+from .voxels import DEFAULT_VOXELS, REMEDY, Volume, VoxelSpec, check_volume
 
 READERS = {
     ".nii": ("NIfTI", read_nifti),
@@ -21,11 +21,11 @@ READERS = {
 
 
 def read_volume(
-    path: str | Path, voxels: Voxels = DEFAULT_VOXELS, finite: bool = True, layered: bool = False
+    path: str | Path, spec: VoxelSpec = DEFAULT_VOXELS, require_finite: bool = True, allow_layers: bool = False
 ) -> Volume:
-    """Read one numeric volume from a file; unless `finite` is False, all values must be finite.
+    """Read one numeric volume from a file; unless `require_finite` is False, all values must be finite.
 
-    If `layered`, the values of a segmentation may be (I, J, K, L), in layers that overlap.
+    If `allow_layers`, the values of a segmentation may be (I, J, K, L), in layers that overlap.
 
     Raises
     ------
@@ -41,8 +41,8 @@ def read_volume(
     if ending is None:
         raise InputError(f"{path}: unsupported file type; expected {', '.join(READERS)}. {REMEDY}")
     kind, read = READERS[ending]
-    with read_as(path, kind, REMEDY):
-        volume = read(path, voxels)
+    with wrap_errors(path, kind, REMEDY):
+        volume = read(path, spec)
         if kind != "NIfTI":  # the NIfTI reader itself uses `axes` for files without orientation
-            volume = replace(volume, notes=(*volume.notes, *voxels.ignored_axes))
-        return check_volume(path, volume, voxels, finite, layered)
+            volume = replace(volume, notes=(*volume.notes, *spec.ignored_axes_note))
+        return check_volume(path, volume, spec, require_finite, allow_layers)

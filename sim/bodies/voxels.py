@@ -23,14 +23,14 @@ MAX_UNPACKED_BYTES = 2**31
 
 
 @dataclass(frozen=True)
-class Voxels:
+class VoxelSpec:
     """Limits and options of a brain volume.
 
     Parameters
     ----------
     min_edge, max_edge
         Limits of the voxel edges [m]: no brain scanner is finer, and coarser voxels do not resolve the surface.
-    max_form_difference
+    max_sform_difference
         Maximum distance between the sform and qform positions of a voxel, to allow for round-off [m].
     axes
         Axis directions of a NIfTI file without orientation, such as RAS or LPS; if empty, such a file is rejected.
@@ -38,16 +38,16 @@ class Voxels:
 
     min_edge: float = 1e-5
     max_edge: float = 6e-3
-    max_form_difference: float = 1e-3
+    max_sform_difference: float = 1e-3
     axes: str = ""
 
     @property
-    def ignored_axes(self) -> tuple[str, ...]:
+    def ignored_axes_note(self) -> tuple[str, ...]:
         """Note that `axes` are ignored since the file has its own orientation; () without `axes`."""
         return (f"its own orientation is used: axes {self.axes} are ignored",) if self.axes else ()
 
 
-DEFAULT_VOXELS = Voxels()
+DEFAULT_VOXELS = VoxelSpec()
 """Default limits, for brain scanners."""
 
 
@@ -120,30 +120,30 @@ def _find_opener(path: Path) -> Callable[..., Any]:
     return next((opener for magic, opener in packers.items() if start.startswith(magic)), open)
 
 
-def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layered: bool) -> Volume:
+def check_volume(path: Path, volume: Volume, spec: VoxelSpec, require_finite: bool, allow_layers: bool) -> Volume:
     """Return the volume without singleton axes beyond the third, if it is numeric and has a position.
 
-    `layered` accepts several layers of a segmentation, as (I, J, K, L).
+    `allow_layers` accepts several layers of a segmentation, as (I, J, K, L).
 
     Raises
     ------
     InputError
-        Colours or complex numbers; a slice or several volumes; segments that overlap, unless `layered`. If `finite`,
-        non-finite values. A singular affine, and voxels that are too fine or too coarse.
+        Colours or complex numbers; a slice or several volumes; segments that overlap, unless `allow_layers`. If
+        `require_finite`, non-finite values. A singular affine, and voxels that are too fine or too coarse.
     """
     values, affine = volume.values, volume.affine
     shape = " x ".join(map(str, values.shape))
     if values.dtype.kind not in "biuf":
         raise InputError(f"{path}: holds colours or complex numbers ({values.dtype}), not plain ones. {REMEDY}")
-    if not layered and volume.segments and values.ndim == 4 and values.shape[3] > 1:
+    if not allow_layers and volume.segments and values.ndim == 4 and values.shape[3] > 1:
         raise InputError(
             f"{path}: its segments overlap, in {values.shape[3]} layers, so it is no label map. Export them as a label "
             "map (.nii.gz): there each voxel has one label."
         )
-    most = values.shape[3] if layered and volume.segments and values.ndim == 4 else 1
+    most = values.shape[3] if allow_layers and volume.segments and values.ndim == 4 else 1
     if values.ndim < 3 or min(values.shape[:3]) < 2 or max(values.shape[3:], default=1) > most:
         raise InputError(f"{path}: measures {shape} voxels, which is not one volume. {REMEDY}")
-    if finite and not np.isfinite(values).all():
+    if require_finite and not np.isfinite(values).all():
         lacking = int((~np.isfinite(values)).sum())
         raise InputError(f"{path}: {lacking} of its numbers are not finite. Replace them by 0.")
     spacing = np.linalg.norm(affine[:3, :3], axis=0)
@@ -151,15 +151,15 @@ def check_volume(path: Path, volume: Volume, voxels: Voxels, finite: bool, layer
         raise InputError(
             f"{path}: its affine is singular, so its voxels have no position. Export it with its orientation."
         )
-    if spacing.min() < voxels.min_edge:
+    if spacing.min() < spec.min_edge:
         raise InputError(
             f"{path}: its voxels measure {spacing.min() * 1e3:.3g} mm along an axis; "
-            f"{voxels.min_edge * 1e3:g} mm is the least. Set the voxel size, or resample it."
+            f"{spec.min_edge * 1e3:g} mm is the least. Set the voxel size, or resample it."
         )
-    if spacing.max() > voxels.max_edge:
+    if spacing.max() > spec.max_edge:
         voxel = " x ".join(f"{edge * 1e3:.3g}" for edge in spacing)
         raise InputError(
-            f"{path}: its voxels measure {voxel} mm; {voxels.max_edge * 1e3:g} mm is the maximum for a brain."
+            f"{path}: its voxels measure {voxel} mm; {spec.max_edge * 1e3:g} mm is the maximum for a brain."
         )
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]

@@ -24,8 +24,8 @@ OPENERS = {"vtkZLibDataCompressor": zlib.decompressobj, "vtkLZMADataCompressor":
 WORDS = {"UInt32": "u4", "UInt64": "u8"}  # header word type
 
 
-def check_vtu_size(path: Path, most: int) -> bool:
-    """Reject a file whose compressed arrays expand to more than `most` bytes, or to more than they declare.
+def check_vtu_size(path: Path, max_bytes: int) -> bool:
+    """Reject a file whose compressed arrays expand to more than `max_bytes` bytes, or to more than they declare.
 
     Return False if the arrays cannot be measured as reliably as meshio reads them: not XML, raw or uncompressed data.
 
@@ -61,7 +61,7 @@ def check_vtu_size(path: Path, most: int) -> bool:
     raw = behind is not None
     if behind is None:
         behind = (root.findtext("AppendedData") or "").strip()[1:]
-    left = most
+    left = max_bytes
     for array in root.iter("DataArray"):
         kind = array.get("format")
         if kind in ("binary", "appended"):
@@ -69,7 +69,7 @@ def check_vtu_size(path: Path, most: int) -> bool:
             declared, blocks = _parse_blocks(inside, word)
             left -= declared
             if left < 0:
-                raise build_too_large_error(most)
+                raise build_too_large_error(max_bytes)
             for block in blocks:
                 declared -= _measure_inflated_size(opener, block, declared)
                 if declared < 0:
@@ -108,8 +108,7 @@ def _measure_inflated_size(opener: Callable[[], Any], block: bytes, most: int) -
     while rest and total <= most:
         opened = opener()
         while total <= most and not opened.eof:
-            piece = opened.decompress(rest, BLOCK)
-            rest = getattr(opened, "unconsumed_tail", b"")
+            piece, rest = opened.decompress(rest, BLOCK), getattr(opened, "unconsumed_tail", b"")
             total += len(piece)
             if not piece and not rest:
                 return total

@@ -48,7 +48,7 @@ def build_kernel(device: Device) -> wp.Kernel:
     return strain
 
 
-class Bond:
+class BondTraction:
     """Largest traction between brain and skull, relative to the strength in `Bonded`.
 
     Tension and shear are combined as sqrt((t_n / tension)^2 + (t_s / shear)^2): the quadratic nominal stress criterion
@@ -59,8 +59,7 @@ class Bond:
 
     def __init__(self, effect: Bonded, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 5e-3):
         self._effect, self._device = effect, device
-        covered = (anatomy.slide_normal != 0.0).any(axis=1)
-        corners = space.mesh.surface
+        covered, corners = (anatomy.slide_normal != 0.0).any(axis=1), space.mesh.surface
         wall = (covered | anatomy.fixed.all(axis=1))[corners].all(axis=1) & covered[corners].any(axis=1)
         triangles = space.surface[wall]
         share = np.repeat(compute_areas(space.nodes[triangles[:, :3]])[:, None] / 3.0, 3, axis=1)
@@ -79,13 +78,13 @@ class Bond:
             device.upload(np.array([area[patch].sum() for patch in patches]), wp.float64),
         ]
 
-    def compute_shares(self, force: wp.array) -> np.ndarray:
+    def compute_ratios(self, force: wp.array) -> np.ndarray:
         """Compute the relative traction (n, B) at `nodes` (n,) from the skull's forces (3N, B) [N] on the brain."""
         share = wp.zeros((len(self.nodes), force.shape[1]), dtype=wp.float64, device=self._device.name)
         self._compute_largest_ratio(force, share)
         return share.numpy()
 
-    def share(self, force: wp.array) -> np.ndarray:
+    def compute_max_ratio(self, force: wp.array) -> np.ndarray:
         """Return the maximum of `shares` (B,): above 1 the bond would fail. NaN without a skull."""
         return self._compute_largest_ratio(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
 

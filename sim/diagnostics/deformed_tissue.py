@@ -10,9 +10,9 @@ from ..deformation import Outcome
 from ..discretisation.space import Discretisation
 from ..effects import Bonded, Effect
 from ..runtime.device import Device
-from .bond_traction import Bond
-from .skull_leak import Leak
-from .stretch import Stretch
+from .bond_traction import BondTraction
+from .skull_leak import SkullLeak
+from .stretch import TissueStretch
 
 
 class Diagnostics:
@@ -21,10 +21,10 @@ class Diagnostics:
     def __init__(
         self, anatomy: Anatomy, space: Discretisation, effects: Iterable[Effect], device: Device, limit_strain: bool
     ):
-        self._leak, self._stretch = Leak(anatomy, space, device), Stretch(space, device)
+        self._leak, self._stretch = SkullLeak(anatomy, space, device), TissueStretch(space, device)
         self._limit_strain = limit_strain
         bonded = (effect for effect in effects if isinstance(effect, Bonded))
-        self._bond = next((Bond(effect, anatomy, space, device) for effect in bonded), None)
+        self._bond = next((BondTraction(effect, anatomy, space, device) for effect in bonded), None)
 
     @property
     def needs_forces(self) -> bool:
@@ -33,20 +33,19 @@ class Diagnostics:
 
     def compute_fields(self, u: wp.array, force: wp.array | None) -> dict[str, np.ndarray]:
         """Compute `leaked`, `bond`, `stretch` and `strained` at u (3N, B) [m] with internal forces (3N, B) [N]."""
-        bond = self._bond.share(force) if self._bond and force is not None else np.array(np.nan)
-        return {"leaked": self._leak.share(u), "bond": bond, **self.compute_strains(u)}
+        bond = self._bond.compute_max_ratio(force) if self._bond and force is not None else np.array(np.nan)
+        return {"leaked": self._leak.compute_fraction(u), "bond": bond, **self.compute_strains(u)}
 
     def compute_strains(self, u: wp.array) -> dict[str, np.ndarray]:
         """Compute `stretch` and `strained` at u (3N, B) [m]."""
-        return self._stretch.measure(u)
+        return self._stretch.measure_stretch(u)
 
     def mark_outcomes(self, outcome: np.ndarray, inverted: np.ndarray, strained: np.ndarray) -> np.ndarray:
         """Return outcomes (B,), in which equilibria that real tissue cannot have are marked, if strains are limited.
 
         inverted (B,) counts tetrahedra; strained (B,) [m^3] as in `Deformation`.
         """
-        good = np.array([one.good and self._limit_strain for one in outcome], bool)
-        out = outcome.copy()
+        good, out = np.array([one.good and self._limit_strain for one in outcome], bool), outcome.copy()
         out[good & self._stretch.is_beyond_range(strained)] = Outcome.OVERSTRAINED
         out[good & (inverted > 0)] = Outcome.INVERTED
         return out

@@ -69,7 +69,7 @@ def build_kernel(device: Device) -> wp.Kernel:
     return sweep
 
 
-class Leak:
+class SkullLeak:
     """Volume that passes out through the closed skull, relative to the volume swept by the open surface.
 
     The flux through each covered facet is averaged over those within `around` [m], the size of a palpating tool. Sums
@@ -101,7 +101,7 @@ class Leak:
             device.upload(covered.astype(np.int32), wp.int32),
         ]
 
-    def share(self, u: wp.array) -> np.ndarray:
+    def compute_fraction(self, u: wp.array) -> np.ndarray:
         """Compute the relative leak (B,) at u (3N, B) [m] on the device; 0 without leak, NaN if nothing is open."""
         out = wp.zeros((2, u.shape[1]), dtype=wp.float64, device=self._device.name)
         self._device.launch(build_kernel(self._device), (len(self._arrays[3]), u.shape[1]), [u, *self._arrays], [out])

@@ -67,13 +67,13 @@ def build_kernel(device: Device) -> wp.Kernel:
     return measure
 
 
-class Stretch:
+class TissueStretch:
     """Stretch of the displacement gradients in a discretisation's material law: averages in smoothed elements."""
 
     def __init__(self, space: Discretisation, device: Device):
-        elements = space.split_elements(np.ones(len(space.mesh.tets), bool))[0].elements
+        elements = space.build_elements(np.ones(len(space.mesh.tets), bool))[0].elements
         count, most = elements.table.shape
-        size = np.full(count, most, np.int32) if elements.size is None else elements.size
+        size = np.full(count, most, np.int32) if elements.sizes is None else elements.sizes
         self._device, self._limit = device, min(MAX_VOLUME, MAX_FRACTION * float(elements.weight.sum()))
         self._shape = [
             device.upload(size, wp.int32),
@@ -82,13 +82,13 @@ class Stretch:
             device.upload(elements.weight, wp.float64),
         ]
 
-    def measure(self, u: wp.array) -> dict[str, np.ndarray]:
+    def measure_stretch(self, u: wp.array) -> dict[str, np.ndarray]:
         """Compute `stretch` and `strained` of a `Deformation` at u (3N, B) [m] on the device."""
         found = self._device.upload(np.repeat([[1.0], [1.0], [0.0]], u.shape[1], axis=1), wp.float64)
         self._device.launch(build_kernel(self._device), (len(self._shape[1]), u.shape[1]), [u, *self._shape], [found])
         least, most, volume = found.numpy()
         return {"stretch": np.sqrt(np.stack([least.clip(0.0), most])), "strained": volume}
 
-    def is_beyond_range(self, volume: np.ndarray) -> np.ndarray:
+    def is_beyond_range(self, strained: np.ndarray) -> np.ndarray:
         """Return True (B,) for volumes (B,) [m^3] strained beyond the measured range that make results unreliable."""
-        return volume > self._limit
+        return strained > self._limit

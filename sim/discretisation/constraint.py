@@ -23,14 +23,14 @@ class MinFreeDofs:
 
     Parameters
     ----------
-    normal
+    normal_norm
         Minimum norm of a slide normal's free components; below it, the normal has no effect on them.
-    footprint
+    footprint_fraction
         Minimum free fraction of a footprint's squared weights in every direction.
     """
 
-    normal: float = 1e-6
-    footprint: float = 1e-2
+    normal_norm: float = 1e-6
+    footprint_fraction: float = 1e-2
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class ConstraintKernels:
     """Constraint kernels for one scalar type."""
 
     project: wp.Kernel
-    close: wp.Kernel
+    close_gap: wp.Kernel
     average: wp.Kernel
     spread: wp.Kernel
 
@@ -58,8 +58,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
     ):
         """Project onto the admissible motions: v_i -= n (n . v_i); fixed components of v are zero."""
         i, c = wp.tid()
-        x = vec(v[3 * i, c], v[3 * i + 1, c], v[3 * i + 2, c])
-        n = normal[i]
+        x, n = vec(v[3 * i, c], v[3 * i + 1, c], v[3 * i + 2, c]), normal[i]
         x -= wp.dot(n, x) * n
         for k in range(3):
             v[3 * i + k, c] = wp.where(fixed[i, k] == wp.int8(0), x[k], scalar(0.0))
@@ -76,8 +75,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
     ):
         """Compute gap_i = value - u if fixed, n (drag . value - n . u) if sliding, zero elsewhere."""
         i, c = wp.tid()
-        x = vec(u[3 * i, c], u[3 * i + 1, c], u[3 * i + 2, c])
-        n = normal[i]
+        x, n = vec(u[3 * i, c], u[3 * i + 1, c], u[3 * i + 2, c]), normal[i]
         dragged = wp.dot(drag[i], vec(value[3 * i, c], value[3 * i + 1, c], value[3 * i + 2, c]))
         slip = (dragged - wp.dot(n, x)) * n
         for k in range(3):
@@ -132,7 +130,7 @@ class Constraint:
 
     def __init__(self, fixed: np.ndarray, normal: np.ndarray, device: Device, freedom: MinFreeDofs = MinFreeDofs()):
         self.fixed, self._freedom = fixed, freedom
-        self.normal, drag = _restrict_normals(fixed, normal, freedom.normal)
+        self.normal, drag = _restrict_normals(fixed, normal, freedom.normal_norm)
         self.device = device
         self._fixed = device.upload(fixed.astype(np.int8), wp.int8)
         self._normal = device.upload(self.normal, device.vector)
@@ -141,25 +139,25 @@ class Constraint:
         self._weight: wp.array | None = None
         self._target, self._gram = np.zeros((3, 0)), np.zeros((0, 3, 3))
 
-    def begin(self, value: np.ndarray | None, weight: np.ndarray | None, target: np.ndarray | None) -> None:
+    def begin(self, displacement: np.ndarray | None, footprint: np.ndarray | None, motion: np.ndarray | None) -> None:
         """Set the values (3N, b) [m] of fixed components for a batch; None for zero.
 
-        Footprint weights (N, b) with prescribed mean motion `target` (3, b) [m], or None.
+        Footprint weights (N, b) with prescribed mean motion `motion` (3, b) [m], or None.
 
         Raises
         ------
         InputError
             A footprint that is too constrained to move.
         """
-        self._value = None if value is None else self.device.upload(value)
+        self._value = None if displacement is None else self.device.upload(displacement)
         self._weight = None
-        if weight is not None and target is not None:
-            self._weight, self._target = self.device.upload(weight), target
-            square = weight**2
+        if footprint is not None and motion is not None:
+            self._weight, self._target = self.device.upload(footprint), motion
+            square = footprint**2
             free = np.eye(3) * ~self.fixed[:, None, :] - self.normal[:, :, None] * self.normal[:, None, :]
             self._gram = np.einsum("nb,nij->bij", square, free)
             share = np.linalg.eigvalsh(self._gram)[:, 0] / square.sum(axis=0)
-            if (share < self._freedom.footprint).any():
+            if (share < self._freedom.footprint_fraction).any():
                 raise InputError(
                     f"load {np.argmin(share)} moves a footprint that is (nearly) fixed: choose a free place."
                 )
@@ -173,12 +171,12 @@ class Constraint:
             self._target, self._gram = self._target[:, columns], self._gram[columns]
 
     @property
-    def nodes(self) -> tuple[wp.array, wp.array]:
+    def node_arrays(self) -> tuple[wp.array, wp.array]:
         """Arrays of `project_nodes` on the device: fixed components (N, 3) int8 and normals (N,)."""
         return self._fixed, self._normal
 
     @property
-    def imposes(self) -> bool:
+    def has_motion(self) -> bool:
         """True if the batch prescribes nonzero values or footprint motions."""
         return self._value is not None or self._weight is not None
 
@@ -199,10 +197,9 @@ class Constraint:
         gap = self.device.allocate(*u.shape)
         value = self._value if self._value is not None else gap
         inputs = [self._fixed, self._normal, self._drag, value, u]
-        self.device.launch(build_kernels(self.device).close, (len(self.fixed), u.shape[1]), inputs, [gap])
+        self.device.launch(build_kernels(self.device).close_gap, (len(self.fixed), u.shape[1]), inputs, [gap])
         if self._weight is not None:
-            rest = self.device.allocate(*u.shape)
-            reached = self._average(u) + self._average(gap)
+            rest, reached = self.device.allocate(*u.shape), self._average(u) + self._average(gap)
             self._spread(self._target - reached, rest)
             self.project_nodes(rest)
             combine_columns(self.device, gap, 1.0, rest, gap)

@@ -22,65 +22,64 @@ class Elements:
 
     table (T, n) node numbers. gradient (T, q, n, 3) of the shape functions in the undeformed configuration [1/m].
     weight (T, q) undeformed volume of each quadrature point [m^3]. nodes: number of nodes of the discretisation.
-    owner (T,) tetrahedron of the mesh from which each element takes its tissue. marks (T, k) vertices and labels that
-    identify each element, whatever is cut from the mesh. size (T,) number of nodes of each row, which
+    owner (T,) tetrahedron of the mesh from which each element takes its tissue. keys (T, k) vertices and labels that
+    identify each element, whatever is cut from the mesh. sizes (T,) number of nodes of each row, which
     come first; None: all n.
     """
 
     table: np.ndarray
     gradient: np.ndarray
     weight: np.ndarray
-    nodes: int
+    node_count: int
     owner: np.ndarray
-    marks: np.ndarray
-    size: np.ndarray | None = None
+    keys: np.ndarray
+    sizes: np.ndarray | None = None
 
     def restrict(self, nodes: np.ndarray) -> Elements:
         """Return the elements renumbered to a subset of nodes (n,), ascending, that contains all of theirs."""
-        return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), nodes=len(nodes))
+        return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), node_count=len(nodes))
 
 
-def build_linear_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
-    """Build linear tetrahedra with one quadrature point; the mask `chosen` (T,) selects elements."""
-    tets = mesh.tets[chosen]
+def build_linear_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
+    """Build linear tetrahedra with one quadrature point; the mask `selected` (T,) selects elements."""
+    tets = mesh.tets[selected]
     corners = mesh.nodes[tets]
     jacobian = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     inverse = np.linalg.inv(jacobian)  # rows: gradients of barycentric coordinates 1, 2, 3
     gradient = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
-    weight = mesh.volumes[chosen][:, None]
-    return Elements(tets, gradient[:, None], weight, len(mesh.nodes), np.flatnonzero(chosen), tets)
+    weight = mesh.volumes[selected][:, None]
+    return Elements(tets, gradient[:, None], weight, len(mesh.nodes), np.flatnonzero(selected), tets)
 
 
-def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> Elements:
+def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, selected: np.ndarray) -> Elements:
     """Build ten-node tetrahedra, straight or curved, with eight quadrature points of degree 3.
 
     Zienkiewicz, Taylor 2005, "The Finite Element Method", section 4.7. nodes (N, 3) [m]; table (T, 10): corners, then
-    midpoints of `QUADRATIC_EDGES`; the mask `chosen` (T,) selects elements.
+    midpoints of `QUADRATIC_EDGES`; the mask `selected` (T,) selects elements.
 
     Raises
     ------
     InputError
         An element folded by its mid-edge nodes.
     """
-    table = table[chosen]
-    slope = compute_quadratic_slopes(EIGHT_POINTS)
+    table, slope = table[selected], compute_quadratic_gradients(EIGHT_POINTS)
     jacobian = np.einsum("tai,qaj->tqij", nodes[table], slope)
     volume = np.linalg.det(jacobian)
     folded = np.flatnonzero((volume <= 0.0).any(axis=1))
     if len(folded):
         raise InputError(
-            f"quadratic tetrahedron {np.flatnonzero(chosen)[folded[0]]} (and {len(folded) - 1} more) is folded over "
+            f"quadratic tetrahedron {np.flatnonzero(selected)[folded[0]]} (and {len(folded) - 1} more) is folded over "
             "by its mid-edge nodes: move them towards the middles of their edges."
         )
     gradient = np.einsum("qaj,tqji->tqai", slope, np.linalg.inv(jacobian))
     weight = volume * EIGHT_WEIGHTS / 6.0
-    return Elements(table, gradient, weight, len(nodes), np.flatnonzero(chosen), table[:, :4])
+    return Elements(table, gradient, weight, len(nodes), np.flatnonzero(selected), table[:, :4])
 
 
 def pack_gradients(
     domain: np.ndarray, node: np.ndarray, gradient: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sum gradients (m, 3) by domain (m,) and node (m,): `table`, `size` and `gradient` of `Elements`, one point each.
+    """Sum gradients (m, 3) by domain (m,) and node (m,): `table`, `sizes` and `gradient` of `Elements`, one point each.
 
     Domains are numbered from 0, without gaps.
     """
@@ -97,42 +96,42 @@ def pack_gradients(
     return table, size.astype(np.int32), spread[:, None]
 
 
-def compute_quadratic_shapes(corner: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def compute_quadratic_shapes(barycentric: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return quadratic shape functions (..., n) at barycentric points (..., d): L (2 L - 1) and 4 L_i L_j."""
-    middle = 4.0 * corner[..., edges[:, 0]] * corner[..., edges[:, 1]]
-    return np.concatenate([corner * (2.0 * corner - 1.0), middle], axis=-1)
+    middle = 4.0 * barycentric[..., edges[:, 0]] * barycentric[..., edges[:, 1]]
+    return np.concatenate([barycentric * (2.0 * barycentric - 1.0), middle], axis=-1)
 
 
-def compute_quadratic_slopes(corner: np.ndarray) -> np.ndarray:
+def compute_quadratic_gradients(barycentric: np.ndarray) -> np.ndarray:
     """Return derivatives (q, 10, 3) of the shape functions by barycentric coordinates 1, 2, 3 at points (q, 4)."""
-    slope = np.zeros((len(corner), 10, 4))
-    slope[:, np.arange(4), np.arange(4)] = 4.0 * corner - 1.0
+    slope = np.zeros((len(barycentric), 10, 4))
+    slope[:, np.arange(4), np.arange(4)] = 4.0 * barycentric - 1.0
     for place, (i, j) in enumerate(QUADRATIC_EDGES, start=4):
-        slope[:, place, i], slope[:, place, j] = 4.0 * corner[:, j], 4.0 * corner[:, i]
+        slope[:, place, i], slope[:, place, j] = 4.0 * barycentric[:, j], 4.0 * barycentric[:, i]
     return slope[:, :, 1:] - slope[:, :, :1]
 
 
 def assemble_hooke_stiffness(
-    elements: Elements, mu: np.ndarray, lam: np.ndarray, together: int = 8_000_000
+    elements: Elements, mu: np.ndarray, lam: np.ndarray, block_size: int = 8_000_000
 ) -> sp.csc_array:
     """Assemble the undeformed stiffness (3N, 3N) [N/m] of isotropic elements with Lamé parameters mu, lam (T,) [Pa].
 
     K = integral of 2 mu E^T E + lambda D^T D, with the operators of strain E and volume change D. See Hughes
     2000, "The Finite Element Method", section 2.8. It is a sum of sparse matrix products, since elements have any
-    number of nodes. Blocks of at most `together` numbers limit the memory.
+    number of nodes. Blocks of at most `block_size` numbers limit the memory.
     """
-    total = sp.csr_array((3 * elements.nodes,) * 2)
+    total = sp.csr_array((3 * elements.node_count,) * 2)
     count, points, most = elements.gradient.shape[:3]
-    for part in np.array_split(np.arange(count), max(1, -(-count * points * most * 18 // together))):
+    for part in np.array_split(np.arange(count), max(1, -(-count * points * most * 18 // block_size))):
         table = np.repeat(elements.table[part], points, axis=0)
-        size = np.full(len(table), most) if elements.size is None else np.repeat(elements.size[part], points)
+        size = np.full(len(table), most) if elements.sizes is None else np.repeat(elements.sizes[part], points)
         used = np.arange(most) < size[:, None]
         column, start = table[used], np.append(0, np.cumsum(size))
         slope = elements.gradient[part].reshape(-1, most, 3)[used]
         for modulus, of in ((2.0 * mu[part], _build_strain), (lam[part], _build_divergence)):
             if modulus.any():
                 blocks, weight = of(slope), (modulus[:, None] * elements.weight[part]).ravel()
-                shape = blocks.shape[1] * len(table), 3 * elements.nodes
+                shape = blocks.shape[1] * len(table), 3 * elements.node_count
                 scaled = np.repeat(weight, size)[:, None, None] * blocks
                 left, right = (sp.bsr_array((each, column, start), shape) for each in (blocks, scaled))
                 total += (left.T @ right).tocsr()

@@ -20,19 +20,19 @@ STABILISATION = 0.1  # Share of linear interpolation on a face: stiffens oscilla
 RADIUS = 1.1  # Support radius, relative to the distance of the farthest node of the support.
 
 
-def build_element_free(mesh: TetMesh, chosen: np.ndarray) -> Elements:
-    """Build one integration cell per tetrahedron of the mask `chosen` (T,).
+def build_element_free(mesh: TetMesh, selected: np.ndarray) -> Elements:
+    """Build one integration cell per tetrahedron of the mask `selected` (T,).
 
     grad N_a = 1/V sum over faces of N_a(centroid) n A. Cells share the values N_a of a face, so the gradients sum to
     the surface integral of N_a n. On surfaces and between regions the face's three vertices have a third each: loads
     and fixed nodes act as on linear tetrahedra, and strain may jump between tissues. Other supports cross no such face.
     """
-    tets = mesh.tets[chosen]
+    tets = mesh.tets[selected]
     corner = tets[:, FACES].reshape(-1, 3)
     _, first, face = np.unique(compute_row_keys(corner), return_index=True, return_inverse=True)
     cell = np.repeat(np.arange(len(tets)), len(FACES))
     # Faces with a tetrahedron of the same region on both sides.
-    label = np.unique(mesh.region[chosen], return_inverse=True)[1][cell]
+    label = np.unique(mesh.region[selected], return_inverse=True)[1][cell]
     count, total, square = (np.bincount(face, label**power) for power in range(3))
     inside = (count == 2) & (total**2 == 2.0 * square)
     across, corners = inside[face], corner[first]
@@ -41,30 +41,30 @@ def build_element_free(mesh: TetMesh, chosen: np.ndarray) -> Elements:
     links = sp.csr_array((np.ones(across.sum(), bool), (face[across], cell[across])), (len(first), len(tets)))
     support = _choose_supports(mesh.nodes, tets, sp.csr_array(links[inside]), corners[inside])
     centroid = mesh.nodes[corners[inside]].mean(axis=1)
-    own = compute_shapes(centroid, mesh.nodes[support], support >= 0)
+    own = compute_shape_functions(centroid, mesh.nodes[support], support >= 0)
     table[inside, 3:], shape[inside, 3:] = support, (1.0 - STABILISATION) * own
     a, b, c = np.moveaxis(mesh.nodes[corner], 1, 0)
-    area = np.cross(b - a, c - a) / (2.0 * mesh.volumes[chosen][cell, None])
+    area = np.cross(b - a, c - a) / (2.0 * mesh.volumes[selected][cell, None])
     entry, column = np.nonzero(table[face] >= 0)
     slope = area[entry] * shape[face[entry], column][:, None]
     nodes, size, gradient = pack_gradients(cell[entry], table[face[entry], column], slope)
-    weight = mesh.volumes[chosen][:, None]
-    return Elements(nodes, gradient, weight, len(mesh.nodes), np.flatnonzero(chosen), tets, size)
+    weight = mesh.volumes[selected][:, None]
+    return Elements(nodes, gradient, weight, len(mesh.nodes), np.flatnonzero(selected), tets, size)
 
 
-def compute_shapes(points: np.ndarray, nodes: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Compute shape functions (m, k) at points (m, 3) [m] with supports `nodes` (m, k, 3) [m], as far as `used` (m, k).
+def compute_shape_functions(points: np.ndarray, nodes: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Compute shape functions (m, k) at points (m, 3) [m] with supports `nodes` (m, k, 3) [m], as far as `mask` (m, k).
 
     N_a = w_a p_a^T M^-1 p(x), M = sum of w_a p_a p_a^T, p = (1, x - x_a): linear fields are reproduced. The weight
     w = ((s^2 + e)^-2 - (1 + e)^-2) / (e^-2 - (1 + e)^-2) at distance s, relative to the support radius, makes
     N_a(x_b) = 1 if a = b, else 0, to about 1e-6: Most, Bucher 2005, "A moving least squares weighting function for the
     element-free Galerkin method which almost fulfills essential boundary conditions", Struct. Eng. Mech. 21:315-332.
     """
-    away = np.where(used[..., None], nodes - points[:, None], 0.0)
+    away = np.where(mask[..., None], nodes - points[:, None], 0.0)
     radius = RADIUS * np.linalg.norm(away, axis=2).max(axis=1)
     away = away / radius[:, None, None]
     square, low, high = (away**2).sum(axis=2), (1.0 + REGULARISATION) ** -2, REGULARISATION**-2
-    weight = np.where(used, ((square + REGULARISATION) ** -2 - low) / (high - low), 0.0)
+    weight = np.where(mask, ((square + REGULARISATION) ** -2 - low) / (high - low), 0.0)
     weight /= weight.max(axis=1, keepdims=True)
     basis = np.concatenate([np.ones((*square.shape, 1)), away], axis=2)
     moment = np.einsum("ma,mai,maj->mij", weight, basis, basis)
@@ -85,9 +85,7 @@ def _choose_supports(nodes: np.ndarray, tets: np.ndarray, links: sp.csr_array, c
     near = sp.csr_array(reached @ incidence)
     face = np.repeat(np.arange(len(corner)), np.diff(near.indptr))
     distance = np.linalg.norm(nodes[near.indices] - nodes[corner].mean(axis=1)[face], axis=1)
-    order = np.lexsort((distance, face))
-    rank = np.arange(len(face)) - near.indptr[face]
-    kept = rank < MAX_SUPPORT
-    out = np.full((len(corner), MAX_SUPPORT), -1)
+    order, rank = np.lexsort((distance, face)), np.arange(len(face)) - near.indptr[face]
+    kept, out = rank < MAX_SUPPORT, np.full((len(corner), MAX_SUPPORT), -1)
     out[face[kept], rank[kept]] = near.indices[order][kept]
     return out

@@ -68,14 +68,14 @@ class Footprints:
 
 @dataclass(frozen=True, eq=False)
 class FootprintArrays:
-    """Device arrays for B footprints: `tools` (B,) point and radius [m], `touched` (B,) contact point and distance.
+    """Device arrays for B footprints: `tools` (B,) point and radius [m], `contacts` (B,) contact point and distance.
 
-    `found` (n, B) reduction levels of the nearest points; weight (M, B) and sums (B,) as in `Footprints`.
+    `levels` (n, B) reduction levels of the nearest points; weight (M, B) and sums (B,) as in `Footprints`.
     """
 
     tools: wp.array
-    touched: wp.array
-    found: tuple[wp.array, ...]
+    contacts: wp.array
+    levels: tuple[wp.array, ...]
     weight: wp.array
     sums: wp.array
 
@@ -119,14 +119,14 @@ class ContactSurface:
         self._position = device.upload(nodes[self.nodes], wp.vec3d)
         self._last: tuple[bytes, Footprints] | None = None
 
-    def find_nearest(self, points: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nearest points (B, 3) [m] to `points` (B, 3), and distances (B,), inf if > `within` (B,) [m]."""
-        imprint = self.build_footprints(self._pack_tools(points, within))
+    def find_nearest(self, points: np.ndarray, max_distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return nearest points (B, 3) [m] to points (B, 3), and distances (B,), inf if > `max_distance` (B,) [m]."""
+        imprint = self.allocate_footprints(self._pack_tools(points, max_distance))
         self._find_contacts(imprint)
-        touched = imprint.touched.numpy().reshape(-1, 4)
+        touched = imprint.contacts.numpy().reshape(-1, 4)
         return touched[:, :3], touched[:, 3]
 
-    def press(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
+    def find_footprints(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
         """Return the footprints of tools at `points` (B, 3) with `radii` (B,) [m].
 
         A point off the surface is moved to the nearest surface point, by at most its radius. The last result is cached,
@@ -142,7 +142,7 @@ class ContactSurface:
             last = self._last = key, self._compute_footprints(points, radii)
         return last[1]  # another thread may have replaced self._last since
 
-    def build_footprints(self, tools: wp.array) -> FootprintArrays:
+    def allocate_footprints(self, tools: wp.array) -> FootprintArrays:
         """Allocate the footprint arrays of tools (B,)."""
         count, device = len(tools), self.device.name
         found, left = [], len(self._ball)
@@ -153,17 +153,19 @@ class ContactSurface:
         weight = wp.empty((len(self.nodes), count), dtype=wp.float64, device=device)
         return FootprintArrays(tools, found[-1].flatten(), tuple(found), weight, sums)
 
-    def put(self, imprint: FootprintArrays) -> None:
+    def compute_footprints(self, footprints: FootprintArrays) -> None:
         """Compute the footprints on the device alone; distance inf and weight 0 for a tool without contact."""
-        self._find_contacts(imprint)
-        imprint.weight.zero_()
-        imprint.sums.zero_()
-        inputs = [self._corners, self._ball, self._table, self._position, imprint.tools, imprint.touched]
+        self._find_contacts(footprints)
+        footprints.weight.zero_()
+        footprints.sums.zero_()
+        inputs = [self._corners, self._ball, self._table, self._position, footprints.tools, footprints.contacts]
         inputs += [self._division.max_edge_ratio, self._division.min_subdivisions, self._division.max_subdivisions]
-        self.device.launch(_press, (len(self._ball), len(imprint.tools)), inputs, [imprint.weight, imprint.sums])
+        self.device.launch(
+            _press, (len(self._ball), len(footprints.tools)), inputs, [footprints.weight, footprints.sums]
+        )
 
-    def check_tools_touch(self, points: np.ndarray, radii: np.ndarray) -> None:
-        """Reject tools, with arguments as `press`, if one does not touch the surface.
+    def check_contact(self, points: np.ndarray, radii: np.ndarray) -> None:
+        """Reject tools, with arguments as `find_footprints`, if one does not touch the surface.
 
         Raises
         ------
@@ -179,9 +181,9 @@ class ContactSurface:
                 f"a footprint of {1e3 * small:.3g} mm is too small for the triangles of this surface: give a radius of "
                 f"at least {1e3 * self._least:.3g} mm."
             )
-        imprint = self.build_footprints(self._pack_tools(points, radii))
-        self.put(imprint)
-        self._check_touching(points, radii, imprint.touched.numpy().reshape(-1, 4)[:, 3])
+        imprint = self.allocate_footprints(self._pack_tools(points, radii))
+        self.compute_footprints(imprint)
+        self._check_touching(points, radii, imprint.contacts.numpy().reshape(-1, 4)[:, 3])
         return Footprints(self.nodes, imprint.weight, imprint.sums)
 
     def _check_touching(self, points: np.ndarray, radii: np.ndarray, away: np.ndarray) -> None:
@@ -200,16 +202,17 @@ class ContactSurface:
     def _find_contacts(self, imprint: FootprintArrays) -> None:
         """Find the first contact point of each tool and its distance; inf if larger than its radius."""
         inputs = [self._corners, self._ball, imprint.tools]
-        self.device.launch(_search, imprint.found[0].shape, inputs, [imprint.found[0]])
-        for some, fewer in pairwise(imprint.found):
+        self.device.launch(_search, imprint.levels[0].shape, inputs, [imprint.levels[0]])
+        for some, fewer in pairwise(imprint.levels):
             self.device.launch(_reduce_candidates, fewer.shape, [some], [fewer])
 
 
 def compute_footprint_weights(
     nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray
 ) -> sp.csr_array:
-    """Compute weights (B, N) of unit row sums on the host; arguments as `ContactSurface`, `ContactSurface.press`."""
-    return ContactSurface(nodes, triangles, find_device("cpu", "float64")).press(points, radii).to_matrix(len(nodes))
+    """Compute weights (B, N) of unit row sums on the host; arguments as `ContactSurface` and its `find_footprints`."""
+    surface = ContactSurface(nodes, triangles, find_device("cpu", "float64"))
+    return surface.find_footprints(points, radii).to_matrix(len(nodes))
 
 
 def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -237,7 +240,7 @@ def _select_nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
-def on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+def nearest_on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
     """Return the point nearest to `point` on a triangle.
 
     Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the projection onto the plane if it lies inside, else
@@ -284,7 +287,7 @@ def _search(
     for s in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, ball.shape[0])):
         near = ball[s][3] + best
         if wp.length_sq(_place(ball[s]) - point) <= near * near:
-            nearest = on_triangle(corners[s, 0], corners[s, 1], corners[s, 2], point)
+            nearest = nearest_on_triangle(corners[s, 0], corners[s, 1], corners[s, 2], point)
             far = wp.length(nearest - point)
             if far <= best:
                 best = far
@@ -377,17 +380,17 @@ def _press(
     wp.atomic_add(sums, c, scale * wp.vec4d(m[0], moment[0], moment[1], moment[2]))
 
 
-def compute_push_reactions(skin: ContactSurface, loads: Loads, displacing: np.ndarray | None = None) -> np.ndarray:
+def compute_push_reactions(surface: ContactSurface, loads: Loads, tool_force: np.ndarray | None = None) -> np.ndarray:
     """Compute force and moment about its point that each tool exerts [N, N m]: (B, tools, 6).
 
-    `displacing` (3, B) [N] are the forces of `Displaced` loads.
+    `tool_force` (3, B) [N] are the forces of `Displaced` loads.
     """
     rows = []
     for cause in loads.causes:
         if isinstance(cause, Pushed | Displaced):
-            force = cause.force if isinstance(cause, Pushed) else displacing
+            force = cause.force if isinstance(cause, Pushed) else tool_force
             assert force is not None
             force = force if isinstance(cause, Pushed) else force.T
-            arm = skin.press(cause.point, cause.footprint).compute_centres() - cause.point
+            arm = surface.find_footprints(cause.point, cause.footprint).compute_centres() - cause.point
             rows.append(np.concatenate([force, np.cross(arm, force)], axis=1))
     return np.stack(rows, axis=1) if rows else np.zeros((len(loads), 0, 6))

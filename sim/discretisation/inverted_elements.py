@@ -11,7 +11,7 @@ from .space import Discretisation
 
 
 @cache
-def build_kernel(device: Device, size: int, points: int, least: float) -> wp.Kernel:
+def build_kernel(device: Device, size: int, points: int, min_ratio: float) -> wp.Kernel:
     """Build the kernel for tetrahedra of `size` nodes and `points` quadrature points, over (tetrahedron, load case)."""
     scalar, vec = device.scalar, device.vector
 
@@ -30,14 +30,14 @@ def build_kernel(device: Device, size: int, points: int, least: float) -> wp.Ker
             for a in range(size):
                 i = 3 * table[e, a]
                 F += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]), gradient[e, q, a])
-            if wp.determinant(F) <= scalar(least):
+            if wp.determinant(F) <= scalar(min_ratio):
                 wp.atomic_add(out, c, 1)
                 return
 
     return count_inverted
 
 
-class Inversion:
+class InversionCounter:
     """Counter of tetrahedra that are inverted or collapsed at some quadrature point.
 
     Linear tetrahedra have one point, quadratic ones eight. With smoothed and element-free strains, which are averages,
@@ -46,8 +46,7 @@ class Inversion:
     """
 
     def __init__(self, space: Discretisation, device: Device, bounded: bool = False, collapsed: float = 1e-6):
-        every = np.ones(len(space.mesh.tets), bool)
-        quadratic = space.element == "p2"
+        every, quadratic = np.ones(len(space.mesh.tets), bool), space.element == "p2"
         elements = (
             build_quadratic_elements(space.nodes, space.table, every)
             if quadratic
@@ -58,13 +57,13 @@ class Inversion:
         self._table = device.upload(elements.table, wp.int32)
         self._gradient = device.upload(elements.gradient, device.vector)
 
-    def find_doubtful(self, inverted: np.ndarray) -> np.ndarray:
-        """Return a mask (B,) of states with `inverted` (B,) > 0 tetrahedra that may be unphysical equilibria.
+    def find_suspect(self, counts: np.ndarray) -> np.ndarray:
+        """Return a mask (B,) of states with `counts` (B,) > 0 tetrahedra that may be unphysical equilibria.
 
         All False if the law is `bounded` and sees averages only: then a descent cannot invert these, and a strong load
         may invert single tetrahedra from any start.
         """
-        return self._telling & (inverted > 0)
+        return self._telling & (counts > 0)
 
     def count(self, u: wp.array) -> np.ndarray:
         """Count inverted tetrahedra (B,) in u (3N, B) [m], on the device."""

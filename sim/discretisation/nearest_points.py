@@ -8,17 +8,17 @@ from typing import NamedTuple
 import numpy as np
 import warp as wp
 
-from ..runtime.device import forward_kernel, load
-from .footprint import on_triangle
+from ..runtime.device import forward_kernel, load_module
+from .footprint import nearest_on_triangle
 
 # Number of alternating projections between a triangle and an extended core.
 PROJECTION_ITERATIONS = 16
 
 
-class NearestPlaces(NamedTuple):
+class NearestPoints(NamedTuple):
     """Barycentric coordinates (S, 3) of surface points, distances (S,) [m], and directions from the core (S, 3)."""
 
-    share: np.ndarray
+    barycentric: np.ndarray
     distance: np.ndarray
     normal: np.ndarray
 
@@ -29,51 +29,51 @@ class PlacedBox:
 
     The flat core of a blade contacts tissue below it only: penetration depth is the height above it.
 
-    middle (3,) [m]; axes (3, 3), as columns; half (3,) [m].
+    centre (3,) [m]; axes (3, 3), as columns; half_sizes (3,) [m].
     """
 
-    middle: np.ndarray
+    centre: np.ndarray
     axes: np.ndarray
-    half: np.ndarray
+    half_sizes: np.ndarray
 
-    def move(self, way: np.ndarray) -> PlacedBox:
+    def move(self, translation: np.ndarray) -> PlacedBox:
         """Return the box translated by (3,) [m]."""
-        return replace(self, middle=self.middle + way)
+        return replace(self, centre=self.centre + translation)
 
     @property
     def corners(self) -> np.ndarray:
         """Corners (8, 3) [m] of the box."""
         signs = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-        return self.middle + (signs * self.half) @ self.axes.T
+        return self.centre + (signs * self.half_sizes) @ self.axes.T
 
-    def find_nearest(self, corners: np.ndarray) -> NearestPlaces:
+    def find_nearest(self, corners: np.ndarray) -> NearestPoints:
         """Return the points nearest to the box on triangles with `corners` (S, 3, 3) [m].
 
         Alternating projections with momentum (Beck, Teboulle 2009, "A fast iterative
         shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2:183-202, equations 4.1 to 4.3).
         """
-        return Nearest(len(corners)).to(self, corners)
+        return NearestSearch(len(corners)).find_nearest(self, corners)
 
-    def compute_distances(self, corners: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def compute_distances(self, corners: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return distances (n,) [m] and directions (n, 3) from the box to points of barycentric coordinates (n, 3)."""
-        place = np.einsum("nc,nci->ni", share, corners) - self.middle
+        place = np.einsum("nc,nci->ni", barycentric, corners) - self.centre
         local = place @ self.axes
-        away = place - np.clip(local, -self.half, self.half) @ self.axes.T
+        away = place - np.clip(local, -self.half_sizes, self.half_sizes) @ self.axes.T
         distance = np.sqrt(np.einsum("ni,ni->n", away, away))
         normal = away / np.maximum(distance, np.finfo(float).tiny)[:, None]
-        if self.half[2] == 0.0 and self.half[:2].all():
-            through = (np.abs(local[:, :2]) <= self.half[:2]).all(axis=1) & (local[:, 2] >= 0.0)
+        if self.half_sizes[2] == 0.0 and self.half_sizes[:2].all():
+            through = (np.abs(local[:, :2]) <= self.half_sizes[:2]).all(axis=1) & (local[:, 2] >= 0.0)
             return np.where(through, -local[:, 2], distance), np.where(through[:, None], -self.axes[:, 2], normal)
         return distance, normal
 
 
-class Nearest:
+class NearestSearch:
     """Nearest point search on a fixed number of triangles, with reused memory."""
 
     def __init__(self, count: int):
         self._corners = np.empty((count, 3, 3))
-        self._found = NearestPlaces(np.empty((count, 3)), np.empty(count), np.empty((count, 3)))
-        load(_find_nearest.module)
+        self._found = NearestPoints(np.empty((count, 3)), np.empty(count), np.empty((count, 3)))
+        load_module(_find_nearest.module)
         kinds = (wp.vec3d, wp.vec3d, wp.float64, wp.vec3d)
         given = zip((self._corners, *self._found), kinds, strict=True)
         arrays = [wp.array(each, dtype=kind, device="cpu", copy=False) for each, kind in given]
@@ -83,13 +83,13 @@ class Nearest:
             _find_nearest, count, [arrays[0], *stands], arrays[1:], device="cpu", record_cmd=True, record_tape=False
         )
 
-    def to(self, core: PlacedBox, corners: np.ndarray) -> NearestPlaces:
+    def find_nearest(self, core: PlacedBox, corners: np.ndarray) -> NearestPoints:
         """Return the points as `PlacedBox.find_nearest`; overwrites the previous result."""
         if self._launch is None:  # no triangles
             return self._found
         self._corners[:] = corners
-        stands = wp.vec3d(*core.middle), wp.mat33d(*core.axes.ravel()), wp.vec3d(*core.half)
-        for number, value in enumerate([*stands, PROJECTION_ITERATIONS if core.half.any() else 1], 1):
+        stands = wp.vec3d(*core.centre), wp.mat33d(*core.axes.ravel()), wp.vec3d(*core.half_sizes)
+        for number, value in enumerate([*stands, PROJECTION_ITERATIONS if core.half_sizes.any() else 1], 1):
             self._launch.set_param_at_index(number, value)
         self._launch.launch()
         return self._found
@@ -117,7 +117,7 @@ def _find_nearest(
     ahead = wp.vec3d(place)  # copies, since plain assignment would alias
     for _turn in range(turns):
         last, before = wp.vec3d(place), wp.float64(pace)
-        place = on_triangle(a, b, c, _find_nearest_in_box(ahead, middle, axes, half))
+        place = nearest_on_triangle(a, b, c, _find_nearest_in_box(ahead, middle, axes, half))
         pace = (one + wp.sqrt(one + wp.float64(4.0) * before * before)) / wp.float64(2.0)
         ahead = place + ((before - one) / pace) * (place - last)
     first, second, offset = b - a, c - a, place - a

@@ -13,23 +13,23 @@ import warp as wp
 from ..loads import Loads
 from ..runtime.columns import combine_columns, compute_norms
 from ..runtime.device import Device
-from ..runtime.views import get_library, run_in_order, to_host, view
+from ..runtime.views import get_library, run_in_order, to_host, to_view
 from .constraint import Constraint
-from .term import Barrier, Cases, Paced, Strained, Term
+from .term import Barrier, Cases, StepTerm, StrainTerm, Term
 
 
 @dataclass(frozen=True, eq=False)
-class Imposed:
+class ImposedMotion:
     """Prescribed values of a batch, the arguments of `Constraint.begin`."""
 
-    value: np.ndarray | None = None
-    weight: np.ndarray | None = None
-    target: np.ndarray | None = None
+    displacement: np.ndarray | None = None
+    footprint: np.ndarray | None = None
+    motion: np.ndarray | None = None
 
 
-def build_no_imposed(loads: Loads) -> Imposed:
+def build_zero_motion(loads: Loads) -> ImposedMotion:
     """Return zero values for fixed components, and no footprint motion."""
-    return Imposed()
+    return ImposedMotion()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,17 +37,17 @@ class Problem:
     """Terms, constraints, and displacements prescribed by loads; N nodes on one device.
 
     Arrays are (3N, b), one column per active load case. `barriers` are the contact terms.
-    `elastic`: only elastic terms resist deformation; user-defined effects may be others. A constraint gap of up to
-    `closed` units of round-off of the largest displacement counts as closed.
+    `is_elastic`: only elastic terms resist deformation; user-defined effects may be others. A constraint gap of up to
+    `gap_round_off` units of round-off of the largest displacement counts as closed.
     """
 
     terms: tuple[Term, ...]
     constraint: Constraint
     device: Device
-    impose: Callable[[Loads], Imposed] = build_no_imposed
+    build_imposed: Callable[[Loads], ImposedMotion] = build_zero_motion
     barriers: tuple[Barrier, ...] = ()
-    elastic: bool = True
-    closed: float = 100.0
+    is_elastic: bool = True
+    gap_round_off: float = 100.0
 
     @property
     def rows(self) -> int:
@@ -55,24 +55,24 @@ class Problem:
         return self.constraint.fixed.size
 
     @property
-    def plain(self) -> bool:
+    def can_accelerate(self) -> bool:
         """True if only constant loads and purely resisting terms act, as solver accelerations require."""
-        return self.elastic and all(term.constant or term.passive for term in self.terms)
+        return self.is_elastic and all(term.constant or term.passive for term in self.terms)
 
     @property
-    def bounded(self) -> bool:
+    def prevents_inversion(self) -> bool:
         """True if the energy of all elastic terms is infinite for inverted elements."""
-        return self.elastic and all(term.bounded for term in self.terms if isinstance(term, Strained))
+        return self.is_elastic and all(term.prevents_inversion for term in self.terms if isinstance(term, StrainTerm))
 
     @property
-    def steep(self) -> bool:
+    def is_steep(self) -> bool:
         """True if the tangent of a term may differ strongly from the undeformed stiffness."""
         return any(term.steep for term in self.terms)
 
     @property
-    def paced(self) -> bool:
+    def depends_on_step(self) -> bool:
         """True if the stiffness depends on the time step."""
-        return any(isinstance(term, Paced) for term in self.terms)
+        return any(isinstance(term, StepTerm) for term in self.terms)
 
     def find_overlaps(self, u: wp.array) -> np.ndarray:
         """Return a mask (2, b) of load cases with overlaps in any barrier, as `Barrier.find_overlaps`."""
@@ -81,8 +81,8 @@ class Problem:
 
     def begin(self, cases: Cases) -> None:
         """Set the load cases of a batch."""
-        imposed = self.impose(cases.loads)
-        self.constraint.begin(imposed.value, imposed.weight, imposed.target)
+        imposed = self.build_imposed(cases.loads)
+        self.constraint.begin(imposed.displacement, imposed.footprint, imposed.motion)
         for term in self.terms:
             term.begin(cases)
 
@@ -138,8 +138,8 @@ class Problem:
         """
         gap, size = self.constraint.close_gap(u)
         with run_in_order(self.device):
-            largest = to_host(get_library(self.device).amax(abs(view(u)), 0)) if u.size else np.zeros(u.shape[1])
-        off = size > self.closed * np.finfo(self.device.precision).eps * largest
+            largest = to_host(get_library(self.device).amax(abs(to_view(u)), 0)) if u.size else np.zeros(u.shape[1])
+        off = size > self.gap_round_off * np.finfo(self.device.precision).eps * largest
         return combine_columns(self.device, gap, off - 1.0, gap, gap), off
 
     def linearise(self, u: wp.array, definite: np.ndarray) -> None:
@@ -160,11 +160,11 @@ class Problem:
             term.add_diagonal(out)
         return out
 
-    def rest_curvature(self, step: float = math.inf) -> sp.csc_array:
+    def rest_curvature(self, time_step: float = math.inf) -> sp.csc_array:
         """Assemble the undeformed stiffness (3N, 3N) [N/m] of the terms that provide one, for a time step [s]."""
         offered = [matrix for matrix in (term.rest_curvature() for term in self.terms) if matrix is not None]
-        if step < math.inf:
-            offered += [term.curvature_at_pace(step) for term in self.terms if isinstance(term, Paced)]
+        if time_step < math.inf:
+            offered += [term.compute_step_stiffness(time_step) for term in self.terms if isinstance(term, StepTerm)]
         return reduce(lambda a, b: a + b, offered, sp.csc_array((self.rows, self.rows)))
 
     def longest_step(self, u: wp.array, du: wp.array) -> np.ndarray:

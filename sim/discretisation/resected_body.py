@@ -17,24 +17,24 @@ class RemainingBody:
 
     Parameters
     ----------
-    done
+    steps_done
         Number of steps.
     anatomy
         Remaining anatomy, with the vertex numbers of the whole body.
-    loose
+    loose_tetrahedra
         Tetrahedra (n,) of the whole body, removed because they lost contact with all fixed nodes.
     """
 
-    done: int
+    steps_done: int
     anatomy: Anatomy
-    loose: np.ndarray
+    loose_tetrahedra: np.ndarray
 
     def __str__(self) -> str:
         """Return the description for users."""
-        said = f"{self.done} step{'' if self.done == 1 else 's'} done"
-        if not len(self.loose):
+        said = f"{self.steps_done} step{'' if self.steps_done == 1 else 's'} done"
+        if not len(self.loose_tetrahedra):
             return said
-        return f"{said}; {len(self.loose)} tetrahedra that nothing held any more went too"
+        return f"{said}; {len(self.loose_tetrahedra)} tetrahedra that nothing held any more went too"
 
 
 def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[RemainingBody, ...]:
@@ -43,25 +43,25 @@ def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[
     Raises
     ------
     InputError
-        See `compute_remains`.
+        See `compute_remaining_bodies`.
     """
     effects = tuple(effects)
     cut = next(effect for effect in effects if isinstance(effect, Resection))
     kinds = {type(effect) for effect in effects}
     held = Held in kinds or not anatomy.fixed.any()
     whole = anatomy if held else replace(anatomy, fixed=np.zeros_like(anatomy.fixed))
-    return compute_remains(whole, cut, bool(kinds & {Bonded, Slide}))
+    return compute_remaining_bodies(whole, cut, bool(kinds & {Bonded, Slide}))
 
 
-def compute_remains(anatomy: Anatomy, effect: Resection, slides: bool = True) -> tuple[RemainingBody, ...]:
-    """Return the remaining bodies after 0, 1, ... all steps; `slides`: slide normals support tissue.
+def compute_remaining_bodies(anatomy: Anatomy, effect: Resection, sliding: bool = True) -> tuple[RemainingBody, ...]:
+    """Return the remaining bodies after 0, 1, ... all steps; `sliding`: slide normals support tissue.
 
     Raises
     ------
     InputError
         A body that is not fixed; a step with a tetrahedron that the mesh does not have, or the last of the body.
     """
-    return tuple(_iterate_bodies(anatomy, effect, slides))
+    return tuple(_iterate_bodies(anatomy, effect, sliding))
 
 
 def _iterate_bodies(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[RemainingBody]:

@@ -34,8 +34,7 @@ def check_fixed(mesh: TetMesh, fixed: np.ndarray, normal: np.ndarray, tolerance:
         free, at = _count_free_motions(mesh.nodes, fixed, normal, cluster[mine], node[mine], tolerance)
         if free == 0:
             continue
-        hinged = len(np.unique(cluster[mine])) > 1
-        part = node[mine & (cluster == at)]
+        hinged, part = len(np.unique(cluster[mine])) > 1, node[mine & (cluster == at)]
         where = f"{len(part)} nodes round {np.round(1e3 * mesh.nodes[part].mean(axis=0), 1)} mm"
         if hinged:
             raise InputError(
@@ -49,9 +48,9 @@ def check_fixed(mesh: TetMesh, fixed: np.ndarray, normal: np.ndarray, tolerance:
         )
 
 
-def find_loose_tetrahedra(anatomy: Anatomy, slides: bool = True, tolerance: float = 1e-6) -> np.ndarray:
-    """Return tetrahedra (n,) that can move rigidly: without fixed nodes or, if `slides`, sufficient slide normals."""
-    normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
+def find_loose_tetrahedra(anatomy: Anatomy, sliding: bool = True, tolerance: float = 1e-6) -> np.ndarray:
+    """Return tetrahedra (n,) that can move rigidly: without fixed nodes or, if `sliding`, sufficient slide normals."""
+    normal = anatomy.slide_normal if sliding else np.zeros_like(anatomy.slide_normal)
     cluster, nodes = _label_clusters(anatomy.mesh.tets), anatomy.mesh.nodes
     loose = []
     for number in np.unique(cluster):

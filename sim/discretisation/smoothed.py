@@ -12,16 +12,16 @@ from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys
 from .element import Elements, build_linear_elements, pack_gradients
 
 
-def build_edge_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
-    """Build one element per edge and region, over the `chosen` tetrahedra (T,) bool around it."""
-    ends = np.sort(mesh.tets[chosen][:, EDGES].reshape(-1, 2))
-    return _build_averaged_elements(mesh, chosen, compute_row_keys(ends).reshape(-1, len(EDGES)), ends)
+def build_edge_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
+    """Build one element per edge and region, over the `selected` tetrahedra (T,) bool around it."""
+    ends = np.sort(mesh.tets[selected][:, EDGES].reshape(-1, 2))
+    return _build_averaged_elements(mesh, selected, compute_row_keys(ends).reshape(-1, len(EDGES)), ends)
 
 
-def build_node_elements(mesh: TetMesh, chosen: np.ndarray) -> Elements:
-    """Build one element per node and region, over the `chosen` tetrahedra (T,) bool around it."""
-    corners = mesh.tets[chosen].astype(np.int64)
-    return _build_averaged_elements(mesh, chosen, corners, corners.reshape(-1, 1))
+def build_node_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
+    """Build one element per node and region, over the `selected` tetrahedra (T,) bool around it."""
+    corners = mesh.tets[selected].astype(np.int64)
+    return _build_averaged_elements(mesh, selected, corners, corners.reshape(-1, 1))
 
 
 def _build_averaged_elements(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray, vertices: np.ndarray) -> Elements:
@@ -43,4 +43,4 @@ def _build_averaged_elements(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray,
     table, size, spread = pack_gradients(every, linear.table[tet].ravel(), gradient.reshape(-1, 3))
     owner = linear.owner[first // lent]
     marks = np.column_stack([vertices[first], mesh.region[owner]])
-    return Elements(table, spread, volume[:, None], linear.nodes, owner, marks, size)
+    return Elements(table, spread, volume[:, None], linear.node_count, owner, marks, size)

@@ -20,7 +20,7 @@ class ElementPart:
     """Elements and the part of the stiffness they carry: "whole", "shape" or "volume"."""
 
     elements: Elements
-    carries: str
+    portion: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,15 +46,14 @@ class Discretisation:
         return self.interpolate_field(self.mesh.nodes)
 
     @property
-    def marks(self) -> np.ndarray:
+    def keys(self) -> np.ndarray:
         """Unique key (N, 2) of each node, whatever is cut: its vertex twice, or the ends of its edge."""
         return np.concatenate([np.repeat(np.arange(len(self.mesh.nodes))[:, None], 2, axis=1), self.edges])
 
     @cached_property
     def corner_interpolation(self) -> sp.csr_array:
         """Interpolation matrix (N, C) from the C corner nodes to all nodes, linear along each edge."""
-        corner = np.unique(self.table[:, :4])
-        place = np.zeros(self.count, np.int64)
+        corner, place = np.unique(self.table[:, :4]), np.zeros(self.count, np.int64)
         place[corner] = np.arange(len(corner))
         middle, first = np.unique(self.table[:, 4:], return_index=True)
         ends = self.table[:, QUADRATIC_EDGES].reshape(-1, 2)[first]
@@ -75,8 +74,8 @@ class Discretisation:
         middles = self.table[:, 4:].ravel()[first[np.searchsorted(key, asked)]]
         return np.column_stack([corners, middles.reshape(-1, 3)])
 
-    def split_elements(self, chosen: np.ndarray) -> tuple[ElementPart, ...]:
-        """Build the elements over the `chosen` tetrahedra (T,) bool.
+    def build_elements(self, selected: np.ndarray) -> tuple[ElementPart, ...]:
+        """Build the elements over the `selected` tetrahedra (T,) bool.
 
         Raises
         ------
@@ -84,12 +83,12 @@ class Discretisation:
             Quadratic elements that are folded.
         """
         if self.element == "p1":
-            return (ElementPart(build_linear_elements(self.mesh, chosen), "whole"),)
+            return (ElementPart(build_linear_elements(self.mesh, selected), "whole"),)
         if self.element == "springs":
-            return (ElementPart(build_linear_elements(self.mesh, chosen), "springs"),)
+            return (ElementPart(build_linear_elements(self.mesh, selected), "springs"),)
         if self.element == "p2":
-            return (ElementPart(build_quadratic_elements(self.nodes, self.table, chosen), "whole"),)
-        return _build_averaged_parts(self.mesh, self.element, chosen.tobytes())
+            return (ElementPart(build_quadratic_elements(self.nodes, self.table, selected), "whole"),)
+        return _build_averaged_parts(self.mesh, self.element, selected.tobytes())
 
     def extend_fixed(self, fixed: np.ndarray) -> np.ndarray:
         """Return the fixed components (N, 3) of all nodes from those of the mesh (V, 3).
@@ -103,20 +102,19 @@ class Discretisation:
             out[wall[wall >= len(fixed)], component] = True
         return out
 
-    def extend_normals(self, normal: np.ndarray, fixed: np.ndarray, facing: float = 0.75) -> np.ndarray:
+    def extend_normals(self, normal: np.ndarray, fixed: np.ndarray, min_cosine: float = 0.75) -> np.ndarray:
         """Return the slide normals (N, 3) of all nodes from those of the mesh (V, 3); fixed (V, 3) bool.
 
         An added node slides if its edge lies on a surface triangle whose corners all slide or are fixed. Its normal
         is the integral of its shape function's gradient over all adjacent triangles, so no volume passes through.
         If that normal deviates from its ends' (at the edge of a box, for example), only the sliding triangles count.
-        Normals deviate if their cosine is at most `facing`.
+        Normals deviate if their cosine is at most `min_cosine`.
         """
         out = np.zeros((self.count, 3))
         out[: len(normal)] = normal
         if not len(self.edges):
             return out
-        corners = self.mesh.surface
-        slides = (normal != 0.0).any(axis=1)
+        corners, slides = self.mesh.surface, (normal != 0.0).any(axis=1)
         wall = (slides | fixed.all(axis=1))[corners].all(axis=1) & slides[corners].any(axis=1)
         a, b, c = np.moveaxis(self.mesh.nodes[corners], 1, 0)
         twice = np.cross(b - a, c - a)
@@ -124,7 +122,7 @@ class Discretisation:
         np.add.at(near, self.surface[wall, 3:], twice[wall, None])
         np.add.at(every, self.surface[:, 3:], twice[:, None])
         near, every = normalise_vectors(near[len(normal) :]), normalise_vectors(every[len(normal) :])
-        agrees = (np.einsum("nei,ni->ne", normal[self.edges], every) > facing) | ~slides[self.edges]
+        agrees = (np.einsum("nei,ni->ne", normal[self.edges], every) > min_cosine) | ~slides[self.edges]
         found = np.where(agrees.all(axis=1, keepdims=True), every, near)
         out[len(normal) :] = np.where((near != 0.0).any(axis=1, keepdims=True), found, 0.0)
         return out

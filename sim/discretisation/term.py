@@ -164,20 +164,20 @@ class Term(Protocol):
 
 
 @runtime_checkable
-class Paced(Term, Protocol):
+class StepTerm(Term, Protocol):
     """Term whose stiffness grows as time steps shrink, which preconditioners must include."""
 
-    def curvature_at_pace(self, step: float) -> sp.csc_array:
+    def compute_step_stiffness(self, time_step: float) -> sp.csc_array:
         """Return the addition to the undeformed stiffness (3N, 3N) [N/m] for a time step [s]."""
         ...
 
 
 @runtime_checkable
-class Remembering(Term, Protocol):
+class HistoryTerm(Term, Protocol):
     """Term whose memory, if any, belongs to elements or nodes: (B, n, width), one row for each."""
 
     @property
-    def marks(self) -> np.ndarray:
+    def keys(self) -> np.ndarray:
         """Unique key (n, k) of each row by vertices and other numbers, whatever is cut from the mesh."""
         ...
 
@@ -188,35 +188,35 @@ class Remembering(Term, Protocol):
 
 
 @runtime_checkable
-class Strained(Term, Protocol):
+class StrainTerm(Term, Protocol):
     """Term of elements whose stiffness depends on the strain; H is the displacement gradient."""
 
     @property
-    def bounded(self) -> bool:
+    def prevents_inversion(self) -> bool:
         """True if its energy is infinite for inverted elements."""
         ...
 
-    def second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
+    def compute_second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
         """Return elements (T,), half the second stress derivative (k, 9, 9, 9) [Pa] by tissue, tissue indices (T,).
 
         Derivative of stress component a by gradient components b and c, row-major, in the undeformed configuration.
         """
         ...
 
-    def elements_on(self, nodes: np.ndarray) -> np.ndarray:
+    def find_elements_on(self, nodes: np.ndarray) -> np.ndarray:
         """Return the elements (k,) whose nodes are all marked in `nodes` (N,) bool."""
         ...
 
-    def raise_strain(self, some: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
+    def update_max_strain(self, elements: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
         """Raise out (N, k) to |H| at the nodes of some elements (m,) int32, for load cases (k,) int32 of u (3N, b)."""
         ...
 
     def add_stiffening(
-        self, some: wp.array, u: wp.array, columns: wp.array, least: wp.array, place: wp.array, out: wp.array
+        self, elements: wp.array, u: wp.array, columns: wp.array, min_strain: wp.array, index: wp.array, out: wp.array
     ) -> None:
         """Add the tangent stiffness minus the undeformed one [N/m] of these elements to out (k, p, p) float64.
 
-        Only points with |H| above `least` (k,) count. The rows of a node in out begin at 3 `place` (N, k).
+        Only points with |H| above `min_strain` (k,) count. The rows of a node in out begin at 3 `index` (N, k).
         """
         ...
 
@@ -228,11 +228,11 @@ class Barrier(Term, Protocol):
         """Return the path fraction (B,), at most 1, that tools may move at once, with the body at u (3N, B) [m]."""
         ...
 
-    def count_gaps(self, cases: Cases) -> np.ndarray:
+    def compute_path_in_gaps(self, cases: Cases) -> np.ndarray:
         """Return the motion (B,) of the tools on their whole path, or of the tissue, in units of the gap."""
         ...
 
-    def find_buried(self, u: wp.array) -> np.ndarray:
+    def find_penetrating(self, u: wp.array) -> np.ndarray:
         """Return a mask (b,) of load cases with a tool inside the body at u (3N, b) [m], even without contact."""
         ...
 
@@ -240,7 +240,7 @@ class Barrier(Term, Protocol):
         """Return masks (2, b) of load cases where a tool overlaps touchable surface at u (3N, b) [m], or bone."""
         ...
 
-    def widen(self, times: float) -> None:
+    def widen_gap(self, factor: float) -> None:
         """Widen the gap by a factor until the next batch begins."""
         ...
 
@@ -255,25 +255,25 @@ class BlockFunctions:
 
     Parameters
     ----------
-    stage, near
+    barrier_struct, pairs_struct
         Structs of their arguments: the barrier, and its near pairs, which they update.
     add_force
         (x, stage, near, column, thread, out): add the gradient at x (3n, b) to out (3n, b).
     add_matrix
         (x, stage, near, definite, place, column, thread, out): add the tangent stiffness to out (b, 3m, 3m), as
-        `Reduction.curvature`, after `add_force` at the same x.
-    longest
+        `ReducedBarrier.compute_stiffness`, after `add_force` at the same x.
+    bound_step
         (x, way, stage, near, column, thread): return the fraction of a step, at most 1, that stays inside the domain.
     """
 
-    stage: Any
-    near: Any
+    barrier_struct: Any
+    pairs_struct: Any
     add_force: wp.Function
     add_matrix: wp.Function
-    longest: wp.Function
+    bound_step: wp.Function
 
 
-class Reduction(Protocol):
+class ReducedBarrier(Protocol):
     """Barrier of b load cases on the n touchable nodes, as a function of their displacement w (3n, b) [m].
 
     Arrays are those of `views.library`, float64.
@@ -284,16 +284,16 @@ class Reduction(Protocol):
         """Warp functions for kernels."""
         ...
 
-    def build_stage(self, columns: np.ndarray) -> tuple[Any, Any]:
-        """Return the structs `stage` and `near` for some load cases (k,)."""
+    def build_structs(self, columns: np.ndarray) -> tuple[Any, Any]:
+        """Return the structs of barrier and near pairs for some load cases (k,)."""
         ...
 
-    def slope(self, w: Any) -> Any:
+    def compute_gradient(self, w: Any) -> Any:
         """Return the gradient (3n, b) [N]."""
         ...
 
-    def curvature(self, w: Any, place: Any, size: int, definite: np.ndarray) -> Any:
-        """Return the tangent stiffness (b, 3 size, 3 size) [N/m] between the nodes with `place` (n, b) >= 0.
+    def compute_stiffness(self, w: Any, index: Any, size: int, definite: np.ndarray) -> Any:
+        """Return the tangent stiffness (b, 3 size, 3 size) [N/m] between the nodes with `index` (n, b) >= 0.
 
         It is positive semi-definite for load cases marked `definite` (b,).
         """
@@ -301,26 +301,26 @@ class Reduction(Protocol):
 
 
 @runtime_checkable
-class Local(Barrier, Protocol):
+class LocalBarrier(Barrier, Protocol):
     """Barrier that acts on a subset of the nodes only."""
 
     @property
-    def touchable(self) -> np.ndarray:
+    def touchable_nodes(self) -> np.ndarray:
         """Nodes (n,), ascending, on which it can act."""
         ...
 
-    def select_nodes(self, most: int) -> np.ndarray:
-        """Return the touchable nodes, followed by the nearest others up to `most` in total: (k,)."""
+    def select_nodes(self, max_nodes: int) -> np.ndarray:
+        """Return the touchable nodes, followed by the nearest others up to `max_nodes` in total: (k,)."""
         ...
 
-    def reduce(self, columns: np.ndarray) -> Reduction | None:
+    def reduce(self, columns: np.ndarray) -> ReducedBarrier | None:
         """Return the barrier on these nodes, for some load cases (k,), in its current state; None without contact.
 
         The object is reused: it reflects the latest call.
         """
         ...
 
-    def get_pressed(self) -> tuple[np.ndarray, np.ndarray]:
+    def get_active_stiffness(self) -> tuple[np.ndarray, np.ndarray]:
         """Return active nodes (a,) of these n at the last linearisation, of one load case, and their tangent stiffness.
 
         The matrix (3a, 3a) [N/m] is positive semi-definite.
@@ -328,9 +328,9 @@ class Local(Barrier, Protocol):
         ...
 
 
-class Curved(Term, Protocol):
+class AssembledTerm(Term, Protocol):
     """Term that provides its tangent stiffness as a matrix."""
 
-    def curvature(self) -> sp.csc_array:
+    def assemble_stiffness(self) -> sp.csc_array:
         """Assemble K(u) (3N, 3N) [N/m] at the last linearisation, of one load case."""
         ...

@@ -14,7 +14,7 @@ from ..anatomy import describe_region
 from ..arguments import check_vertex_numbers
 from ..errors import InputError
 from ..geometry.surface import compute_vertex_areas
-from ..geometry.tetmesh import TRIANGLE_EDGES, compute_row_keys, find_single_faces
+from ..geometry.tetmesh import TRIANGLE_EDGES, compute_row_keys, find_boundary_faces
 from .kelvin_integrals import integrate_triangles
 from .linear_body import LinearBody
 
@@ -61,7 +61,7 @@ class _Region:
 
 
 def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
-    """Return displacements (a, 3, n, 3) [m/N] of vertices `nodes` (n,) under unit forces at `body.acting` (a,).
+    """Return displacements (a, 3, n, 3) [m/N] of vertices `nodes` (n,) under unit forces at `body.loaded` (a,).
 
     The second axis is the force's direction. Collocation at the vertices of the boundary, with linear displacements
     and tractions on its triangles (Brebbia & Dominguez 1992, ch. 4; James & Pai 1999 for simulated surgery).
@@ -77,7 +77,7 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     """
     nodes = check_vertex_numbers("nodes", nodes, len(body.fixed))
     regions, move, pull = _build_regions(body)
-    moved, pulled, loads = 3 * (move.max() + 1), 3 * (pull.max() + 1), 3 * len(body.acting)
+    moved, pulled, loads = 3 * (move.max() + 1), 3 * (pull.max() + 1), 3 * len(body.loaded)
     matrix, load, row = np.empty((moved + pulled, moved + pulled), order="F"), np.empty((moved + pulled, loads)), 0
     for region in regions:
         vertices = np.unique(region.triangles)
@@ -102,7 +102,7 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
 def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndarray]:
     """Return the regions, and the numbers (N,) of the unknown displacement and traction of each vertex, or -1."""
     mesh, parts = body.anatomy.mesh, _find_tissues(body)
-    boundaries = [find_single_faces(mesh.tets[some]) for some, _ in parts]
+    boundaries = [find_boundary_faces(mesh.tets[some]) for some, _ in parts]
     triangles, region = np.vstack(boundaries), np.repeat(np.arange(len(parts)), [len(each) for each in boundaries])
     inner = ~_is_among(triangles, mesh.surface)
     covered = body.fixed[triangles].all(axis=1) & ~inner
@@ -110,18 +110,16 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
     # Refine the free surface, triangles with a vertex on it, and, if these include it, the interface.
     marked = np.any(np.isin(triangles, triangles[~covered & ~inner]), axis=1)
     marked = marked | (inner & np.any(marked[inner]))
-    walls = triangles[covered][:, TRIANGLE_EDGES].reshape(-1, 2)
-    whole = triangles
+    walls, whole = triangles[covered][:, TRIANGLE_EDGES].reshape(-1, 2), triangles
     nodes, triangles, parent, edges = _refine(mesh.nodes, whole, marked)
     region, inner, covered = region[parent], inner[parent], covered[parent]
     fixed, count = np.append(body.fixed, _is_among(edges, walls)), len(nodes)
     move = _number(np.setdiff1d(triangles, np.flatnonzero(fixed)), count)
     pull = _number(np.unique(triangles[covered | inner]), count)
-    act, density = _number(np.asarray(body.acting), count), np.zeros(count)
+    act, density = _number(np.asarray(body.loaded), count), np.zeros(count)
     # All triangles at `acting` are refined. `halved`: ends of the edge that a node halves; for a vertex, itself twice.
-    density[body.acting] = 0.25 / compute_vertex_areas(nodes, triangles[~inner])[body.acting]
-    halved = np.vstack([np.arange(len(mesh.nodes)).repeat(2).reshape(-1, 2), edges])
-    regions = []
+    density[body.loaded] = 0.25 / compute_vertex_areas(nodes, triangles[~inner])[body.loaded]
+    halved, regions = np.vstack([np.arange(len(mesh.nodes)).repeat(2).reshape(-1, 2), edges]), []
     for number, (some, lame) in enumerate(parts):
         own = region == number
         ends, within, unknown = triangles[own].ravel(), np.repeat(inner[own], 3), np.repeat((inner | covered)[own], 3)
@@ -131,7 +129,7 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
             _distribute(
                 np.where(within, -1, act[corner]),
                 (4.0 * (halved[ends] == corner[:, None]).mean(axis=1) - 1.0) * density[corner],
-                len(body.acting),
+                len(body.loaded),
             )
             for corner in whole[parent[own]].T.repeat(3, axis=1)
         )
@@ -195,7 +193,7 @@ def _check_places(body: LinearBody, covered: np.ndarray, interface: np.ndarray) 
     surface = np.isin(np.arange(len(body.fixed)), body.anatomy.mesh.surface)
     inner = surface < ~body.anatomy.orphaned
     inner[interface] = True
-    bad, acting = np.flatnonzero(body.fixed & inner), check_vertex_numbers("acting", body.acting, len(body.fixed))
+    bad, acting = np.flatnonzero(body.fixed & inner), check_vertex_numbers("acting", body.loaded, len(body.fixed))
     if len(bad):
         raise InputError(
             f"vertex {bad[0]} (and {len(bad) - 1} more) is fixed inside the body or at the tumour's surface: boundary "

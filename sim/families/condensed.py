@@ -18,7 +18,7 @@ TOGETHER = 96  # Right-hand sides that are solved together.
 
 
 def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
-    """Return displacements (a, 3, n, 3) [m/N] of vertices `nodes` (n,) under unit forces at `body.acting` (a,).
+    """Return displacements (a, 3, n, 3) [m/N] of vertices `nodes` (n,) under unit forces at `body.loaded` (a,).
 
     The stiffness is that of smoothed tetrahedra in the undeformed state, factorised in double precision.
     """
@@ -27,7 +27,7 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     held = Anatomy(anatomy.mesh, fixed, np.zeros_like(anatomy.slide_normal), anatomy.craniotomy)
     problem = compile_problem((body.tissue, Held()), held, device, discretise(anatomy.mesh, "smoothed"))
     solver = build_rest_solver(problem)
-    loaded, read = ((3 * some[:, None] + np.arange(3)).ravel() for some in (body.acting, nodes))
+    loaded, read = ((3 * some[:, None] + np.arange(3)).ravel() for some in (body.loaded, nodes))
     out = np.empty((len(loaded), len(read)))
     for first in range(0, len(loaded), TOGETHER):
         some = loaded[first : first + TOGETHER]
@@ -36,4 +36,4 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
         found = device.allocate(*force.shape)
         solver.apply(device.upload(force), np.ones(len(some), bool), found)
         out[first : first + len(some)] = found.numpy()[read].T
-    return out.reshape(len(body.acting), 3, len(nodes), 3)
+    return out.reshape(len(body.loaded), 3, len(nodes), 3)

@@ -14,35 +14,35 @@ import warp as wp
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Elasticity
-from ..runtime.views import run_in_order, to_host, to_library, view
+from ..runtime.views import run_in_order, to_host, to_library, to_view
 from .models import Relaxation
 
 
 @dataclass(frozen=True)
-class Steps:
+class ExplicitSteps:
     """Number and size of the time steps.
 
     Parameters
     ----------
-    most, every
+    max_steps, check_interval
         Largest number of steps; steps between two tests of convergence.
-    fraction
+    step_fraction
         Step as a fraction of the critical one in the undeformed state; compressed tissue is stiffer.
-    lowest
+    min_eigenvalue
         Lowest eigenvalue at the start, relative to the highest.
     """
 
-    most: int = 4000
-    every: int = 25
-    fraction: float = 0.7
-    lowest: float = 1e-3
+    max_steps: int = 4000
+    check_interval: int = 25
+    step_fraction: float = 0.7
+    min_eigenvalue: float = 1e-3
 
 
 TOLERANCE = 1e-3  # Relative residual of convergence.
 
 
-def prepare(
-    problem: Problem, space: Discretisation, tissue: Elasticity, settings: Steps = Steps()
+def build_solver(
+    problem: Problem, space: Discretisation, tissue: Elasticity, settings: ExplicitSteps = ExplicitSteps()
 ) -> Callable[[int], tuple[wp.array, int]]:
     """Return the function that relaxes a number of load cases: displacements (3N, b) [m] and steps.
 
@@ -51,19 +51,19 @@ def prepare(
     device = problem.device
     rows = np.asarray(abs(problem.rest_curvature()).sum(axis=1)).reshape(-1, 1)
     mass = to_library(device, np.where(rows > 0.0, rows, 1.0))  # a vertex without tetrahedron is fixed
-    step = 2.0 * settings.fraction
+    step = 2.0 * settings.step_fraction
 
     def relax(count: int) -> tuple[wp.array, int]:
         u, before, last = (device.allocate(problem.rows, count) for _ in range(3))
-        x, old, place = view(u), view(before), view(last)
-        force, lowest = 0.0 * place, np.full(count, settings.lowest)
-        for done in range(1, settings.most + 1):
+        x, old, place = to_view(u), to_view(before), to_view(last)
+        force, lowest = 0.0 * place, np.full(count, settings.min_eigenvalue)
+        for done in range(1, settings.max_steps + 1):
             gradient = problem.gradient(u)
             problem.constraint.project(gradient)
             damping = to_library(device, 2.0 * np.sqrt(lowest) * step)
             with run_in_order(device):
-                g = view(gradient)
-                if done % settings.every == 0:
+                g = to_view(gradient)
+                if done % settings.check_interval == 0:
                     moved = x - place
                     change, motion = (to_host((moved * other).sum(0)) for other in (g - force, mass * moved))
                     known = (change > 0.0) & (change < motion)
@@ -71,13 +71,13 @@ def prepare(
                     place[:], force = x, g
                 new = x + ((2.0 - damping) * (x - old) - 2.0 * step**2 * g / mass) / (2.0 + damping)
                 old[:], x[:] = x, new
-            if done % settings.every == 0:
+            if done % settings.check_interval == 0:
                 _, free, scale = problem.residual(u)
                 if not (np.isfinite(free + scale) & (free > TOLERANCE * scale)).any():
                     return u, done
-        return u, settings.most
+        return u, settings.max_steps
 
     return relax
 
 
-EXPLICIT = Relaxation("smoothed", prepare, TOLERANCE)
+EXPLICIT = Relaxation("smoothed", build_solver, TOLERANCE)

@@ -25,27 +25,26 @@ def compute_kelvinlet_response(body: LinearBody, nodes: np.ndarray) -> np.ndarra
     has the tissue of most of the mesh.
     """
     points, pins, (mu, nu) = body.anatomy.mesh.nodes, _choose_pins(body), _find_main_tissue(body)
-    sources, places = (points[np.concatenate([some, pins])] for some in (body.acting, nodes))
+    sources, places = (points[np.concatenate([some, pins])] for some in (body.loaded, nodes))
     whole = compute_kelvinlets(places, sources, _compute_spacing(body), nu) / (4.0 * np.pi * mu)
     whole = whole.reshape(3 * len(sources), 3 * len(places))
     free, known = np.split(whole, [3 * len(nodes)], axis=1)
-    acting = 3 * len(body.acting)
+    acting = 3 * len(body.loaded)
     holding = np.linalg.solve(known[acting:].T, -known[:acting].T).T
-    return (free[:acting] + holding @ free[acting:]).reshape(len(body.acting), 3, len(nodes), 3)
+    return (free[:acting] + holding @ free[acting:]).reshape(len(body.loaded), 3, len(nodes), 3)
 
 
-def compute_kelvinlets(places: np.ndarray, sources: np.ndarray, spread: float, poisson: float) -> np.ndarray:
-    """Return displacements times 4 pi mu (s, 3, n, 3) [1/m] at places (n, 3) [m] under unit forces at sources (s, 3).
+def compute_kelvinlets(points: np.ndarray, sources: np.ndarray, radius: float, poisson: float) -> np.ndarray:
+    """Return displacements times 4 pi mu (s, 3, n, 3) [1/m] at points (n, 3) [m] under unit forces at sources (s, 3).
 
         u = ((1 - b) / r_e + e^2 / (2 r_e^3) + b / r_e^3 r r^T) f / (4 pi mu),  r_e^2 = r^2 + e^2,  b = 1 / (4 - 4 nu)
 
-    Forces are spread over a radius e = `spread` [m] in an infinite body with Poisson's ratio nu.
+    Forces are spread over a radius e = `radius` [m] in an infinite body with Poisson's ratio nu.
     De Goes, James 2017, "Regularized Kelvinlets", ACM Trans. Graph. 36:40, equation 6.
     """
-    arm = places - sources[:, None]
-    length = np.sqrt((arm**2).sum(axis=2) + spread**2)[..., None, None]
-    b = 1.0 / (4.0 - 4.0 * poisson)
-    block = ((1.0 - b) / length + spread**2 / (2.0 * length**3)) * np.eye(3)
+    arm = points - sources[:, None]
+    length, b = np.sqrt((arm**2).sum(axis=2) + radius**2)[..., None, None], 1.0 / (4.0 - 4.0 * poisson)
+    block = ((1.0 - b) / length + radius**2 / (2.0 * length**3)) * np.eye(3)
     block += b * arm[..., :, None] * arm[..., None, :] / length**3
     return block.transpose(0, 2, 1, 3)
 
@@ -55,8 +54,8 @@ def compute_thin_plate_response(body: LinearBody, nodes: np.ndarray) -> np.ndarr
 
     Bookstein 1989, "Principal warps", IEEE Trans. Pattern Anal. Mach. Intell. 11:567-585, in three dimensions.
     """
-    points, controls = body.anatomy.mesh.nodes, np.concatenate([body.acting, _choose_pins(body)])
-    unit = np.eye(len(controls))[:, : len(body.acting)]
+    points, controls = body.anatomy.mesh.nodes, np.concatenate([body.loaded, _choose_pins(body)])
+    unit = np.eye(len(controls))[:, : len(body.loaded)]
     spline = RBFInterpolator(points[controls], unit, kernel="linear", degree=1)
     return _continue_half_space(body, spline(points[nodes]))
 
@@ -67,7 +66,7 @@ def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     Sederberg, Parry 1986, "Free-form deformation of solid geometric models"; with the B-splines of Rueckert et al.
     1999, IEEE Trans. Med. Imaging 18:712-721, fitted by least squares with a penalty on the differences of neighbours.
     """
-    points, controls = body.anatomy.mesh.nodes, np.concatenate([body.acting, _choose_pins(body)])
+    points, controls = body.anatomy.mesh.nodes, np.concatenate([body.loaded, _choose_pins(body)])
     low, high = points.min(axis=0), points.max(axis=0)
     cell = (high - low).max() / LATTICE
     count = np.ceil((high - low) / cell).astype(int) + 3
@@ -77,7 +76,7 @@ def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
         weights.resize(len(some), count.prod())  # SciPy leaves out columns behind the last one in use
     rough = LaplacianNd(tuple(count)).tosparse()
     factor = splu(sp.csc_array(fit.T @ fit - SMOOTHING * rough))
-    return _continue_half_space(body, read @ factor.solve(fit[: len(body.acting)].T.toarray()))
+    return _continue_half_space(body, read @ factor.solve(fit[: len(body.loaded)].T.toarray()))
 
 
 def _continue_half_space(body: LinearBody, weight: np.ndarray) -> np.ndarray:
@@ -88,8 +87,8 @@ def _continue_half_space(body: LinearBody, weight: np.ndarray) -> np.ndarray:
     the centre of a disc of radius e moves as under uniform pressure.
     """
     (mu, nu), mesh, spread = _find_main_tissue(body), body.anatomy.mesh, _compute_spacing(body)
-    inward = -compute_vertex_normals(mesh.nodes, mesh.surface)[body.acting][:, None]
-    arm = mesh.nodes[body.acting] - mesh.nodes[body.acting, None]
+    inward = -compute_vertex_normals(mesh.nodes, mesh.surface)[body.loaded][:, None]
+    arm = mesh.nodes[body.loaded] - mesh.nodes[body.loaded, None]
     along = arm - (arm * inward).sum(axis=2, keepdims=True) * inward
     far = np.sqrt((along**2).sum(axis=2) + 0.25 * spread**2)[..., None, None]
     out = (1.0 - nu) / far * np.eye(3) + nu / far**3 * along[..., :, None] * along[..., None, :]
@@ -113,10 +112,8 @@ def _compute_spacing(body: LinearBody) -> float:
 
 def _choose_pins(body: LinearBody) -> np.ndarray:
     """Return at most `PINS` fixed vertices of the surface, far from each other."""
-    points = body.anatomy.mesh.nodes
-    fixed = np.setdiff1d(body.anatomy.mesh.surface, body.acting)
-    chosen = [0]
-    far = np.full(len(fixed), np.inf)
+    points, fixed = body.anatomy.mesh.nodes, np.setdiff1d(body.anatomy.mesh.surface, body.loaded)
+    chosen, far = [0], np.full(len(fixed), np.inf)
     while len(chosen) < min(PINS, len(fixed)):
         far = np.minimum(far, np.linalg.norm(points[fixed] - points[fixed[chosen[-1]]], axis=1))
         chosen.append(int(far.argmax()))

@@ -26,7 +26,7 @@ class LinearBody:
         Mesh of V vertices.
     fixed
         Mask (V,) of vertices that do not move.
-    acting
+    loaded
         Vertices (a,), ascending, of the surface that is not fixed: forces act on these.
     lame
         Lamé parameters mu, lambda [Pa] at small strain, by region label.
@@ -36,13 +36,13 @@ class LinearBody:
 
     anatomy: Anatomy
     fixed: np.ndarray
-    acting: np.ndarray
+    loaded: np.ndarray
     lame: Mapping[int, tuple[float, float]]
     tissue: Elasticity
 
 
-def check_effects(name: str, effects: Iterable[Effect]) -> Elasticity:
-    """Return the tissue, if a family called `name` supports all effects.
+def check_effects(family: str, effects: Iterable[Effect]) -> Elasticity:
+    """Return the tissue, if a family called `family` supports all effects.
 
     Raises
     ------
@@ -53,17 +53,17 @@ def check_effects(name: str, effects: Iterable[Effect]) -> Elasticity:
     other = next((type(effect).__name__ for effect in effects if not isinstance(effect, SUPPORTED)), None)
     if other is not None:
         names = ", ".join(kind.__name__ for kind in SUPPORTED)
-        raise InputError(f"{name} does not compute {other}, only {names}: use finite elements (--deformer fem).")
+        raise InputError(f"{family} does not compute {other}, only {names}: use finite elements (--deformer fem).")
     tissue = next((effect for effect in effects if isinstance(effect, Elasticity)), None)
     if tissue is None:
         raise InputError("no effect resists deformation: add Elasticity.")
     if any(law is not None and law.prony for law in (tissue.default, *tissue.regions.values())):
-        raise InputError(f"{name} does not compute tissue that relaxes: remove its Prony series.")
+        raise InputError(f"{family} does not compute tissue that relaxes: remove its Prony series.")
     return tissue
 
 
-def build_body(name: str, anatomy: Anatomy, effects: Iterable[Effect]) -> LinearBody:
-    """Return the body of a family called `name`.
+def build_linear_body(family: str, anatomy: Anatomy, effects: Iterable[Effect]) -> LinearBody:
+    """Return the body of a family called `family`.
 
     Raises
     ------
@@ -72,20 +72,20 @@ def build_body(name: str, anatomy: Anatomy, effects: Iterable[Effect]) -> Linear
         free vertices; a quadratic mesh.
     """
     effects = tuple(effects)
-    tissue = check_effects(name, effects)
+    tissue = check_effects(family, effects)
     if anatomy.mesh.middles is not None:
-        raise InputError(f"{name} requires linear tetrahedra: use finite elements, or a mesh without mid-edge nodes.")
+        raise InputError(f"{family} requires linear tetrahedra: use finite elements, or a mesh without mid-edge nodes.")
     problem = compile_problem(effects, anatomy, find_device("cpu", "float64"))
-    still = find_fixed(name, problem) | anatomy.orphaned
+    still = list_fixed_vertices(family, problem) | anatomy.orphaned
     acting = np.setdiff1d(anatomy.mesh.surface, np.flatnonzero(still))
     if not len(acting):
-        raise InputError(f"{name} requires a free vertex on the surface: open a craniotomy.")
+        raise InputError(f"{family} requires a free vertex on the surface: open a craniotomy.")
     laws = collect_laws(tissue, np.unique(anatomy.mesh.region).tolist())
     return LinearBody(anatomy, still, acting, {label: law.lame for label, law in laws.items()}, tissue)
 
 
-def find_fixed(name: str, problem: Problem) -> np.ndarray:
-    """Return the mask (V,) of vertices that are fixed, for a family called `name`.
+def list_fixed_vertices(family: str, problem: Problem) -> np.ndarray:
+    """Return the mask (V,) of vertices that are fixed, for a family called `family`.
 
     Raises
     ------
@@ -94,5 +94,7 @@ def find_fixed(name: str, problem: Problem) -> np.ndarray:
     """
     fixed = problem.constraint.fixed
     if (fixed.any(axis=1) != fixed.all(axis=1)).any():
-        raise InputError(f"{name} requires vertices that are fixed in all directions or in none: use finite elements.")
+        raise InputError(
+            f"{family} requires vertices that are fixed in all directions or in none: use finite elements."
+        )
     return np.asarray(fixed.all(axis=1))

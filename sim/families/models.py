@@ -15,9 +15,9 @@ from ..anatomy import Anatomy
 from ..arguments import check_vertex_numbers
 from ..compile import check_causes, compile_problem
 from ..deformation import Cost, Deformation, Outcome, join_deformations
-from ..diagnostics.stretch import Stretch
+from ..diagnostics.stretch import TissueStretch
 from ..discretisation.footprint import ContactSurface, compute_push_reactions
-from ..discretisation.inverted_elements import Inversion
+from ..discretisation.inverted_elements import InversionCounter
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation, discretise
 from ..discretisation.term import Cases
@@ -30,11 +30,11 @@ from ..runtime.columns import unstack_columns
 from ..runtime.device import Device, find_device
 from ..runtime.memory import measure_free_bytes
 from ..runtime.method_lock import lock_method
-from ..runtime.views import view
-from .linear_body import LinearBody, build_body, check_effects
+from ..runtime.views import to_view
+from .linear_body import LinearBody, build_linear_body, check_effects
 
 Respond = Callable[[LinearBody, np.ndarray], np.ndarray]
-"""Function (body, nodes (n,)) -> displacements (a, 3, n, 3) [m/N] of vertices under unit forces at `body.acting`."""
+"""Function (body, nodes (n,)) -> displacements (a, 3, n, 3) [m/N] of vertices under unit forces at `body.loaded`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +45,14 @@ class Relaxation:
     ----------
     element
         Element of `Discretisation`.
-    prepare
+    build_solver
         Function that returns the method for a problem: (number of load cases) -> displacements (3N, b) [m] and steps.
     tolerance
         Relative residual at which a load case counts as converged.
     """
 
     element: str
-    prepare: Callable[[Problem, Discretisation, Elasticity], Callable[[int], tuple[wp.array, int]]]
+    build_solver: Callable[[Problem, Discretisation, Elasticity], Callable[[int], tuple[wp.array, int]]]
     tolerance: float
 
 
@@ -62,7 +62,7 @@ class _ForceModel(ABC):
     def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], watched: Discretisation, device: Device):
         self._name, self.anatomy, self.effects, self.lock = name, anatomy, tuple(effects), RLock()
         self._surface = ContactSurface(anatomy.mesh.nodes, anatomy.mesh.surface, device)
-        self._stretch, self._inversion = Stretch(watched, device), Inversion(watched, device)
+        self._stretch, self._inversion = TissueStretch(watched, device), InversionCounter(watched, device)
 
     @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
@@ -89,7 +89,7 @@ class _ForceModel(ABC):
 
         `outcome` (b,) is that of load cases without inverted or overstrained elements.
         """
-        strains, inverted = self._stretch.measure(u), self._inversion.count(u)
+        strains, inverted = self._stretch.measure_stretch(u), self._inversion.count(u)
         outcome[self._stretch.is_beyond_range(strains["strained"])] = Outcome.OVERSTRAINED
         outcome[inverted > 0] = Outcome.INVERTED
         reaction = compute_push_reactions(self._surface, loads)
@@ -125,7 +125,7 @@ class RelaxationModel(_ForceModel):
         super().__init__(name, anatomy, effects, space, on)
         self._source, self._batch, self._tolerance = f"{name} ({tissue})", batch, method.tolerance
         self._problem = compile_problem(effects, anatomy, on, space, self._surface)
-        self._relax = method.prepare(self._problem, space, tissue)
+        self._relax = method.build_solver(self._problem, space, tissue)
 
     def _deform(self, loads: Loads, nodes: np.ndarray) -> Deformation:
         firsts = range(0, max(1, len(loads)), self._batch)
@@ -137,7 +137,7 @@ class RelaxationModel(_ForceModel):
         u, steps = self._relax(len(loads))
         residual = measure_residual(problem, u)
         finite = np.isfinite(u.numpy()).all(axis=0) & np.isfinite(residual)
-        view(u)[:, np.flatnonzero(~finite)] = 0.0
+        to_view(u)[:, np.flatnonzero(~finite)] = 0.0
         outcome = np.full(len(loads), Outcome.BUDGET)
         outcome[residual <= self._tolerance] = Outcome.CONVERGED
         outcome[~finite] = Outcome.NOT_FINITE
@@ -172,15 +172,15 @@ class LinearModel(_ForceModel):
     Raises
     ------
     InputError
-        Input that `build_body` or `respond` rejects. `deform`: loads other than `Pushed` and `Nodal`; forces at
+        Input that `build_linear_body` or `respond` rejects. `deform`: loads other than `Pushed` and `Nodal`; forces at
         vertices inside the body.
     """
 
     def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], respond: Respond, outcome: Outcome):
         effects, mesh = tuple(effects), anatomy.mesh
-        self._body, self._good = build_body(name, anatomy, effects), outcome
+        self._body, self._good = build_linear_body(name, anatomy, effects), outcome
         self._respond = lru_cache(2)(partial(self._build_table, respond))
-        free = np.isin(mesh.tets, self._body.acting).any(axis=1) | anatomy.in_tumour
+        free = np.isin(mesh.tets, self._body.loaded).any(axis=1) | anatomy.in_tumour
         self._watched, table = np.unique(mesh.tets[free].astype(np.int64), return_inverse=True)
         part = discretise(TetMesh(mesh.nodes[self._watched], table.reshape(-1, 4), mesh.region[free]), "p1")
         super().__init__(name, anatomy, effects, part, find_device("cpu", "float64"))
@@ -207,7 +207,7 @@ class LinearModel(_ForceModel):
     def _build_table(self, respond: Respond, vertices: bytes) -> np.ndarray:
         """Return the responses at vertices (n,), given as bytes of int64; fixed vertices do not move."""
         nodes = np.frombuffer(vertices, np.int64)
-        needed = 2 * 9 * 8 * len(self._body.acting) * len(nodes)
+        needed = 2 * 9 * 8 * len(self._body.loaded) * len(nodes)
         if needed > measure_free_bytes(self._surface.device):
             raise InputError(
                 f"{self._name} needs {needed / 2**30:.1f} GiB for the table of this mesh: use finite elements, or a "
@@ -218,17 +218,17 @@ class LinearModel(_ForceModel):
         return table
 
     def _compute_motion(self, force: np.ndarray, acting: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Return displacements (B, n, 3) [m] of `nodes` under forces (B, a, 3) [N], nonzero at `acting` only."""
+        """Return displacements (B, n, 3) [m] of `nodes` under forces (B, a, 3) [N], nonzero at `loaded` only."""
         table = self._respond(nodes.tobytes())[acting]
         return np.tensordot(force[:, acting], table, axes=2)
 
     def _compute_forces(self, loads: Loads) -> np.ndarray:
-        """Return the forces (B, a, 3) [N] at `body.acting`; fixed vertices bear the rest."""
-        acting, count = self._body.acting, len(self.anatomy.mesh.nodes)
+        """Return the forces (B, a, 3) [N] at `body.loaded`; fixed vertices bear the rest."""
+        acting, count = self._body.loaded, len(self.anatomy.mesh.nodes)
         force = np.zeros((len(loads), len(acting), 3))
         for cause in loads.causes:
             if isinstance(cause, Pushed):
-                weight = self._surface.press(cause.point, cause.footprint).to_matrix(count)[:, acting]
+                weight = self._surface.find_footprints(cause.point, cause.footprint).to_matrix(count)[:, acting]
                 force += weight.toarray()[:, :, None] * cause.force[:, None]
             if isinstance(cause, Nodal):
                 check_field("Nodal.force", cause.force, count)

@@ -17,10 +17,10 @@ from ..discretisation.space import Discretisation
 from ..effects import Elasticity
 from ..geometry.tetmesh import EDGES
 from ..runtime.device import forward_kernel
-from ..runtime.views import run_in_order, to_library, view
+from ..runtime.views import run_in_order, to_library, to_view
 from ..terms.laws.invariants import cofactor
 from ..terms.laws.springs import compute_spring_coefficients
-from .linear_body import find_fixed
+from .linear_body import list_fixed_vertices
 from .models import Relaxation
 
 
@@ -34,7 +34,7 @@ class Substeps:
         Number of time steps, and of iterations in each.
     step
         Duration of a step [s].
-    kept
+    velocity_factor
         Fraction of the velocity that a step keeps.
     density
         Density of the tissue [kg/m^3].
@@ -43,7 +43,7 @@ class Substeps:
     count: int = 200
     iterations: int = 1
     step: float = 1e-3
-    kept: float = 0.95
+    velocity_factor: float = 0.95
     density: float = 1040.0
 
 
@@ -54,10 +54,10 @@ def get_displacement(u: wp.array2d(dtype=wp.float64), node: int, c: int):
 
 
 @wp.func
-def shift(u: wp.array2d(dtype=wp.float64), node: int, c: int, by: wp.vec3d):
-    """Add `by` [m] to the displacement of a node in load case c."""
+def add_displacement(u: wp.array2d(dtype=wp.float64), node: int, c: int, increment: wp.vec3d):
+    """Add `increment` [m] to the displacement of a node in load case c."""
     for k in range(3):
-        u[3 * node + k, c] += by[k]
+        u[3 * node + k, c] += increment[k]
 
 
 @forward_kernel
@@ -90,8 +90,8 @@ def solve_constraints(
         if w > wp.float64(0.0) and size > wp.float64(0.0):
             change = -(size - wp.length(L) + a * multiplier[e, k, c]) / (w + a)
             multiplier[e, k, c] += change
-            shift(u, i, c, -(inverse[i] * change / size) * l)
-            shift(u, j, c, (inverse[j] * change / size) * l)
+            add_displacement(u, i, c, -(inverse[i] * change / size) * l)
+            add_displacement(u, j, c, (inverse[j] * change / size) * l)
     F = wp.identity(n=3, dtype=wp.float64)
     for k in range(4):
         F += wp.outer(get_displacement(u, table[e, k], c), gradient[e, k])
@@ -103,10 +103,10 @@ def solve_constraints(
     multiplier[e, 6, c] += step
     for k in range(4):
         i = int(table[e, k])
-        shift(u, i, c, inverse[i] * step * (cof * gradient[e, k]))
+        add_displacement(u, i, c, inverse[i] * step * (cof * gradient[e, k]))
 
 
-def prepare(
+def build_solver(
     problem: Problem, space: Discretisation, tissue: Elasticity, settings: Substeps = Substeps()
 ) -> Callable[[int], tuple[wp.array, int]]:
     """Return the function that moves a number of load cases: displacements (3N, b) [m] and iterations.
@@ -121,7 +121,7 @@ def prepare(
     laws, region = collect_laws(tissue, np.unique(mesh.region).tolist()), mesh.region.tolist()
     numbers = compute_spring_coefficients(np.array([laws[label].lame for label in region]), elements.gradient)
     mass = np.bincount(mesh.tets.ravel(), np.repeat(0.25 * settings.density * mesh.volumes, 4), len(mesh.nodes))
-    free = ~find_fixed("xpbd", problem) & (mass > 0.0)
+    free = ~list_fixed_vertices("xpbd", problem) & (mass > 0.0)
     inverse = np.where(free, 1.0 / np.maximum(mass, 1e-12), 0.0)
     stiffness = mesh.volumes[:, None] * np.column_stack([np.repeat(numbers[:, :1], 6, axis=1), numbers[:, 1]])
     inputs = [
@@ -137,12 +137,14 @@ def prepare(
     def relax(count: int) -> tuple[wp.array, int]:
         """Predict positions by u += kept (u - u-) + h^2 a, and solve the constraints, in every step."""
         u, before = device.allocate(problem.rows, count), device.allocate(problem.rows, count)
-        multiplier, (x, old) = device.allocate(len(mesh.tets), 7, count), map(view, (u, before))
+        multiplier, (x, old) = device.allocate(len(mesh.tets), 7, count), map(to_view, (u, before))
         with run_in_order(device):
-            moved = -(settings.step**2) * to_library(device, np.repeat(inverse, 3)[:, None]) * view(problem.gradient(u))
+            moved = (
+                -(settings.step**2) * to_library(device, np.repeat(inverse, 3)[:, None]) * to_view(problem.gradient(u))
+            )
         for _ in range(settings.count):
             with run_in_order(device):
-                old[:], x[:] = x, x + settings.kept * (x - old) + moved
+                old[:], x[:] = x, x + settings.velocity_factor * (x - old) + moved
             multiplier.zero_()
             for order in settings.iterations * colours:
                 device.launch(solve_constraints, (len(order), count), [order, *inputs], [u, multiplier])
@@ -163,4 +165,4 @@ def group_tetrahedra(tets: np.ndarray) -> list[np.ndarray]:
     return [np.flatnonzero(colour == each) for each in range(colour.max() + 1)]
 
 
-XPBD = Relaxation("springs", prepare, tolerance=1e-2)
+XPBD = Relaxation("springs", build_solver, tolerance=1e-2)

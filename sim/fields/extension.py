@@ -7,20 +7,20 @@ from scipy import ndimage
 SMOOTHING_ITERATIONS = 6
 
 
-def extend_field(field: np.ndarray, known: np.ndarray, reach: float) -> np.ndarray:
-    """Return the field (3, I, J, K) with nodes outside the mask `known` (I, J, K) filled; zero beyond `reach` [nodes].
+def extend_field(field: np.ndarray, defined: np.ndarray, max_distance: float) -> np.ndarray:
+    """Fill nodes of a field (3, I, J, K) outside the mask `defined` (I, J, K); zero beyond `max_distance` [nodes].
 
     Filled nodes take the nearest known value, scaled down with distance, and are smoothed. Their values do not exceed
     the known ones.
     """
-    filled = np.where(known, field, np.float32(0.0))
+    filled = np.where(defined, field, np.float32(0.0))
     moving = np.argwhere(filled.any(axis=0))
     if not len(moving):
         return filled
-    away = int(np.ceil(reach)) + SMOOTHING_ITERATIONS
+    away = int(np.ceil(max_distance)) + SMOOTHING_ITERATIONS
     low, high = np.maximum(moving.min(axis=0) - away, 0), moving.max(axis=0) + away + 1
     window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    _fill(filled[(slice(None), *window)], known[window], reach)
+    _fill(filled[(slice(None), *window)], defined[window], max_distance)
     return filled
 
 
@@ -33,24 +33,22 @@ def _fill(field: np.ndarray, known: np.ndarray, reach: float) -> None:
         step = at - side
         square += step * step
     free = (square > 0) & (square < reach * reach)
-    source = tuple(nearest[:, free])
-    left = 1.0 - np.sqrt(square[free]) / reach
+    source, left = tuple(nearest[:, free]), 1.0 - np.sqrt(square[free]) / reach
     fade = (left * left * (3.0 - 2.0 * left)).astype(np.float32)
     for part in field:
         part[free] = fade * part[source]
-    smooth(field, free, SMOOTHING_ITERATIONS)
+    smooth_field(field, free, SMOOTHING_ITERATIONS)
 
 
-def smooth(field: np.ndarray, free: np.ndarray, sweeps: int) -> None:
-    """Replace nodes marked `free` (I, J, K), except at the edge, by the mean of their six neighbours, `sweeps` times.
+def smooth_field(field: np.ndarray, free: np.ndarray, iterations: int) -> None:
+    """Replace nodes marked `free` (I, J, K), except at the edge, by the mean of their neighbours, `iterations` times.
 
     The field (3, I, J, K) is changed in place.
     """
-    middle = slice(1, -1)
-    inner = free[1:-1, 1:-1, 1:-1]
+    middle, inner = slice(1, -1), free[1:-1, 1:-1, 1:-1]
     total = np.empty(inner.shape, field.dtype)
     for part in field:
-        for _ in range(sweeps):
+        for _ in range(iterations):
             np.add(part[:-2, middle, middle], part[2:, middle, middle], out=total)
             total += part[middle, :-2, middle]
             total += part[middle, 2:, middle]

@@ -6,12 +6,12 @@ import numpy as np
 from scipy import ndimage
 from scipy.optimize import minimize
 
-from .extension import smooth
+from .extension import smooth_field
 
 
 @dataclass(frozen=True)
 class UnfoldingSettings:
-    """Settings of `unfold`."""
+    """Settings of `unfold_field`."""
 
     min_determinant: float = 0.05  # Jacobian determinant below which a cell is corrected
     target_determinant: float = 0.15  # target determinant of the correction
@@ -75,13 +75,13 @@ def find_corner_nodes(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(cells[:, None, None] + CORNER_NEIGHBOURS, -1, 0)), shape))
 
 
-def compute_corner_volumes(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def compute_corner_volumes(positions: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Return signed volumes (n, 8) at the corners (n, 8, 4) of cells, from node positions (N, 3) [spacings]."""
-    at = places[corners]
+    at = positions[corners]
     return CORNER_SIGNS * np.linalg.det(at[:, :, 1:] - at[:, :, :1])
 
 
-def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float) -> float:
+def unfold_field(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float) -> float:
     """Remove folds of a field (3, I, J, K) [m] in place, and return the least determinant that remains.
 
     Nodes inside the body (I, J, K) move least, then those of the collar (I, J, K) around it, since the body's surface
@@ -94,16 +94,14 @@ def unfold(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: f
         bad = found < UNFOLDING.min_determinant
         if not bad.any():
             break
-        grown = UNFOLDING.margin + turn
-        labels = np.empty(bad.shape, np.int32)
+        grown, labels = UNFOLDING.margin + turn, np.empty(bad.shape, np.int32)
         ndimage.label(ndimage.maximum_filter(bad, 2 * grown + 5), output=labels)
         for where in ndimage.find_objects(labels):
             window = tuple(slice(each.start, each.stop + 1) for each in where)
-            part = field[(slice(None), *window)]
-            nodes = np.pad(bad[where], [(0, 1)] * 3)
+            part, nodes = field[(slice(None), *window)], np.pad(bad[where], [(0, 1)] * 3)
             near = ndimage.maximum_filter(nodes, 2 * grown + 2)
             if turn >= UNFOLDING.first_smoothed_attempt:
-                smooth(part, ndimage.maximum_filter(nodes, 2 * turn + 2), UNFOLDING.smoothing_iterations)
+                smooth_field(part, ndimage.maximum_filter(nodes, 2 * turn + 2), UNFOLDING.smoothing_iterations)
             outer = np.where(collar[window], UNFOLDING.collar_weight, UNFOLDING.outer_weight)
             stiff = np.where(inside[window], UNFOLDING.body_weight, outer)
             _repair_cells(part, near, stiff, spacing)
@@ -117,16 +115,14 @@ def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
     cells = np.argwhere(ndimage.maximum_filter(near, 2, origin=-1)[:-1, :-1, :-1])
     used, corners = np.unique(find_corner_nodes(cells, shape), return_inverse=True)
-    corners = corners.reshape(-1, 4)
-    signs = np.tile(CORNER_SIGNS, len(cells))
+    corners, signs = corners.reshape(-1, 4), np.tile(CORNER_SIGNS, len(cells))
     flat = part.reshape(3, -1)
     rest = flat[:, used].T / spacing + np.stack(np.unravel_index(used, shape), axis=-1)
     free = np.flatnonzero(near.reshape(-1)[used])
     held = stiff.reshape(-1)[used[free], None]
 
     def cost(variables: np.ndarray) -> tuple[float, np.ndarray]:
-        change = variables.reshape(-1, 3)
-        places = rest.copy()
+        change, places = variables.reshape(-1, 3), rest.copy()
         places[free] += change
         at = places[corners]
         a, b, c = np.moveaxis(at[:, 1:] - at[:, :1], 1, 0)

@@ -21,28 +21,27 @@ class Grid:
         affine[:3, 3] = self.origin
         return affine
 
-    def index(self, points: np.ndarray) -> np.ndarray:
+    def to_indices(self, points: np.ndarray) -> np.ndarray:
         """Return fractional indices (..., 3) of points (..., 3) [m]."""
         return (points - self.origin) / self.spacing
 
-    def compute_points(self, numbers: np.ndarray) -> np.ndarray:
-        """Return the positions (n, 3) [m] of nodes by their numbers (n,) in the flat grid."""
-        return self.origin + self.spacing * np.stack(np.unravel_index(numbers, self.shape), axis=-1)
+    def compute_positions(self, node_numbers: np.ndarray) -> np.ndarray:
+        """Return the positions (n, 3) [m] of nodes by their node_numbers (n,) in the flat grid."""
+        return self.origin + self.spacing * np.stack(np.unravel_index(node_numbers, self.shape), axis=-1)
 
     def find_corners(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return node numbers (n, 8) of the cells that contain points (n, 3) [m], and trilinear weights (n, 8)."""
-        index = self.index(points)
+        index = self.to_indices(points)
         first = np.clip(np.floor(index).astype(int), 0, np.array(self.shape) - 2)
-        share = index - first
-        strides = np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
+        share, strides = index - first, np.array([self.shape[1] * self.shape[2], self.shape[2], 1])
         numbers = (first @ strides)[:, None] + np.array(list(np.ndindex(2, 2, 2))) @ strides
         x, y, z = np.stack([1.0 - share, share], axis=-1).transpose(1, 0, 2)
         weights = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
         return numbers, weights.reshape(-1, 8)
 
-    def read(self, field: np.ndarray, points: np.ndarray) -> np.ndarray:
+    def interpolate(self, field: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Interpolate a field (3, I, J, K) at points (n, 3) [m], trilinearly; zero outside: (n, 3)."""
-        index = self.index(points).T
+        index = self.to_indices(points).T
         return np.stack([ndimage.map_coordinates(part, index, order=1) for part in field], axis=-1)
 
 

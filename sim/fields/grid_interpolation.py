@@ -31,7 +31,7 @@ def interpolate_in_tetrahedra(
     count = int(np.prod(grid.shape))
     field, inside = np.zeros((3, count), np.float32), np.zeros(count, bool)
     first, slopes = values[tets[:, 0]], values[tets[:, 1:]] - values[tets[:, :1]]
-    for hits in _iterate_hits(grid.shape, grid.index(nodes[tets])):
+    for hits in _iterate_hits(grid.shape, grid.to_indices(nodes[tets])):
         field[:, hits.node] = (first[hits.tet] + np.einsum("nc,nci->ni", hits.weights, slopes[hits.tet])).T
         inside[hits.node] = True
     return field.reshape(3, *grid.shape), inside.reshape(grid.shape)

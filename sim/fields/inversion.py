@@ -29,7 +29,7 @@ def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.
     found, going, left = guess.copy(), np.arange(len(points)), []
     last = np.full(len(points), np.inf)
     for _ in range(INVERSION.max_iterations):
-        new = -grid.read(forward, points[going] + found[going])
+        new = -grid.interpolate(forward, points[going] + found[going])
         change = np.linalg.norm(new - found[going], axis=1)
         nearer = change < INVERSION.max_change_ratio * last[going]
         left.append(going[~nearer])
@@ -49,7 +49,7 @@ def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess:
     step = np.zeros_like(guess)
     for _ in range(INVERSION.max_iterations):
         at = points[going] + trial[going]
-        rest = trial[going] + grid.read(forward, at)
+        rest = trial[going] + grid.interpolate(forward, at)
         size = np.linalg.norm(rest, axis=1)
         good = size < least[going]
         best[going[good]], least[going[good]] = trial[going[good]], size[good]
@@ -65,10 +65,9 @@ def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess:
 
 def _compute_newton_step(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Return the Newton step (n, 3) [m] at places (n, 3) [m] with residuals `rest` (n, 3)."""
-    half = 0.25 * grid.spacing
-    columns = []
+    half, columns = 0.25 * grid.spacing, []
     for axis in np.eye(3):
-        ahead, behind = (grid.read(forward, at + sign * half * axis) for sign in (1.0, -1.0))
+        ahead, behind = (grid.interpolate(forward, at + sign * half * axis) for sign in (1.0, -1.0))
         columns.append((ahead - behind) / (2.0 * half) + axis)
     matrix = np.stack(columns, axis=-1)
     flat = np.abs(np.linalg.det(matrix)) < 1e-3

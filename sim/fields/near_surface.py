@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ..geometry.closest_point import find_closest_points
-from ..geometry.tetmesh import find_single_faces
+from ..geometry.tetmesh import find_boundary_faces
 
 CANDIDATE_TRIANGLES = 16  # candidate triangles for the closest point
 BLOCK_SIZE = 4096  # points per block
@@ -20,10 +20,9 @@ def extrapolate_beyond_surface(
     A point takes the value of the closest surface point plus a linear extrapolation. The gradient is
     the mean over the tetrahedra around each vertex; the change is limited to half of the value.
     """
-    surface = find_single_faces(tets)
+    surface = find_boundary_faces(tets)
     corners, slopes = nodes[surface], compute_vertex_gradients(nodes, tets, values)
-    middles = KDTree(corners.mean(axis=1))
-    found = np.empty((len(points), 3))
+    middles, found = KDTree(corners.mean(axis=1)), np.empty((len(points), 3))
     for first in range(0, len(points), BLOCK_SIZE):
         some = slice(first, first + BLOCK_SIZE)
         near = middles.query(points[some], k=min(CANDIDATE_TRIANGLES, len(surface)))[1].reshape(len(points[some]), -1)

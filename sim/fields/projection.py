@@ -10,7 +10,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from ..geometry.tetmesh import find_single_faces
+from ..geometry.tetmesh import find_boundary_faces
 from .grid import Grid
 
 # Points per block, to limit memory.
@@ -19,7 +19,7 @@ BLOCK_POINTS = 200_000
 
 @dataclass(frozen=True)
 class ProjectionSettings:
-    """Settings of `project`."""
+    """Settings of `project_field`."""
 
     fit_tolerance: float = 2e-5  # Interpolation error above which tetrahedra are fitted [m].
     test_density: float = 1.0  # points per grid spacing along a tetrahedron's longest edge, in the error test
@@ -56,7 +56,7 @@ class _Samples(NamedTuple):
     simplex: np.ndarray
 
 
-def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: NodalField) -> None:
+def project_field(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: NodalField) -> None:
     """Fit a field (3, I, J, K), sampled in a body (mask `inside`) and its `collar`, to the body's field between nodes.
 
     Nodes at interpolation errors above 0.02 mm change in place, in the collar only where it moves. The squared
@@ -64,8 +64,7 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
     surface, which nodes outside represent. Small weights keep changes small and even, and the field straight in
     the collar.
     """
-    flat = field.reshape(3, -1)
-    bad = np.zeros(len(body.tets), bool)
+    flat, bad = field.reshape(3, -1), np.zeros(len(body.tets), bool)
     for some in _sample_tetrahedra(grid, body, np.arange(len(body.tets)), PROJECTION.test_density):
         numbers, weights = grid.find_corners(some.points)
         error = np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1)
@@ -88,8 +87,7 @@ def project(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarra
         weighted = rows.T.multiply(some.weights).tocsr()
         matrix = matrix + weighted @ rows
         side += weighted @ (some.values - _read(flat, numbers, weights))
-    scale = sparse.diags(1.0 / np.asarray(matrix.diagonal(), np.float64))
-    change = np.zeros_like(field)
+    scale, change = sparse.diags(1.0 / np.asarray(matrix.diagonal(), np.float64)), np.zeros_like(field)
     for part, right in zip(change.reshape(3, -1), side.T, strict=True):
         part[nodes] = cg(matrix, right, rtol=PROJECTION.solver_tolerance, maxiter=PROJECTION.max_iterations, M=scale)[0]
     field += change
@@ -110,7 +108,7 @@ def _sample_tetrahedra(grid: Grid, body: NodalField, which: np.ndarray, density:
 
 def _sample_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
     """Yield points of the surface triangles with a vertex in `touched` (V,)."""
-    faces = find_single_faces(body.tets)
+    faces = find_boundary_faces(body.tets)
     faces = faces[touched[faces].any(axis=1)]
     a, b, c = body.nodes[faces].transpose(1, 0, 2)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / (2.0 * grid.spacing**2)
@@ -121,8 +119,7 @@ def _sample_simplices(
     grid: Grid, body: NodalField, simplices: np.ndarray, weights: np.ndarray, density: float
 ) -> Iterator[_Samples]:
     """Yield regular lattice points of simplices (n, c) of vertices; the points of one share its weight (n,)."""
-    corners = body.nodes[simplices]
-    size = simplices.shape[1]
+    corners, size = body.nodes[simplices], simplices.shape[1]
     first, second = np.triu_indices(size, 1)
     longest = np.linalg.norm(corners[:, first] - corners[:, second], axis=2).max(axis=1, initial=0.0)
     orders = np.clip(np.ceil(density * longest / grid.spacing), 1, PROJECTION.max_subdivisions).astype(int)

@@ -9,12 +9,12 @@ from scipy import ndimage
 from ..anatomy import Anatomy
 from ..geometry.tetmesh import compute_signed_volumes
 from .extension import extend_field
-from .folds import unfold
+from .folds import unfold_field
 from .grid import Grid, build_grid_around
 from .grid_interpolation import interpolate_in_tetrahedra
 from .inversion import invert_field
 from .near_surface import extrapolate_beyond_surface
-from .projection import NodalField, project
+from .projection import NodalField, project_field
 
 MIN_DIVISOR = 1e-30  # guard against division by 0
 
@@ -49,10 +49,10 @@ class WarpFields:
         (3, I, J, K) [m]: deformed position y was at y + backward(y). Also called *resampling*.
     resected
         (I, J, K) bool: nodes in resected tissue, in the undeformed configuration.
-    least
+    min_determinants
         Least Jacobian determinants of the two fields, and least relative volume of a tetrahedron.
         If one is <= 0, the fields fold, or the body alone.
-    reach
+    fade_distance
         Distance from the body over which the field fades to zero [m].
     """
 
@@ -60,41 +60,40 @@ class WarpFields:
     forward: np.ndarray
     backward: np.ndarray
     resected: np.ndarray
-    least: tuple[float, float, float]
-    reach: float
+    min_determinants: tuple[float, float, float]
+    fade_distance: float
 
     @property
-    def folds(self) -> bool:
+    def has_folds(self) -> bool:
         """True if one of the fields folds."""
-        return not min(self.least[:2]) > 0.0
+        return not min(self.min_determinants[:2]) > 0.0
 
 
-def compute_reach(displacement: np.ndarray) -> float:
+def compute_fade_distance(displacement: np.ndarray) -> float:
     """Return the distance [m] over which the field of displacements (..., 3) [m] fades to zero."""
     largest = float(np.linalg.norm(displacement, axis=-1).max())
     return WARP_FIELDS.min_fade_distance + WARP_FIELDS.fade_factor * largest
 
 
-def compute_faint_threshold(displacement: np.ndarray) -> float:
+def compute_cutoff(displacement: np.ndarray) -> float:
     """Return the limit [m] below which displacements (..., 3) [m] are neglected, so that the grid can be smaller."""
     largest = float(np.linalg.norm(displacement, axis=-1).max())
     return min(WARP_FIELDS.zeroing_threshold, WARP_FIELDS.zeroing_fraction * largest)
 
 
-def remove_faint(displacement: np.ndarray) -> np.ndarray:
+def remove_negligible(displacement: np.ndarray) -> np.ndarray:
     """Return displacements (..., 3) [m] with negligible ones set to zero."""
     size = np.linalg.norm(displacement, axis=-1, keepdims=True)
-    share = np.clip(size / max(compute_faint_threshold(displacement), MIN_DIVISOR) - 1.0, 0.0, 1.0)
+    share = np.clip(size / max(compute_cutoff(displacement), MIN_DIVISOR) - 1.0, 0.0, 1.0)
     return displacement * (share * share * (3.0 - 2.0 * share))
 
 
-def warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float) -> Grid:
+def build_warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float) -> Grid:
     """Build the grid with a spacing [m] around the part of a body that displacements (B, V, 3) [m] move."""
-    mesh = anatomy.mesh
-    moves = np.asarray(displacements.any(axis=(0, 2)))
+    mesh, moves = anatomy.mesh, np.asarray(displacements.any(axis=(0, 2)))
     tets, faces = (of[moves[of].any(axis=1)] for of in (mesh.tets, mesh.surface))
     held, outer = np.unique(tets if len(tets) else mesh.tets), np.unique(faces)
-    reach = compute_reach(displacements)
+    reach = compute_fade_distance(displacements)
     places = [mesh.nodes[held], *(mesh.nodes[held] + displacements[:, held])]
     for some in (mesh.nodes[outer], *(mesh.nodes[outer] + displacements[:, outer])):
         places += [some - reach, some + reach]
@@ -106,7 +105,7 @@ def find_collar(inside: np.ndarray) -> np.ndarray:
     return np.asarray(ndimage.maximum_filter(inside, 3) & ~inside)
 
 
-def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.ndarray, float]:
+def compute_forward(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the field (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian determinant.
 
     It is linear in each tetrahedron, and fitted where sampling is not accurate between grid nodes. It is
@@ -117,14 +116,14 @@ def forward_on(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.
     collar = find_collar(inside)
     numbers = np.flatnonzero(collar)
     field.reshape(3, -1)[:, numbers] = extrapolate_beyond_surface(
-        nodes, tets, displacement, grid.compute_points(numbers)
+        nodes, tets, displacement, grid.compute_positions(numbers)
     ).T
-    project(grid, field, inside, collar, NodalField(nodes, tets, displacement))
-    filled = extend_field(field, inside | collar, compute_reach(displacement) / grid.spacing)
-    return filled, unfold(filled, inside, collar, grid.spacing)
+    project_field(grid, field, inside, collar, NodalField(nodes, tets, displacement))
+    filled = extend_field(field, inside | collar, compute_fade_distance(displacement) / grid.spacing)
+    return filled, unfold_field(filled, inside, collar, grid.spacing)
 
 
-def invert_on_grid(
+def compute_inverse(
     grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Return the inverse (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian determinant.
@@ -134,37 +133,36 @@ def invert_on_grid(
     now, tets = body.mesh.nodes + displacement, body.mesh.tets
     field, inside = interpolate_in_tetrahedra(grid, now, tets, -displacement)
     numbers = np.flatnonzero(~inside & (np.abs(forward).max(axis=0) > WARP_FIELDS.inversion_threshold))
-    flat = field.reshape(3, -1)
-    guess = -forward.reshape(3, -1)[:, numbers].T.astype(np.float64)
-    flat[:, numbers] = invert_field(grid, forward, grid.compute_points(numbers), guess).T
+    flat, guess = field.reshape(3, -1), -forward.reshape(3, -1)[:, numbers].T.astype(np.float64)
+    flat[:, numbers] = invert_field(grid, forward, grid.compute_positions(numbers), guess).T
     collar = find_collar(inside)
-    project(grid, field, inside, collar, NodalField(now, tets, -displacement))
-    return field, unfold(field, inside, collar, grid.spacing)
+    project_field(grid, field, inside, collar, NodalField(now, tets, -displacement))
+    return field, unfold_field(field, inside, collar, grid.spacing)
 
 
-def warp_fields(
+def compute_warp_fields(
     anatomy: Anatomy,
     displacement: np.ndarray,
     spacing: float,
-    left: Anatomy | None = None,
-    made: Callable[[], object] = lambda: None,
+    remaining: Anatomy | None = None,
+    progress: Callable[[], object] = lambda: None,
 ) -> WarpFields:
     """Return the fields of a displacement (V, 3) [m] on a grid with a spacing [m].
 
-    `left` is the remaining body after a resection. Outside the body the fields fade. `made` is
+    `remaining` is the remaining body after a resection. Outside the body the fields fade. `progress` is
     called after each of the two fields.
     """
-    displacement = remove_faint(displacement)
-    body, grid = left or anatomy, warp_grid(anatomy, displacement[None], spacing)
+    displacement = remove_negligible(displacement)
+    body, grid = remaining or anatomy, build_warp_grid(anatomy, displacement[None], spacing)
     mesh = body.mesh
-    forward, least_forward = forward_on(grid, body, displacement)
-    made()
-    backward, least_backward = invert_on_grid(grid, body, displacement, forward)
-    made()
+    forward, least_forward = compute_forward(grid, body, displacement)
+    progress()
+    backward, least_backward = compute_inverse(grid, body, displacement, forward)
+    progress()
     share = float((compute_signed_volumes(mesh.nodes + displacement, mesh.tets) / mesh.volumes).min())
     resected = np.zeros(grid.shape, bool)
     if len(mesh.tets) < len(anatomy.mesh.tets):
         resected = interpolate_in_tetrahedra(grid, anatomy.mesh.nodes, anatomy.mesh.tets, displacement)[1]
         resected &= ~interpolate_in_tetrahedra(grid, mesh.nodes, mesh.tets, displacement)[1]
     least = least_forward, least_backward, share
-    return WarpFields(grid, forward, backward, resected, least, compute_reach(displacement))
+    return WarpFields(grid, forward, backward, resected, least, compute_fade_distance(displacement))

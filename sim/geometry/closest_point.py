@@ -8,7 +8,7 @@ DISTANCE_TOLERANCE = 1e-9  # Relative difference of one distance computed in two
 BLOCK_SIZE = 128  # Points compared with shared triangles at once: more only take more memory.
 
 
-class Closest(NamedTuple):
+class ClosestPoints(NamedTuple):
     """Closest points (B, 3) [m], with their triangles (B,) and barycentric weights (B, 3)."""
 
     point: np.ndarray
@@ -16,7 +16,7 @@ class Closest(NamedTuple):
     weights: np.ndarray
 
 
-def find_closest_points(points: np.ndarray, corners: np.ndarray) -> Closest:
+def find_closest_points(points: np.ndarray, corners: np.ndarray) -> ClosestPoints:
     """Find the closest points to points (B, 3) [m] on triangles with corners (S, 3, 3), or (B, S, 3, 3) [m].
 
     It is the projection to a triangle's plane if this is inside, else the closest point of an edge. Triangles without
@@ -31,14 +31,13 @@ def find_closest_points(points: np.ndarray, corners: np.ndarray) -> Closest:
             near = _list_candidates(some, middle, reach)
             found = find_closest_points(some, corners[near])
             parts.append(found._replace(triangle=near[np.arange(len(near)), found.triangle]))
-        return parts[0] if len(parts) == 1 else Closest(*map(np.concatenate, zip(*parts, strict=True)))
+        return parts[0] if len(parts) == 1 else ClosestPoints(*map(np.concatenate, zip(*parts, strict=True)))
     edge = np.roll(corners, -1, axis=2) - corners
     arm = points[:, None, None] - corners
     square = np.einsum("bsei,bsei->bse", edge, edge)
     share = np.einsum("bsei,bsei->bse", arm, edge) / np.where(square > 0.0, square, 1.0)
     share = np.clip(share, 0.0, 1.0)
-    off = arm - share[..., None] * edge
-    normal = np.cross(edge[:, :, 0], edge[:, :, 1])
+    off, normal = arm - share[..., None] * edge, np.cross(edge[:, :, 0], edge[:, :, 1])
     twice = np.einsum("bsi,bsi->bs", normal, normal)  # the square of twice the area
     twice = np.where(twice > 0.0, twice, np.inf)[..., None]
     # A corner's weight is the area spanned by the projection and the opposite edge.
@@ -49,14 +48,13 @@ def find_closest_points(points: np.ndarray, corners: np.ndarray) -> Closest:
     far = np.concatenate([np.einsum("bsei,bsei->bse", off, off), np.where(inside, height, np.inf)[..., None]], axis=2)
     triangle, kind = np.divmod(far.reshape(len(far), -1).argmin(axis=1), 4)
     row = np.arange(len(far))
-    weights = inner[row, triangle]
-    on_edge = kind < 3
+    weights, on_edge = inner[row, triangle], kind < 3
     some, start = row[on_edge], kind[on_edge]
     along = share[some, triangle[on_edge], start]
     weights[on_edge] = 0.0
     weights[some, start] = 1.0 - along
     weights[some, (start + 1) % 3] = along
-    return Closest(np.einsum("bc,bci->bi", weights, corners[row, triangle]), triangle, weights)
+    return ClosestPoints(np.einsum("bc,bci->bi", weights, corners[row, triangle]), triangle, weights)
 
 
 def compute_bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,14 +8,14 @@ TOLERANCE = 1e-9  # Tolerance relative to the radius, so that by rounding no bal
 
 
 def find_resting_tip(
-    nodes: np.ndarray, triangles: np.ndarray, through: np.ndarray, inward: np.ndarray, radius: float
+    nodes: np.ndarray, triangles: np.ndarray, line_point: np.ndarray, inward: np.ndarray, radius: float
 ) -> np.ndarray:
     """Find the tip (3,) [m] of one ball: `find_resting_tips` on nodes (V, 3) [m], along a line through (3,) [m]."""
-    return find_resting_tips(nodes[None], triangles, through[None], inward, np.array([radius]))[0]
+    return find_resting_tips(nodes[None], triangles, line_point[None], inward, np.array([radius]))[0]
 
 
 def find_resting_tips(
-    nodes: np.ndarray, triangles: np.ndarray, through: np.ndarray, inward: np.ndarray, radius: np.ndarray
+    nodes: np.ndarray, triangles: np.ndarray, line_point: np.ndarray, inward: np.ndarray, radius: np.ndarray
 ) -> np.ndarray:
     """Find the tips (B, 3) [m] of balls, each moved down a line until its first contact with its own surface.
 
@@ -28,7 +28,7 @@ def find_resting_tips(
     nodes, triangles
         Surfaces: positions (B, V, 3) [m], and vertex numbers (F, 3) that they share. Triangles without area count as
         edges.
-    through, inward
+    line_point, inward
         Any point (B, 3) [m] of each line, and the unit direction (3,) in which the balls move.
     radius
         Radius of each ball (B,) [m].
@@ -38,12 +38,12 @@ def find_resting_tips(
     InputError
         A ball whose path misses the surface.
     """
-    across = nodes - through[:, None]
+    across = nodes - line_point[:, None]
     across = across - (across @ inward)[..., None] * inward
     least, most = (bound(across[:, triangles], axis=2) for bound in (np.min, np.max))
     reach = radius[:, None, None]
     case, face = np.nonzero(((least <= reach) & (most >= -reach)).all(axis=2))
-    corners = nodes[case[:, None], triangles[face]] - through[case, None]
+    corners = nodes[case[:, None], triangles[face]] - line_point[case, None]
     first = np.full(len(nodes), np.inf)
     for distance in (
         part(corners, inward, radius[case, None])
@@ -54,9 +54,9 @@ def find_resting_tips(
     if len(passing):
         raise InputError(
             f"the path of the ball of radius {1e3 * radius[passing[0]]:.3g} mm through "
-            f"{np.round(1e3 * through[passing[0]], 1)} mm misses the surface: choose another path."
+            f"{np.round(1e3 * line_point[passing[0]], 1)} mm misses the surface: choose another path."
         )
-    return through + (first + radius)[:, None] * inward
+    return line_point + (first + radius)[:, None] * inward
 
 
 def _compute_vertex_paths(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:

@@ -7,21 +7,21 @@ from .tetmesh import compute_row_keys
 
 
 def compute_geodesic_distances(
-    nodes: np.ndarray, triangles: np.ndarray, source: np.ndarray, limit: float, steiner: int = 4
+    nodes: np.ndarray, triangles: np.ndarray, source: np.ndarray, max_distance: float, points_per_edge: int = 4
 ) -> np.ndarray:
     """Compute the shortest paths (V,) [m] over the surface `triangles` (S, 3) from `source` (3,) to each node.
 
-    Infinite for nodes off the surface or farther than `limit` [m]. Dijkstra's algorithm on a graph of the nodes and
-    of further points on the edges, joined straight across each triangle (Lanthier, Maheshwari & Sack 2001). The
-    source is joined to the triangles around its nearest node. With four points on every edge (`steiner`) the paths
-    are at most about 1 % too long.
+    Infinite for nodes off the surface or farther than `max_distance` [m]. Dijkstra's algorithm on a graph of the nodes
+    and of further points on the edges, joined straight across each triangle (Lanthier, Maheshwari & Sack 2001). The
+    source is joined to the triangles around its nearest node. With four `points_per_edge` the paths are at most about
+    1 % too long.
     """
     size = np.linalg.norm(nodes[triangles] - nodes[np.roll(triangles, 1, axis=1)], axis=2).max()
-    near = np.linalg.norm(nodes[triangles] - source, axis=2).min(axis=1) <= limit + size
+    near = np.linalg.norm(nodes[triangles] - source, axis=2).min(axis=1) <= max_distance + size
     used, local = np.unique(triangles[near], return_inverse=True)
-    points, corners = _add_steiner_points(nodes[used], local, steiner)
+    points, corners = _add_steiner_points(nodes[used], local, points_per_edge)
 
-    links = corners[:, np.array([(i, j) for i in range(3 + 3 * steiner) for j in range(i)])].reshape(-1, 2)
+    links = corners[:, np.array([(i, j) for i in range(3 + 3 * points_per_edge) for j in range(i)])].reshape(-1, 2)
     nearest = np.linalg.norm(nodes[used] - source, axis=1).argmin()
     first = np.unique(corners[(local == nearest).any(axis=1)])
     points = np.concatenate([points, source[None]])
@@ -30,7 +30,7 @@ def compute_geodesic_distances(
     links = links[np.unique(compute_row_keys(links), return_index=True)[1]]  # unique: the graph would sum duplicates
     length = np.linalg.norm(points[links[:, 0]] - points[links[:, 1]], axis=1)
     graph = coo_array((np.maximum(length, 1e-12), links.T), shape=(start + 1, start + 1)).tocsr()
-    along = csgraph.dijkstra(graph, directed=False, indices=start, limit=limit)
+    along = csgraph.dijkstra(graph, directed=False, indices=start, limit=max_distance)
     result = np.full(len(nodes), np.inf)
     result[used] = along[: len(used)]
     return result
@@ -40,8 +40,7 @@ def _add_steiner_points(nodes: np.ndarray, triangles: np.ndarray, count: int) ->
     """Return all points of the graph, the nodes first, and their numbers on each triangle (S, 3 + 3 count)."""
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, first, number = np.unique(compute_row_keys(sides), return_index=True, return_inverse=True)
-    edges = sides[first]
-    share = (np.arange(count) + 1.0) / (count + 1.0)
+    edges, share = sides[first], (np.arange(count) + 1.0) / (count + 1.0)
     start, end = nodes[edges[:, 0]], nodes[edges[:, 1]]
     added = start[:, None] + share[:, None] * (end - start)[:, None]
     on_sides = len(nodes) + number.reshape(-1, 1) * count + np.arange(count)

@@ -14,18 +14,18 @@ WEIGHT_TOLERANCE = 1e-12  # Barycentric weights below this are round-off.
 
 
 @dataclass(frozen=True, eq=False)
-class Located:
+class LocatedPoints:
     """Points in a mesh: vertices (n, 4) of the tetrahedron that contains each, and barycentric weights (n, 4)."""
 
     vertices: np.ndarray
     weights: np.ndarray
 
-    def read(self, field: np.ndarray) -> np.ndarray:
+    def interpolate(self, field: np.ndarray) -> np.ndarray:
         """Interpolate values (B, V, k) at the vertices linearly to the points: (B, n, k)."""
         return np.einsum("nc,bnck->bnk", self.weights, field[:, self.vertices])
 
 
-def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> Located:
+def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> LocatedPoints:
     """Locate points (n, 3) [m]; for one outside the mesh, its weights are clipped to a nearby tetrahedron.
 
     In graded meshes the tetrahedron of a point is among the 64 `candidates` with the nearest centroids.
@@ -34,7 +34,7 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> Located:
     unheld = np.flatnonzero(weights.min(axis=1) < -WEIGHT_TOLERANCE)
     tet[unheld], weights[unheld] = _choose_tetrahedra(mesh, points[unheld], candidates)
     inside = np.where(weights > WEIGHT_TOLERANCE, weights, 0.0)
-    return Located(mesh.tets[tet], inside / inside.sum(axis=1, keepdims=True))
+    return LocatedPoints(mesh.tets[tet], inside / inside.sum(axis=1, keepdims=True))
 
 
 class _Cells(NamedTuple):
@@ -61,6 +61,5 @@ def _choose_tetrahedra(mesh: TetMesh, points: np.ndarray, candidates: int) -> tu
     near = cells.middles.query(points, k=count)[1].reshape(len(points), count)
     inner = np.einsum("nkij,nkj->nki", cells.inverse[near], points[:, None] - cells.corner[near])
     weights = np.concatenate([1.0 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)
-    best = weights.min(axis=-1).argmax(axis=1)
-    row = np.arange(len(points))
+    best, row = weights.min(axis=-1).argmax(axis=1), np.arange(len(points))
     return near[row, best], weights[row, best]

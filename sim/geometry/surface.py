@@ -11,18 +11,18 @@ class BlurRange:
 
     Parameters
     ----------
-    reach
+    cutoff
         Cut-off radius [standard deviations of the blur].
-    narrowest
+    min_blur_ratio
         Minimum blur, relative to the longest edge: every corner has a triangle's centroid within two thirds of that
         edge.
-    together
+    block_size
         Points summed at once: bounds the memory.
     """
 
-    reach: float = 3.5
-    narrowest: float = 0.25
-    together: int = 2_000
+    cutoff: float = 3.5
+    min_blur_ratio: float = 0.25
+    block_size: int = 2_000
 
 
 def compute_blurred_normals(
@@ -39,13 +39,13 @@ def compute_blurred_normals(
 
     a, b, c = np.moveaxis(nodes[triangles], 1, 0)
     longest = np.linalg.norm([b - a, c - b, a - c], axis=2).max()
-    blur = max(blur, limits.narrowest * longest)
+    blur = max(blur, limits.min_blur_ratio * longest)
     twice, middle = np.cross(b - a, c - a), KDTree((a + b + c) / 3.0)
     out = np.zeros_like(points)
-    for first in range(0, len(points), limits.together):
-        some = slice(first, first + limits.together)
+    for first in range(0, len(points), limits.block_size):
+        some = slice(first, first + limits.block_size)
         near = (
-            KDTree(points[some]).sparse_distance_matrix(middle, limits.reach * blur, output_type="coo_matrix").tocsr()
+            KDTree(points[some]).sparse_distance_matrix(middle, limits.cutoff * blur, output_type="coo_matrix").tocsr()
         )
         near.data = np.exp(-0.5 * (near.data / blur) ** 2)
         out[some] = near @ twice

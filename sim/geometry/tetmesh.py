@@ -29,7 +29,7 @@ def compute_signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
     return np.einsum("ti,ti->t", np.cross(b - a, c - a), d - a) / 6.0
 
 
-def find_single_faces(tets: np.ndarray) -> np.ndarray:
+def find_boundary_faces(tets: np.ndarray) -> np.ndarray:
     """Return the outward triangles (S, 3) that belong to exactly one of the tetrahedra `tets` (T, 4)."""
     faces = tets[:, FACES].reshape(-1, 3)
     _, first, count = np.unique(compute_row_keys(faces), return_index=True, return_counts=True)
@@ -138,7 +138,7 @@ class TetMesh:
     @cached_property
     def surface(self) -> np.ndarray:
         """Outer triangles (S, 3), by their corners, with outward normals."""
-        return find_single_faces(self.tets)
+        return find_boundary_faces(self.tets)
 
     def mark_elements(self, *labels: int) -> np.ndarray:
         """Mark (T,) bool the elements of these regions."""
@@ -146,7 +146,7 @@ class TetMesh:
 
     def find_boundary(self, *labels: int) -> np.ndarray:
         """Return the boundary triangles (S, 3) of these regions together, by their corners, with outward normals."""
-        return find_single_faces(self.tets[self.mark_elements(*labels)])
+        return find_boundary_faces(self.tets[self.mark_elements(*labels)])
 
     def find_nodes(self, *labels: int) -> np.ndarray:
         """Return the node numbers (n,) of these regions' elements, ascending."""
@@ -169,7 +169,7 @@ def compute_digest(*arrays: np.ndarray) -> str:
     return sha.hexdigest()[:16]
 
 
-def orient_tetrahedra(nodes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, int]:
+def orient_tetrahedra(nodes: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, int]:
     """Return tetrahedra with positive volumes, and the number of those reoriented. Zero volumes stay as they are.
 
     table (T, 4) corners or (T, 10) corners and mid-edge nodes: if corners are swapped, so are the edges between them.
@@ -179,11 +179,10 @@ def orient_tetrahedra(nodes: np.ndarray, table: np.ndarray) -> tuple[np.ndarray,
     InputError
         Wrong shapes, non-finite coordinates, node numbers out of range.
     """
-    tets = table[:, :4] if table.shape[1:] == (10,) else table
+    tets = cells[:, :4] if cells.shape[1:] == (10,) else cells
     _check_corners(nodes, tets)
-    negative = compute_signed_volumes(nodes, tets) < 0.0
-    turned = np.array(table)
-    turned[negative] = turned[negative][:, FLIPPED_ORDER[: table.shape[1]]]
+    negative, turned = compute_signed_volumes(nodes, tets) < 0.0, np.array(cells)
+    turned[negative] = turned[negative][:, FLIPPED_ORDER[: cells.shape[1]]]
     return turned, int(negative.sum())
 
 

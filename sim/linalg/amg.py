@@ -13,11 +13,11 @@ import pyamg
 import scipy.sparse as sp
 
 from ..runtime.device import Device
-from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevel, make_regular
+from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevelCycle, fill_diagonal
 from .pcg import Preconditioner
 
 Direct = Callable[[sp.csc_array, sp.csc_array, np.ndarray], Preconditioner]
-"""Function that solves K over motions L (n, m), unknowns numbered by node (m,), as `multifrontal.Factor` does."""
+"""Function that solves K over motions L (n, m), unknowns numbered by node (m,), as `multifrontal.SparseFactor` does."""
 # No strength threshold. Energy-minimising smoothing draws no random numbers: the same mesh gives the same levels.
 AMG_SETTINGS: dict[str, Any] = {
     "strength": ("symmetric", {"theta": 0.0}),
@@ -31,15 +31,15 @@ AMG_SETTINGS: dict[str, Any] = {
 
 def build_multigrid_cycle(
     stiffness: sp.bsr_array,
-    motions: np.ndarray,
-    direct: Direct,
+    rigid_motions: np.ndarray,
+    build_direct: Direct,
     device: Device,
-    largest_last: int = 1_000,
+    max_coarsest: int = 1_000,
     smoother: Chebyshev = CHEBYSHEV,
 ) -> Preconditioner:
-    """Build one V-cycle on K (3N, 3N) [N/m], positive definite in blocks of nodes, with rigid motions (3N, 6).
+    """Build one V-cycle on K (3N, 3N) [N/m], positive definite in blocks of nodes, with rigid rigid_motions (3N, 6).
 
-    The last level has at most `largest_last` nodes, of six unknowns each.
+    The last level has at most `max_coarsest` nodes, of six unknowns each.
 
     Raises
     ------
@@ -47,15 +47,17 @@ def build_multigrid_cycle(
         K is singular over the last level's motions.
     """
     *fine, _ = pyamg.smoothed_aggregation_solver(
-        sp.bsr_matrix(stiffness), B=motions, max_coarse=largest_last, **AMG_SETTINGS
+        sp.bsr_matrix(stiffness), B=rigid_motions, max_coarse=max_coarsest, **AMG_SETTINGS
     ).levels
     if not fine:
-        return _build_direct_solver(sp.csc_array(stiffness), sp.csc_array(sp.eye_array(len(motions))), 3, direct)
+        return _build_direct_solver(
+            sp.csc_array(stiffness), sp.csc_array(sp.eye_array(len(rigid_motions))), 3, build_direct
+        )
     *upper, lowest = fine
-    coarse = _build_direct_solver(sp.csc_array(lowest.A), sp.csc_array(lowest.P), lowest.P.blocksize[1], direct)
-    solver = TwoLevel(coarse, _to_bsr(lowest.A), device, smoother=smoother)
+    coarse = _build_direct_solver(sp.csc_array(lowest.A), sp.csc_array(lowest.P), lowest.P.blocksize[1], build_direct)
+    solver = TwoLevelCycle(coarse, _to_bsr(lowest.A), device, smoother=smoother)
     for level in reversed(upper):
-        solver = TwoLevel(
+        solver = TwoLevelCycle(
             ReducedPreconditioner(sp.bsr_array(level.P), solver, device), _to_bsr(level.A), device, smoother=smoother
         )
     solver.name = f"algebraic multigrid, {len(fine) + 1} levels"
@@ -69,7 +71,7 @@ def _build_direct_solver(stiffness: sp.csc_array, motions: sp.csc_array, size: i
 
 
 def _to_bsr(matrix: sp.bsr_matrix) -> sp.bsr_array:
-    return make_regular(sp.csr_array(matrix), matrix.blocksize[0])
+    return fill_diagonal(sp.csr_array(matrix), matrix.blocksize[0])
 
 
 def build_rigid_motions(points: np.ndarray) -> np.ndarray:

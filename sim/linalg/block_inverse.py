@@ -20,12 +20,12 @@ TEMPORARY_ROWS = 3  # Temporary block rows, in addition to the matrix, during an
 
 
 @dataclass(frozen=True)
-class Exchange:
+class BlockInversion:
     """Block size and limits of an exchange.
 
     Parameters
     ----------
-    block
+    block_size
         Unknowns per block; temporary memory is proportional to it.
     memory_fraction
         Fraction of the free memory that may be used.
@@ -35,53 +35,52 @@ class Exchange:
         Size of the matrix product that measures the speed of a device.
     """
 
-    block: int = 4096
+    block_size: int = 4096
     memory_fraction: float = 0.9
     max_seconds: float = 40.0
     trial_size: int = 4096
 
 
 @cache
-def measure_rate_of_work(where: str, trial: int = Exchange.trial_size) -> float:
-    """Measure multiply-adds per second in double precision, by the second of two matrix products of size `trial`."""
-    one = torch.ones((trial, trial), dtype=torch.float64, device=where)
-    spent = 0.0
+def measure_matmul_rate(device: str, size: int = BlockInversion.trial_size) -> float:
+    """Measure multiply-adds per second in double precision, by the second of two matrix products of size `size`."""
+    one, spent = torch.ones((size, size), dtype=torch.float64, device=device), 0.0
     for _ in range(2):
         begun = time.perf_counter()
         float((one @ one)[0, 0])  # waits for the result
         spent = time.perf_counter() - begun
-    return trial**3 / spent
+    return size**3 / spent
 
 
-def exchange_bytes(count: int, settings: Exchange = Exchange()) -> int:
+def estimate_bytes(count: int, settings: BlockInversion = BlockInversion()) -> int:
     """Estimate the memory of an exchange [bytes]: half the matrix in double precision, and temporary block rows."""
-    return 8 * (count * (count + settings.block) // 2 + TEMPORARY_ROWS * min(count, settings.block) * count)
+    return 8 * (count * (count + settings.block_size) // 2 + TEMPORARY_ROWS * min(count, settings.block_size) * count)
 
 
-def can_exchange(count: int, where: str, besides: int = 0, settings: Exchange = Exchange()) -> bool:
-    """Return True if a GPU can exchange `count` unknowns in time, and has memory for that and `besides` bytes."""
+def can_invert(count: int, device: str, other_bytes: int = 0, settings: BlockInversion = BlockInversion()) -> bool:
+    """Return True if a GPU can exchange `count` unknowns in time, and has memory for that and `other_bytes` bytes."""
     if not torch.cuda.is_available():
         return False
-    free, _ = torch.cuda.mem_get_info(where)
-    if exchange_bytes(count, settings) + besides >= settings.memory_fraction * free:
+    free, _ = torch.cuda.mem_get_info(device)
+    if estimate_bytes(count, settings) + other_bytes >= settings.memory_fraction * free:
         return False
-    return count**3 / 2 < settings.max_seconds * measure_rate_of_work(where, settings.trial_size)
+    return count**3 / 2 < settings.max_seconds * measure_matmul_rate(device, settings.trial_size)
 
 
-def to_half_rows(matrix: sp.csc_array, cuts: Sequence[int], where: str) -> list[torch.Tensor]:
+def to_lower_block_rows(matrix: sp.csc_array, bounds: Sequence[int], device: str) -> list[torch.Tensor]:
     """Split a symmetric matrix (n, n) into rows of blocks between the cuts, each up to its diagonal block."""
     rows, out = sp.csr_array(matrix), []
-    for first, stop in pairwise(cuts):
+    for first, stop in pairwise(bounds):
         part = sp.coo_array(rows[first:stop])
         own = part.col < stop
-        place = tuple(torch.as_tensor(index[own], dtype=torch.int64, device=where) for index in (part.row, part.col))
-        block = torch.zeros((stop - first, stop), dtype=torch.float64, device=where)
-        out.append(block.index_put_(place, torch.as_tensor(part.data[own].astype(np.float64), device=where)))
+        place = tuple(torch.as_tensor(index[own], dtype=torch.int64, device=device) for index in (part.row, part.col))
+        block = torch.zeros((stop - first, stop), dtype=torch.float64, device=device)
+        out.append(block.index_put_(place, torch.as_tensor(part.data[own].astype(np.float64), device=device)))
     return out
 
 
-def invert(rows: Sequence[torch.Tensor]) -> None:
-    """Replace A by -A^-1, in the rows of `to_half_rows`.
+def invert_in_place(rows: Sequence[torch.Tensor]) -> None:
+    """Replace A by -A^-1, in the rows of `to_lower_block_rows`.
 
     Raises
     ------
@@ -105,13 +104,13 @@ def invert(rows: Sequence[torch.Tensor]) -> None:
         rows[k][:, own] = -inverse
 
 
-def compute_block_cuts(count: int, block: int = Exchange.block) -> list[int]:
+def compute_block_bounds(count: int, block_size: int = BlockInversion.block_size) -> list[int]:
     """Return the bounds of the blocks of `count` unknowns."""
-    return [*range(0, count, block), count]
+    return [*range(0, count, block_size), count]
 
 
 def eliminate_unknowns(
-    matrix: sp.csc_array, border: sp.csc_array, where: str, block: int = Exchange.block
+    matrix: sp.csc_array, border: sp.csc_array, device: str, block_size: int = BlockInversion.block_size
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute X = A^-1 B (n, m) in single precision and B^T X (m, m), of sparse A (n, n) and B (n, m).
 
@@ -120,10 +119,10 @@ def eliminate_unknowns(
     RuntimeError
         A is not positive definite.
     """
-    cuts = compute_block_cuts(len(matrix.indptr) - 1, block)
+    cuts = compute_block_bounds(len(matrix.indptr) - 1, block_size)
     stop = cuts[-1] + len(border.indptr) - 1
     whole = sp.csc_array(sp.block_array([[matrix, border], [border.T, None]]))
-    *rows, last = to_half_rows(whole, [*cuts, stop], where)
+    *rows, last = to_lower_block_rows(whole, [*cuts, stop], device)
     for k in range(len(rows)):
         _eliminate(rows[k], [*rows[k + 1 :], last])
     while rows:  # back substitution
@@ -150,7 +149,7 @@ def _invert_block(block: torch.Tensor) -> torch.Tensor:
     return torch.cholesky_inverse(torch.linalg.cholesky(block))
 
 
-def release(where: str) -> None:
+def release_memory(device: str) -> None:
     """Release cached GPU memory, which batches of loads need."""
-    if where != "cpu":
+    if device != "cpu":
         torch.cuda.empty_cache()

@@ -76,8 +76,7 @@ def build_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
 @cache
 def build_host_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
     """Build the CPU kernel for the same product, over block rows."""
-    scalar = device.scalar
-    real = {"float32": "float", "float64": "double"}[device.precision]
+    scalar, real = device.scalar, {"float32": "float", "float64": "double"}[device.precision]
     code = ROW_CODE.replace("real", real).replace("WIDE", str(-(-rows // LANES) * LANES))
 
     @wp.func_native(code.replace("ROWS", str(rows)).replace("COLUMNS", str(columns)))
@@ -107,7 +106,7 @@ def build_host_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
     return add_product
 
 
-class Sparse:
+class BlockSparse:
     """Sparse matrix (m, n) in block compressed rows (BSR)."""
 
     def __init__(self, matrix: sp.bsr_array, device: Device):
@@ -124,10 +123,10 @@ class Sparse:
     def multiply(self, x: wp.array) -> wp.array:
         """Compute A x (m, b) of x (n, b)."""
         out = self._device.allocate(self.rows, x.shape[1])
-        self.add_to(out, 1.0, x)
+        self.add_product(out, 1.0, x)
         return out
 
-    def add_to(self, out: wp.array, factor: float, x: wp.array) -> None:
+    def add_product(self, out: wp.array, factor: float, x: wp.array) -> None:
         """Add factor A x to out (m, b), with x (n, b)."""
         inputs, count = [*self._entries, self._device.scalar(factor), x], self.rows // self._size[0]
         if self._device.on_cuda:

@@ -7,24 +7,24 @@ from typing import Any
 import numpy as np
 
 from ..discretisation.problem import Problem
-from ..runtime.views import cast_like, to_double, to_host, to_library, view
-from .multifrontal import Factor
+from ..runtime.views import cast_like, to_double, to_host, to_library, to_view
+from .multifrontal import SparseFactor
 from .pcg import Preconditioner
 
 
 @dataclass(frozen=True)
-class Columns:
+class ColumnCache:
     """Block size and cache of a compliance's columns.
 
     Parameters
     ----------
-    block
+    block_size
         Nodes whose columns are computed together, always by the same arithmetic: the cache affects time, never values.
     max_bytes, min_blocks
         Maximum size of the cached columns [bytes]; minimum number of cached blocks, if these are larger.
     """
 
-    block: int = 16
+    block_size: int = 16
     max_bytes: int = 2**28
     min_blocks: int = 8
 
@@ -47,14 +47,14 @@ class Compliance:
     """
 
     def __init__(
-        self, problem: Problem, preconditioner: Preconditioner, nodes: np.ndarray, columns: Columns = Columns()
+        self, problem: Problem, preconditioner: Preconditioner, nodes: np.ndarray, columns: ColumnCache = ColumnCache()
     ):
         device = problem.device
         self._problem, self._preconditioner, self.nodes = problem, preconditioner, nodes
         self.rows = (3 * nodes[:, None] + np.arange(3)).ravel()
         self.places = to_library(device, self.rows)
-        self._width = 3 * columns.block
-        self.columns = view(replace(device, precision="float64").allocate(len(self.rows), len(self.rows)))
+        self._width = 3 * columns.block_size
+        self.columns = to_view(replace(device, precision="float64").allocate(len(self.rows), len(self.rows)))
         self.known = np.zeros(len(nodes), bool)
         size = self._width * problem.rows * np.dtype(device.precision).itemsize
         self._kept = max(columns.min_blocks, columns.max_bytes // size)
@@ -64,16 +64,16 @@ class Compliance:
         """Compute H force: displacements (3N, b) [m] under forces (3N, b) [N]."""
         device, constraint = self._problem.device, self._problem.constraint
         pull, out = device.allocate(*force.shape), device.allocate(*force.shape)
-        view(pull)[:] = force
+        to_view(pull)[:] = force
         constraint.project_nodes(pull)
         self._preconditioner.apply(pull, np.ones(force.shape[1], bool), out)
         constraint.project_nodes(out)
-        return view(out)
+        return to_view(out)
 
-    def spread(self, force: Any) -> Any:
+    def compute_full_motion(self, force: Any) -> Any:
         """Compute the displacements (3N, b) [m] of all nodes under forces (3n, b) [N] on the first n of `nodes`."""
         device, every = self._problem.device, -(-len(force) // self._width)
-        out = view(device.allocate(self._problem.rows, force.shape[1]))
+        out = to_view(device.allocate(self._problem.rows, force.shape[1]))
         force = cast_like(out, force)
         # On a GPU, multiplying by zeros is faster than asking where they are.
         at_hand = device.on_cuda and self.known[: len(force) // 3].all() and every <= self._kept
@@ -89,17 +89,17 @@ class Compliance:
         acting = np.flatnonzero(to_host((force != 0.0).any(1)))
         return self.columns[acting].T @ to_double(force[acting])
 
-    def build_matrix(self, acting: np.ndarray) -> Any:
-        """Return H (3n, 3n) [m/N] between `nodes`; the columns at `acting` (n,) bool nodes are valid."""
-        self.ensure_known(acting)
+    def build_matrix(self, loaded: np.ndarray) -> Any:
+        """Return H (3n, 3n) [m/N] between `nodes`; the columns at `loaded` (n,) bool nodes are valid."""
+        self.ensure_columns(loaded)
         return self.columns.T
 
-    def ensure_known(self, acting: np.ndarray) -> None:
-        """Compute the missing `columns` (stored as rows) at `acting` (n,) nodes, and mark them in `known` (n,)."""
-        missing = acting & ~self.known
-        if missing.any() and isinstance(self._preconditioner, Factor):
+    def ensure_columns(self, loaded: np.ndarray) -> None:
+        """Compute the missing `columns` (stored as rows) at `loaded` (n,) nodes, and mark them in `known` (n,)."""
+        missing = loaded & ~self.known
+        if missing.any() and isinstance(self._preconditioner, SparseFactor):
             self.columns[:], self.known[:] = self._preconditioner.compute_compliance(self.rows).T, True
-        for block in self._find_blocks(np.repeat(acting & ~self.known, 3)):
+        for block in self._find_blocks(np.repeat(loaded & ~self.known, 3)):
             self._block(block)
 
     def _find_blocks(self, rows: np.ndarray) -> list[int]:

@@ -30,7 +30,7 @@ LOW_TYPES = {"float32": wp.float16, "float64": wp.float64}
 
 def can_invert(rows: int, device: Device) -> bool:
     """Return True if the GPU can invert `rows` unknowns in time, and store the inverse."""
-    return block_inverse.can_exchange(rows, wp.device_to_torch(device.name), estimate_inverse_bytes(rows, device))
+    return block_inverse.can_invert(rows, wp.device_to_torch(device.name), estimate_inverse_bytes(rows, device))
 
 
 def estimate_inverse_bytes(rows: int, device: Device) -> int:
@@ -39,8 +39,8 @@ def estimate_inverse_bytes(rows: int, device: Device) -> int:
 
 
 @cache
-def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """Build kernels that map to the matrix's unknowns, in type `low`, and back; each thread takes `some` rows."""
+def build_kernels(device: Device, dtype: Any, rows_per_thread: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """Build kernels that map to the matrix's unknowns, in type `dtype`, and back; `rows_per_thread` rows each."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -52,19 +52,19 @@ def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Ke
         square: wp.array(dtype=wp.float64),
         r: wp.array2d(dtype=scalar),
         # outputs
-        out: wp.array2d(dtype=low),
+        out: wp.array2d(dtype=dtype),
     ):
         """Compute out_i = scale_i (L^T r)_i / |r|."""
         block, c = wp.tid()
         size = scalar(wp.sqrt(square[c]))
         share = wp.where(size > scalar(0.0), scalar(1.0) / size, scalar(0.0))
-        for j in range(some):
-            i = some * block + j
+        for j in range(rows_per_thread):
+            i = rows_per_thread * block + j
             if i < scale.shape[0]:
                 total = scalar(0.0)
                 for k in range(first[i], first[i + 1]):
                     total += value[k] * r[column[k], c]
-                out[i, c] = low(share * scale[i] * total)
+                out[i, c] = dtype(share * scale[i] * total)
 
     @forward_kernel(module="unique")
     def raise_(
@@ -72,15 +72,15 @@ def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Ke
         column: wp.array(dtype=wp.int32),
         value: wp.array(dtype=scalar),
         square: wp.array(dtype=wp.float64),
-        solved: wp.array2d(dtype=low),
+        solved: wp.array2d(dtype=dtype),
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """Compute out_r = |r| (L x)_r."""
         block, c = wp.tid()
         size = scalar(wp.sqrt(square[c]))
-        for j in range(some):
-            r = some * block + j
+        for j in range(rows_per_thread):
+            r = rows_per_thread * block + j
             if r < out.shape[0]:
                 total = scalar(0.0)
                 for k in range(first[r], first[r + 1]):
@@ -91,12 +91,12 @@ def build_kernels(device: Device, low: Any, some: int) -> tuple[wp.Kernel, wp.Ke
 
 
 @dataclass(frozen=True, eq=False)
-class Buffers:
+class SolveBuffers:
     """Right-hand sides and solutions for one batch width, in the matrix's unknowns; squared norms (b,)."""
 
-    right: wp.array
-    solved: wp.array
-    square: wp.array
+    right_side: wp.array
+    solution: wp.array
+    square_norm: wp.array
 
 
 class DenseInverse:
@@ -116,19 +116,19 @@ class DenseInverse:
         self._device = device
         where = wp.device_to_torch(device.name)
         count = len(motions.indptr) - 1
-        rows = block_inverse.to_half_rows(
-            sp.csc_array(motions.T @ stiffness @ motions), block_inverse.compute_block_cuts(count), where
+        rows = block_inverse.to_lower_block_rows(
+            sp.csc_array(motions.T @ stiffness @ motions), block_inverse.compute_block_bounds(count), where
         )
-        block_inverse.invert(rows)
+        block_inverse.invert_in_place(rows)
         scale = torch.cat([-row[:, -len(row) :].diagonal() for row in rows]).sqrt()
         self._size = -(-count // TILE) * TILE
         self._inverse = _build_matrix(rows, scale, self._size, wp.dtype_to_torch(LOW_TYPES[device.precision]))
-        block_inverse.release(where)
+        block_inverse.release_memory(where)
         self._scale = device.upload(scale.cpu().numpy())
         back = motions @ sp.diags_array(scale.cpu().numpy())
         self._into, self._back = (_copy_to_device(sp.csr_array(matrix), device) for matrix in (motions.T, back))
         self._tiles = list_tiles(self._size, device.name)
-        self._rooms: dict[int, Buffers] = {}
+        self._rooms: dict[int, SolveBuffers] = {}
         torch.cuda.synchronize(where)
 
     def prepare(self, problem: Problem, columns: int) -> None:
@@ -138,25 +138,25 @@ class DenseInverse:
         """Multiply by the dense matrix, in Warp's stream."""
         device, count = self._device, r.shape[1]
         room, some = self._get_buffers(count), ROWS_PER_THREAD if count > 1 else 1
-        lower, raise_ = build_kernels(device, room.right.dtype, some)
-        room.square.zero_()
-        add_dots(device, r, r, room.square)
-        inputs = [*self._into, self._scale, room.square, r]
-        device.launch(lower, (-(-self._scale.shape[0] // some), count), inputs, [room.right])
+        lower, raise_ = build_kernels(device, room.right_side.dtype, some)
+        room.square_norm.zero_()
+        add_dots(device, r, r, room.square_norm)
+        inputs = [*self._into, self._scale, room.square_norm, r]
+        device.launch(lower, (-(-self._scale.shape[0] // some), count), inputs, [room.right_side])
         if self._is_half_read(count):
-            room.solved.zero_()
-            add_product(self._tiles, wp.from_torch(self._inverse), room.right.flatten(), room.solved.flatten())
+            room.solution.zero_()
+            add_product(self._tiles, wp.from_torch(self._inverse), room.right_side.flatten(), room.solution.flatten())
         else:
             with torch.cuda.stream(wp.stream_to_torch(device.name)):
-                torch.matmul(self._inverse, wp.to_torch(room.right), out=wp.to_torch(room.solved))
-        inputs = [*self._back, room.square, room.solved]
+                torch.matmul(self._inverse, wp.to_torch(room.right_side), out=wp.to_torch(room.solution))
+        inputs = [*self._back, room.square_norm, room.solution]
         device.launch(raise_, (-(-r.shape[0] // some), count), inputs, [out])
 
     def _is_half_read(self, count: int) -> bool:
         """Return True if only half of the matrix is read: for one load case reading is the whole cost."""
         return count == 1 and self._inverse.dtype == torch.float16
 
-    def _get_buffers(self, count: int) -> Buffers:
+    def _get_buffers(self, count: int) -> SolveBuffers:
         """Return the buffers for a batch width; those of workspace widths stay cached, and the latest other."""
         if count not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_workspace_width(width)}
@@ -165,7 +165,7 @@ class DenseInverse:
                 low = wp.float32
             shape = (self._size, -(-count // TILE) * TILE if count > 1 else 1)
             right, solved = (wp.zeros(shape, dtype=low, device=name) for _ in range(2))
-            self._rooms[count] = Buffers(right, solved, wp.zeros(count, dtype=wp.float64, device=name))
+            self._rooms[count] = SolveBuffers(right, solved, wp.zeros(count, dtype=wp.float64, device=name))
         return self._rooms[count]
 
 

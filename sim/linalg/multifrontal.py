@@ -18,9 +18,9 @@ from scipy.linalg import get_blas_funcs, get_lapack_funcs
 from ..accuracy import Precision
 from ..discretisation.problem import Problem
 from ..runtime.device import Device
-from ..runtime.threads import choose_threads, limit_to_one_thread, run_together
+from ..runtime.threads import choose_threads, limit_to_one_thread, run_concurrently
 from .symbolic import FRONT_SIZES, Front, FrontSizes, build_fronts
-from .triangular_solve import Sweep, add_lower
+from .triangular_solve import TriangularSweeps, add_lower_block
 
 # Cholesky factor, inverse of a triangular matrix, symmetric update, and triangular solve.
 potrf, trtri = get_lapack_funcs(("potrf", "trtri"), dtype=np.float64)
@@ -31,7 +31,7 @@ Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 
 
 @dataclass(frozen=True)
-class Factorisation:
+class FactorSettings:
     """Settings of a factor and of its sweeps.
 
     Parameters
@@ -52,7 +52,7 @@ class Factorisation:
     fronts: FrontSizes = FRONT_SIZES
 
 
-class Factor:
+class SparseFactor:
     """Stiffness K over some motions, L (L^T K L)^-1 L^T, factorised once on the host in double precision.
 
     Parameters
@@ -84,7 +84,7 @@ class Factor:
         node: np.ndarray,
         device: Device,
         precision: Precision = "float32",
-        settings: Factorisation = Factorisation(),
+        settings: FactorSettings = FactorSettings(),
     ):
         free = sp.csc_array(motions.T @ stiffness @ motions)
         order, fronts = build_fronts(free, node, choose_threads(len(node)), settings.fronts)
@@ -95,7 +95,7 @@ class Factor:
             values, self._panels = factorise_panels(
                 sp.csc_array(free[order][:, order]), fronts, precision, settings.pivot_tolerance
             )
-        self._sweep = Sweep(fronts, values, precision)
+        self._sweep = TriangularSweeps(fronts, values, precision)
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """Do nothing: the undeformed stiffness is used at every state."""
@@ -135,7 +135,7 @@ class Factor:
 
         share = choose_threads(len(rows))
         with limit_to_one_thread():
-            run_together([partial(fill, range(size * k, len(rows), size * share)) for k in range(share)])
+            run_concurrently([partial(fill, range(size * k, len(rows), size * share)) for k in range(share)])
         return out
 
     def _solve_columns(self, x: np.ndarray) -> np.ndarray:
@@ -185,7 +185,7 @@ def _apply_sweeps(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
 
 
 def factorise_panels(
-    matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision, singular: float
+    matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision, pivot_tolerance: float
 ) -> tuple[np.ndarray, list[FrontPanel]]:
     """Factorise a matrix; return the values of all panels in one array, and the panels.
 
@@ -204,10 +204,10 @@ def factorise_panels(
         for front, shape, (first, stop) in zip(every, shapes, pairwise(cuts), strict=True)
     ]
     ends = np.cumsum([0, *(len(part) for part in fronts)]).tolist()
-    work = _Fronts(matrix, panels, singular)
+    work = _Fronts(matrix, panels, pivot_tolerance)
     lower = [partial(work.eliminate, range(first, stop)) for first, stop in pairwise(ends[:-1])]
     left: list[Updates] = [{} for _ in lower]
-    run_together([partial(task, updates) for task, updates in zip(lower, left, strict=True)])
+    run_concurrently([partial(task, updates) for task, updates in zip(lower, left, strict=True)])
     meeting: Updates = {}
     for updates in left:
         for number, waiting in updates.items():
@@ -232,7 +232,7 @@ class _Fronts:
             front, size = panel.front, len(panel.values)
             whole = self._assemble_rows(front)
             for border, update in updates.pop(number, ()):
-                add_lower(update, np.searchsorted(front.rows, border), whole)
+                add_lower_block(update, np.searchsorted(front.rows, border), whole)
             root, info = potrf(whole[:size, :size], lower=1)
             if info or (np.diagonal(root) ** 2 <= self._least[front.first : front.stop]).any():
                 raise RuntimeError("it is not positive definite")

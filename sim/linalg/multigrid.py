@@ -17,7 +17,7 @@ from ..discretisation.constraint import Constraint
 from ..discretisation.problem import Problem
 from ..runtime.columns import combine_columns, compute_dots, gather_columns, scatter_columns
 from ..runtime.device import Device, forward_kernel
-from .block_sparse import Sparse
+from .block_sparse import BlockSparse
 from .pcg import Preconditioner
 
 
@@ -29,18 +29,18 @@ class Chebyshev:
     ----------
     degree
         Degree of the polynomial: products with the stiffness before the coarse solver, and as many after it.
-    damped
+    min_damped
         Smallest damped eigenvalue, relative to the largest; the coarse solver handles the others.
     power_iterations
         Products in the estimate of the largest eigenvalue, which is computed once.
-    margin
+    safety_factor
         Factor on this estimate, which is from below.
     """
 
     degree: int = 3
-    damped: float = 1.0 / 8.0
+    min_damped: float = 1.0 / 8.0
     power_iterations: int = 20
-    margin: float = 1.1
+    safety_factor: float = 1.1
 
 
 CHEBYSHEV = Chebyshev()
@@ -77,7 +77,7 @@ def build_kernel(device: Device, size: int) -> wp.Kernel:
     return step
 
 
-class TwoLevel:
+class TwoLevelCycle:
     """Symmetric cycle: smooth, correct by the coarse solver, smooth.
 
     Parameters
@@ -106,11 +106,11 @@ class TwoLevel:
     ):
         self.name, self._smoother = name, smoother
         self._coarse, self._device = coarse, device
-        self._stiffness = Sparse(stiffness, device)
+        self._stiffness = BlockSparse(stiffness, device)
         self._size = stiffness.blocksize[0]
         inverse = np.linalg.inv(_extract_diagonal(stiffness))
         self._inverse = device.upload(inverse, wp.types.matrix((self._size, self._size), device.scalar))
-        self._largest = smoother.margin * self._estimate_eigenvalue()
+        self._largest = smoother.safety_factor * self._estimate_eigenvalue()
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """Do nothing: the undeformed stiffness is used at every state."""
@@ -134,20 +134,20 @@ class TwoLevel:
 
     def _smooth(self, x: wp.array, r: wp.array) -> None:
         """Add the smoothing polynomial applied to the residual r to x; r is overwritten. Saad 2003, algorithm 12.1."""
-        low = self._smoother.damped * self._largest
+        low = self._smoother.min_damped * self._largest
         centre, radius = (self._largest + low) / 2.0, (self._largest - low) / 2.0
         ratio = radius / centre
         d = self._device.allocate(*r.shape)
         self._step(0.0, 1.0 / centre, r, d, x)
         for _ in range(self._smoother.degree - 1):
-            self._stiffness.add_to(r, -1.0, d)
+            self._stiffness.add_product(r, -1.0, d)
             following = 1.0 / (2.0 * centre / radius - ratio)
             self._step(following * ratio, 2.0 * following / radius, r, d, x)
             ratio = following
 
     def _compute_residual(self, r: wp.array, x: wp.array) -> wp.array:
         out = wp.clone(r)
-        self._stiffness.add_to(out, -1.0, x)
+        self._stiffness.add_product(out, -1.0, x)
         return out
 
     def _step(self, kept: float, added: float, r: wp.array, d: wp.array, x: wp.array) -> None:
@@ -176,7 +176,7 @@ class ReducedPreconditioner:
 
     def __init__(self, motions: sp.bsr_array, coarse: Preconditioner, device: Device):
         self.coarse, self._device = coarse, device
-        self._up, self._down = Sparse(motions, device), Sparse(sp.bsr_array(motions.T), device)
+        self._up, self._down = BlockSparse(motions, device), BlockSparse(sp.bsr_array(motions.T), device)
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """Do nothing: the undeformed stiffness is used at every state."""
@@ -194,10 +194,10 @@ def project_to_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_a
     basis = constraint.build_basis()
     projection = sp.csr_array(basis @ basis.T)
     blocked = sp.eye_array(constraint.fixed.size) - projection
-    return make_regular(sp.csr_array(projection @ stiffness @ projection + stiffness.diagonal().mean() * blocked), 3)
+    return fill_diagonal(sp.csr_array(projection @ stiffness @ projection + stiffness.diagonal().mean() * blocked), 3)
 
 
-def make_regular(matrix: sp.csr_array, size: int) -> sp.bsr_array:
+def fill_diagonal(matrix: sp.csr_array, size: int) -> sp.bsr_array:
     """Convert to blocks (size, size); zero diagonal entries, of unknowns without elements, become the mean."""
     diagonal = matrix.diagonal()
     missing = np.where(diagonal == 0.0, diagonal.mean(), 0.0)

@@ -99,12 +99,12 @@ class BlockJacobi:
 class LinearSolution:
     """Solution x (3N, b); True (b,) where it was truncated, at negative curvature or at the radius.
 
-    size (b,): the preconditioner's norm sqrt(x . M x) [J^1/2]; iterations of the batch.
+    norm (b,): the preconditioner's norm sqrt(x . M x) [J^1/2]; iterations of the batch.
     """
 
     x: wp.array
     truncated: np.ndarray
-    size: np.ndarray
+    norm: np.ndarray
     iterations: int
 
 
@@ -113,7 +113,7 @@ def solve_conjugate_gradients(
     preconditioner: Preconditioner,
     r: wp.array,
     tolerance: np.ndarray,
-    most: int,
+    max_iterations: int,
     radius: np.ndarray | None = None,
 ) -> LinearSolution:
     """Solve P K P x = r at the last linearisation, per load case until |r| <= tolerance (b,), or truncated.
@@ -124,7 +124,7 @@ def solve_conjugate_gradients(
         (3N, b) [N], already projected; overwritten with the residual.
     tolerance
         (b,) [N], absolute.
-    most
+    max_iterations
         Largest number of iterations.
     radius
         (b,) [J^1/2]: bound of x in the preconditioner's norm; at negative curvature x is extended to it.
@@ -145,7 +145,7 @@ def solve_conjugate_gradients(
     xx, xp, pp = np.zeros(columns), np.zeros(columns), rz
     truncated = np.zeros(columns, bool)
     iterations = 0
-    while live.any() and iterations < most:
+    while live.any() and iterations < max_iterations:
         q.zero_()
         problem.add_curvature(p, q)
         problem.constraint.project(q)

@@ -14,8 +14,8 @@ from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..errors import InputError
 from ..runtime.device import Device
-from .multifrontal import Factor, find_moved_nodes
-from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevel, project_to_free
+from .multifrontal import SparseFactor, find_moved_nodes
+from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevelCycle, project_to_free
 from .pcg import BlockJacobi, Preconditioner
 
 
@@ -47,15 +47,15 @@ class Preconditioning:
 def choose_preconditioner(
     problem: Problem,
     space: Discretisation,
-    unsmoothed: Callable[[float], sp.csc_array],
-    step: float = math.inf,
+    assemble_linear: Callable[[float], sp.csc_array],
+    time_step: float = math.inf,
     settings: Preconditioning = Preconditioning(),
 ) -> Preconditioner:
     """Build the preconditioner: undeformed stiffness, inverted (CUDA) or factorised if this is fast enough.
 
     Two levels if it has too many entries; algebraic multigrid if even the coarse level is too large; block Jacobi if no
-    node is free. `unsmoothed` assembles the undeformed stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh,
-    for a time step [s]; `step` is the time step of the stiffness.
+    node is free. `assemble_linear` assembles the undeformed stiffness (3V, 3V) [N/m] of linear tetrahedra on the same
+    mesh, for a time step [s]; `time_step` is the time step of the stiffness.
 
     Raises
     ------
@@ -67,25 +67,25 @@ def choose_preconditioner(
         return BlockJacobi(device)
     try:
         if space.element == "p2":
-            stiffness = problem.rest_curvature(step)
+            stiffness = problem.rest_curvature(time_step)
             if device.on_cuda and _can_invert(len(constraint.build_basis().indptr) - 1, device):
                 return _build_solver(stiffness, constraint, space.nodes, device, settings)
             lifted = _build_corner_preconditioner(stiffness, space, constraint, device, settings)
             name = f"p-multigrid on {get_preconditioner_name(lifted.coarse)}"
-            return TwoLevel(lifted, project_to_free(stiffness, constraint), device, name, settings.smoother)
+            return TwoLevelCycle(lifted, project_to_free(stiffness, constraint), device, name, settings.smoother)
         if space.element in ("smoothed", "element-free") and problem.rows > settings.max_smoothed_factorised:
             # Averaging reduces the stiffness, so that the coarse solver never overshoots. Element-free, it overshoots
             # at nu >= 0.49; the cycle was positive definite up to 0.499.
-            coarse = _build_solver(unsmoothed(step), constraint, space.nodes, device, settings)
+            coarse = _build_solver(assemble_linear(time_step), constraint, space.nodes, device, settings)
             name = f"two levels on {get_preconditioner_name(coarse)}"
-            fine = project_to_free(problem.rest_curvature(step), constraint)
-            return TwoLevel(coarse, fine, device, name, settings.smoother)
-        return _build_solver(problem.rest_curvature(step), constraint, space.nodes, device, settings)
+            fine = project_to_free(problem.rest_curvature(time_step), constraint)
+            return TwoLevelCycle(coarse, fine, device, name, settings.smoother)
+        return _build_solver(problem.rest_curvature(time_step), constraint, space.nodes, device, settings)
     except RuntimeError as error:
-        raise InputError(explain_no_factor(error, device.name)) from error
+        raise InputError(explain_factor_failure(error, device.name)) from error
 
 
-def explain_no_factor(error: RuntimeError, device: str) -> str:
+def explain_factor_failure(error: RuntimeError, device: str) -> str:
     """Explain why there is no factor: a device without memory, or a mesh that is not fixed."""
     if "allocate" in str(error):
         return f"{device} has too little free memory for this mesh: end what else runs there, or choose --device cpu."
@@ -95,9 +95,9 @@ def explain_no_factor(error: RuntimeError, device: str) -> str:
 def get_preconditioner_name(preconditioner: Preconditioner) -> str:
     """Return the name of a preconditioner for messages."""
     match preconditioner:
-        case TwoLevel():
+        case TwoLevelCycle():
             return preconditioner.name
-        case Factor():
+        case SparseFactor():
             return "sparse factor"
         case BlockJacobi():
             return "block Jacobi"
@@ -120,7 +120,7 @@ def build_rest_solver(problem: Problem) -> Preconditioner:
     """
     basis = problem.constraint.build_basis()
     device = problem.device
-    return build_direct(problem.rest_curvature(), basis, find_moved_nodes(basis), device, device.precision)
+    return build_direct_solver(problem.rest_curvature(), basis, find_moved_nodes(basis), device, device.precision)
 
 
 def _build_corner_preconditioner(
@@ -141,11 +141,11 @@ def _build_solver(
     basis = constraint.build_basis()
     count = len(basis.indptr) - 1
     if _can_invert(count, device) if device.on_cuda else count <= settings.max_factorised:
-        return build_direct(stiffness, basis, find_moved_nodes(basis), device)
+        return build_direct_solver(stiffness, basis, find_moved_nodes(basis), device)
     from .amg import build_multigrid_cycle, build_rigid_motions
 
     motions = basis @ (basis.T @ build_rigid_motions(points))
-    blocks, coarse = project_to_free(stiffness, constraint), partial(build_direct, device=device)
+    blocks, coarse = project_to_free(stiffness, constraint), partial(build_direct_solver, device=device)
     return build_multigrid_cycle(blocks, motions, coarse, device, settings.max_coarsest_nodes, settings.smoother)
 
 
@@ -156,7 +156,7 @@ def _can_invert(count: int, device: Device) -> bool:
     return can_invert(count, device)
 
 
-def build_direct(
+def build_direct_solver(
     stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device, precision: Precision = "float32"
 ) -> Preconditioner:
     """Build a direct solver of K (3N, 3N) over motions (3N, n), each of one `node` (n,): inverse if it fits, or factor.
@@ -172,4 +172,4 @@ def build_direct(
         from .dense_inverse import DenseInverse
 
         return DenseInverse(stiffness, motions, device)
-    return Factor(stiffness, motions, node, device, precision)
+    return SparseFactor(stiffness, motions, node, device, precision)

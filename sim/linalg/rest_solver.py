@@ -23,7 +23,7 @@ class RestStiffnessSolver:
         Problem whose stiffness is used.
     preconditioner
         Preconditioner of the problem: for conjugate gradients, if there is no exact inverse.
-    inner
+    max_iterations
         Maximum number of conjugate gradient iterations.
     tolerance
         Relative residual of the linear solves.
@@ -34,12 +34,12 @@ class RestStiffnessSolver:
 
     problem: Problem
     preconditioner: Preconditioner
-    inner: int
+    max_iterations: int
     tolerance: float = 1e-9
     max_factorised: int = 60_000
 
     @cached_property
-    def exact(self) -> Preconditioner | None:
+    def exact_inverse(self) -> Preconditioner | None:
         """Inverse of the undeformed stiffness in the problem's precision, if available or worth it for many solves."""
         pays = not self.problem.device.on_cuda and self.problem.rows <= self.max_factorised
         return build_rest_solver(self.problem) if pays or is_exact(self.preconditioner) else None
@@ -53,18 +53,18 @@ class RestStiffnessSolver:
             Too few iterations.
         """
         problem, columns = self.problem, force.shape[1]
-        if self.exact is not None:
+        if self.exact_inverse is not None:
             out = problem.device.allocate(*force.shape)
-            self.exact.apply(force, np.ones(columns, bool), out)
+            self.exact_inverse.apply(force, np.ones(columns, bool), out)
             problem.constraint.project(out)
             return out
         problem.linearise(problem.device.allocate(*force.shape), np.zeros(columns, bool))
         self.preconditioner.prepare(problem, columns)
         wanted = self.tolerance * compute_norms(problem.device, force)
-        found = solve_conjugate_gradients(problem, self.preconditioner, force, wanted, self.inner)
+        found = solve_conjugate_gradients(problem, self.preconditioner, force, wanted, self.max_iterations)
         if (compute_norms(problem.device, force) > 10.0 * wanted).any():
             raise InputError(
-                f"a linear solve of the power series did not reach {self.tolerance:g} in {self.inner} iterations: "
-                "increase `inner` of its Accuracy."
+                f"a linear solve of the power series did not reach {self.tolerance:g} in {self.max_iterations} "
+                "iterations: increase `inner` of its Accuracy."
             )
         return found.x

@@ -12,7 +12,7 @@ import warp as wp
 from ..discretisation.problem import Problem
 from ..runtime.device import Device
 from .multifrontal import find_moved_nodes
-from .preconditioner import build_direct
+from .preconditioner import build_direct_solver
 
 
 @dataclass(frozen=True)
@@ -36,18 +36,18 @@ class Condensation:
     """Exterior of a part of the mesh, condensed to the rows that both share.
 
     rows (m,) are those of the part's 3n that touch the exterior. stiffness (m, m) [N/m] is the condensed stiffness of
-    the exterior. follow (3N, m) maps their motion to the whole mesh, zero in the part itself.
+    the exterior. extension (3N, m) maps their motion to the whole mesh, zero in the part itself.
     """
 
     rows: np.ndarray
     stiffness: np.ndarray
-    follow: np.ndarray
+    extension: np.ndarray
 
 
 def condense_exterior(
-    problem: Problem, nodes: np.ndarray, own: sp.csc_array, settings: Condensing = Condensing()
+    problem: Problem, nodes: np.ndarray, part_stiffness: sp.csc_array, settings: Condensing = Condensing()
 ) -> Condensation:
-    """Condense the exterior of the part of `nodes` (n,), whose elements have the undeformed stiffness `own` (3n, 3n).
+    """Condense the exterior of the part of `nodes` (n,), of undeformed `part_stiffness` (3n, 3n) [N/m].
 
     Raises
     ------
@@ -56,7 +56,7 @@ def condense_exterior(
     """
     part = (3 * nodes[:, None] + np.arange(3)).ravel()
     whole, basis = sp.csr_array(problem.rest_curvature()), problem.constraint.build_basis()
-    beyond = sp.csr_array(whole[part][:, part] - own)
+    beyond = sp.csr_array(whole[part][:, part] - part_stiffness)
     rows = np.flatnonzero(abs(beyond).max(axis=1).toarray().ravel() > settings.round_off * abs(whole).max())
     stiffness = beyond[rows][:, rows].toarray()
     far = sp.csc_array(basis[:, ~np.isin(find_moved_nodes(basis), nodes)])
@@ -77,13 +77,13 @@ def _compute_reduction(
         from . import block_inverse
 
         where = wp.device_to_torch(device.name)
-        if block_inverse.can_exchange(len(far.indptr) + len(coupling.indptr), where):
+        if block_inverse.can_invert(len(far.indptr) + len(coupling.indptr), where):
             across, taken = block_inverse.eliminate_unknowns(
                 sp.csc_array(far.T @ whole @ far), sp.csc_array(far.T @ coupling), where
             )
             return -(far.astype(np.float32) @ across), taken
     fine = Device(device.name, "float64")
-    solver = build_direct(sp.csc_array(whole), far, find_moved_nodes(far), fine, "float64")
+    solver = build_direct_solver(sp.csc_array(whole), far, find_moved_nodes(far), fine, "float64")
     count = len(coupling.indptr) - 1
     follow, taken = np.zeros((len(whole.indptr) - 1, count), device.precision), np.zeros((count, count))
     for first in range(0, count, strip):

@@ -9,7 +9,7 @@ import warp as wp
 
 from ..accuracy import Precision
 from ..runtime.device import Device, forward_kernel
-from ..runtime.threads import run_together
+from ..runtime.threads import run_concurrently
 from .symbolic import Front
 
 # Elimination: x_own becomes the first k of t = panel^T x_own, and the others are added to x_border. Four rows of a
@@ -120,16 +120,16 @@ def _add_part(
     _add(part, place, whole)
 
 
-def add_lower(part: np.ndarray, place: np.ndarray, whole: np.ndarray) -> None:
-    """Add the lower half of `part` (m, m) to rows and columns `place` (m,), ascending, of `whole`; both by columns.
+def add_lower_block(block: np.ndarray, index: np.ndarray, matrix: np.ndarray) -> None:
+    """Add the lower half of `block` (m, m) to rows and columns `index` (m,), ascending, of `matrix`; both by columns.
 
     NumPy takes ten times as long.
     """
-    views = [wp.array(array, device="cpu", copy=False) for array in (part.T, place, whole.T)]
+    views = [wp.array(array, device="cpu", copy=False) for array in (block.T, index, matrix.T)]
     Device("cpu", "float64").launch(_add_part, (1,), views[:2], views[2:])
 
 
-class Sweep:
+class TriangularSweeps:
     """Sweeps through the fronts of a factor, part by part, with the values of all panels in one array.
 
     All parts but the last are swept at the same time, each on its own copy of the right-hand sides.
@@ -168,12 +168,12 @@ class Sweep:
         for part, own in zip(values, self._lower, strict=True):
             part[:, own] = x.T[:, own]
         values[0, :, self._upper] = x.T[:, self._upper]
-        run_together([partial(sweep, up, self._fronts[part], part) for part in range(parts)])
+        run_concurrently([partial(sweep, up, self._fronts[part], part) for part in range(parts)])
         values[0, :, self._upper] = values[:, :, self._upper].sum(axis=0)
         for kernel in (up, down):
             sweep(kernel, self._fronts[-1], 0)
         values[1:, :, self._upper] = values[0, :, self._upper]
-        run_together([partial(sweep, down, self._fronts[part], part) for part in range(parts)])
+        run_concurrently([partial(sweep, down, self._fronts[part], part) for part in range(parts)])
         solved = np.empty((len(x), columns), x.dtype)
         for part, own in zip(values, self._lower, strict=True):
             solved[own] = part[:, own].T

@@ -27,7 +27,7 @@ from ..effects import Effect
 from ..linalg.pcg import Preconditioner
 from ..linalg.preconditioner import build_rest_solver
 from ..linalg.schur import condense_exterior
-from ..minimisers.lbfgs import Descended, Lbfgs
+from ..minimisers.lbfgs import DescentResult, Lbfgs
 from ..minimisers.residual import ResidualEvaluator, ResidualState
 from ..runtime.columns import combine_columns, put_rows, take_rows
 from ..runtime.dense_product import build_product
@@ -40,13 +40,13 @@ class NearPart:
 
     Parameters
     ----------
-    share, max_opening
+    fraction, max_opening
         Fraction of the tetrahedra; largest fraction of surface vertices that may be free.
     max_iterations, straggler_fraction
         Maximum L-BFGS iterations in one cycle, which ends earlier if at most this fraction of the load cases is live.
     """
 
-    share: float = 0.2
+    fraction: float = 0.2
     max_opening: float = 0.25
     max_iterations: int = 100
     straggler_fraction: float = 0.05
@@ -65,10 +65,10 @@ class BatchElimination:
         (3n,) on the device: rows of the near part among the whole's 3N.
     part, lbfgs
         Near part within the condensed far part, and the solver of this subproblem.
-    shared, follow
+    shared_rows, extend
         (m,) rows of the near part shared with the far part, on the device; (x (m, b), out (3N, b)): the far part's
         motion.
-    limits, near
+    limits, size
         Limits of the cycles; extent and limits of the near part.
     """
 
@@ -77,20 +77,20 @@ class BatchElimination:
     rows: wp.array
     part: LocalProblem
     lbfgs: Lbfgs
-    shared: wp.array
-    follow: Callable[[wp.array, wp.array], None]
+    shared_rows: wp.array
+    extend: Callable[[wp.array, wp.array], None]
     limits: CycleLimits = DEFAULT_CYCLE_LIMITS
-    near: NearPart = NEAR_PART
+    size: NearPart = NEAR_PART
 
     def descend(
-        self, start: wp.array, tolerance: np.ndarray, most: int, warm_start: Mapping[str, np.ndarray] | None = None
-    ) -> Descended:
-        """Solve as `Lbfgs.descend`, in at most `most` cycles; returns no L-BFGS history."""
+        self, start: wp.array, tolerance: np.ndarray, max_iter: int, warm_start: Mapping[str, np.ndarray] | None = None
+    ) -> DescentResult:
+        """Solve as `Lbfgs.descend`, in at most `max_iter` cycles; returns no L-BFGS history."""
 
         def cycle(judge: ResidualEvaluator, now: ResidualState, force: np.ndarray) -> ResidualState:
             return judge(self._run_cycle(now.u, now.g, force))
 
-        return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
+        return run_cycles(self.problem, start, tolerance, max_iter, self.limits, cycle)
 
     def _run_cycle(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
         """Run one cycle from residual g (3N, b) at u (3N, b); return the next state (3N, b).
@@ -108,16 +108,16 @@ class BatchElimination:
         g = device.allocate(*near.shape)
         part.linearise(near, every)  # `definite`: the undeformed curvature
         part.add_curvature(back, g)
-        self.part.put(None)
+        self.part.set_force(None)
         load = part.gradient(near)
-        self.part.put(combine_columns(device, load, -1.0, g, load))
+        self.part.set_force(combine_columns(device, load, -1.0, g, load))
         part.constraint.project_nodes(g)
         found = self.lbfgs.descend(
-            near, np.zeros(count), self.near.max_iterations, None, force, self.near.straggler_fraction, (g, back)
+            near, np.zeros(count), self.size.max_iterations, None, force, self.size.straggler_fraction, (g, back)
         )
         missed = combine_columns(device, found.u, -1.0, aim, aim)
         followed = wp.empty_like(out)
-        self.follow(take_rows(device, missed, self.shared), followed)
+        self.extend(take_rows(device, missed, self.shared_rows), followed)
         self.problem.constraint.project_nodes(followed)  # removes motion off the sliding planes by rounding
         combine_columns(device, out, 1.0, followed, out)
         put_rows(device, found.u, self.rows, out)
@@ -126,17 +126,17 @@ class BatchElimination:
 
 def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
     """Return True if the free surface is a small part of the whole surface, and not empty."""
-    return 0 < len(open_vertices(space, constraint)) <= NEAR_PART.max_opening * len(np.unique(space.mesh.surface))
+    return 0 < len(list_open_vertices(space, constraint)) <= NEAR_PART.max_opening * len(np.unique(space.mesh.surface))
 
 
 def find_near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.ndarray:
-    """Mark (T,) bool the fraction `NEAR.share` of the tetrahedra that is nearest to the free surface."""
+    """Mark (T,) bool the fraction `NearPart.fraction` of the tetrahedra that is nearest to the free surface."""
     mesh = space.mesh
-    distance, _ = KDTree(mesh.nodes[open_vertices(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
-    return distance <= np.quantile(distance, NEAR_PART.share)
+    distance, _ = KDTree(mesh.nodes[list_open_vertices(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
+    return distance <= np.quantile(distance, NEAR_PART.fraction)
 
 
-def open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:
+def list_open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:
     """List the surface vertices (n,) that are neither fixed nor slide."""
     surface = np.unique(space.mesh.surface)
     return surface[~constraint.fixed[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
@@ -165,6 +165,6 @@ def build_batch_elimination(
         rows=device.upload((3 * nodes[:, None] + np.arange(3)).ravel(), wp.int32),
         part=part,
         lbfgs=Lbfgs(part.problem, solver),
-        shared=device.upload(around.rows, wp.int32),
-        follow=build_product(around.follow, device, rough=True),
+        shared_rows=device.upload(around.rows, wp.int32),
+        extend=build_product(around.extension, device, reduced=True),
     )

@@ -18,7 +18,7 @@ from ..discretisation.space import Discretisation
 from ..effects import Effect
 from ..linalg.pcg import Preconditioner
 from ..minimisers.compact_lbfgs import build_empty_history
-from ..minimisers.lbfgs import Descended
+from ..minimisers.lbfgs import DescentResult
 from ..minimisers.line_search import backtrack_by_slopes, is_step_too_long
 from ..minimisers.residual import ResidualEvaluator, ResidualState
 from ..runtime.columns import combine_columns
@@ -50,7 +50,7 @@ class ClampedSize:
 
 
 # Few cycles, because each is expensive; the line search already rejects steps whose forces explode.
-CLAMPED_CYCLE_LIMITS = CycleLimits(cycles=30, patience=8, max_rise=1e6, forcing=0.1, tolerance_factor=0.5)
+CLAMPED_CYCLE_LIMITS = CycleLimits(max_cycles=30, patience=8, max_rise=1e6, forcing=0.1, tolerance_factor=0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +73,9 @@ class ClampedElimination:
     size: ClampedSize = ClampedSize()
 
     def descend(
-        self, start: wp.array, tolerance: np.ndarray, most: int, warm_start: Mapping[str, np.ndarray] | None = None
-    ) -> Descended:
-        """Solve as `Lbfgs.descend`, for one load case, in at most `most` cycles; returns no L-BFGS history."""
+        self, start: wp.array, tolerance: np.ndarray, max_iter: int, warm_start: Mapping[str, np.ndarray] | None = None
+    ) -> DescentResult:
+        """Solve as `Lbfgs.descend`, for one load case, in at most `max_iter` cycles; returns no L-BFGS history."""
         chosen, part, pairs = (
             np.zeros(len(self.space.table), bool),
             None,
@@ -89,21 +89,21 @@ class ClampedElimination:
                 z = self._compute_response(now.g)
                 chosen = self._mark_touching(self._find_strained_nodes(now.u.numpy()[:, 0] - z))
                 if not chosen.any():
-                    return replace(now, free=np.full(1, np.inf))
+                    return replace(now, norm=np.full(1, np.inf))
                 part = ClampedPart(self.problem, self.effects, self.space, chosen, judge.constant, now.u)
-                new = judge(part.settle(now.u, force[0]))
+                new = judge(part.solve_part(now.u, force[0]))
                 z = self._compute_response(new.g)
                 return new
             new = self._search_line(
                 judge, now, part, -z - pairs.compute_motion(pairs.compute_weights(_copy_to_host(now.g))), force[0]
             )
-            if not new.finite[0]:
+            if not new.is_finite[0]:
                 return new
             after = self._compute_response(new.g)
             s, y = _copy_to_host(new.u) - _copy_to_host(now.u), _copy_to_host(new.g) - _copy_to_host(now.g)
             if s @ y > 0.0:
                 pairs = pairs.add_pair(s, y, after - z)
-            if new.free[0] > self.size.residual_factor * now.free[0]:
+            if new.norm[0] > self.size.residual_factor * now.norm[0]:
                 more = self._find_residual_nodes(_copy_to_host(new.g), part.nodes)
                 if len(more):
                     chosen |= self._mark_touching(more)
@@ -111,7 +111,7 @@ class ClampedElimination:
             z = after
             return new
 
-        return run_cycles(self.problem, start, tolerance, most, self.limits, cycle)
+        return run_cycles(self.problem, start, tolerance, max_iter, self.limits, cycle)
 
     def _search_line(
         self, judge: ResidualEvaluator, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float
@@ -124,12 +124,12 @@ class ClampedElimination:
         way = device.upload(d[:, None])
         length = float(self.problem.longest_step(now.u, way)[0])
         for _ in range(self.size.max_backtracks if predicted > 0.0 else 0):
-            new = judge(part.settle(combine_columns(device, now.u, length, way, wp.empty_like(way)), force))
+            new = judge(part.solve_part(combine_columns(device, now.u, length, way, wp.empty_like(way)), force))
             slope = float(_copy_to_host(new.g) @ d)
-            if new.finite[0] and not is_step_too_long(slope, predicted):
+            if new.is_finite[0] and not is_step_too_long(slope, predicted):
                 return new
             length *= backtrack_by_slopes(slope, predicted)
-        return replace(now, free=np.full(1, np.inf))
+        return replace(now, norm=np.full(1, np.inf))
 
     def _compute_response(self, g: wp.array) -> np.ndarray:
         """Compute the linear response (3N,) [m] of the undeformed mesh to a force g (3N, 1) [N]."""

@@ -12,7 +12,7 @@ from ..compile import compile_clamped_part
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..effects import Effect
-from ..linalg.multifrontal import Factor, find_moved_nodes
+from ..linalg.multifrontal import SparseFactor, find_moved_nodes
 from ..minimisers.lbfgs import Lbfgs
 from ..minimisers.lbfgs_kernels import DONE, NOT_FINITE
 from ..minimisers.newton import find_equilibrium
@@ -27,14 +27,14 @@ class PartLimits:
     ----------
     max_iterations, stale_iterations
         Maximum L-BFGS iterations before Newton; iterations above which the factor is recomputed.
-    outer, inner
+    max_outer, max_inner
         Limits of Newton, as in `Accuracy`.
     """
 
     max_iterations: int = 400
     stale_iterations: int = 25
-    outer: int = 60
-    inner: int = 60
+    max_outer: int = 60
+    max_inner: int = 60
 
 
 class ClampedPart:
@@ -71,28 +71,28 @@ class ClampedPart:
         self._rows = (3 * self.nodes[:, None] + np.arange(3)).ravel()
         part, self._curvature = compile_clamped_part(effects, space, problem, chosen, self.nodes)
         self._part = part.problem
-        part.put(device.upload(-constant.numpy()[self._rows]))
+        part.set_force(device.upload(-constant.numpy()[self._rows]))
         values = u.numpy()[self._rows]
         if not (values.any() and self._begin_at(device.upload(values))):
             self._begin_with(self._part.rest_curvature())
 
-    def settle(self, u: wp.array, force: float) -> wp.array:
-        """Return u (3N, 1) with the part in equilibrium, to a residual of about `force` [N].
+    def solve_part(self, u: wp.array, force_tolerance: float) -> wp.array:
+        """Return u (3N, 1) with the part in equilibrium, to a residual of about `force_tolerance` [N].
 
         Return u unchanged if the part's forces are not finite.
         """
         part, device, values, limits = self._part, self._part.device, u.numpy().copy(), self._limits
         part.constraint.begin(values[self._rows], None, None)
         begun = device.upload(values[self._rows])
-        found = self._lbfgs.descend(begun, np.zeros(1), limits.max_iterations, None, np.array([force]))
+        found = self._lbfgs.descend(begun, np.zeros(1), limits.max_iterations, None, np.array([force_tolerance]))
         end = found.u
         if found.status[0] == NOT_FINITE:
             return u
         if found.status[0] != DONE:
             _, _, scale = part.residual(end)
-            aim = float(np.clip(force / scale[0], MIN_TOLERANCE[device.precision], 0.5))
-            budget = Accuracy(aim, limits.outer, limits.inner, device.precision, 0)
-            end = find_equilibrium(part, NewtonCG(self._factor, limits.inner), end, budget).u
+            aim = float(np.clip(force_tolerance / scale[0], MIN_TOLERANCE[device.precision], 0.5))
+            budget = Accuracy(aim, limits.max_outer, limits.max_inner, device.precision, 0)
+            end = find_equilibrium(part, NewtonCG(self._factor, limits.max_inner), end, budget).u
         if found.steps[0] > limits.stale_iterations:
             self._begin_at(end)
         values[self._rows] = end.numpy()
@@ -110,5 +110,5 @@ class ClampedPart:
     def _begin_with(self, stiffness: sp.csc_array) -> None:
         """Use a stiffness (3n, 3n) [N/m] as initial Hessian of L-BFGS."""
         basis = self._part.constraint.build_basis()
-        self._factor = Factor(stiffness, basis, find_moved_nodes(basis), self._part.device)
+        self._factor = SparseFactor(stiffness, basis, find_moved_nodes(basis), self._part.device)
         self._lbfgs = Lbfgs(self._part, self._factor)

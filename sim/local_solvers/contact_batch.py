@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..minimisers.compact_lbfgs import BatchHistory
-from ..minimisers.residual import ResidualEvaluator, compute_relative
+from ..minimisers.residual import ResidualEvaluator, compute_relative_residual
 from .strained_part import StrainedModel
 
 
@@ -17,31 +17,31 @@ class ContactState:
     """State u (3N, b) [m]; gradients (3N, b) [N] of the smooth terms, and of all, with 2-norms (b,); scales (b,)."""
 
     u: Any
-    smooth: Any
-    whole: Any
-    free: np.ndarray
+    smooth_gradient: Any
+    gradient: Any
+    norm: np.ndarray
     scale: np.ndarray
 
     @property
     def relative(self) -> np.ndarray:
         """Relative residuals (b,)."""
-        return compute_relative(self.free, self.scale)
+        return compute_relative_residual(self.norm, self.scale)
 
     @property
-    def finite(self) -> np.ndarray:
+    def is_finite(self) -> np.ndarray:
         """True (b,) where residual and scale are finite; forces may overflow."""
-        return np.isfinite(self.free) & np.isfinite(self.scale)
+        return np.isfinite(self.norm) & np.isfinite(self.scale)
 
-    def select(self, stay: np.ndarray) -> ContactState:
+    def select(self, columns: np.ndarray) -> ContactState:
         """Return the state of some load cases (k,)."""
-        parts = (self.u[:, stay], self.smooth[:, stay], self.whole[:, stay])
-        return ContactState(*parts, self.free[stay], self.scale[stay])
+        parts = (self.u[:, columns], self.smooth_gradient[:, columns], self.gradient[:, columns])
+        return ContactState(*parts, self.norm[columns], self.scale[columns])
 
-    def put(self, columns: np.ndarray, some: Any, other: ContactState) -> None:
-        """Overwrite load cases (k,) with those of another state; `some` is the same selection for device arrays."""
-        for mine, its in ((self.u, other.u), (self.smooth, other.smooth), (self.whole, other.whole)):
-            mine[:, some] = its[:, some]
-        self.free[columns], self.scale[columns] = other.free[columns], other.scale[columns]
+    def put_columns(self, columns: np.ndarray, index: Any, source: ContactState) -> None:
+        """Overwrite load cases (k,) with those of another state; `index` is the same selection for device arrays."""
+        for name in ("u", "smooth_gradient", "gradient"):
+            getattr(self, name)[:, index] = getattr(source, name)[:, index]
+        self.norm[columns], self.scale[columns] = source.norm[columns], source.scale[columns]
 
 
 @dataclass(eq=False)
@@ -53,14 +53,14 @@ class Batch:
     history, model
         L-BFGS histories, or models of strained tissue that correct the undeformed compliance; `stale` (b,) bool marks
         models to be recomputed.
-    force, rest, aimed
+    force, response, target_force
         (3n, b) [N] forces of the tools; (3N, b) [m] linear response of the undeformed mesh to the residual with these
         forces; (3n, b) [N] forces after the step, if there is a model.
-    x, length, predicted
+    d, length, decrease
         (3N, b) [m] direction, (b,) trial step length, and (b,) [J] predicted decrease.
-    proximal, stalled, steps
+    proximal, stalls, steps
         (b,) proximal coefficient, steps in a row with little progress, and number of steps.
-    failed, waiting, ended
+    failures, waiting, ended
         (b,) failures in a row to find the tools' forces; (b,) bool: to be tried again; (b,) bool: ended, but still in
         the arrays.
     """
@@ -71,40 +71,40 @@ class Batch:
     model: StrainedModel | None
     stale: np.ndarray
     force: Any
-    rest: Any
-    aimed: Any
-    x: Any
+    response: Any
+    target_force: Any
+    d: Any
     length: np.ndarray
-    predicted: np.ndarray
+    decrease: np.ndarray
     proximal: np.ndarray
-    stalled: np.ndarray
+    stalls: np.ndarray
     steps: np.ndarray
-    failed: np.ndarray
+    failures: np.ndarray
     waiting: np.ndarray
     ended: np.ndarray
 
-    def keep(self, stay: np.ndarray) -> None:
+    def keep(self, columns: np.ndarray) -> None:
         """Keep these load cases (k,)."""
-        self.evaluator, self.state = self.evaluator.select(stay), self.state.select(stay)
+        self.evaluator, self.state = self.evaluator.select(columns), self.state.select(columns)
         if self.model is None:
-            self.history.keep(stay)
+            self.history.keep(columns)
         else:
-            self.model = self.model.select(stay)
-        self.force, self.aimed = self.force[:, stay], self.aimed[:, stay]
-        self.rest, self.x = self.rest[:, stay], self.x[:, stay]
-        for name in ("stale", "length", "predicted", "proximal", "stalled", "steps", "failed", "waiting", "ended"):
-            setattr(self, name, getattr(self, name)[stay])
+            self.model = self.model.select(columns)
+        self.force, self.target_force = self.force[:, columns], self.target_force[:, columns]
+        self.response, self.d = self.response[:, columns], self.d[:, columns]
+        for name in ("stale", "length", "decrease", "proximal", "stalls", "steps", "failures", "waiting", "ended"):
+            setattr(self, name, getattr(self, name)[columns])
 
     @property
-    def updated(self) -> np.ndarray:
+    def is_updated(self) -> np.ndarray:
         """True (b,) where a load case has a model that differs from the undeformed stiffness."""
-        return self.history.count > 0 if self.model is None else self.model.bent
+        return self.history.count > 0 if self.model is None else self.model.is_strained
 
-    def forget(self, columns: np.ndarray) -> None:
+    def reset_model(self, columns: np.ndarray) -> None:
         """Reset the model of some load cases (k,) to the undeformed stiffness."""
         if not len(columns):
             return
         if self.model is None:
-            self.history.forget(columns)
+            self.history.clear(columns)
         else:
-            self.model.forget(columns)
+            self.model.reset_columns(columns)

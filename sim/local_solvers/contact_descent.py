@@ -19,17 +19,17 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..discretisation.term import Local
+from ..discretisation.term import LocalBarrier
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
 from ..linalg.preconditioner import is_exact
 from ..minimisers.compact_lbfgs import BatchHistory
-from ..minimisers.lbfgs import Descended
+from ..minimisers.lbfgs import DescentResult
 from ..minimisers.lbfgs_kernels import DONE, LIVE, NOT_FINITE
 from ..minimisers.line_search import backtrack_by_slopes, is_step_too_long
 from ..minimisers.residual import ResidualEvaluator, build_evaluator
 from ..runtime.device import Device
-from ..runtime.views import cast_like, from_view, run_in_order, select_columns, to_double, to_host, to_library, view
+from ..runtime.views import cast_like, from_view, run_in_order, select_columns, to_double, to_host, to_library, to_view
 from .contact_batch import Batch, ContactState
 from .contact_forces import FORCES, NONCONVEX, ContactCompliance, ForceLimits, allocate_scratch, solve_contact_forces
 from .contact_limits import CONTACT_LIMITS, ContactLimits
@@ -40,7 +40,7 @@ from .strained_part import STRAIN_LIMITS, StrainedPart, StrainLimits
 
 @dataclass(frozen=True, eq=False)
 class ContactDescent:
-    """Solver for a problem with one `Local` barrier, whose constraints stay satisfied.
+    """Solver for a problem with one `LocalBarrier` barrier, whose constraints stay satisfied.
 
     problem
         Problem to solve.
@@ -52,26 +52,25 @@ class ContactDescent:
         Limits of the iteration.
     strains
         Limits of strained tissue.
-    replays
+    uses_graphs
         True if steps of single load cases are captured as GPU graphs.
     """
 
     problem: Problem
     preconditioner: Preconditioner
-    barrier: Local
+    barrier: LocalBarrier
     limits: ContactLimits = CONTACT_LIMITS
     strains: StrainLimits = STRAIN_LIMITS
-    replays: bool = False
+    uses_graphs: bool = False
 
     @cached_property
     def compliance(self) -> Compliance:
         """Compliance at the touchable nodes, followed by those that a model of strained tissue may include."""
-        exact = is_exact(self.preconditioner)
-        own = self.barrier.touchable
+        exact, own = is_exact(self.preconditioner), self.barrier.touchable_nodes
         nodes = self.barrier.select_nodes(self.strains.max_candidates) if exact else own
         compliance = Compliance(self.problem, self.preconditioner, nodes)
         if exact and self.problem.device.on_cuda:  # all columns take as long as one
-            compliance.ensure_known(np.arange(len(nodes)) < len(own))
+            compliance.ensure_columns(np.arange(len(nodes)) < len(own))
         return compliance
 
     @cached_property
@@ -79,12 +78,12 @@ class ContactDescent:
         """Builder of models of strained tissue; None with multigrid, whose compliance is slow."""
         if not is_exact(self.preconditioner):
             return None
-        return StrainedPart(self.problem, self.compliance, len(self.barrier.touchable), self.strains)
+        return StrainedPart(self.problem, self.compliance, len(self.barrier.touchable_nodes), self.strains)
 
     @cached_property
-    def steps(self) -> ContactSteps | None:
+    def captured_steps(self) -> ContactSteps | None:
         """Captured steps for single load cases; None if steps are not captured."""
-        if self._strained is None or not self.replays:
+        if self._strained is None or not self.uses_graphs:
             return None
         self._strained.prepare()
         size = self._strained.size
@@ -93,7 +92,7 @@ class ContactDescent:
     @cached_property
     def _rows(self) -> Any:
         """Rows (3n,) of the touchable nodes, on the device."""
-        return self.compliance.places[: 3 * len(self.barrier.touchable)]
+        return self.compliance.places[: 3 * len(self.barrier.touchable_nodes)]
 
     @cached_property
     def _room(self) -> Callable[[int, int, int], Scratch]:
@@ -105,30 +104,30 @@ class ContactDescent:
         """Device with double precision."""
         return replace(self.problem.device, precision="float64")
 
-    def descend(self, start: wp.array, tolerance: np.ndarray, most: int) -> Descended:
-        """Solve as `Lbfgs.descend`, in at most `most` steps of each load case; returns no L-BFGS history."""
+    def descend(self, start: wp.array, tolerance: np.ndarray, max_iter: int) -> DescentResult:
+        """Solve as `Lbfgs.descend`, in at most `max_iter` steps of each load case; returns no L-BFGS history."""
         count, device, limits = start.shape[1], self.problem.device, self.limits
         result, live = wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
         with run_in_order(device):
             batch = self._begin_batch(start)
-            if count == 1 and self.steps is not None:
-                self._replay(self.steps, batch, tolerance, most)
+            if count == 1 and self.captured_steps is not None:
+                self._replay(self.captured_steps, batch, tolerance, max_iter)
             ready = np.ones(count, bool)
             while True:
-                over = ready & self._find_ended(batch, tolerance[live], most)
+                over = ready & self._find_ended(batch, tolerance[live], max_iter)
                 done = over & (batch.state.relative <= tolerance[live])
                 if (ready & ~over).any():
                     over |= self._compute_directions(batch, ready & ~over, tolerance[live])
                 if over.any():
                     leave = np.flatnonzero(over)
                     there = live[leave]
-                    view(result)[:, there] = batch.state.u[:, leave]
-                    status[there] = np.where(done, DONE, np.where(batch.state.finite, LIVE, NOT_FINITE))[leave]
+                    to_view(result)[:, there] = batch.state.u[:, leave]
+                    status[there] = np.where(done, DONE, np.where(batch.state.is_finite, LIVE, NOT_FINITE))[leave]
                     steps[there], residual[there] = batch.steps[leave], batch.state.relative[leave]
                     batch.ended |= over
                     if batch.ended.all():
-                        return Descended(result, status, steps, residual, {})
+                        return DescentResult(result, status, steps, residual, {})
                     if batch.ended.mean() >= limits.ended_fraction:
                         stay = np.flatnonzero(~batch.ended)
                         batch.keep(stay)
@@ -137,9 +136,9 @@ class ContactDescent:
 
     def _begin_batch(self, start: wp.array) -> Batch:
         judge, count = build_evaluator(self.problem, start), start.shape[1]
-        now = self._evaluate_state(judge, view(start) + 0.0)
+        now = self._evaluate_state(judge, to_view(start) + 0.0)
         force, none = self._compute_balancing_forces(now), np.zeros(count)
-        rest = self._compute_response(now.smooth, force)
+        rest = self._compute_response(now.smooth_gradient, force)
         model = None
         if self._strained is not None and count <= self.strains.max_cases:
             model = self._strained.build_model(start, np.arange(count))
@@ -147,9 +146,9 @@ class ContactDescent:
         slow, steps, failed = np.zeros((3, count), int)
         stale, waiting, ended = np.zeros((3, count), bool)
         return Batch(
-            evaluator=judge, state=now, history=pairs, model=model, stale=stale, force=force, rest=rest,
-            aimed=force + 0.0, x=0.0 * rest, length=none, predicted=none.copy(), proximal=none.copy(),
-            stalled=slow, steps=steps, failed=failed, waiting=waiting, ended=ended,
+            evaluator=judge, state=now, history=pairs, model=model, stale=stale, force=force, response=rest,
+            target_force=force + 0.0, d=0.0 * rest, length=none, decrease=none.copy(), proximal=none.copy(),
+            stalls=slow, steps=steps, failures=failed, waiting=waiting, ended=ended,
         )  # fmt: skip
 
     def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:
@@ -160,12 +159,12 @@ class ContactDescent:
         known, judge, limits = None, batch.evaluator, self.limits
         if batch.model is None or not steps.set_tools(judge.constant):
             return
-        batch.state, batch.force, batch.rest, batch.x = steps.hold(batch.state, batch.force, batch.rest)
+        batch.state, batch.force, batch.response, batch.d = steps.load_state(batch.state, batch.force, batch.response)
         while not self._find_ended(batch, tolerance, most).any():
             self._rebuild_models(batch, np.ones(1, bool))
             if batch.model is not known:
                 known = batch.model
-                steps.load(known)
+                steps.load_model(known)
             force_tolerance = self._compute_force_tolerance(batch, tolerance)[0]
             said = steps.compute_direction(force_tolerance, batch.proximal[0], bool(self._find_nonconvex(batch)[0]))
             if said[STATUS] == TOO_MANY_TOUCHED:
@@ -174,24 +173,24 @@ class ContactDescent:
                 return
             if batch.waiting.any():
                 # The load case's model may have been reset.
-                known = None if batch.failed[0] % limits.max_failures == 0 else known
+                known = None if batch.failures[0] % limits.max_failures == 0 else known
                 continue
-            batch.predicted[:] = said[PREDICTED_DECREASE]
+            batch.decrease[:] = said[PREDICTED_DECREASE]
             while True:
-                t, ahead, free, scale = read_step_result(said, judge.square)
+                t, ahead, free, scale = read_step_result(said, judge.norms)
                 there, misled = self._take_steps(batch, t, ahead, free)
                 if there.any() or misled.any():
                     break
                 said = steps.shorten_step(batch.length[0])
             if there.any():
-                steps.move_to_last_step()
-                batch.state.free[:], batch.state.scale[:] = free, scale
+                steps.take_step()
+                batch.state.norm[:], batch.state.scale[:] = free, scale
             else:  # the load case's model has been reset
                 known = None
 
     def _find_ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
         """Return the load cases (b,) that have ended, in equilibrium or not."""
-        lost = (batch.stalled >= self.limits.patience) | (batch.steps >= most) | ~batch.state.finite
+        lost = (batch.stalls >= self.limits.patience) | (batch.steps >= most) | ~batch.state.is_finite
         return lost | (batch.state.relative <= tolerance)
 
     def _rebuild_models(self, batch: Batch, wanted: np.ndarray) -> None:
@@ -229,35 +228,39 @@ class ContactDescent:
 
     def _find_nonconvex(self, batch: Batch) -> np.ndarray:
         """Return the load cases (b,) whose model may be non-convex."""
-        return batch.failed >= 2 * self.limits.max_failures
+        return batch.failures >= 2 * self.limits.max_failures
 
     def _increase_proximal_term(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
         """Increase the proximal coefficient of `waiting` cases (b,), without forces; return those (b,) to give up."""
         times = self.limits.max_failures
         batch.waiting = waiting
-        batch.failed = np.where(waiting, batch.failed + 1, 0)
-        fresh = waiting & (batch.failed % times == 0)
-        batch.forget(np.flatnonzero(fresh))
+        batch.failures = np.where(waiting, batch.failures + 1, 0)
+        fresh = waiting & (batch.failures % times == 0)
+        batch.reset_model(np.flatnonzero(fresh))
         batch.proximal = np.where(fresh, 0.0, np.where(waiting, self._raise_drag(batch.proximal), batch.proximal))
-        return batch.failed >= 3 * times
+        return batch.failures >= 3 * times
 
     def _compute_steps(self, batch: Batch, some: np.ndarray, force: Any) -> None:
         """Compute directions, step lengths and predicted decreases of load cases (k,) under forces (3n, b)."""
         now, device = batch.state, self.problem.device
         on = select_columns(device, some, len(batch.proximal))
         if batch.model is None:
-            batch.rest[:, on] += self.compliance.spread((force - batch.force)[:, on])
+            batch.response[:, on] += self.compliance.compute_full_motion((force - batch.force)[:, on])
             batch.force[:, on] = force[:, on]
-            batch.x[:, on] = -batch.rest[:, on]
+            batch.d[:, on] = -batch.response[:, on]
         else:
-            batch.aimed[:, on] = force[:, on]
-            batch.x[:, on] = -batch.rest[:, on] - self.compliance.apply(self._compute_forces(batch, force)[0])[:, on]
-        if batch.history.most:
+            batch.target_force[:, on] = force[:, on]
+            batch.d[:, on] = (
+                -batch.response[:, on] - self.compliance.apply(self._compute_forces(batch, force)[0])[:, on]
+            )
+        if batch.history.max_pairs:
             history = batch.history.get_history(some)
-            batch.x[:, on] -= history.compute_motion(history.compute_weights(self._pull(now.smooth, force)[:, on]))
-        longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.x))
+            batch.d[:, on] -= history.compute_motion(
+                history.compute_weights(self._pull(now.smooth_gradient, force)[:, on])
+            )
+        longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.d))
         batch.length[some] = longest[some]
-        batch.predicted[some] = -_compute_dots(now.whole[:, on], batch.x[:, on])
+        batch.decrease[some] = -_compute_dots(now.gradient[:, on], batch.d[:, on])
 
     def _solve_forces(
         self, batch: Batch, some: np.ndarray, tolerance: np.ndarray, most: ForceLimits
@@ -269,16 +272,16 @@ class ContactDescent:
         if barrier is None:
             return known, np.ones(len(some), bool)
         exact = self._compute_force_tolerance(batch, tolerance)[some]
-        soft, free = ContactCompliance(self.compliance, self._exact, self._room), now.u[rows] - batch.rest[rows]
+        soft, free = ContactCompliance(self.compliance, self._exact, self._room), now.u[rows] - batch.response[rows]
         if batch.model is not None:
             free = free - self._compute_forces(batch, batch.force)[1]
-            soft = replace(soft, own=batch.model.own[on])
+            soft = replace(soft, own=batch.model.change[on])
         free, here = free[:, on], to_double(now.u[rows][:, on])
-        if batch.history.most:
+        if batch.history.max_pairs:
             history = batch.history.get_history(some)
             own = to_double(history.sw[:, :, rows])
-            soft = replace(soft, history=own, middle=to_double(history.middle))
-            weights = history.compute_weights(self._pull(now.smooth, batch.force)[:, on])
+            soft = replace(soft, history=own, middle=to_double(history.middle_matrix))
+            weights = history.compute_weights(self._pull(now.smooth_gradient, batch.force)[:, on])
             free = free - (to_double(weights).mT @ own)[:, 0].T
         return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.proximal[some], most)
 
@@ -289,12 +292,12 @@ class ContactDescent:
         """
         assert batch.model is not None
         device, compliance = self.problem.device, self.compliance
-        out, change = view(device.allocate(*batch.rest.shape)), force - batch.force
-        near = batch.rest[compliance.places] + cast_like(batch.rest, compliance.compute_motion(change))
-        own = view(batch.model.apply_stiffness(device, from_view(device, near)))
+        out, change = to_view(device.allocate(*batch.response.shape)), force - batch.force
+        near = batch.response[compliance.places] + cast_like(batch.response, compliance.compute_motion(change))
+        own = to_view(batch.model.apply_stiffness(device, from_view(device, near)))
         out[self._rows] = cast_like(out, change)
         out[compliance.places] += own
-        return out, cast_like(batch.rest, compliance.compute_motion(own)[: len(self._rows)])
+        return out, cast_like(batch.response, compliance.compute_motion(own)[: len(self._rows)])
 
     def _raise_drag(self, drag: np.ndarray) -> np.ndarray:
         return np.maximum(self.limits.proximal, self.limits.growth * drag)
@@ -310,15 +313,15 @@ class ContactDescent:
         if not going.any():
             return batch.waiting & ~batch.ended
         new = self._evaluate_state(
-            batch.evaluator, now.u + to_library(self.problem.device, t.astype(self.problem.device.precision)) * batch.x
+            batch.evaluator, now.u + to_library(self.problem.device, t.astype(self.problem.device.precision)) * batch.d
         )
-        ahead = np.where(new.finite, _compute_dots(new.whole, batch.x), np.inf)
-        there, misled = self._take_steps(batch, t, ahead, new.free)
+        ahead = np.where(new.is_finite, _compute_dots(new.gradient, batch.d), np.inf)
+        there, misled = self._take_steps(batch, t, ahead, new.norm)
         taken = np.flatnonzero(there)
         if len(taken):
             some = select_columns(self.problem.device, taken, len(t))
             self._update_models(batch, new, taken, some)
-            now.put(taken, some, new)
+            now.put_columns(taken, some, new)
         return misled | there | (batch.waiting & ~batch.ended)
 
     def _take_steps(self, batch: Batch, t: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -327,46 +330,46 @@ class ContactDescent:
         The decision uses the slopes `ahead` (b,) and the residuals `free` (b,) after the step.
         """
         limits, now, going = self.limits, batch.state, ~(batch.waiting | batch.ended)
-        far = going & is_step_too_long(ahead, batch.predicted) & (t > limits.accepted_length)
-        batch.length, there = np.where(far, t * backtrack_by_slopes(ahead, batch.predicted), t), going & ~far
+        far = going & is_step_too_long(ahead, batch.decrease) & (t > limits.accepted_length)
+        batch.length, there = np.where(far, t * backtrack_by_slopes(ahead, batch.decrease), t), going & ~far
         misled = far & (batch.length < limits.reset_length)
         if misled.any():  # reading from the GPU only if needed
-            misled &= batch.updated
-        well = (t > limits.min_good_step) & (free <= limits.residual_factor * now.free)
+            misled &= batch.is_updated
+        well = (t > limits.min_good_step) & (free <= limits.residual_factor * now.norm)
         eased = np.where(batch.proximal >= limits.proximal, batch.proximal / limits.growth, 0.0)
-        worse = (t < limits.min_good_step) | (free > now.free)
+        worse = (t < limits.min_good_step) | (free > now.norm)
         drag = np.where(
             there & well, eased, np.where(misled | (there & worse), self._raise_drag(batch.proximal), batch.proximal)
         )
         batch.proximal, batch.steps = drag, batch.steps + (misled | there)
-        batch.stale |= there & (free > limits.stale_factor * now.free)
-        batch.stalled = np.where(there & well, 0, batch.stalled + (misled | there))
-        batch.forget(np.flatnonzero(misled))
+        batch.stale |= there & (free > limits.stale_factor * now.norm)
+        batch.stalls = np.where(there & well, 0, batch.stalls + (misled | there))
+        batch.reset_model(np.flatnonzero(misled))
         return there, misled
 
     def _update_models(self, batch: Batch, new: ContactState, taken: np.ndarray, some: Any) -> None:
         """Update the models with the accepted steps of load cases (k,); `some` is this selection for device arrays."""
         now = batch.state
         if batch.model is not None:
-            batch.force[:, some] = batch.aimed[:, some]
-            batch.rest[:, some] = self._compute_response(new.smooth[:, some], batch.force[:, some])
+            batch.force[:, some] = batch.target_force[:, some]
+            batch.response[:, some] = self._compute_response(new.smooth_gradient[:, some], batch.force[:, some])
             return
-        moved, change = new.u[:, some] - now.u[:, some], new.smooth[:, some] - now.smooth[:, some]
-        rest = self._compute_response(new.smooth[:, some], batch.force[:, some])
-        way = rest - batch.rest[:, some]
-        batch.rest[:, some] = rest
-        positive = np.flatnonzero((_compute_dots(moved, change) > self.limits.min_curvature) & new.finite[taken])
+        moved, change = new.u[:, some] - now.u[:, some], new.smooth_gradient[:, some] - now.smooth_gradient[:, some]
+        rest = self._compute_response(new.smooth_gradient[:, some], batch.force[:, some])
+        way = rest - batch.response[:, some]
+        batch.response[:, some] = rest
+        positive = np.flatnonzero((_compute_dots(moved, change) > self.limits.min_curvature) & new.is_finite[taken])
         if len(positive):
             on = select_columns(self.problem.device, positive, len(taken))
             batch.history.update_history(taken[positive], moved[:, on], change[:, on], way[:, on])
 
     def _compute_balancing_forces(self, now: ContactState) -> Any:
         """Return the forces (3n, b) at touched nodes that balance the smooth terms."""
-        barrier, rows = self.barrier.reduce(np.arange(len(now.free))), self._rows
-        own = to_double(now.smooth[rows])
+        barrier, rows = self.barrier.reduce(np.arange(len(now.norm))), self._rows
+        own = to_double(now.smooth_gradient[rows])
         if barrier is None:
             return 0.0 * own
-        slope = barrier.slope(to_double(now.u[rows]))
+        slope = barrier.compute_gradient(to_double(now.u[rows]))
         shape = -1, 3, slope.shape[1]
         touched = (slope != 0.0).reshape(shape).any(1)
         return (-own.reshape(shape) * touched[:, None]).reshape(slope.shape)
@@ -381,12 +384,12 @@ class ContactDescent:
         """Evaluate the states u (3N, b) as `Problem.residual` does."""
         problem, device = self.problem, self.problem.device
         place, pressed = device.allocate(*u.shape), device.allocate(*u.shape)
-        view(place)[:] = u
+        to_view(place)[:] = u
         found = judge(place)
         self.barrier.add_gradient(place, pressed)
         problem.constraint.project_nodes(pressed)
-        whole = view(found.g)
-        return ContactState(view(place), whole - view(pressed), whole, found.free, found.scale)
+        whole = to_view(found.g)
+        return ContactState(to_view(place), whole - to_view(pressed), whole, found.norm, found.scale)
 
     def _compute_response(self, smooth: Any, force: Any) -> Any:
         """Compute the linear response (3N, b) [m] of the undeformed mesh to the residual."""

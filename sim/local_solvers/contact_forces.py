@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..discretisation.term import Reduction
+from ..discretisation.term import ReducedBarrier
 from ..linalg.compliance import Compliance
 from ..minimisers.lbfgs_kernels import PAIRS
 from ..runtime.blocks import launch
 from ..runtime.device import Device
-from ..runtime.threads import run_together
-from ..runtime.views import from_view, select_columns, to_host, view
+from ..runtime.threads import run_concurrently
+from ..runtime.views import from_view, select_columns, to_host, to_view
 from .contact_kernel import build_kernel
-from .contact_structs import OPEN, SOLVED, TOO_MANY_TOUCHED, UNKNOWN, ComplianceModel, Ends, Scratch
+from .contact_structs import OPEN, SOLVED, TOO_MANY_TOUCHED, UNKNOWN, ComplianceModel, Limits, Scratch
 
 
 @dataclass(frozen=True)
@@ -65,27 +65,28 @@ class ContactCompliance:
     """Compliance C at n nodes: that of the undeformed mesh, plus the updates of b load cases.
 
     `history` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision are L-BFGS updates, None without history. `own`
-    (b, 3n, 3n) in single precision is the change by strained tissue. `room` is `allocate_scratch`, perhaps cached.
+    (b, 3n, 3n) in single precision is the change by strained tissue. `get_scratch`: `allocate_scratch`, perhaps cached.
     """
 
-    rest: Compliance
+    undeformed: Compliance
     device: Device
-    room: Callable[[int, int, int], Scratch]
+    get_scratch: Callable[[int, int, int], Scratch]
     history: Any = None
     middle: Any = None
     own: Any = None
 
-    def ensure_known(self, force: Any) -> None:
+    def ensure_columns(self, force: Any) -> None:
         """Compute the undeformed compliance, if missing, at the nodes on which forces (3n, b) act."""
-        every = self.rest.known.copy()
+        every = self.undeformed.known.copy()
         if not every[: len(force) // 3].all():
             every[: len(force) // 3] = to_host((force != 0.0).any(1)).reshape(-1, 3).any(axis=1)
-            self.rest.ensure_known(every)
+            self.undeformed.ensure_columns(every)
 
-    def build_model(self, columns: np.ndarray, rounded: float) -> ComplianceModel:
+    def build_model(self, columns: np.ndarray, diagonal_shift: float) -> ComplianceModel:
         """Return the compliance of some load cases (k,) for kernels."""
-        out, n, count = ComplianceModel(), len(self.rest.rows), len(columns)
-        out.rest, out.known = from_view(self.device, self.rest.columns), self.device.upload(self.rest.known, wp.int32)
+        out, n, count = ComplianceModel(), len(self.undeformed.rows), len(columns)
+        out.rest = from_view(self.device, self.undeformed.columns)
+        out.known = self.device.upload(self.undeformed.known, wp.int32)
         none = wp.zeros((count, 0, 0), dtype=wp.float32, device=self.device.name)
         kinds = (
             ("history", self.device.allocate(count, 0, n)),
@@ -96,50 +97,50 @@ class ContactCompliance:
             known = getattr(self, name)
             some = None if known is None else known[select_columns(self.device, columns, len(known))]
             setattr(out, name, nothing if some is None else from_view(self.device, some))
-        out.diagonal_shift = rounded
+        out.diagonal_shift = diagonal_shift
         return out
 
 
 def solve_contact_forces(
-    barrier: Reduction,
-    soft: ContactCompliance,
-    here: Any,
-    there: Any,
-    known: Any,
+    barrier: ReducedBarrier,
+    compliance: ContactCompliance,
+    positions: Any,
+    targets: Any,
+    known_forces: Any,
     tolerance: np.ndarray,
-    drag: np.ndarray,
+    proximal: np.ndarray,
     limits: ForceLimits = FORCES,
 ) -> tuple[Any, np.ndarray]:
     """Solve for the forces f (3n, b) [N]; return them, and which load cases (b,) are solved.
 
     A load case fails if its model is not convex: the curvature of the tool exceeds the stiffness of the tissue, and the
-    step would be far too long. `here` (3n, b) [m] are the present positions, w1 is `there` and f1 `known` (3n, b). The
-    forces have a relative `tolerance` (b,). `drag` (b,) is d relative to the stiffness of a touched node.
+    step would be far too long. `positions` (3n, b) [m] are the present positions, w1 is `targets` and f1 `known_forces`
+    (3n, b). The forces have a relative `tolerance` (b,). `proximal` (b,) is d relative to a touched node's stiffness.
     """
-    out, status = known + 0.0, np.full(here.shape[1], OPEN)
-    soft.ensure_known(known)
+    out, status = known_forces + 0.0, np.full(positions.shape[1], OPEN)
+    compliance.ensure_columns(known_forces)
     for room in (limits.first_capacity, limits.max_capacity):
         status[status == TOO_MANY_TOUCHED] = OPEN
         each = max(1, limits.max_bytes // (4 * 8 * (3 * room) ** 2))
         while (status == OPEN).any():
             some = np.flatnonzero(status == OPEN)[:each]
-            on = select_columns(soft.device, some, len(status))
-            own = here[:, on], there[:, on], known[:, on]
-            asked = tolerance[some], drag[some]
-            force, status[some], touched = _solve_forces(barrier, soft, some, own, asked, limits, room)
+            on = select_columns(compliance.device, some, len(status))
+            own = positions[:, on], targets[:, on], known_forces[:, on]
+            asked = tolerance[some], proximal[some]
+            force, status[some], touched = _solve_forces(barrier, compliance, some, own, asked, limits, room)
             ready = np.flatnonzero(status[some] == SOLVED)
             if len(ready):
-                here_too = select_columns(soft.device, ready, len(some))
-                out[:, select_columns(soft.device, some[ready], len(status))] = force[:, here_too]
+                here_too = select_columns(compliance.device, ready, len(some))
+                out[:, select_columns(compliance.device, some[ready], len(status))] = force[:, here_too]
             lacking = status[some] == UNKNOWN
             if lacking.any():
-                soft.ensure_known((to_host(touched)[:, lacking] >= 0).repeat(3, axis=0))
+                compliance.ensure_columns((to_host(touched)[:, lacking] >= 0).repeat(3, axis=0))
                 status[some[lacking]] = OPEN
     return out, status == SOLVED
 
 
 def _solve_forces(
-    barrier: Reduction,
+    barrier: ReducedBarrier,
     soft: ContactCompliance,
     columns: np.ndarray,
     own: tuple[Any, Any, Any],
@@ -153,14 +154,14 @@ def _solve_forces(
     """
     device, count = soft.device, len(columns)
     nodes, functions = len(own[0]) // 3, barrier.functions
-    scratch = soft.room(nodes, 1 << (count - 1).bit_length(), room)
+    scratch = soft.get_scratch(nodes, 1 << (count - 1).bit_length(), room)
     out, status = device.allocate(3 * nodes, count), wp.zeros(count, dtype=wp.int32, device=device.name)
     arrays = [from_view(device, x) for x in own] + [device.upload(x) for x in asked]
-    touching = barrier.build_stage(columns)
+    touching = barrier.build_structs(columns)
     kernel, model, ends = (
         build_kernel(device, functions),
         soft.build_model(columns, limits.diagonal_shift),
-        allocate_ends(limits, room),
+        build_kernel_limits(limits, room),
     )
 
     def part(first: int, stop: int) -> None:
@@ -168,20 +169,20 @@ def _solve_forces(
         launch(device, kernel, stop - first, inputs, [out, status])
 
     middle = count if device.on_cuda else (count + 1) // 2
-    run_together([partial(part, 0, middle), partial(part, middle, count)])
-    return view(out), status.numpy(), view(scratch.place)[:, :count]
+    run_concurrently([partial(part, 0, middle), partial(part, middle, count)])
+    return to_view(out), status.numpy(), to_view(scratch.place)[:, :count]
 
 
-def allocate_ends(limits: ForceLimits, room: int) -> Ends:
-    """Return the limits for the kernel, with capacity for `room` touched nodes."""
-    ends = Ends()
+def build_kernel_limits(limits: ForceLimits, capacity: int) -> Limits:
+    """Return the limits for the kernel, with capacity for `capacity` touched nodes."""
+    ends = Limits()
     ends.max_iterations, ends.max_backtracks = limits.max_iterations, limits.max_backtracks
-    ends.nonconvex_iterations, ends.capacity = limits.nonconvex_iterations, room
+    ends.nonconvex_iterations, ends.capacity = limits.nonconvex_iterations, capacity
     return ends
 
 
-def allocate_scratch(device: Device, nodes: int, columns: int, room: int) -> Scratch:
-    """Allocate scratch arrays for numbers of nodes, load cases, and touched nodes (`room`)."""
+def allocate_scratch(device: Device, nodes: int, columns: int, capacity: int) -> Scratch:
+    """Allocate scratch arrays for numbers of nodes, load cases, and touched nodes (`capacity`)."""
 
     def numbers(*shape: int) -> wp.array:
         return wp.empty(shape, dtype=wp.float64, device=device.name)
@@ -189,7 +190,7 @@ def allocate_scratch(device: Device, nodes: int, columns: int, room: int) -> Scr
     def counts(*shape: int) -> wp.array:
         return wp.empty(shape, dtype=wp.int32, device=device.name)
 
-    out, size = Scratch(), 3 * room
+    out, size = Scratch(), 3 * capacity
     for name in ("force", "w", "at", "slope", "change", "way", "held"):
         setattr(out, name, numbers(columns, 3 * nodes).transpose())
     out.place, out.acts = counts(columns, nodes).transpose(), counts(columns, nodes).transpose()

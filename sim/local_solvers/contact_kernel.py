@@ -7,9 +7,9 @@ import warp as wp
 from ..discretisation.term import BlockFunctions
 from ..linalg.block_factor import build_functions
 from ..minimisers.lbfgs_kernels import DEFAULT_BACKTRACK, MAX_BACKTRACK, MIN_BACKTRACK, OVERSHOOT
-from ..runtime.blocks import before, get_block_shape, total, wait
+from ..runtime.blocks import get_block_shape, get_prefix, get_sum, wait
 from ..runtime.device import Device, forward_kernel
-from .contact_structs import NO_EQUILIBRIUM, OPEN, SOLVED, TOO_MANY_TOUCHED, UNKNOWN, ComplianceModel, Ends, Scratch
+from .contact_structs import NO_EQUILIBRIUM, OPEN, SOLVED, TOO_MANY_TOUCHED, UNKNOWN, ComplianceModel, Limits, Scratch
 
 CPU_SUMS = 8  # Sums per thread at once, to hide memory latency on the CPU.
 CUDA_SUMS = 2  # The same on CUDA, with its many threads.
@@ -20,14 +20,14 @@ TOUCHED, ACTING = wp.constant(0), wp.constant(1)  # Columns of `Scratch.counts`:
 def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     """Build the kernel for a barrier, launched over (load case, thread)."""
     down, across = get_block_shape(device)
-    threads, dense, Stage, Near = down * across, build_functions(device), barrier.stage, barrier.near
+    threads, dense, Stage, Near = down * across, build_functions(device), barrier.barrier_struct, barrier.pairs_struct
     wide = wp.constant(CUDA_SUMS if device.on_cuda else CPU_SUMS)
     Strip = wp.types.vector(length=wide, dtype=wp.float64)
     overshoot, least, middle, most = (
         wp.constant(wp.float64(x)) for x in (OVERSHOOT, MIN_BACKTRACK, DEFAULT_BACKTRACK, MAX_BACKTRACK)
     )
     factor, solve = dense.factor, dense.solve
-    add_force, add_matrix, longest = barrier.add_force, barrier.add_matrix, barrier.longest
+    add_force, add_matrix, longest = barrier.add_force, barrier.add_matrix, barrier.bound_step
 
     @wp.func
     def dot(x: wp.array2d(dtype=wp.float64), y: wp.array2d(dtype=wp.float64), c: int, me: int) -> wp.float64:
@@ -35,7 +35,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         own = wp.float64(0.0)
         for r in range(me, x.shape[0], threads):
             own += x[r, c] * y[r, c]
-        return total(own)
+        return get_sum(own)
 
     @wp.func
     def is_nonzero(x: wp.array2d(dtype=wp.float64), i: int, c: int) -> bool:
@@ -50,7 +50,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         for i in range(me, place.shape[0], threads):
             if is_nonzero(x, i, c) != (place[i, c] >= 0):
                 other += wp.float64(1.0)
-        return total(other) == wp.float64(0.0)
+        return get_sum(other) == wp.float64(0.0)
 
     @wp.func
     def list_nodes(
@@ -70,7 +70,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         for i in range(begin, end):
             if is_nonzero(x, i, c):
                 mine += 1
-        number = before(mine)
+        number = get_prefix(mine)
         for i in range(begin, end):
             place[i, c] = -1
             if is_nonzero(x, i, c):
@@ -205,7 +205,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         own = wp.float64(0.0)
         for i in range(me, 3 * m, threads):
             own += s.soft[c, i, i]
-        mean = total(own) / wp.float64(3 * m)
+        mean = get_sum(own) / wp.float64(3 * m)
         for i in range(me, 3 * m, threads):
             s.soft[c, i, i] = s.soft[c, i, i] + model.diagonal_shift * mean
         wait()
@@ -286,7 +286,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         stage: Stage,
         near: Near,
         model: ComplianceModel,
-        ends: Ends,
+        ends: Limits,
         s: Scratch,
         # outputs
         out: wp.array2d(dtype=wp.float64),
@@ -370,7 +370,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             own = wp.float64(0.0)
             for r in range(me, size, threads):
                 own += (s.slope[r, c] - s.force[r, c]) * s.way[r, c]
-            predicted = -total(own)
+            predicted = -get_sum(own)
             t = longest(s.w, s.way, stage, near, c, me)
             for cut in range(ends.max_backtracks + 1):
                 for r in range(me, size, threads):
@@ -380,7 +380,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 own = wp.float64(0.0)
                 for r in range(me, size, threads):
                     own += (s.slope[r, c] - s.force[r, c] - t * s.change[r, c]) * s.way[r, c]
-                ahead = total(own)
+                ahead = get_sum(own)
                 if ahead <= overshoot * wp.abs(predicted) or cut == ends.max_backtracks:
                     break
                 share = middle

@@ -10,7 +10,7 @@ import warp as wp
 from scipy.linalg import lu_factor, lu_solve
 
 from ..discretisation.problem import Problem
-from ..discretisation.term import Local
+from ..discretisation.term import LocalBarrier
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import BlockJacobi, Preconditioner
 from ..runtime.threads import limit_to_one_thread
@@ -33,7 +33,7 @@ class ContactPreconditioner:
 
     on_device = False
 
-    def __init__(self, rest: Preconditioner, compliance: Compliance, barrier: Local):
+    def __init__(self, rest: Preconditioner, compliance: Compliance, barrier: LocalBarrier):
         self._rest, self._compliance, self._barrier = rest, compliance, barrier
 
         self._felt: tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
@@ -43,7 +43,7 @@ class ContactPreconditioner:
         self._rest.prepare(problem, columns)
         self._felt = None
         if columns == 1:
-            nodes, curvature = self._barrier.get_pressed()
+            nodes, curvature = self._barrier.get_active_stiffness()
             if 0 < len(nodes) <= FORCES.max_capacity:
                 # BLAS threads wait for one another, very long where other processes use their cores.
                 with limit_to_one_thread():
@@ -61,7 +61,7 @@ class ContactPreconditioner:
             own = z[self._compliance.rows, 0].reshape(-1, 3)[nodes].ravel()
             with limit_to_one_thread():
                 force[nodes] = lu_solve(whole, curvature @ own).reshape(-1, 3)
-                out.assign(z - self._compliance.spread(force.reshape(-1, 1)))
+                out.assign(z - self._compliance.compute_full_motion(force.reshape(-1, 1)))
 
 
 def build_contact_preconditioner(
@@ -73,8 +73,8 @@ def build_contact_preconditioner(
     """
     if contact is not None:
         return ContactPreconditioner(rest, contact.compliance, contact.barrier)
-    tools = [barrier for barrier in problem.barriers if isinstance(barrier, Local)]
+    tools = [barrier for barrier in problem.barriers if isinstance(barrier, LocalBarrier)]
     if len(problem.barriers) == 1 or len(tools) != 1 or isinstance(rest, BlockJacobi):
         return rest
     (tool,) = tools
-    return ContactPreconditioner(rest, Compliance(problem, rest, tool.touchable), tool)
+    return ContactPreconditioner(rest, Compliance(problem, rest, tool.touchable_nodes), tool)

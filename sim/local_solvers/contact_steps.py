@@ -12,21 +12,21 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..discretisation.term import Local
+from ..discretisation.term import LocalBarrier
 from ..linalg.compliance import Compliance
 from ..linalg.pcg import Preconditioner
 from ..minimisers.lbfgs_kernels import FREE, WHOLE
-from ..minimisers.residual import allocate_balance, compute_residual_arrays
+from ..minimisers.residual import allocate_residual_arrays, compute_residual_arrays
 from ..runtime import blocks
 from ..runtime.columns import add_dots, combine_columns, put_rows, take_rows
 from ..runtime.columns import build_kernels as columns_kernels_of
 from ..runtime.device import Device, forward_kernel
-from ..runtime.views import from_view, view
+from ..runtime.views import from_view, to_view
 from .contact_batch import ContactState
-from .contact_forces import FORCES, NONCONVEX, allocate_ends, allocate_scratch
+from .contact_forces import FORCES, NONCONVEX, allocate_scratch, build_kernel_limits
 from .contact_kernel import build_kernel
-from .contact_structs import ComplianceModel, Ends
-from .press_kernel import build_press_kernel
+from .contact_structs import ComplianceModel, Limits
+from .press_kernel import build_gemv_kernel
 from .strained_part import StrainedModel
 
 # Threads that share one row of a matrix product.
@@ -125,16 +125,16 @@ def build_kernels(device: Device) -> ContactStepKernels:
     return ContactStepKernels(compute_positions, compute_change, read_length, add_forces, write_results)
 
 
-def read_step_result(said: np.ndarray, square: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def read_step_result(output: np.ndarray, norms: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return length, slope ahead [J], residual [N] and its scale [N] of a step, (1,) each, from `ContactSteps` output.
 
-    `square` (1,) is `ResidualEvaluator.square`.
+    `norms` (1,) is `ResidualEvaluator.square`.
     """
     with np.errstate(invalid="ignore", over="ignore"):
-        free = np.sqrt(said[[FREE_SUM]])
-        scale = np.sqrt(np.maximum(np.maximum(square, said[MAX_SQUARE_NORM]), said[[WHOLE_SUM]] - said[FREE_SUM]))
-    ahead = np.where(np.isfinite(free) & np.isfinite(scale), said[[TRIAL_SLOPE]], np.inf)
-    return said[[TRIED_LENGTH]], ahead, free, scale
+        free = np.sqrt(output[[FREE_SUM]])
+        scale = np.sqrt(np.maximum(np.maximum(norms, output[MAX_SQUARE_NORM]), output[[WHOLE_SUM]] - output[FREE_SUM]))
+    ahead = np.where(np.isfinite(free) & np.isfinite(scale), output[[TRIAL_SLOPE]], np.inf)
+    return output[[TRIED_LENGTH]], ahead, free, scale
 
 
 class ContactSteps:
@@ -153,10 +153,10 @@ class ContactSteps:
     """
 
     def __init__(
-        self, problem: Problem, preconditioner: Preconditioner, barrier: Local, compliance: Compliance, size: int
+        self, problem: Problem, preconditioner: Preconditioner, barrier: LocalBarrier, compliance: Compliance, size: int
     ):
         device = problem.device
-        name, exact, count = device.name, replace(device, precision="float64"), 3 * len(barrier.touchable)
+        name, exact, count = device.name, replace(device, precision="float64"), 3 * len(barrier.touchable_nodes)
         self._problem, self._preconditioner, self._barrier, self._device = problem, preconditioner, barrier, device
 
         def numbers(rows: int) -> wp.array:
@@ -166,7 +166,7 @@ class ContactSteps:
         self._new_u, self._new_smooth, self._new_rest = (numbers(problem.rows) for _ in range(3))
         self._constant, self._pull, self._answer, self._pressed = (numbers(problem.rows) for _ in range(4))
         self._force, self._found, self._here, self._there = (exact.allocate(count, 1) for _ in range(4))
-        self._balance = allocate_balance(problem, 1)
+        self._balance = allocate_residual_arrays(problem, 1)
         self._near, self._own, self._more, self._change = (numbers(len(compliance.rows)) for _ in range(4))
         self._rows = device.upload(compliance.rows, wp.int32)
         self._touched = self._rows[:count]
@@ -189,32 +189,32 @@ class ContactSteps:
         self._live = np.ones(1, bool)
         self._graphs: dict[str, wp.Graph] = {}
 
-    def load(self, model: StrainedModel) -> None:
+    def load_model(self, model: StrainedModel) -> None:
         """Load a model of strained tissue for one load case."""
         for array in (self._nodes, self._matrix, self._model.own):
             array.zero_()
-        if model.wide:
+        if model.has_strained_nodes:
             count = model.nodes.shape[1]
-            view(self._nodes)[:, :count] = model.nodes
-            view(self._matrix)[:, : 3 * count, : 3 * count] = model.matrix
-            view(self._model.own)[:] = model.own
+            to_view(self._nodes)[:, :count] = model.nodes
+            to_view(self._matrix)[:, : 3 * count, : 3 * count] = model.matrix
+            to_view(self._model.own)[:] = model.change
 
-    def compute_direction(self, tolerance: float, drag: float, bent: bool = False) -> np.ndarray:
+    def compute_direction(self, tolerance: float, proximal: float, allow_nonconvex: bool = False) -> np.ndarray:
         """Solve for the tools' forces with a proximal term, their direction and longest step: (`OUTPUT_SIZE`,) results.
 
-        With `bent` the model need not be convex. If the status is not `SOLVED`, the other results are invalid. The
-        returned array is overwritten by the next call.
+        With `allow_nonconvex` the model need not be convex. If the status is not `SOLVED`, the other results are
+        invalid. The returned array is overwritten by the next call.
         """
-        self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, drag
-        ends = allocate_ends(NONCONVEX if bent else FORCES, FORCES.first_capacity)
-        return self._run("bent" if bent else "aim", lambda: self._compute_direction(ends))
+        self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, proximal
+        ends = build_kernel_limits(NONCONVEX if allow_nonconvex else FORCES, FORCES.first_capacity)
+        return self._run("bent" if allow_nonconvex else "aim", lambda: self._compute_direction(ends))
 
     def shorten_step(self, length: float) -> np.ndarray:
         """Evaluate a shorter step; return its results."""
         self._up.numpy()[LENGTH] = length
         return self._run("again", self._retry_shorter_step)
 
-    def move_to_last_step(self) -> None:
+    def take_step(self) -> None:
         """Accept the last step."""
         self._run("accept", self._take_step)
 
@@ -224,17 +224,17 @@ class ContactSteps:
         if reduction is None:
             return False
         if self._touch is None:
-            self._touch = build_kernel(self._exact, reduction.functions), reduction.build_stage(np.zeros(1, int))
+            self._touch = build_kernel(self._exact, reduction.functions), reduction.build_structs(np.zeros(1, int))
         wp.copy(self._constant, constant)
         return True
 
-    def hold(self, now: ContactState, force: Any, rest: Any) -> tuple[ContactState, Any, Any, Any]:
+    def load_state(self, state: ContactState, force: Any, response: Any) -> tuple[ContactState, Any, Any, Any]:
         """Load a state, forces, and linear response; return views on them, and on the direction `x`."""
-        here = [view(array) for array in (self._u, self._smooth, self._whole, self._force, self._rest, self._x)]
-        for mine, its in zip(here, (now.u, now.smooth, now.whole, force, rest), strict=False):
+        here = [to_view(array) for array in (self._u, self._smooth, self._whole, self._force, self._rest, self._x)]
+        for mine, its in zip(here, (state.u, state.smooth_gradient, state.gradient, force, response), strict=False):
             mine[:] = its
         u, smooth, whole, *others = here
-        return ContactState(u, smooth, whole, now.free.copy(), now.scale.copy()), *others
+        return ContactState(u, smooth, whole, state.norm.copy(), state.scale.copy()), *others
 
     def _run(self, name: str, work: Callable[[], None]) -> np.ndarray:
         device = self._device
@@ -250,7 +250,7 @@ class ContactSteps:
                 self._graphs[name] = capture.graph
         return self._down.numpy()
 
-    def _compute_direction(self, ends: Ends) -> None:
+    def _compute_direction(self, ends: Limits) -> None:
         device, k = self._device, build_kernels(self._device)
         assert self._touch is not None
         kernel, stage = self._touch
@@ -303,7 +303,7 @@ class ContactSteps:
         wp.copy(self._pull, self._new_smooth)
         device.launch(k.add_forces, (len(self._touched),), [self._touched, self._found], [self._pull])
         self._compute_response(self._new_rest)
-        inputs = [self._status, self._length, self._promised, self._ahead, found.sums, found.own]
+        inputs = [self._status, self._length, self._promised, self._ahead, found.sums, found.term_norms]
         device.launch(k.write_results, (1,), inputs, [self._out])
         wp.copy(self._down, self._out)
 
@@ -323,14 +323,14 @@ class ContactSteps:
         inputs = [self._matrix, self._nodes, self._near]
         dim = (ROW_THREADS, 1, self._matrix.shape[2])
         self._device.launch(
-            build_press_kernel(self._device, wp.float64, wp.float64, ROW_THREADS), dim, inputs, [self._own]
+            build_gemv_kernel(self._device, wp.float64, wp.float64, ROW_THREADS), dim, inputs, [self._own]
         )
 
     def _give(self, force: wp.array, out: wp.array, rows: int) -> None:
         """Add the motion under forces to the first `rows` of `out`."""
         inputs = [self._compliance, self._every, force]
         self._device.launch(
-            build_press_kernel(self._device, wp.float64, wp.float64, ROW_THREADS), (ROW_THREADS, 1, rows), inputs, [out]
+            build_gemv_kernel(self._device, wp.float64, wp.float64, ROW_THREADS), (ROW_THREADS, 1, rows), inputs, [out]
         )
 
     def _compute_response(self, out: wp.array) -> None:

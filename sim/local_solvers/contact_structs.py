@@ -24,7 +24,7 @@ class ComplianceModel:
 
 
 @wp.struct
-class Ends:
+class Limits:
     """Limits of the iteration, as `contact_forces.ForceLimits`; `capacity` is the capacity for touched nodes."""
 
     max_iterations: wp.int32

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..minimisers.lbfgs import Descended
+from ..minimisers.lbfgs import DescentResult
 from ..minimisers.lbfgs_kernels import DONE, LIVE, NOT_FINITE
 from ..minimisers.residual import ResidualEvaluator, ResidualState, build_evaluator
 from ..runtime.columns import scatter_columns
@@ -23,7 +23,7 @@ class CycleLimits:
 
     Parameters
     ----------
-    cycles
+    max_cycles
         Maximum number of cycles.
     patience
         Cycles within which the residual must be halved; otherwise another solver takes over.
@@ -33,7 +33,7 @@ class CycleLimits:
         Residual of the local solution: fraction of the whole residual, or of the tolerance if larger.
     """
 
-    cycles: int = 20
+    max_cycles: int = 20
     patience: int = 5
     max_rise: float = 30.0
     forcing: float = 0.03
@@ -47,28 +47,28 @@ without an accepted step gets a residual that is not finite."""
 
 
 def run_cycles(
-    problem: Problem, start: wp.array, tolerance: np.ndarray, most: int, limits: CycleLimits, cycle: Cycle
-) -> Descended:
-    """Iterate from start (3N, b) [m], as `Lbfgs.descend`, in at most `most` cycles; returns no L-BFGS history.
+    problem: Problem, start: wp.array, tolerance: np.ndarray, max_cycles: int, limits: CycleLimits, cycle: Cycle
+) -> DescentResult:
+    """Iterate from start (3N, b) [m], as `Lbfgs.descend`, in at most `max_cycles` cycles; returns no L-BFGS history.
 
     Each load case ends in the state with its smallest residual, or within its tolerance (b,).
     """
     device, count = problem.device, start.shape[1]
     judge = build_evaluator(problem, start)
     now, result, live = judge(start), wp.clone(start), np.arange(count)
-    status, steps, residual = np.where(now.finite, LIVE, NOT_FINITE), np.zeros(count, int), np.full(count, np.inf)
-    first, least, mark, idle = now.free, np.full(count, np.inf), np.full(count, np.inf), np.zeros(count, int)
-    last = min(limits.cycles, most)
+    status, steps, residual = np.where(now.is_finite, LIVE, NOT_FINITE), np.zeros(count, int), np.full(count, np.inf)
+    first, least, mark, idle = now.norm, np.full(count, np.inf), np.full(count, np.inf), np.zeros(count, int)
+    last = min(limits.max_cycles, max_cycles)
     for number in range(last + 1):
-        sane = now.finite & ~(now.free > limits.max_rise * first[live])
+        sane = now.is_finite & ~(now.norm > limits.max_rise * first[live])
         # Diverging forces raise the scale, and so lower the relative residual.
-        done = sane & (now.free <= first[live]) & (now.relative <= tolerance[live])
-        better = done | (sane & (now.free <= np.fmin(first, least)[live]))
+        done = sane & (now.norm <= first[live]) & (now.relative <= tolerance[live])
+        better = done | (sane & (now.norm <= np.fmin(first, least)[live]))
         scatter_columns(device, now.u, live[better], result, np.flatnonzero(better))
-        least[live[better]], residual[live[better]] = now.free[better], now.relative[better]
+        least[live[better]], residual[live[better]] = now.norm[better], now.relative[better]
         steps[live[sane]], status[live[done]] = number, DONE
-        halved = now.free <= 0.5 * mark[live]
-        mark[live[halved]] = now.free[halved]
+        halved = now.norm <= 0.5 * mark[live]
+        mark[live[halved]] = now.norm[halved]
         idle[live] = np.where(halved, 0, idle[live] + 1)
         stay = np.flatnonzero(sane & ~done & (idle[live] < limits.patience))
         if number == last or len(stay) == 0:
@@ -76,5 +76,5 @@ def run_cycles(
         if len(stay) < len(live):
             judge, now, live = judge.select(stay), now.select(device, stay), live[stay]
         goal = limits.tolerance_factor * tolerance[live] * now.scale
-        now = cycle(judge, now, np.fmax(limits.forcing * now.free, goal))
-    return Descended(result, status, steps, residual, {})
+        now = cycle(judge, now, np.fmax(limits.forcing * now.norm, goal))
+    return DescentResult(result, status, steps, residual, {})

@@ -19,11 +19,11 @@ from ..arguments import is_all_finite
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..linalg.compliance import Compliance
-from ..linalg.multifrontal import Factor
+from ..linalg.multifrontal import SparseFactor
 from ..linalg.pcg import Preconditioner
-from ..minimisers.lbfgs import Descended, Lbfgs
+from ..minimisers.lbfgs import DescentResult, Lbfgs
 from ..runtime.threads import limit_to_one_thread
-from .batch_elimination import open_vertices
+from .batch_elimination import list_open_vertices
 from .strained_part import StrainedPart, StrainLimits
 
 SINGLE_LIMITS = StrainLimits(max_nodes=320, max_omitted=np.inf)
@@ -36,13 +36,13 @@ class Renewal:
 
     Parameters
     ----------
-    max_served
+    max_reused_steps
         Maximum steps of a descent whose model is handed on to the next.
     max_evaluations
         L-BFGS evaluations without convergence, after which the model is recomputed at the present state.
     """
 
-    max_served: int = 4
+    max_reused_steps: int = 4
     max_evaluations: int = 8
 
 
@@ -59,7 +59,7 @@ class StiffnessUpdate:
     factor: np.ndarray
     pivots: np.ndarray
 
-    def pull(self, motion: np.ndarray) -> np.ndarray:
+    def compute_force(self, motion: np.ndarray) -> np.ndarray:
         """Compute the correcting forces (n,) [N] for a linear response (3N,) [m] of the undeformed mesh."""
         return -lu_solve((self.factor, self.pivots), self.added @ motion[self.rows], check_finite=False)
 
@@ -78,7 +78,7 @@ class StiffenedPreconditioner:
 
     on_device = False
 
-    def __init__(self, rest: Factor, problem: Problem):
+    def __init__(self, rest: SparseFactor, problem: Problem):
         self._rest, self._problem = rest, problem
         self.stiffening: StiffnessUpdate | None = None
 
@@ -93,7 +93,7 @@ class StiffenedPreconditioner:
         z = out.numpy()[:, 0].astype(np.float32)
         pull, more = wp.zeros_like(r), wp.zeros_like(r)
         with limit_to_one_thread():
-            pull.numpy()[self.stiffening.rows, 0] = self.stiffening.pull(z)
+            pull.numpy()[self.stiffening.rows, 0] = self.stiffening.compute_force(z)
         self._problem.constraint.project_nodes(pull)
         self._rest.apply(pull, live, more)
         whole, g = out.numpy() + more.numpy(), r.numpy()
@@ -114,28 +114,28 @@ class StrainedDescent:
         Limits after which a model is recomputed.
     """
 
-    def __init__(self, problem: Problem, factor: Factor, part: StrainedPart, renewal: Renewal = Renewal()):
+    def __init__(self, problem: Problem, factor: SparseFactor, part: StrainedPart, renewal: Renewal = Renewal()):
         self._problem, self._part, self._renewal = problem, part, renewal
         self._preconditioner = StiffenedPreconditioner(factor, problem)
         self._lbfgs = Lbfgs(problem, self._preconditioner)
 
     def descend(
-        self, start: wp.array, tolerance: np.ndarray, most: int, warm_start: Mapping[str, np.ndarray] | None = None
-    ) -> Descended:
+        self, start: wp.array, tolerance: np.ndarray, max_iter: int, warm_start: Mapping[str, np.ndarray] | None = None
+    ) -> DescentResult:
         """Solve as `Lbfgs.descend`, for one load case; `warm_start` is the model. The first call takes 0.5 s more."""
         self._part.prepare()
-        u, left, steps = start, most, 0
+        u, left, steps = start, max_iter, 0
         self._preconditioner.stiffening = self.get_warm_start(warm_start) or self._build_stiffness_update(u)
         while True:
             some = min(left, self._renewal.max_evaluations)
             found = self._lbfgs.descend(u, tolerance, some)
             left, steps = left - some, steps + int(found.steps[0])
-            if not len(found.left) or left <= 0:
+            if not len(found.unfinished) or left <= 0:
                 break
             u = found.u
             self._preconditioner.stiffening = self._build_stiffness_update(u)
         stiffening, self._preconditioner.stiffening = self._preconditioner.stiffening, None
-        serves = warm_start is not None and steps <= self._renewal.max_served
+        serves = warm_start is not None and steps <= self._renewal.max_reused_steps
         kept = stiffening.warm_start if stiffening and serves else {}
         return replace(found, steps=np.array([steps]), warm_start=kept)
 
@@ -174,9 +174,9 @@ class StrainedDescent:
 
 
 def build_strained_part(
-    problem: Problem, preconditioner: Preconditioner, space: Discretisation, strains: StrainLimits = SINGLE_LIMITS
+    problem: Problem, preconditioner: Preconditioner, space: Discretisation, limits: StrainLimits = SINGLE_LIMITS
 ) -> StrainedPart:
     """Build the finder of strained tissue for a mesh with a small opening: models use the nodes nearest to it."""
-    distance, _ = KDTree(space.nodes[open_vertices(space, problem.constraint)]).query(space.nodes)
-    near = np.sort(np.argsort(distance, kind="stable")[: strains.max_candidates])
-    return StrainedPart(problem, Compliance(problem, preconditioner, near), 0, strains)
+    distance, _ = KDTree(space.nodes[list_open_vertices(space, problem.constraint)]).query(space.nodes)
+    near = np.sort(np.argsort(distance, kind="stable")[: limits.max_candidates])
+    return StrainedPart(problem, Compliance(problem, preconditioner, near), 0, limits)

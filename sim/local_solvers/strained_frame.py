@@ -14,8 +14,8 @@ from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
 from ..runtime.columns import combine_columns
 from ..runtime.device import Device
-from ..runtime.views import cast_like, get_library, run_in_order, solve_dense, to_library, view
-from .press_kernel import build_press_kernel
+from ..runtime.views import cast_like, get_library, run_in_order, solve_dense, to_library, to_view
+from .press_kernel import build_gemv_kernel
 from .strained_part import StrainedPart
 
 # Keys of warm-start data.
@@ -46,7 +46,7 @@ def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedM
     None if strained tissue does not fit. The host does not wait for the GPU.
     """
     with run_in_order(device):
-        found = part.find_stiffening(u, np.arange(1), full=True)
+        found = part.find_stiffening(u, np.arange(1), fixed_size=True)
         if found is None:
             return None
         lib, (places, added) = get_library(device), found
@@ -55,7 +55,7 @@ def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedM
             wp.zeros(shape, dtype=dtype, device=device.name)
             for shape, dtype in ((added.shape, wp.float32), (places.shape, wp.int32))
         )
-        bent, nodes = view(own), view(of)
+        bent, nodes = to_view(own), to_view(of)
         added = cast_like(bent, added)
         system = added @ cast_like(bent, part.build_compliance(rows))
         diagonal = range(rows.shape[1])
@@ -98,13 +98,13 @@ class UpdatedPreconditioner:
         self._matrix = wp.zeros((1, size, size), dtype=wp.float32, device=name)
         self._pull, self._more = (problem.device.allocate(problem.rows, 1) for _ in range(2))
 
-    def load(self, bent: UpdatedModel | None) -> None:
+    def load_model(self, model: UpdatedModel | None) -> None:
         """Load another model, or none."""
-        if bent is None:
+        if model is None:
             self._matrix.zero_()
         else:
-            wp.copy(self._nodes, bent.nodes)
-            wp.copy(self._matrix, bent.matrix)
+            wp.copy(self._nodes, model.nodes)
+            wp.copy(self._matrix, model.matrix)
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """Prepare the preconditioner of the undeformed mesh."""
@@ -116,7 +116,7 @@ class UpdatedPreconditioner:
         self._rest.apply(r, live, out)
         self._pull.zero_()
         kernel, shape = (
-            build_press_kernel(device, wp.float32, device.scalar, ROW_THREADS),
+            build_gemv_kernel(device, wp.float32, device.scalar, ROW_THREADS),
             (ROW_THREADS, *self._matrix.shape[:2]),
         )
         device.launch(kernel, shape, [self._matrix, self._nodes, out], [self._pull])

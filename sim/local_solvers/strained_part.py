@@ -15,21 +15,21 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.problem import Problem
-from ..discretisation.term import Strained
+from ..discretisation.term import StrainTerm
 from ..linalg.compliance import Compliance
 from ..runtime.device import Device
 from ..runtime.views import (
     cast_like,
     from_view,
     get_library,
-    order_by_size,
     pad_zeros,
+    rank_rows,
     sort_columns,
     to_host,
     to_library,
-    view,
+    to_view,
 )
-from .press_kernel import build_press_kernel
+from .press_kernel import build_gemv_kernel
 
 
 @dataclass(frozen=True)
@@ -77,31 +77,31 @@ class StrainedModel:
 
     nodes: Any
     matrix: Any
-    own: Any
+    change: Any
 
     @property
-    def wide(self) -> bool:
+    def has_strained_nodes(self) -> bool:
         """True if any load case has strained nodes."""
         return self.nodes.shape[1] > 0
 
     @property
-    def bent(self) -> np.ndarray:
+    def is_strained(self) -> np.ndarray:
         """True (b,) where a load case has strained nodes."""
         return to_host((self.matrix != 0.0).any(-1).any(-1))
 
     def select(self, columns: np.ndarray) -> StrainedModel:
         """Return the models of some load cases (k,)."""
-        return StrainedModel(self.nodes[columns], self.matrix[columns], self.own[columns])
+        return StrainedModel(self.nodes[columns], self.matrix[columns], self.change[columns])
 
-    def forget(self, columns: np.ndarray) -> None:
+    def reset_columns(self, columns: np.ndarray) -> None:
         """Reset the models of some load cases (k,) to the undeformed stiffness."""
-        self.matrix[columns], self.own[columns] = 0.0, 0.0
+        self.matrix[columns], self.change[columns] = 0.0, 0.0
 
     def merge_columns(self, columns: np.ndarray, other: StrainedModel) -> StrainedModel:
         """Return the models with those of some load cases (k,) replaced by another's."""
         most = max(self.nodes.shape[1], other.nodes.shape[1])
         mine, its = self._pad_nodes(most), other._pad_nodes(most)
-        for one, two in ((mine.nodes, its.nodes), (mine.matrix, its.matrix), (mine.own, its.own)):
+        for one, two in ((mine.nodes, its.nodes), (mine.matrix, its.matrix), (mine.change, its.change)):
             one[columns] = two
         return mine
 
@@ -109,28 +109,28 @@ class StrainedModel:
         """Return the models with capacity for `most` nodes."""
         missing = most - self.nodes.shape[1]
         nodes, matrix = pad_zeros(self.nodes, (missing,)), pad_zeros(self.matrix, (3 * missing, 3 * missing))
-        return StrainedModel(nodes, matrix, self.own)
+        return StrainedModel(nodes, matrix, self.change)
 
     def apply_stiffness(self, device: Device, motion: wp.array) -> wp.array:
         """Compute E M E' motion (3n, b) [N] of motions (3n, b) [m] of the compliance's nodes."""
         out, (count, size) = wp.zeros_like(motion), self.matrix.shape[:2]
         inputs = [from_view(device, self.matrix), from_view(device, self.nodes), motion]
-        device.launch(build_press_kernel(device, wp.float64, wp.float64), (1, count, size), inputs, [out])
+        device.launch(build_gemv_kernel(device, wp.float64, wp.float64), (1, count, size), inputs, [out])
         return out
 
 
-def choose_strained(device: Device, strain: Any, least: float, most: int) -> tuple[Any, Any, Any]:
-    """Choose the `most` rows of each load case with the largest strains (n, b) above `least`: ascending, (m, b).
+def choose_strained_rows(device: Device, strain: Any, min_strain: float, max_rows: int) -> tuple[Any, Any, Any]:
+    """Choose `max_rows` rows of each load case with the largest strains (n, b) above `min_strain`: ascending, (m, b).
 
     n marks unused places. Return also the strain (b,) above which rows are chosen, and their number (b,).
     """
     lib, count = get_library(device), len(strain)
-    columns, order = to_library(device, np.arange(strain.shape[1])), order_by_size(strain)
-    limit = 0.0 * strain[0] + least
-    if count > most:
-        limit = lib.maximum(limit, strain[order[most], columns])
-    kept = strain[order[:most], columns] > limit
-    return sort_columns(lib.where(kept, order[:most], count)), limit, kept.sum(0)
+    columns, order = to_library(device, np.arange(strain.shape[1])), rank_rows(strain)
+    limit = 0.0 * strain[0] + min_strain
+    if count > max_rows:
+        limit = lib.maximum(limit, strain[order[max_rows], columns])
+    kept = strain[order[:max_rows], columns] > limit
+    return sort_columns(lib.where(kept, order[:max_rows], count)), limit, kept.sum(0)
 
 
 class StrainedPart:
@@ -156,7 +156,7 @@ class StrainedPart:
         self._near = device.upload(nodes, wp.int32)
         near = np.zeros(problem.rows // 3, bool)
         near[nodes] = True
-        found = [(term, term.elements_on(near)) for term in problem.terms if isinstance(term, Strained)]
+        found = [(term, term.find_elements_on(near)) for term in problem.terms if isinstance(term, StrainTerm)]
         self._elements = [(term, device.upload(some, wp.int32)) for term, some in found]
 
     def build_model(self, u: wp.array, columns: np.ndarray) -> StrainedModel | None:
@@ -166,35 +166,35 @@ class StrainedPart:
 
     def prepare(self) -> None:
         """Compute the compliance at all nodes, unless that is done."""
-        self.compliance.ensure_known(np.ones(len(self.compliance.nodes), bool))
+        self.compliance.ensure_columns(np.ones(len(self.compliance.nodes), bool))
 
-    def find_stiffening(self, u: wp.array, columns: np.ndarray, full: bool = False) -> tuple[Any, Any] | None:
+    def find_stiffening(self, u: wp.array, columns: np.ndarray, fixed_size: bool = False) -> tuple[Any, Any] | None:
         """Select the most strained nodes, as indices into the compliance (k, n); assemble their D (k, 3n, 3n) [N/m].
 
-        D is zero where a load case has fewer nodes. With `full`, n is the maximum, and the host does not wait for the
-        GPU. None if tissue that does not fit is strained more than `cut`.
+        D is zero where a load case has fewer nodes. With `fixed_size`, n is the maximum, and the host does not wait for
+        the GPU. None if tissue that does not fit is strained more than `cut`.
         """
         device, count, strains = self._problem.device, len(columns), self._strains
         picked = device.upload(columns, wp.int32)
         strain = device.allocate(self._problem.rows // 3, count)
         for term, some in self._elements:
-            term.raise_strain(some, u, picked, strain)
-        nodes, limit, numbers = choose_strained(
-            device, view(strain)[view(self._near)], strains.min_strain, strains.max_nodes
+            term.update_max_strain(some, u, picked, strain)
+        nodes, limit, numbers = choose_strained_rows(
+            device, to_view(strain)[to_view(self._near)], strains.min_strain, strains.max_nodes
         )
         if strains.max_omitted < np.inf and float(limit.max()) > max(strains.max_omitted, strains.min_strain):
             return None
-        wide = len(nodes) if full else int(numbers.max())
+        wide = len(nodes) if fixed_size else int(numbers.max())
         place = wp.full((len(strain), count), -1, dtype=wp.int32, device=device.name)
         near, axes = len(self._near), to_library(device, np.arange(max(wide, count), dtype=np.int32))
-        ranks = view(wp.full((near + 1, count), -1, dtype=wp.int32, device=device.name))
+        ranks = to_view(wp.full((near + 1, count), -1, dtype=wp.int32, device=device.name))
         ranks[nodes[:wide], axes[:count]] = axes[:wide, None]
-        view(place)[view(self._near)] = ranks[:near]
+        to_view(place)[to_view(self._near)] = ranks[:near]
         stiffer = wp.zeros((count, 3 * wide, 3 * wide), dtype=wp.float64, device=device.name)
         if wide:
             for term, some in self._elements:
                 term.add_stiffening(some, u, picked, from_view(device, limit), place, stiffer)
-        return cast_like(ranks, nodes[:wide].T.clip(max=near - 1)), view(stiffer)
+        return cast_like(ranks, nodes[:wide].T.clip(max=near - 1)), to_view(stiffer)
 
     def build_compliance(self, rows: Any) -> Any:
         """Return C (b, n, n) [m/N] between some computed rows (b, n) of the compliance, symmetrised."""
@@ -207,7 +207,7 @@ class StrainedPart:
         device, count, size = self._problem.device, len(nodes), stiffer.shape[1]
         # One more row and column collect the entries of nodes that cannot be touched.
         shape = count, 3 * self._touchable + 1, 3 * self._touchable + 1
-        own = view(wp.zeros(shape, dtype=wp.float32, device=device.name))
+        own = to_view(wp.zeros(shape, dtype=wp.float32, device=device.name))
         matrix, axes = 0.0 * stiffer, to_library(device, np.arange(3))
         each = max(1, self._strains.max_bytes // (6 * 8 * max(size, 1) ** 2))
         for first in range(0, count if size else 0, each):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..runtime.device import Device
-from ..runtime.views import cast_like, select_columns, to_host, to_library, view
+from ..runtime.views import cast_like, select_columns, to_host, to_library, to_view
 from .lbfgs_kernels import PAIRS
 
 
@@ -30,14 +30,14 @@ class CurvaturePairs:
     yw: np.ndarray
 
     @cached_property
-    def middle(self) -> np.ndarray:
+    def middle_matrix(self) -> np.ndarray:
         """Middle matrix M (2m, 2m) of the compact representation."""
-        return compute_middle(self.sy, self.yw)
+        return compute_middle_matrix(self.sy, self.yw)
 
     def compute_weights(self, force: np.ndarray) -> np.ndarray:
         """Compute the coefficients M [S, W]' force (2m,) for a force (3N,)."""
         force = force.astype(self.s.dtype)
-        return self.middle @ np.concatenate([self.s @ force, self.w @ force])
+        return self.middle_matrix @ np.concatenate([self.s @ force, self.w @ force])
 
     def compute_motion(self, weights: np.ndarray) -> np.ndarray:
         """Compute the displacement [S, W] weights (3N,)."""
@@ -56,12 +56,12 @@ class CurvaturePairs:
         return CurvaturePairs(steps, ways, sy, yw)
 
 
-def build_empty_history(rows: int, kind: str) -> CurvaturePairs:
-    """Build an empty L-BFGS history for one load case of `rows` unknowns, dtype `kind`."""
-    return CurvaturePairs(*np.zeros((2, 0, rows), kind), *np.zeros((2, 0, 0)))
+def build_empty_history(rows: int, dtype: str) -> CurvaturePairs:
+    """Build an empty L-BFGS history for one load case of `rows` unknowns, dtype `dtype`."""
+    return CurvaturePairs(*np.zeros((2, 0, rows), dtype), *np.zeros((2, 0, 0)))
 
 
-def compute_middle(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
+def compute_middle_matrix(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
     """Compute the middle matrix M (..., 2m, 2m) from s_i . y_j and y_i . w_j (..., m, m); zero pairs have no effect."""
     upper, eye = np.triu(sy), np.eye(sy.shape[-1])
     own = np.diagonal(upper, axis1=-2, axis2=-1)[..., None] * eye
@@ -84,7 +84,7 @@ class BatchHistory:
     def __init__(self, device: Device, rows: int, columns: int):
         self._device = device
         # s and w on the device, their products on the host in float64; pair i of a load case is in slot i modulo PAIRS.
-        self._sw = view(device.allocate(columns * 2 * PAIRS, rows)).reshape(columns, 2 * PAIRS, rows)
+        self._sw = to_view(device.allocate(columns * 2 * PAIRS, rows)).reshape(columns, 2 * PAIRS, rows)
         self._sy, self._yw = np.zeros((2, columns, PAIRS, PAIRS))
         self.count = np.zeros(columns, int)
         self._asked: tuple[np.ndarray, LbfgsHistory] | None = None
@@ -95,13 +95,13 @@ class BatchHistory:
         self._sw = self._sw[columns]
         self._sy, self._yw, self.count = self._sy[columns], self._yw[columns], self.count[columns]
 
-    def forget(self, columns: np.ndarray) -> None:
+    def clear(self, columns: np.ndarray) -> None:
         """Clear the history of some load cases (k,)."""
         self._asked = None
         self._sw[columns], self._sy[columns], self._yw[columns], self.count[columns] = 0.0, 0.0, 0.0, 0
 
     @property
-    def most(self) -> int:
+    def max_pairs(self) -> int:
         """Largest number of pairs of any load case."""
         return min(int(self.count.max(initial=0)), PAIRS)
 
@@ -113,7 +113,7 @@ class BatchHistory:
         both = np.concatenate([order, PAIRS + order], axis=1)
         place = columns[:, None, None], order[:, :, None], order[:, None, :]
         middle = np.empty((len(columns), 2 * PAIRS, 2 * PAIRS))
-        found = compute_middle(self._sy[place], self._yw[place])
+        found = compute_middle_matrix(self._sy[place], self._yw[place])
         middle[np.arange(len(columns))[:, None, None], both[:, :, None], both[:, None, :]] = found
         own = self._sw[select_columns(self._device, columns, len(self.count))]
         history = LbfgsHistory(own, to_library(self._device, middle.astype(self._device.precision)))
@@ -140,11 +140,11 @@ class LbfgsHistory:
     """Compact L-BFGS representation of k load cases: [S, W]' (k, 2m, 3N) and the middle matrix M (k, 2m, 2m)."""
 
     sw: Any
-    middle: Any
+    middle_matrix: Any
 
     def compute_weights(self, force: Any) -> Any:
         """Compute the coefficients M [S, W]' force (k, 2m, 1) for forces (3N, k) [N]."""
-        return self.middle @ (self.sw @ force.T[:, :, None])
+        return self.middle_matrix @ (self.sw @ force.T[:, :, None])
 
     def compute_motion(self, weights: Any) -> Any:
         """Compute the displacements [S, W] weights (3N, k) [m]."""

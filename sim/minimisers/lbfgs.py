@@ -17,7 +17,7 @@ from ..discretisation.term import Cases
 from ..linalg.pcg import Preconditioner
 from ..runtime.columns import MAX_EXACT, find_workspace_width, scatter_columns
 from .lbfgs_kernels import LIVE, PAIRS, STOPPED
-from .lbfgs_state import Workspace, allocate_memory
+from .lbfgs_state import LbfgsWorkspace, allocate_memory
 
 # L-BFGS history of a descent on the host, load cases first: s and w (b, m, 3N), products (b, m, m), slot of the newest
 # pair and number of pairs (b,).
@@ -26,26 +26,26 @@ MAX_CARRIED = MAX_EXACT  # Largest batch [load cases] that hands its history on:
 
 
 @dataclass(frozen=True)
-class Schedule:
+class CheckSchedule:
     """Interval of the host's checks, and when live load cases move to a narrower workspace.
 
     Parameters
     ----------
     check_interval
         Iterations between two checks.
-    narrowing
+    width_ratio
         They move if the narrower width is at most this fraction of the present one.
     """
 
     check_interval: int = 1
-    narrowing: float = 0.85
+    width_ratio: float = 0.85
 
 
-CUDA_SCHEDULE = Schedule(check_interval=2, narrowing=0.75)  # A check stalls the GPU.
+CUDA_SCHEDULE = CheckSchedule(check_interval=2, width_ratio=0.75)  # A check stalls the GPU.
 
 
 @dataclass(frozen=True, eq=False)
-class Descended:
+class DescentResult:
     """End of a descent: u (3N, b) [m] on the device; status, steps, relative residuals (b,) on the host; history."""
 
     u: wp.array
@@ -55,7 +55,7 @@ class Descended:
     warm_start: Mapping[str, np.ndarray]
 
     @property
-    def left(self) -> np.ndarray:
+    def unfinished(self) -> np.ndarray:
         """Load cases (k,) that did not end, so that another method can continue them."""
         return np.flatnonzero((self.status == LIVE) | (self.status == STOPPED))
 
@@ -73,11 +73,11 @@ class Lbfgs:
         Checks by the host; None: default of the device.
     """
 
-    def __init__(self, problem: Problem, preconditioner: Preconditioner, schedule: Schedule | None = None):
+    def __init__(self, problem: Problem, preconditioner: Preconditioner, schedule: CheckSchedule | None = None):
         self._problem = problem
-        self._schedule = schedule or (CUDA_SCHEDULE if problem.device.on_cuda else Schedule())
+        self._schedule = schedule or (CUDA_SCHEDULE if problem.device.on_cuda else CheckSchedule())
         self._preconditioner = preconditioner
-        self._workspaces: dict[int, Workspace] = {}
+        self._workspaces: dict[int, LbfgsWorkspace] = {}
         self._ground: dict[str, wp.array] = {}
 
     @property
@@ -89,44 +89,44 @@ class Lbfgs:
         self,
         start: wp.array,
         tolerance: np.ndarray,
-        most: int,
+        max_iter: int,
         history: Mapping[str, np.ndarray] | None = None,
-        force: np.ndarray | None = None,
-        stragglers: float = 0.0,
-        ahead: tuple[wp.array, wp.array] | None = None,
-    ) -> Descended:
-        """Minimise the potential of the batch that the problem has begun, from start (3N, b) [m], in `most` iterations.
+        force_tolerance: np.ndarray | None = None,
+        straggler_fraction: float = 0.0,
+        initial_residual: tuple[wp.array, wp.array] | None = None,
+    ) -> DescentResult:
+        """Minimise the potential of the begun batch, from start (3N, b) [m], in at most `max_iter` iterations.
 
         The start satisfies the constraints, and no footprint moves. A load case ends at its tolerance (b,), relative as
-        in `Problem.residual`, or where the 2-norm of the residual is at most force (b,) [N]. `history` is that of an
-        earlier descent of the same problem near this state, if any; with None this descent returns no history
-        either. The descent stops when at most the fraction `stragglers` of all load cases is live. `ahead` holds the
-        residual at the start and its preconditioned form (3N, b), if they are available. Each returned u is the last
-        accepted state of its load case.
+        in `Problem.residual`, or where the 2-norm of the residual is at most force_tolerance (b,) [N]. `history` is
+        that of an earlier descent of the same problem near this state, if any; with None this descent returns no
+        history either. The descent stops when at most the fraction `straggler_fraction` of all load cases is live.
+        `initial_residual` holds the residual at the start and its preconditioned form (3N, b), if they are available.
+        Each returned u is the last accepted state of its load case.
         """
         device, count = self._problem.device, start.shape[1]
         u, place = wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
         carried = history is not None and count <= MAX_CARRIED
         if count == 0:
-            return Descended(u, status, steps, residual, {})
+            return DescentResult(u, status, steps, residual, {})
         workspace, tried = self._get_workspace(count), 0
         workspace.begin(
             start,
             tolerance,
-            np.zeros(count) if force is None else force,
+            np.zeros(count) if force_tolerance is None else force_tolerance,
             (history or {}) if count <= MAX_CARRIED else {},
         )
-        if ahead is not None:
-            workspace.set_direction(*ahead)
+        if initial_residual is not None:
+            workspace.set_direction(*initial_residual)
         while True:
-            more = min(self._schedule.check_interval, most - tried)
+            more = min(self._schedule.check_interval, max_iter - tried)
             workspace.iterate(more)
             tried += more
             now = workspace.columns["status"].numpy()[: len(place)]
             left = int((now == LIVE).sum())
-            last = tried >= most or left <= stragglers * count
-            if last or (count > MAX_CARRIED and self._find_width(left) <= self._schedule.narrowing * workspace.width):
+            last = tried >= max_iter or left <= straggler_fraction * count
+            if last or (count > MAX_CARRIED and self._find_width(left) <= self._schedule.width_ratio * workspace.width):
                 leave = np.flatnonzero(now != LIVE) if not last else np.arange(len(now))
                 there = place[leave]
                 scatter_columns(device, workspace.columns["u"], there, u, leave)
@@ -135,19 +135,19 @@ class Lbfgs:
                 )
                 if last:
                     history = {name: to_rows_first(workspace.columns[name]) for name in HISTORY_KEYS} if carried else {}
-                    return Descended(u, status, steps, residual, history)
+                    return DescentResult(u, status, steps, residual, history)
                 stay = np.flatnonzero(now == LIVE)
                 place, before, workspace = place[stay], workspace, self._get_workspace(len(stay))
-                workspace.take(before, stay)
+                workspace.take_columns(before, stay)
 
-    def _get_workspace(self, count: int) -> Workspace:
+    def _get_workspace(self, count: int) -> LbfgsWorkspace:
         """Return a workspace for `count` load cases or slightly more."""
         width = self._find_width(count)
         if width > max(self._workspaces, default=0):
             self._workspaces, self._ground = {}, {}  # free the old memory before more is allocated
             self._ground = allocate_memory(self._problem, width)
         if width not in self._workspaces:
-            self._workspaces[width] = Workspace(self._problem, self._preconditioner, width, self._ground)
+            self._workspaces[width] = LbfgsWorkspace(self._problem, self._preconditioner, width, self._ground)
         return self._workspaces[width]
 
     def _find_width(self, count: int) -> int:

@@ -36,12 +36,12 @@ PRODUCTS = 3  # Number of these rows.
 class LbfgsKernels:
     """L-BFGS kernels for one scalar type and number of pairs."""
 
-    absorb: wp.Kernel
+    add_gradient: wp.Kernel
     multiply: wp.Kernel
-    judge: wp.Kernel
-    aim: wp.Kernel
-    move: wp.Kernel
-    clamp: wp.Kernel
+    check_step: wp.Kernel
+    set_direction: wp.Kernel
+    accept: wp.Kernel
+    limit_step: wp.Kernel
 
 
 def get_rows_per_thread(device: Device) -> int:

@@ -65,24 +65,24 @@ class LbfgsState:
     """L-BFGS arrays of `width` load cases by name; those that move with load cases, by number type; the memory."""
 
     columns: Mapping[str, wp.array]
-    moved: Mapping[str, wp.array]
-    ground: Mapping[str, wp.array]  # kept alive here: its views hold no reference
+    movable: Mapping[str, wp.array]
+    memory: Mapping[str, wp.array]  # kept alive here: its views hold no reference
 
 
-def allocate_state(problem: Problem, width: int, ground: Mapping[str, wp.array]) -> LbfgsState:
+def allocate_state(problem: Problem, width: int, memory: Mapping[str, wp.array]) -> LbfgsState:
     """Build the state of `width` load cases on memory that `allocate_memory` made for at least this width."""
     columns: dict[str, wp.array] = {}
     together: dict[str, wp.array] = {}
     for kind, (_, moved, written) in describe_layout(problem).items():
         first = 0
         for name, shape in {**moved, **written}.items():
-            columns[name] = _view_memory(ground[kind], first, (*shape, width))
+            columns[name] = _view_memory(memory[kind], first, (*shape, width))
             first += width * prod(shape)
-        together[kind] = _view_memory(ground[kind], 0, (_count_values(moved), width))
-    return LbfgsState(columns, together, ground)
+        together[kind] = _view_memory(memory[kind], 0, (_count_values(moved), width))
+    return LbfgsState(columns, together, memory)
 
 
-class Workspace:
+class LbfgsWorkspace:
     """Workspace of L-BFGS, load cases last, on shared memory. On a GPU the iteration is captured once as a graph.
 
     Parameters
@@ -106,11 +106,11 @@ class Workspace:
         self._trial = ResidualArrays(a["new_g"], a["part"], a["sums"], a["own"])
 
     def begin(
-        self, start: wp.array, tolerance: np.ndarray, force: np.ndarray, history: Mapping[str, np.ndarray]
+        self, start: wp.array, tolerance: np.ndarray, force_tolerance: np.ndarray, history: Mapping[str, np.ndarray]
     ) -> None:
         """Load a batch of at most `width` load cases; the first iteration evaluates its start (3N, b)."""
         a, device, spare = self.columns, self._problem.device, self.width - start.shape[1]
-        for array in (a["d"], a["g"], a["z"], self.state.moved["double"], self.state.moved["whole"]):
+        for array in (a["d"], a["g"], a["z"], self.state.movable["double"], self.state.movable["whole"]):
             array.zero_()
         if spare:
             index = self._pad_indices(np.arange(start.shape[1]))
@@ -122,7 +122,7 @@ class Workspace:
             a[name].fill_(value)
         # Load cases that only fill the workspace converge at once.
         a["tolerance"].assign(np.append(tolerance, np.full(spare, np.inf)))
-        a["force"].assign(np.append(force, np.full(spare, np.inf)))
+        a["force"].assign(np.append(force_tolerance, np.full(spare, np.inf)))
         constant, loud = compute_constant_gradients(self._problem, a["u"])
         wp.copy(a["constant"], constant)
         wp.copy(a["loud"], loud)
@@ -142,15 +142,15 @@ class Workspace:
         a["t"].fill_(1.0)
         self._limit_steps()
 
-    def take(self, other: Workspace, stay: np.ndarray) -> None:
+    def take_columns(self, source: LbfgsWorkspace, columns: np.ndarray) -> None:
         """Continue with these load cases (k,) of another workspace's batch."""
-        index = self._pad_indices(stay)
+        index = self._pad_indices(columns)
         self._problem.keep(index)
         there = self._problem.device.upload(index, wp.int32)
-        for kind, own in self.state.moved.items():
-            wp.copy(own, gather_columns(self._problem.device, other.state.moved[kind], there))
-        if len(stay) < self.width:
-            self.columns["status"][len(stay) :].fill_(DONE)
+        for kind, own in self.state.movable.items():
+            wp.copy(own, gather_columns(self._problem.device, source.state.movable[kind], there))
+        if len(columns) < self.width:
+            self.columns["status"][len(columns) :].fill_(DONE)
         self.prepare()
 
     def _pad_indices(self, stay: np.ndarray) -> np.ndarray:
@@ -167,11 +167,11 @@ class Workspace:
         self._problem.linearise(u, np.zeros(u.shape[1], bool))
         self._preconditioner.prepare(self._problem, u.shape[1])
 
-    def iterate(self, times: int) -> None:
+    def iterate(self, count: int) -> None:
         """Run this number of L-BFGS iterations."""
         device = self._problem.device
         if not (device.on_cuda and self._preconditioner.on_device):
-            for _ in range(times):
+            for _ in range(count):
                 self.run_iteration()
             return
         if self._graph is None:
@@ -181,8 +181,8 @@ class Workspace:
             with wp.ScopedCapture(device.name, force_module_load=False) as capture:
                 self.run_iteration()
             self._graph = capture.graph
-            times -= 1
-        for _ in range(times):
+            count -= 1
+        for _ in range(count):
             wp.capture_launch(self._graph)
 
     def run_iteration(self) -> None:
@@ -194,16 +194,18 @@ class Workspace:
         step = lbfgs_trial_kernels.build_kernels(device, spread).step
         device.launch(step, (spread.count_threads(rows), count), [a["u"], a["t"], a["d"]], [a["v"]])
         found = compute_residual_arrays(problem, a["v"], a["constant"], a["d"], self._trial)
-        inputs = [a["loud"], found.own, a["tolerance"], a["force"], found.sums, a["predicted"]]
+        inputs = [a["loud"], found.term_norms, a["tolerance"], a["force"], found.sums, a["predicted"]]
         names = ("status", "accepted", "steps", "cut", "t", "step_length", "residual", "slot", "aiming")
-        device.launch(k.judge, one, inputs, [a[name] for name in names])
+        device.launch(k.check_step, one, inputs, [a[name] for name in names])
         if count == 1 and (not device.on_cuda or wp.is_conditional_graph_supported()):
             wp.capture_if(a["aiming"], self._compute_directions)
         else:
             self._compute_directions()
         inputs = [a["status"], a["accepted"], a["known"], a["slot"], a["step_length"], a["along_s"], a["along_w"]]
         outputs = [a["u"], a["d"], a["g"], a["z"], a["s"], a["w"]]
-        device.launch(k.move, (-(-rows // get_rows_per_thread(device)), count), [*inputs, found.g, a["new_z"]], outputs)
+        device.launch(
+            k.accept, (-(-rows // get_rows_per_thread(device)), count), [*inputs, found.g, a["new_z"]], outputs
+        )
         self._limit_steps()
 
     def _compute_directions(self) -> None:
@@ -227,13 +229,13 @@ class Workspace:
         inputs = [a["aiming"], a["step_length"], self._trial.sums, a["products"]]
         outputs = [a["status"], a["head"], a["known"], a["slot"], a["t"], a["predicted"]]
         outputs += [a["sg"], a["wg"], a["sy"], a["yw"], a["along_s"], a["along_w"]]
-        device.launch(k.aim, (count,), inputs, outputs)
+        device.launch(k.set_direction, (count,), inputs, outputs)
 
     def _limit_steps(self) -> None:
         a, bound = self.columns, self.columns["bound"]
         for term in self._problem.terms:
             term.longest_step(a["u"], a["d"], bound)
-        self._problem.device.launch(self._kernels.clamp, (self.width,), [], [bound, a["t"]])
+        self._problem.device.launch(self._kernels.limit_step, (self.width,), [], [bound, a["t"]])
 
 
 def _view_memory(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:

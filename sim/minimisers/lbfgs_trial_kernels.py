@@ -10,7 +10,7 @@ from functools import cache
 
 import warp as wp
 
-from ..runtime.columns import get_warp_width, summed
+from ..runtime.columns import get_warp_width, sum_warp
 from ..runtime.device import Device, forward_kernel
 from .lbfgs_kernels import FREE, GZ, GZ_OLD, OWN, ROWS_PER_THREAD, SLOPE, WHOLE, YW
 
@@ -20,14 +20,14 @@ ROWS_PER_CPU_THREAD = 1024  # The same on the CPU.
 
 @dataclass(frozen=True)
 class ThreadSpread:
-    """Distribution of rows, or nodes: groups of `lanes` neighbouring threads, `each` rows per thread."""
+    """Distribution of rows, or nodes: groups of `lanes` neighbouring threads, `rows_per_thread` rows per thread."""
 
     lanes: int
-    each: int
+    rows_per_thread: int
 
     def count_threads(self, count: int) -> int:
         """Return the number of threads for `count` rows, or nodes."""
-        return -(-count // (self.lanes * self.each)) * self.lanes
+        return -(-count // (self.lanes * self.rows_per_thread)) * self.lanes
 
 
 def choose_thread_spread(device: Device, columns: int) -> ThreadSpread:
@@ -38,14 +38,14 @@ def choose_thread_spread(device: Device, columns: int) -> ThreadSpread:
 
 
 @wp.func
-def first_row(thread: int, lanes: int, each: int):
+def get_first_row(thread: int, lanes: int, each: int):
     """Return the first row of a thread; its next rows follow at intervals of `lanes`."""
     return thread // lanes * lanes * each + thread % lanes
 
 
 @wp.func
-def alone(value: wp.float64) -> wp.float64:
-    """Return the value itself: replaces `summed` where no neighbouring thread has part of the same sum."""
+def return_value(value: wp.float64) -> wp.float64:
+    """Return the value itself: replaces `sum_warp` where no neighbouring thread has part of the same sum."""
     return value
 
 
@@ -61,8 +61,8 @@ class LbfgsTrialKernels:
 def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
     """Build the trial kernels for a device's scalar type."""
     scalar, vec = device.scalar, device.vector
-    lanes, each = spread.lanes, spread.each
-    together = summed if lanes > 1 else alone
+    lanes, each = spread.lanes, spread.rows_per_thread
+    together = sum_warp if lanes > 1 else return_value
     own_row, whole_row, free_row, slope_row = OWN, WHOLE, FREE, SLOPE
 
     @forward_kernel(module="unique")
@@ -75,7 +75,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
     ):
         """Compute the trial point v = u + t_c d."""
         thread, c = wp.tid()
-        length, first = scalar(t[c]), first_row(thread, lanes, each)
+        length, first = scalar(t[c]), get_first_row(thread, lanes, each)
         for k in range(each):
             r = first + lanes * k
             if r < u.shape[0]:
@@ -94,7 +94,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
         """Project the gradient; add to sums: |total - constant|^2, |total|^2, |free|^2, free . d."""
         thread, c = wp.tid()
         own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-        first = first_row(thread, lanes, each)
+        first = get_first_row(thread, lanes, each)
         for i in range(first, wp.min(first + lanes * each, fixed.shape[0]), lanes):
             x = vec(total[3 * i, c], total[3 * i + 1, c], total[3 * i + 2, c])
             y = x - vec(constant[3 * i, c], constant[3 * i + 1, c], constant[3 * i + 2, c])
@@ -121,7 +121,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
 def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
     """Build the kernel `multiply` for a single load case, launched over (products, threads of rows)."""
     scalar, m, spread = device.scalar, pairs, choose_thread_spread(device, 1)
-    lanes, each = spread.lanes, spread.each
+    lanes, each = spread.lanes, spread.rows_per_thread
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GZ_OLD, 2 * m + YW
 
     @forward_kernel(module="unique")
@@ -140,8 +140,8 @@ def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
         product, thread = wp.tid()
         pair = product % m
         if product < 2 * m and pair >= known[0]:
-            return  # uniform over the warp, so `summed` below stays valid
-        total, first = wp.float64(0.0), first_row(thread, lanes, each)
+            return  # uniform over the warp, so `sum_warp` below stays valid
+        total, first = wp.float64(0.0), get_first_row(thread, lanes, each)
         for k in range(each):
             r = first + lanes * k
             if r < g.shape[0]:
@@ -158,7 +158,7 @@ def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
                     x -= g[r, 0]
                     y = new_z[r, 0] - z[r, 0]
                 total += wp.float64(x) * wp.float64(y)
-        total = summed(total)
+        total = sum_warp(total)
         if thread % lanes == 0:
             wp.atomic_add(products, product, 0, total)
 

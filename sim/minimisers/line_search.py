@@ -16,7 +16,7 @@ from .newton_cg import Direction
 
 
 @dataclass(frozen=True)
-class Search:
+class LineSearch:
     """Settings of the line search.
 
     Parameters
@@ -36,20 +36,20 @@ class Search:
     min_length: float = 1e-8
 
 
-def is_step_too_long(ahead: Any, predicted: Any) -> Any:
-    """Return True for steps whose slope `ahead` exceeds `OVERSHOOT` times the predicted decrease, or is not finite."""
-    return ~(np.asarray(ahead) <= OVERSHOOT * np.abs(predicted))
+def is_step_too_long(slope: Any, predicted: Any) -> Any:
+    """Return True for steps whose slope `slope` exceeds `OVERSHOOT` times the predicted decrease, or is not finite."""
+    return ~(np.asarray(slope) <= OVERSHOOT * np.abs(predicted))
 
 
-def backtrack_by_slopes(ahead: Any, predicted: Any) -> Any:
+def backtrack_by_slopes(slope: Any, predicted: Any) -> Any:
     """Return the backtracking factors of rejected steps: zero of the secant through both slopes, within bounds."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        kept = np.divide(predicted, np.add(predicted, ahead))
-    known = np.greater(predicted, 0.0) & np.isfinite(ahead)
+        kept = np.divide(predicted, np.add(predicted, slope))
+    known = np.greater(predicted, 0.0) & np.isfinite(slope)
     return np.clip(np.where(known, kept, DEFAULT_BACKTRACK), MIN_BACKTRACK, MAX_BACKTRACK)
 
 
-def search(problem: Problem, u: wp.array, direction: Direction, settings: Search = Search()) -> np.ndarray:
+def search_line(problem: Problem, u: wp.array, direction: Direction, settings: LineSearch = LineSearch()) -> np.ndarray:
     """Find step lengths (b,) in (0, 1] along a direction from u (3N, b); zero if none is found.
 
     A length is accepted when phi'(t) <= 0.5 x the predicted decrease: the energy still falls, or its minimum along the
@@ -57,7 +57,7 @@ def search(problem: Problem, u: wp.array, direction: Direction, settings: Search
     slopes at both gives the next trial.
     """
     t = problem.longest_step(u, direction.d)
-    predicted = direction.predicted
+    predicted = direction.decrease
     low, high = np.zeros(len(t)), np.full(len(t), np.inf)
     slope_low, slope_high = -predicted, np.full(len(t), np.inf)
     found, refinements = np.zeros(len(t), bool), np.zeros(len(t), int)

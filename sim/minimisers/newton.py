@@ -13,9 +13,9 @@ from ..deformation import Outcome
 from ..discretisation.problem import Problem
 from ..runtime.columns import combine_columns, compute_norms, gather_columns, scatter_columns
 from ..runtime.device import Device
-from .line_search import search
-from .newton_cg import Descent
-from .residual import compute_relative
+from .line_search import search_line
+from .newton_cg import DescentMethod
+from .residual import compute_relative_residual
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Newton:
 
     Parameters
     ----------
-    largest_forcing
+    max_forcing
         Inexact Newton: upper bound of the relative linear residual.
     patience
         If the residual has not fallen by a tenth in this number of iterations, it is compared with round-off.
@@ -38,7 +38,7 @@ class Newton:
         Factor on the change of nodal forces by that digit: with each term's forces below it, the model is stress-free.
     """
 
-    largest_forcing: float = 0.25
+    max_forcing: float = 0.25
     patience: int = 4
     max_stalled: int = 16
     round_off: float = 4.0
@@ -57,7 +57,7 @@ class Equilibrium:
 
 
 def find_equilibrium(
-    problem: Problem, descent: Descent, start: wp.array, accuracy: Accuracy, settings: Newton = Newton()
+    problem: Problem, descent: DescentMethod, start: wp.array, accuracy: Accuracy, settings: Newton = Newton()
 ) -> Equilibrium:
     """Minimise the potential of a problem that has begun a batch, from start (3N, B) [m].
 
@@ -80,7 +80,7 @@ def find_equilibrium(
         if step and open_gap.any():  # projected directions keep closed constraints closed
             gap, open_gap = problem.compute_gap(u)
         vanished = scale <= last_digit**2 * first[live]
-        share = compute_relative(free, np.where(vanished, 0.0, scale))
+        share = compute_relative_residual(free, np.where(vanished, 0.0, scale))
         bad = ~np.isfinite(share)
         done = ~bad & ~open_gap & (share <= accuracy.tolerance)
         idle[live] = np.where(share <= 0.9 * best[live], 0, idle[live] + 1)
@@ -91,7 +91,7 @@ def find_equilibrium(
             moved = compute_norms(device, combine_columns(device, u, -1.0, before, wp.empty_like(u)))
             still[live] += stuck & (moved <= last_digit * compute_norms(device, u))
             failed |= still[live] >= settings.max_stalled
-            drowned = stuck & ~open_gap & (free <= settings.round_off * round_off(problem, u, g))
+            drowned = stuck & ~open_gap & (free <= settings.round_off * compute_round_off(problem, u, g))
             outcome[live[failed]] = Outcome.STALLED
             outcome[live[drowned]] = Outcome.ROUND_OFF
             failed |= drowned
@@ -114,12 +114,10 @@ def find_equilibrium(
             u, g, gap = (gather_columns(device, array, stay) for array in (u, g, gap))
             live, taken, open_gap, share = live[stay], taken[stay], open_gap[stay], share[stay]
         # Superlinear, and never finer than the tolerance needs.
-        forcing = np.clip(
-            np.sqrt(share), 0.3 * accuracy.tolerance / np.maximum(share, 1e-300), settings.largest_forcing
-        )
-        found = descent.find(problem, u, g, gap if open_gap.any() else None, forcing, taken)
+        forcing = np.clip(np.sqrt(share), 0.3 * accuracy.tolerance / np.maximum(share, 1e-300), settings.max_forcing)
+        found = descent.find_direction(problem, u, g, gap if open_gap.any() else None, forcing, taken)
         linear_iterations += found.iterations
-        length = search(problem, u, found)
+        length = search_line(problem, u, found)
         before, u = u, combine_columns(device, u, length, found.d, wp.empty_like(u))
         # A failed search is repeated once along a direction of positive definite curvature.
         failed = (length == 0.0) & (taken == 0.0)
@@ -127,7 +125,7 @@ def find_equilibrium(
     return Equilibrium(result, outcome, iterations, residual, linear_iterations)
 
 
-def round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
+def compute_round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
     """Compute the change (b,) [N] of the residual g (3N, b) at u (3N, b) by the last digit of every displacement.
 
     The residual cannot fall below this: the required displacements are not representable in the floating-point type.

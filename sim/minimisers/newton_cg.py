@@ -17,11 +17,11 @@ class Direction:
     """Search direction d (3N, b) [m]; decrease (b,) [J] that the linear model predicts along it; linear iterations."""
 
     d: wp.array
-    predicted: np.ndarray
+    decrease: np.ndarray
     iterations: int
 
 
-class Descent(Protocol):
+class DescentMethod(Protocol):
     """Method that computes search directions of b load cases at once; it may keep a state for the batch."""
 
     def begin(self) -> None:
@@ -32,13 +32,13 @@ class Descent(Protocol):
         """Keep these load cases (k,): the others have left the batch."""
         ...
 
-    def find(
-        self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
+    def find_direction(
+        self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, length: np.ndarray
     ) -> Direction:
         """Compute the direction at u (3N, b) with residual g (3N, b) [N].
 
         `gap` (3N, b) [m], if any, is the motion that closes the constraints; the free nodes follow it. `forcing` (b,):
-        allowed linear residual, relative to the right-hand side. `taken` (b,): accepted length of the last direction;
+        allowed linear residual, relative to the right-hand side. `length` (b,): accepted length of the last direction;
         where it is zero, the undeformed stiffness replaces the tangent stiffness, whose direction failed. The caller
         changes neither g nor d afterwards.
         """
@@ -67,22 +67,22 @@ class NewtonCG:
             self._radius, self._size = self._radius[columns], self._size[columns]
             self._truncated = self._truncated[columns]
 
-    def find(
-        self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, taken: np.ndarray
+    def find_direction(
+        self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, length: np.ndarray
     ) -> Direction:
-        """Compute the direction; see `Descent.find`."""
+        """Compute the direction; see `DescentMethod.find_direction`."""
         device, columns = problem.device, u.shape[1]
-        definite = taken == 0.0
+        definite = length == 0.0
         problem.linearise(u, definite)
         self._preconditioner.prepare(problem, columns)
         rhs, pulled = compute_right_hand_side(problem, g, gap)
         # No radius where a gap must be closed in full, or where the curvature is that of the undeformed stiffness.
-        self._radius = np.where(pulled | definite, np.inf, self._compute_radius(taken))
+        self._radius = np.where(pulled | definite, np.inf, self._compute_radius(length))
         tolerance = forcing * compute_norms(device, rhs)
         found = solve_conjugate_gradients(
             problem, self._preconditioner, wp.clone(rhs), tolerance, self._most, self._radius
         )
-        self._size, self._truncated = found.size, found.truncated
+        self._size, self._truncated = found.norm, found.truncated
         predicted = compute_dots(device, rhs, found.x)
         if gap is not None:
             combine_columns(device, found.x, 1.0, gap, found.x)

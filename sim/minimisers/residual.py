@@ -18,17 +18,17 @@ from .lbfgs_kernels import FREE, OWN, PAIRS, SUMS, WHOLE, build_kernels
 class ResidualArrays:
     """Residual g (3N, b) [N] on the device, and the `sums` (SUMS, b) that L-BFGS decides by.
 
-    `own` holds square norms (terms, b) of the gradients of the terms that are not constant. `part` (3N, b) is
+    `term_norms` holds square norms (terms, b) of the gradients of the terms that are not constant. `scratch` (3N, b) is
     workspace, zero between calls.
     """
 
     g: wp.array
-    part: wp.array
+    scratch: wp.array
     sums: wp.array
-    own: wp.array
+    term_norms: wp.array
 
 
-def allocate_balance(problem: Problem, count: int) -> ResidualArrays:
+def allocate_residual_arrays(problem: Problem, count: int) -> ResidualArrays:
     """Allocate the arrays of a `ResidualArrays` for `count` load cases."""
     device = problem.device
     sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
@@ -47,20 +47,21 @@ def compute_residual_arrays(
     The result is written to `workspace`, if it is given.
     """
     device, (rows, count) = problem.device, v.shape
-    workspace = workspace or allocate_balance(problem, count)
+    workspace = workspace or allocate_residual_arrays(problem, count)
     varying = [term for term in problem.terms if not term.constant]
     workspace.sums.zero_()
     wp.copy(workspace.g, constant)
     if len(varying) == 1:
         varying[0].add_gradient(v, workspace.g)
-        workspace = replace(workspace, own=workspace.sums[OWN : OWN + 1])
+        workspace = replace(workspace, term_norms=workspace.sums[OWN : OWN + 1])
     else:
-        absorb = build_kernels(device, PAIRS).absorb
-        workspace.own.zero_()
+        absorb = build_kernels(device, PAIRS).add_gradient
+        workspace.term_norms.zero_()
         for number, term in enumerate(varying):
-            term.add_gradient(v, workspace.part)
-            device.launch(absorb, (-(-rows // CHUNK), count), [], [workspace.part, workspace.g, workspace.own[number]])
-    inputs = [constant, *problem.constraint.nodes, v if d is None else d]
+            term.add_gradient(v, workspace.scratch)
+            outputs = [workspace.scratch, workspace.g, workspace.term_norms[number]]
+            device.launch(absorb, (-(-rows // CHUNK), count), [], outputs)
+    inputs = [constant, *problem.constraint.node_arrays, v if d is None else d]
     spread = lbfgs_trial_kernels.choose_thread_spread(device, count)
     device.launch(
         lbfgs_trial_kernels.build_kernels(device, spread).finish,
@@ -87,57 +88,57 @@ def compute_constant_gradients(problem: Problem, u: wp.array) -> tuple[wp.array,
 
 @dataclass(frozen=True, eq=False)
 class ResidualState:
-    """State of b load cases: u (3N, b) [m], residuals g (3N, b) [N], their 2-norms `free` (b,), and `scale` (b,).
+    """State of b load cases: u (3N, b) [m], residuals g (3N, b) [N], their 2-norms `norm` (b,), and `scale` (b,).
 
     The scale [N] is the largest 2-norm of a term's own gradient or of the reaction at constrained nodes.
     """
 
     u: wp.array
     g: wp.array
-    free: np.ndarray
+    norm: np.ndarray
     scale: np.ndarray
 
     @property
     def relative(self) -> np.ndarray:
         """Relative residuals (b,)."""
-        return compute_relative(self.free, self.scale)
+        return compute_relative_residual(self.norm, self.scale)
 
     @property
-    def finite(self) -> np.ndarray:
+    def is_finite(self) -> np.ndarray:
         """True (b,) where residual and scale are finite; forces may overflow."""
-        return np.isfinite(self.free) & np.isfinite(self.scale)
+        return np.isfinite(self.norm) & np.isfinite(self.scale)
 
-    def select(self, device: Device, stay: np.ndarray) -> ResidualState:
+    def select(self, device: Device, columns: np.ndarray) -> ResidualState:
         """Return the state of some load cases (k,)."""
-        u, g = (gather_columns(device, array, stay) for array in (self.u, self.g))
-        return ResidualState(u, g, self.free[stay], self.scale[stay])
+        u, g = (gather_columns(device, array, columns) for array in (self.u, self.g))
+        return ResidualState(u, g, self.norm[columns], self.scale[columns])
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualEvaluator:
     """Callable that evaluates the residuals of the batch that a problem has begun.
 
-    `constant` (3N, b) [N] is the summed gradient of the constant terms, `square` (b,) the largest square norm of one.
+    `constant` (3N, b) [N] is the summed gradient of the constant terms, `norms` (b,) the largest square norm of one.
     """
 
     problem: Problem
     constant: wp.array
-    square: np.ndarray
+    norms: np.ndarray
 
     def __call__(self, u: wp.array) -> ResidualState:
         """Return the residuals of states u (3N, b) [m]."""
         found = compute_residual_arrays(self.problem, u, self.constant)
         sums = found.sums.numpy()
         with np.errstate(invalid="ignore", over="ignore"):
-            largest = np.maximum(self.square, found.own.numpy().max(axis=0, initial=0.0))
+            largest = np.maximum(self.norms, found.term_norms.numpy().max(axis=0, initial=0.0))
             largest = np.maximum(largest, sums[WHOLE] - sums[FREE])
             return ResidualState(u, found.g, np.sqrt(sums[FREE]), np.sqrt(largest))
 
-    def select(self, stay: np.ndarray) -> ResidualEvaluator:
+    def select(self, columns: np.ndarray) -> ResidualEvaluator:
         """Keep only some load cases (k,), in the problem too, and return their evaluator."""
-        self.problem.keep(stay)
+        self.problem.keep(columns)
         return ResidualEvaluator(
-            self.problem, gather_columns(self.problem.device, self.constant, stay), self.square[stay]
+            self.problem, gather_columns(self.problem.device, self.constant, columns), self.norms[columns]
         )
 
 
@@ -147,10 +148,10 @@ def build_evaluator(problem: Problem, u: wp.array) -> ResidualEvaluator:
     return ResidualEvaluator(problem, constant, loud.numpy().max(axis=0, initial=0.0))
 
 
-def compute_relative(free: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def compute_relative_residual(norm: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Divide residual norms (b,) [N] by their scales (b,) [N]; zero where no force acts."""
     with np.errstate(invalid="ignore"):  # forces that overflowed
-        return np.divide(free, scale, out=np.zeros_like(free), where=scale != 0.0)
+        return np.divide(norm, scale, out=np.zeros_like(norm), where=scale != 0.0)
 
 
 def measure_residual(problem: Problem, u: wp.array) -> np.ndarray:
@@ -158,5 +159,5 @@ def measure_residual(problem: Problem, u: wp.array) -> np.ndarray:
     _, free, scale = problem.residual(u)
     gap, size = problem.constraint.close_gap(u)
     largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)
-    worse = np.maximum(compute_relative(free, scale), compute_relative(size, largest))
+    worse = np.maximum(compute_relative_residual(free, scale), compute_relative_residual(size, largest))
     return np.where(np.isnan(worse), np.inf, worse)

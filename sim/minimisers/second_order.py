@@ -17,8 +17,8 @@ import scipy.sparse as sp
 
 from ..discretisation.element import Elements
 from ..discretisation.problem import Problem
-from ..discretisation.term import Strained
-from ..runtime.threads import choose_threads, run_together
+from ..discretisation.term import StrainTerm
+from ..runtime.threads import choose_threads, run_concurrently
 from ..runtime.views import run_in_order, to_host, to_library
 
 CPU_BATCH = 256  # Elements of one batch on the CPU: the data of a pair fit into the cache of a core.
@@ -36,9 +36,9 @@ class _Some:
 
 def compute_second_order(
     problem: Problem,
-    moved: np.ndarray,
-    answers: np.ndarray,
-    near: np.ndarray,
+    unit_motions: np.ndarray,
+    functionals: np.ndarray,
+    pair_mask: np.ndarray,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """List pairs (P, 2) of force components p <= q, and compute the response (P, r) float32 [1/N^2] to each.
@@ -49,27 +49,27 @@ def compute_second_order(
     ----------
     problem
         Problem whose elastic terms are used.
-    moved
+    unit_motions
         (3m, 3N) [m/N]: undeformed compliance, displacements under unit forces on m nodes.
-    answers
-        (r, 3N): as `SeriesReading.answers`, of the requested functionals.
-    near
+    functionals
+        (r, 3N): as `OutputFunctionals.solutions`, of the requested functionals.
+    pair_mask
         (m, m) bool, symmetric: nodes whose pairs are requested.
     progress
         Called with the number of finished batches of elements, and with their total.
     """
     device = problem.device
-    first, second = np.nonzero(np.triu(np.repeat(np.repeat(near, 3, axis=0), 3, axis=1)))
-    start = np.searchsorted(first, np.arange(len(moved) + 1))
-    terms = [term for term in problem.terms if isinstance(term, Strained)]
+    first, second = np.nonzero(np.triu(np.repeat(np.repeat(pair_mask, 3, axis=0), 3, axis=1)))
+    start = np.searchsorted(first, np.arange(len(unit_motions) + 1))
+    terms = [term for term in problem.terms if isinstance(term, StrainTerm)]
     work = [
         one
         for term in terms
-        for one in _list_batches(*term.second_order(), CUDA_BATCH if device.on_cuda else CPU_BATCH)
+        for one in _list_batches(*term.compute_second_order(), CUDA_BATCH if device.on_cuda else CPU_BATCH)
     ]
     others, done = to_library(device, second), count(1)
     tasks = 1 if device.on_cuda else choose_threads(sum(len(each.chosen) for each in work))
-    tables = [to_library(device, np.zeros((len(first), len(answers)), np.float32)) for _ in range(tasks)]
+    tables = [to_library(device, np.zeros((len(first), len(functionals)), np.float32)) for _ in range(tasks)]
 
     def add_all(table: Any, those: list[_Some]) -> None:
         for some in those:
@@ -79,8 +79,8 @@ def compute_second_order(
     def add(table: Any, some: _Some) -> None:
         gradient = _build_gradient_matrix(some.elements, some.chosen)
         weight = np.repeat(some.elements.weight[some.chosen].ravel(), 9)[:, None]
-        strain = to_library(device, (gradient @ moved.T).astype(np.float32).reshape(-1, 9, len(moved)))
-        lever = to_library(device, (weight * (gradient @ answers.T)).astype(np.float32))
+        strain = to_library(device, (gradient @ unit_motions.T).astype(np.float32).reshape(-1, 9, len(unit_motions)))
+        lever = to_library(device, (weight * (gradient @ functionals.T)).astype(np.float32))
         tensor = to_library(device, some.tensor)
         for component in np.flatnonzero(np.diff(start)).tolist():
             rows = slice(int(start[component]), int(start[component + 1]))
@@ -89,7 +89,7 @@ def compute_second_order(
             table[rows] -= stress.reshape(len(lever), -1).T @ lever
 
     with run_in_order(device):
-        run_together([partial(add_all, table, work[k::tasks]) for k, table in enumerate(tables)])
+        run_concurrently([partial(add_all, table, work[k::tasks]) for k, table in enumerate(tables)])
         table = to_host(sum(tables[1:], tables[0]))
     twice = np.where(first == second, 1.0, 2.0).astype(np.float32)
     return np.column_stack([first, second]), table * twice[:, None]
@@ -114,4 +114,4 @@ def _build_gradient_matrix(elements: Elements, chosen: np.ndarray) -> sp.csr_arr
     shape = count, points, most, 3, 3
     value = np.broadcast_to(slope[:, :, :, None, :], shape).ravel()
     place = np.broadcast_to(row, shape).ravel(), np.broadcast_to(column, shape).ravel()
-    return sp.csr_array(sp.coo_array((value, place), shape=(9 * count * points, 3 * elements.nodes)))
+    return sp.csr_array(sp.coo_array((value, place), shape=(9 * count * points, 3 * elements.node_count)))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import InputError
-from .partial_files import STALE_SECONDS, list_partials, remove_left_overs, to_partial_path
+from .partial_files import STALE_SECONDS, list_partials, remove_partial_files, to_partial_path
 
 
 def explain_error(error: OSError) -> str:
@@ -18,11 +18,11 @@ def explain_error(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno else "the library that writes it failed"
 
 
-def check_output(path: str | Path, suffix: str, stale: float = STALE_SECONDS, sweep: bool = True) -> Path:
+def check_output(path: str | Path, suffix: str, max_age: float = STALE_SECONDS, clean: bool = True) -> Path:
     """Return a path that can be written, with its folder created; called before long work, so that no result is lost.
 
-    Left-overs of killed runs with the same output are removed; `sweep` False saves listing a folder with very many
-    files. Another machine's unfinished file counts as a left-over after `stale` seconds.
+    Left-overs of killed runs with the same output are removed; `clean` False saves listing a folder with very many
+    files. Another machine's unfinished file counts as a left-over after `max_age` seconds.
 
     Raises
     ------
@@ -40,8 +40,8 @@ def check_output(path: str | Path, suffix: str, stale: float = STALE_SECONDS, sw
         ) from error
     if path.is_dir():
         raise InputError(f"{path}: cannot be written, it is a folder. Choose another name.")
-    if sweep:
-        remove_left_overs(path.parent, path.name, stale)
+    if clean:
+        remove_partial_files(path.parent, path.name, max_age)
     probe = to_partial_path(path)
     try:  # permissions are not enough: the file system may be read-only or full
         probe.touch()
@@ -53,17 +53,17 @@ def check_output(path: str | Path, suffix: str, stale: float = STALE_SECONDS, sw
 
 
 @contextmanager
-def write_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Path]:
+def write_atomically(path: str | Path, suffix: str, clean: bool = True) -> Iterator[Path]:
     """Yield a temporary name next to `path`, of the same suffix, which is renamed to `path` when the block succeeds.
 
-    `sweep` is that of `check_output`.
+    `clean` is that of `check_output`.
 
     Raises
     ------
     InputError
         See `check_output`; and if writing fails.
     """
-    path = check_output(path, suffix, sweep=sweep)
+    path = check_output(path, suffix, clean=clean)
     partial = to_partial_path(path)
     try:
         yield partial
@@ -77,17 +77,17 @@ def write_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Itera
 
 
 @contextmanager
-def write_folder_atomically(path: Path, size: int = 0, kept: Callable[[Path], bool] | None = None) -> Iterator[Path]:
+def write_folder_atomically(path: Path, size: int = 0, is_kept: Callable[[Path], bool] | None = None) -> Iterator[Path]:
     """Yield a hidden folder next to `path`, which is renamed to it when the block succeeds, and removed otherwise.
 
     Parameters
     ----------
     size
         Expected size of its content [bytes].
-    kept
+    is_kept
         Function that returns True if a hidden folder stays after a failure, so that the same work can resume from it.
-        Then several processes may write one folder, and the first to finish renames it. Without `kept` a second process
-        is rejected.
+        Then several processes may write one folder, and the first to finish renames it. Without `is_kept` a second
+        process is rejected.
 
     Raises
     ------
@@ -98,8 +98,8 @@ def write_folder_atomically(path: Path, size: int = 0, kept: Callable[[Path], bo
     partial = to_partial_path(target)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"{path}: exists and is not empty. Choose another name, or remove it.")
-    if kept is None:
-        remove_left_overs(target.parent, target.name)
+    if is_kept is None:
+        remove_partial_files(target.parent, target.name)
         shutil.rmtree(partial, ignore_errors=True)  # left by a dead process with the same number
         others = list_partials(target)
         if others:
@@ -118,9 +118,9 @@ def write_folder_atomically(path: Path, size: int = 0, kept: Callable[[Path], bo
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({explain_error(error)}). {REMEDY}") from error
         finally:
-            if kept is None or not kept(partial):
+            if is_kept is None or not is_kept(partial):
                 shutil.rmtree(partial, ignore_errors=True)
-    remove_left_overs(target.parent, target.name)
+    remove_partial_files(target.parent, target.name)
 
 
 @contextmanager
@@ -136,7 +136,7 @@ def remove_empty_parents(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def write_stream_atomically(path: str | Path, suffix: str, sweep: bool = True) -> Iterator[Stream]:
+def write_stream_atomically(path: str | Path, suffix: str, clean: bool = True) -> Iterator[Stream]:
     """Yield an open binary file, else as `write_atomically`; for HDF5, which ends the process if its own write fails.
 
     Raises
@@ -144,7 +144,7 @@ def write_stream_atomically(path: str | Path, suffix: str, sweep: bool = True) -
     InputError
         See `write_atomically`.
     """
-    with write_atomically(path, suffix, sweep) as partial, partial.open("w+b", buffering=0) as raw:
+    with write_atomically(path, suffix, clean) as partial, partial.open("w+b", buffering=0) as raw:
         stream = Stream(raw)
         try:
             yield stream
@@ -199,13 +199,13 @@ class Stream:
         """Do nothing: the file is not buffered."""
 
 
-def check_disk_space(path: str | Path, size: int, largest: int | None = None) -> None:
-    """Check that `size` bytes fit next to `path`, in files of at most `largest` bytes.
+def check_disk_space(path: str | Path, size: int, largest_file: int | None = None) -> None:
+    """Check that `size` bytes fit next to `path`, in files of at most `largest_file` bytes.
 
     Raises
     ------
     InputError
-        Too little free space, or a limit on the file size below `largest`.
+        Too little free space, or a limit on the file size below `largest_file`.
     """
     path = Path(path)
     existing = next(folder for folder in (path.parent, *path.absolute().parents) if folder.is_dir())
@@ -214,10 +214,10 @@ def check_disk_space(path: str | Path, size: int, largest: int | None = None) ->
         raise InputError(
             f"{path}: needs {_to_mb(size)}, and the disk has {_to_mb(free)} left. Free space, or choose another folder."
         )
-    allowed, largest = _get_max_file_size(), size if largest is None else largest
-    if allowed is not None and allowed < largest:
+    allowed, largest_file = _get_max_file_size(), size if largest_file is None else largest_file
+    if allowed is not None and allowed < largest_file:
         raise InputError(
-            f"{path}: needs a file of {_to_mb(largest)}, but files are limited to {_to_mb(allowed)} here. "
+            f"{path}: needs a file of {_to_mb(largest_file)}, but files are limited to {_to_mb(allowed)} here. "
             "Raise the limit (`ulimit -f`)."
         )
 

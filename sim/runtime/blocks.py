@@ -42,13 +42,13 @@ def write_fold(fold: str) -> str:
 
 
 @wp.func_native(snippet=write_fold("value + other"))
-def total(value: wp.float64) -> wp.float64:
+def get_sum(value: wp.float64) -> wp.float64:
     """Return the sum over the threads."""
     ...
 
 
 @wp.func_native(snippet=write_fold("fmax(value, other)"))
-def largest(value: wp.float64) -> wp.float64:
+def get_max(value: wp.float64) -> wp.float64:
     """Return the largest of the threads' values."""
     ...
 
@@ -73,7 +73,7 @@ def largest(value: wp.float64) -> wp.float64:
 #endif
 """
 )
-def before(value: wp.int32) -> wp.int32:
+def get_prefix(value: wp.int32) -> wp.int32:
     """Return the sum over the threads before this one."""
     ...
 

@@ -62,7 +62,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         total = wp.float64(0.0)
         if r < x.shape[0]:
             total = wp.float64(x[r, 0]) * wp.float64(y[r, 0])
-        total = summed(total)
+        total = sum_warp(total)
         if r % lanes == 0:
             wp.atomic_add(out, 0, total)
 
@@ -139,7 +139,7 @@ def build_kernels(device: Device) -> ColumnKernels:
 
 
 @cache
-def build_moving_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
+def build_copy_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
     """Build the kernels that copy columns out of arrays of a type, and back."""
 
     @forward_kernel(module="unique")
@@ -244,19 +244,19 @@ def gather_columns(
     index = _index(device, columns)
     if out is None:
         out = wp.empty((*x.shape[:-1], len(index)), dtype=x.dtype, device=device.name)
-    gather, _ = build_moving_kernels(x.dtype)
+    gather, _ = build_copy_kernels(x.dtype)
     device.launch(gather, _flatten_rows(out).shape, [_flatten_rows(x), index], [_flatten_rows(out)])
     return out
 
 
 def scatter_columns(
-    device: Device, x: wp.array, columns: np.ndarray, out: wp.array, some: np.ndarray | None = None
+    device: Device, x: wp.array, columns: np.ndarray, out: wp.array, source_columns: np.ndarray | None = None
 ) -> None:
-    """Copy x (..., k), or `some` (k,) columns of it, to some columns (k,) of out (..., b)."""
-    _, scatter = build_moving_kernels(x.dtype)
-    some = np.arange(x.shape[-1]) if some is None else some
-    inputs = [_flatten_rows(x), _index(device, some), _index(device, columns)]
-    device.launch(scatter, (_flatten_rows(x).shape[0], len(some)), inputs, [_flatten_rows(out)])
+    """Copy x (..., k), or `source_columns` (k,) columns of it, to some columns (k,) of out (..., b)."""
+    _, scatter = build_copy_kernels(x.dtype)
+    source_columns = np.arange(x.shape[-1]) if source_columns is None else source_columns
+    inputs = [_flatten_rows(x), _index(device, source_columns), _index(device, columns)]
+    device.launch(scatter, (_flatten_rows(x).shape[0], len(source_columns)), inputs, [_flatten_rows(out)])
 
 
 def unstack_columns(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:
@@ -301,7 +301,7 @@ def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None
     return value;
 """
 )
-def summed(value: wp.float64) -> wp.float64:
+def sum_warp(value: wp.float64) -> wp.float64:
     """Return the sum over the threads of a warp, valid in the first of them; on the CPU the value itself.
 
     All of them must take part, which a launch over a multiple of `get_warp_width` guarantees.

@@ -9,9 +9,9 @@ from .device import Device
 from .threads import limit_to_one_thread
 
 
-def build_product(matrix: np.ndarray, device: Device, rough: bool = False) -> Callable[[wp.array, wp.array], None]:
-    """Build (x, out) -> out (m, b) = matrix (m, n) x (n, b); `rough` lets CUDA round values to eight bits."""
-    return _build_cuda_product(matrix, device, rough) if device.on_cuda else _build_cpu_product(matrix, device)
+def build_product(matrix: np.ndarray, device: Device, reduced: bool = False) -> Callable[[wp.array, wp.array], None]:
+    """Build (x, out) -> out (m, b) = matrix (m, n) x (n, b); `reduced` lets CUDA round values to eight bits."""
+    return _build_cuda_product(matrix, device, reduced) if device.on_cuda else _build_cpu_product(matrix, device)
 
 
 def _build_cpu_product(matrix: np.ndarray, device: Device) -> Callable[[wp.array, wp.array], None]:

@@ -69,7 +69,7 @@ class Device:
         if min(dim) > 0:
             wait_for_foreground()
             if not self.on_cuda:
-                load(kernel.module)
+                load_module(kernel.module)
             wp.launch(
                 kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.name, block_dim=block_dim,
                 record_tape=False,
@@ -79,7 +79,7 @@ class Device:
 _loading, _loaded = Lock(), set[wp.Module]()  # Lock of compilation; modules that are loaded on the CPU.
 
 
-def load(module: wp.Module) -> None:
+def load_module(module: wp.Module) -> None:
     """Load a kernel's module on the CPU; if Warp has not cached it, it is compiled.
 
     One thread at a time loads, and others wait: Warp alone would compile a module once for each thread.
@@ -115,7 +115,7 @@ def find_device(name: str, precision: Precision) -> Device:
     return Device(alias, precision)
 
 
-def parse_device_names(words: str) -> tuple[str, ...]:
+def parse_device_names(text: str) -> tuple[str, ...]:
     """Parse a list of devices into Warp's names: "cuda:0,cuda:1", "cpu,cpu", "all", or a single one.
 
     "all" are the GPUs. A device that occurs twice is shared by two processes.
@@ -126,7 +126,7 @@ def parse_device_names(words: str) -> tuple[str, ...]:
         A device that this machine does not have, "all" without GPUs or with other names, an empty name, CPU and GPUs
         together.
     """
-    if words.strip() == ALL_GPUS:
+    if text.strip() == ALL_GPUS:
         cards = tuple(name for name in _list_devices() if name.startswith("cuda"))
         if not cards:
             raise InputError(
@@ -134,17 +134,17 @@ def parse_device_names(words: str) -> tuple[str, ...]:
                 "separated by commas, as in cpu,cpu."
             )
         return cards
-    asked = [name.strip() for name in words.split(",")]
+    asked = [name.strip() for name in text.split(",")]
     if ALL_GPUS in asked:
-        raise InputError(f"{words!r} lists devices together with 'all', which means every GPU: give 'all' alone.")
+        raise InputError(f"{text!r} lists devices together with 'all', which means every GPU: give 'all' alone.")
     if not any(asked):
-        raise InputError(f"{words!r} names no device: choose auto, or {' or '.join(_list_devices())}.")
+        raise InputError(f"{text!r} names no device: choose auto, or {' or '.join(_list_devices())}.")
     if not all(asked):
-        raise InputError(f"{words!r} contains an empty device name: remove the comma, or add a name.")
+        raise InputError(f"{text!r} contains an empty device name: remove the comma, or add a name.")
     names = tuple(find_device(name, "float32").name for name in asked)
     if len({name.split(":")[0] for name in names}) > 1:
         raise InputError(
-            f"{words!r} mixes CPU and GPUs, whose results differ in their last digits: choose devices of one kind."
+            f"{text!r} mixes CPU and GPUs, whose results differ in their last digits: choose devices of one kind."
         )
     return names
 

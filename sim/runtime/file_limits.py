@@ -25,7 +25,7 @@ MAX_VOXELS = 2**29  # Maximum number of voxels of a volume: that of a head of 20
 
 
 @dataclass(frozen=True)
-class MeshBytes:
+class MeshSizeLimits:
     """Limits of the inflated size of a mesh file's arrays.
 
     Parameters
@@ -34,13 +34,13 @@ class MeshBytes:
         Maximum size of all arrays together [bytes]: nodes, cells, and a few fields.
     max_ratio
         Maximum ratio to the file's size; a mesh does not inflate further, because its coordinates hardly repeat.
-    small
+    min_limit
         Size that every file may inflate to [bytes].
     """
 
     max_bytes: int = 4 * 1024**3
     max_ratio: int = 100
-    small: int = 2**28
+    min_limit: int = 2**28
 
     def limit_bytes(self, size: int) -> int:
         """Return the inflated size [bytes] that is allowed for a file of `size` bytes.
@@ -54,24 +54,24 @@ class MeshBytes:
             raise InputError(
                 f"its size is {size / 1e9:,.3g} GB: at most {self.max_bytes / 1e9:.3g} GB are allowed. Mesh coarser."
             )
-        return min(self.max_bytes, max(self.small, self.max_ratio * size))
+        return min(self.max_bytes, max(self.min_limit, self.max_ratio * size))
 
 
-MESH_BYTES = MeshBytes()
+MESH_BYTES = MeshSizeLimits()
 """Default limits: four gigabytes, and a hundred times a file's size."""
 
 
-def build_too_large_error(most: int) -> InputError:
-    """Build the error for a mesh file whose arrays take more than `most` bytes."""
+def build_too_large_error(max_bytes: int) -> InputError:
+    """Build the error for a mesh file whose arrays take more than `max_bytes` bytes."""
     return InputError(
-        f"its arrays take more than {most / 1e9:.3g} GB: too much for a brain mesh in a file of this size. "
+        f"its arrays take more than {max_bytes / 1e9:.3g} GB: too much for a brain mesh in a file of this size. "
         "Write it again, or use a coarser mesh."
     )
 
 
 @contextmanager
-def limit_memory(most: int) -> Iterator[None]:
-    """Limit the memory that a block may take in addition, to `most` bytes, where the system supports it.
+def limit_memory(max_bytes: int) -> Iterator[None]:
+    """Limit the memory that a block may take in addition, to `max_bytes` bytes, where the system supports it.
 
     For reading with libraries, which trust sizes in a file's header. The limit applies to the whole process, so other
     threads should allocate little meanwhile.
@@ -89,11 +89,11 @@ def limit_memory(most: int) -> Iterator[None]:
         yield
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    ceiling = taken + most if soft == resource.RLIM_INFINITY else min(taken + most, soft)
+    ceiling = taken + max_bytes if soft == resource.RLIM_INFINITY else min(taken + max_bytes, soft)
     resource.setrlimit(resource.RLIMIT_AS, (ceiling, hard))
     try:
         yield
     except MemoryError as error:
-        raise build_too_large_error(most) from error
+        raise build_too_large_error(max_bytes) from error
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

@@ -96,8 +96,8 @@ class Journal:
 
 
 @contextmanager
-def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
-    """Yield the journal of the run that `stated` describes, new or resumed; the file stays.
+def open_journal(path: Path, description: Mapping[str, str]) -> Iterator[Journal]:
+    """Yield the journal of the run that `description` describes, new or resumed; the file stays.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
     DamageWarning
         Damaged records, which are left out.
     """
-    opening = _record((RUN_GROUP, 0), json.dumps(dict(stated)).encode(), b"")
+    opening = _record((RUN_GROUP, 0), json.dumps(dict(description)).encode(), b"")
     key = hashlib.sha256(opening).digest()
     if not path.exists():
         with write_atomically(path, path.suffix) as draft:
@@ -120,7 +120,7 @@ def open_journal(path: Path, stated: Mapping[str, str]) -> Iterator[Journal]:
         raise InputError(f"{path}: cannot be opened ({explain_error(error)}). Delete it.") from error
     with file:
         _lock(path, file)
-        yield Journal(path, file, key, _restore_records(path, file, opening, key, stated))
+        yield Journal(path, file, key, _restore_records(path, file, opening, key, description))
 
 
 def read_description(path: Path) -> dict[str, str]:
@@ -167,17 +167,21 @@ def _restore_records(
 
 
 def check_same_description(
-    path: Path, before: Mapping[str, str], stated: Mapping[str, str], verb: str = "begun", remedy: str = "delete it, "
+    path: Path,
+    stored: Mapping[str, str],
+    description: Mapping[str, str],
+    verb: str = "begun",
+    remedy: str = "delete it, ",
 ) -> None:
-    """Reject a file whose description `before` differs from the present one, `stated`.
+    """Reject a file whose description `stored` differs from the present one, `description`.
 
     Raises
     ------
     InputError
         The first name with another text; for a finished file the `verb` is "made", and there is no `remedy`.
     """
-    for name, wanted in stated.items():
-        found = before.get(name, "nothing")
+    for name, wanted in description.items():
+        found = stored.get(name, "nothing")
         if found != wanted:
             raise InputError(
                 f"{path}: was {verb} with {name} {found}, but now {name} is {wanted}: repeat the first command, "

@@ -23,21 +23,21 @@ class MemoryBudget:
 
     Parameters
     ----------
-    share
+    fraction
         Fraction of the free memory: the remainder is for other programs.
     batch_fraction
         Fraction of the free memory for a batch of automatic size; the remainder is for results and other programs.
     max_cases, max_cases_on_cuda
         Maximum load cases solved together: more do not use the processor better.
-    group
+    cgroup
         Linux folder with the memory limit and use of a control group, such as a container.
     """
 
-    share: float = 0.9
+    fraction: float = 0.9
     batch_fraction: float = 0.5
     max_cases: int = 64
     max_cases_on_cuda: int = 16384
-    group: Path = Path("/sys/fs/cgroup")
+    cgroup: Path = Path("/sys/fs/cgroup")
 
 
 def measure_free_bytes(device: Device, budget: MemoryBudget = MemoryBudget()) -> int:
@@ -53,7 +53,7 @@ def measure_host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
     for line in _read_lines(Path("/proc/meminfo")):
         if line.startswith("MemAvailable:"):
             found.append(1024 * int(line.split()[1]))
-    most, used, parts = (_read_lines(budget.group / name) for name in ("memory.max", "memory.current", "memory.stat"))
+    most, used, parts = (_read_lines(budget.cgroup / name) for name in ("memory.max", "memory.current", "memory.stat"))
     if most and used and most[0].strip().isdigit():
         # Cached files count as used, but are released on demand.
         cached = sum(int(line.split()[1]) for line in parts if line.startswith("inactive_file "))
@@ -69,11 +69,11 @@ def choose_batch_size(rows: int, device: Device, free: int, budget: MemoryBudget
 
 
 def check_fits(
-    rows: int, batch: int, count: int, device: Device, kept: int = 0, budget: MemoryBudget = MemoryBudget()
+    rows: int, batch: int, count: int, device: Device, used_bytes: int = 0, budget: MemoryBudget = MemoryBudget()
 ) -> None:
     """Reject `count` load cases of `rows` = 3N unknowns, `batch` of them together, that do not fit.
 
-    `kept` bytes already belong to the solver.
+    `used_bytes` bytes already belong to the solver.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def check_fits(
     """
     column = estimate_column_bytes(rows, device)
     free = measure_host_bytes(budget)  # read once: Linux takes almost a millisecond to count
-    each, host = RESULT_COPIES * 8 * rows, budget.share * free
+    each, host = RESULT_COPIES * 8 * rows, budget.fraction * free
     answers, alone = each * count, 0 if device.on_cuda else column
     if answers + alone > host:
         fitting = int((host - alone) / each)
@@ -92,7 +92,7 @@ def check_fits(
             + (f"solve at most {fitting} at a time." if fitting > 0 else MESH_REMEDY)
         ) from MemoryError()
     available = measure_free_bytes(device) if device.on_cuda else free
-    room = budget.share * available + kept - (0 if device.on_cuda else answers)
+    room = budget.fraction * available + used_bytes - (0 if device.on_cuda else answers)
     columns = min(batch, count)
     taken = column * find_workspace_width(device, columns)
     if taken > room:

@@ -33,7 +33,7 @@ def to_path(path: object) -> Path:
 
 
 @contextmanager
-def read_as(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
+def wrap_errors(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
     """Turn any exception of a block that reads `path` into an InputError of one sentence.
 
     Parameters
@@ -62,7 +62,7 @@ def read_as(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
 
 
 def parse_json(path: Path, version: str, remedy: str) -> Any:
-    """Parse a JSON file that states its `format`; call it in a block of `read_as`.
+    """Parse a JSON file that states its `format`; call it in a block of `wrap_errors`.
 
     Raises
     ------

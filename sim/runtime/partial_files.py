@@ -14,11 +14,11 @@ STALE_SECONDS = 24 * 3600.0
 """Age [s] after which another machine's unfinished file is a left-over: active runs write every few minutes."""
 
 
-def remove_left_overs(
+def remove_partial_files(
     folder: Path,
     name: str | None = None,
-    stale: float = STALE_SECONDS,
-    kept: Callable[[str], bool] = lambda wanted: False,
+    max_age: float = STALE_SECONDS,
+    is_kept: Callable[[str], bool] = lambda wanted: False,
 ) -> None:
     """Remove unfinished files of dead processes of this machine in a folder, and old ones of other machines.
 
@@ -26,21 +26,21 @@ def remove_left_overs(
     ----------
     name
         Name of the file whose left-overs are removed; None: all files.
-    stale
+    max_age
         Age at which those of other machines are removed [s].
-    kept
+    is_kept
         Function that returns True if the unfinished file for a name stays, because a run may resume from it.
     """
     form = _build_name_pattern(name)
     try:
         for left in list(folder.iterdir()):
             found = form.fullmatch(left.name)
-            if found is None or kept(found[3]):
+            if found is None or is_kept(found[3]):
                 continue
             dead = (
                 not _is_process_alive(int(found[2]))
                 if found[1] == _compute_host_id()
-                else time.time() - left.stat().st_mtime > stale
+                else time.time() - left.stat().st_mtime > max_age
             )
             if dead and left.is_dir():
                 shutil.rmtree(left, ignore_errors=True)
@@ -61,7 +61,7 @@ def to_unfinished_path(path: Path) -> Path:
 
 
 def to_partial_path(path: Path) -> Path:
-    """Return the hidden name under which this process writes `path`, a file or a folder; see `remove_left_overs`."""
+    """Return the hidden name under which this process writes `path`, a file or a folder; see `remove_partial_files`."""
     return path.with_name(f".sulcus-{_compute_host_id()}-{os.getpid()}-{path.name}")
 
 

@@ -20,12 +20,12 @@ VISIBLE_VARIABLE = "CUDA_VISIBLE_DEVICES"
 """Environment variable with the GPUs that a process can use."""
 
 
-class LostError(InputError):
+class LostProcessError(InputError):
     """Process that was killed, or whose GPU failed; results of the other processes are kept."""
 
 
 @dataclass(frozen=True, eq=False)
-class Child:
+class ChildProcess:
     """Process that works on a device, and the pipe to it."""
 
     device: str
@@ -34,40 +34,40 @@ class Child:
 
 
 def start_process(
-    target: Callable[..., object], *given: Any, name: str, variables: Mapping[str, str] | None = None
+    target: Callable[..., object], *args: Any, name: str, variables: Mapping[str, str] | None = None
 ) -> BaseProcess:
     """Start a spawned process that calls `target(*given)`, a function of a module.
 
     The child ends with this process. It ignores Ctrl-C, which the terminal sends to both: this process ends it.
     The `variables` are set in its environment before its first import.
     """
-    process = get_context("spawn").Process(target=_run, args=(target, given), name=name, daemon=True)
+    process = get_context("spawn").Process(target=_run, args=(target, args), name=name, daemon=True)
     with _set_environment(variables or {}), _ignore_interrupts():
         process.start()
     return process
 
 
 @contextmanager
-def process_pool(devices: Sequence[str], make: Callable[..., Any], *given: Any) -> Iterator[tuple[Child, ...]]:
+def process_pool(devices: Sequence[str], build: Callable[..., Any], *args: Any) -> Iterator[tuple[ChildProcess, ...]]:
     """Start a process on each device, which calls `make(device, *given)`; all are killed at the end.
 
-    Each can use its own GPU alone, as "cuda:0". `make` is a function of a module.
+    Each can use its own GPU alone, as "cuda:0". `build` is a function of a module.
 
     Raises
     ------
     InputError
-        Raised by `make`.
+        Raised by `build`.
     LostError
         A process that was killed.
     """
     with ExitStack() as closing:
-        children = [_start_child(device, make, given, closing) for device in devices]
+        children = [_start_child(device, build, args, closing) for device in devices]
         for child in children:
             _receive(child)
         yield tuple(children)
 
 
-def map_apart(function: Callable[[Task], Any], tasks: Sequence[Task], count: int = 1) -> Iterator[tuple[Task, Any]]:
+def map_parallel(function: Callable[[Task], Any], tasks: Sequence[Task], count: int = 1) -> Iterator[tuple[Task, Any]]:
     """Yield each task with its result, in order of completion, from at most `count` processes, killed at the end.
 
     Raises
@@ -80,7 +80,7 @@ def map_apart(function: Callable[[Task], Any], tasks: Sequence[Task], count: int
 
 
 def map_unordered(
-    children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: Iterable[Task]
+    children: Sequence[ChildProcess], work: Callable[[Any, Task], Any], tasks: Iterable[Task]
 ) -> Iterator[tuple[Task, Any]]:
     """Yield each task with `work(made, task)`, in order of completion: the next task goes to the next idle process.
 
@@ -94,7 +94,7 @@ def map_unordered(
     waiting, busy = iter(tasks), {}
     lost: Exception | None = None
 
-    def busied(child: Child) -> None:
+    def busied(child: ChildProcess) -> None:
         for task in waiting:
             with suppress(BrokenPipeError, ConnectionResetError):  # reported when its result is read
                 child.pipe.send((work, task))
@@ -121,7 +121,7 @@ def map_unordered(
         raise lost
 
 
-def run_on_each(children: Sequence[Child], work: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
+def run_on_each(children: Sequence[ChildProcess], work: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
     """Return the result of each process for its own task; all tasks begin together.
 
     Raises
@@ -143,7 +143,7 @@ def run_on_each(children: Sequence[Child], work: Callable[[Any, Task], Any], tas
     return found
 
 
-def _receive(child: Child) -> Any:
+def _receive(child: ChildProcess) -> Any:
     """Receive the next result of a process.
 
     Raises
@@ -155,7 +155,7 @@ def _receive(child: Child) -> Any:
         answer = child.pipe.recv()
     except (EOFError, ConnectionResetError):
         child.process.join(EXIT_TIMEOUT)
-        raise LostError(
+        raise LostProcessError(
             f"the process on {child.device} was ended{_note_exit(child.process.exitcode)}. If that happens again, give "
             f"--device one {child.device} less."
         ) from None
@@ -163,13 +163,13 @@ def _receive(child: Child) -> Any:
         return answer
     if isinstance(answer, RuntimeError) and child.device.startswith("cuda"):  # raised by Warp and torch for a GPU
         reason = (str(answer).strip() or type(answer).__name__).splitlines()[0]
-        raise LostError(
+        raise LostProcessError(
             f"{child.device} failed: {reason}. If that happens again, give --device one {child.device} less."
         ) from answer
     raise answer
 
 
-def to_gpu_variables(device: str) -> dict[str, str]:
+def build_gpu_environment(device: str) -> dict[str, str]:
     """Return the environment in which a process can use the GPU of a device alone, as "cuda:0"; empty for the CPU."""
     kind, _, number = device.partition(":")
     if kind != "cuda":
@@ -178,13 +178,13 @@ def to_gpu_variables(device: str) -> dict[str, str]:
     return {VISIBLE_VARIABLE: cards.split(",")[int(number or 0)] if cards else number or "0"}
 
 
-def _start_child(device: str, make: Callable[..., Any], given: tuple[Any, ...], closing: ExitStack) -> Child:
+def _start_child(device: str, make: Callable[..., Any], given: tuple[Any, ...], closing: ExitStack) -> ChildProcess:
     ours, theirs = Pipe()
-    variables = to_gpu_variables(device)
+    variables = build_gpu_environment(device)
     own = "cuda:0" if variables else device
     process = start_process(_serve, theirs, own, make, given, name=device, variables=variables)
     theirs.close()
-    child = Child(device, process, ours)
+    child = ChildProcess(device, process, ours)
     closing.callback(_end, child)
     return child
 
@@ -217,7 +217,7 @@ def _ignore_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _end(child: Child) -> None:
+def _end(child: ChildProcess) -> None:
     child.process.kill()
     child.process.join()
     child.pipe.close()

@@ -68,7 +68,7 @@ Task = Callable[[], object]  # Function to run on a thread.
 
 
 @dataclass(frozen=True)
-class Sharing:
+class ThreadLimits:
     """Limits for dividing native loops among threads.
 
     Parameters
@@ -83,15 +83,15 @@ class Sharing:
     min_size: int = 3000
 
 
-def choose_threads(work: int, sharing: Sharing = Sharing()) -> int:
-    """Choose the number of threads for a native loop over `work` elements or unknowns."""
-    if work < sharing.min_size:
+def choose_threads(size: int, limits: ThreadLimits = ThreadLimits()) -> int:
+    """Choose the number of threads for a native loop over `size` elements or unknowns."""
+    if size < limits.min_size:
         return 1
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(sharing.max_threads, here)
+    return min(limits.max_threads, here)
 
 
-def run_together(tasks: Sequence[Task]) -> None:
+def run_concurrently(tasks: Sequence[Task]) -> None:
     """Run tasks at the same time, the first on this thread, and wait for all. No task may call this function.
 
     Threads wait at a queue for reuse: the futures of a pool cost four times as long, which matters for tasks of 1 ms.

@@ -20,7 +20,7 @@ def get_library(device: Device) -> Any:
     return np
 
 
-def view(array: wp.array) -> Any:
+def to_view(array: wp.array) -> Any:
     """Return the array as the library's, without a copy."""
     return wp.to_torch(array) if array.device.is_cuda else array.numpy()
 
@@ -36,23 +36,23 @@ def to_double(values: Any) -> Any:
     return values.astype(np.float64) if isinstance(values, np.ndarray) else values.double()
 
 
-def cast_like(other: Any, values: Any) -> Any:
+def cast_like(template: Any, values: Any) -> Any:
     """Convert to another array's precision."""
-    return values.astype(other.dtype) if isinstance(values, np.ndarray) else values.to(other.dtype)
+    return values.astype(template.dtype) if isinstance(values, np.ndarray) else values.to(template.dtype)
 
 
-def pad_zeros(values: Any, more: tuple[int, ...]) -> Any:
+def pad_zeros(values: Any, counts: tuple[int, ...]) -> Any:
     """Append this many zeros at the end of each of the last axes."""
     shape = (
-        *values.shape[: -len(more)],
-        *(old + new for old, new in zip(values.shape[-len(more) :], more, strict=True)),
+        *values.shape[: -len(counts)],
+        *(old + new for old, new in zip(values.shape[-len(counts) :], counts, strict=True)),
     )
     out = np.zeros(shape, values.dtype) if isinstance(values, np.ndarray) else values.new_zeros(shape)
     out[tuple(slice(length) for length in values.shape)] = values
     return out
 
 
-def order_by_size(values: Any) -> Any:
+def rank_rows(values: Any) -> Any:
     """Return the row indices that sort each column of values (n, b) in descending order."""
     if isinstance(values, np.ndarray):
         return np.argsort(-values, axis=0, kind="stable")
@@ -64,16 +64,16 @@ def sort_columns(values: Any) -> Any:
     return np.sort(values, axis=0) if isinstance(values, np.ndarray) else values.sort(dim=0).values
 
 
-def solve_dense(matrix: Any, right: Any) -> Any:
+def solve_dense(matrix: Any, right_side: Any) -> Any:
     """Solve matrix x = right; not finite where the matrix is singular. The host does not wait for the GPU."""
     if not isinstance(matrix, np.ndarray):
         import torch
 
-        return torch.linalg.solve_ex(matrix, right).result
+        return torch.linalg.solve_ex(matrix, right_side).result
     try:
-        return np.linalg.solve(matrix, right)
+        return np.linalg.solve(matrix, right_side)
     except np.linalg.LinAlgError:
-        return np.full_like(right, np.nan)
+        return np.full_like(right_side, np.nan)
 
 
 def to_library(device: Device, values: np.ndarray) -> Any:
@@ -81,12 +81,12 @@ def to_library(device: Device, values: np.ndarray) -> Any:
     return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values
 
 
-def select_columns(device: Device, some: np.ndarray, count: int) -> Any:
+def select_columns(device: Device, columns: np.ndarray, count: int) -> Any:
     """Return an index of columns (k,), ascending, of `count`: a slice for all of them, so that nothing is copied.
 
     On a GPU it is uploaded once for use with several arrays; NumPy indices would be uploaded each time.
     """
-    return slice(None) if len(some) == count else to_library(device, some)
+    return slice(None) if len(columns) == count else to_library(device, columns)
 
 
 def to_host(values: Any) -> np.ndarray:

@@ -11,7 +11,7 @@ from .strategy import SolverResult, Strategy
 from .time_steps import NoMotionStep
 
 
-def solve_off_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
+def solve_free_of_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
     """Solve as `Strategy.solve` the cases whose tools overlap no bone; the others stay at the last of their guesses.
 
     Bone does not yield: a solution would depend on the barrier stiffness alone, and take long.
@@ -29,6 +29,6 @@ def solve_off_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Seq
     restarted, clear = np.zeros(count, bool), np.flatnonzero(~on_bone)
     if len(clear):
         found = strategy.solve(cases.select(clear), [guess[:, clear] for guess in guesses])
-        result.put(clear, found, device)
+        result.put_cases(clear, found, device)
         restarted[clear] = found.restarted
     return replace(result, path_fraction=result.reached, restarted=restarted)

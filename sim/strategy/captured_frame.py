@@ -12,14 +12,14 @@ import numpy as np
 import warp as wp
 
 from ..discretisation.footprint import ContactSurface
-from ..discretisation.inverted_elements import Inversion
+from ..discretisation.inverted_elements import InversionCounter
 from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
 from ..local_solvers.strained_frame import UpdatedModel, UpdatedPreconditioner, update_model_at
 from ..local_solvers.strained_part import StrainedPart
 from ..minimisers.lbfgs_kernels import LIVE, PAIRS
-from ..minimisers.lbfgs_state import LbfgsState, Workspace, allocate_memory, allocate_state
-from ..runtime.columns import get_warp_width, summed
+from ..minimisers.lbfgs_state import LbfgsState, LbfgsWorkspace, allocate_memory, allocate_state
+from ..runtime.columns import get_warp_width, sum_warp
 from ..runtime.device import Device, forward_kernel
 
 MAX_FRAME_EVALUATIONS = 60  # Maximum residual evaluations of a frame: a tool that moves smoothly needs fewer.
@@ -66,7 +66,7 @@ def build_kernels(device: Device) -> FrameKernels:
                 f = scalar(share * given[4 + k])
                 constant[3 * nodes[i] + k, 0] = -f
                 square += wp.float64(f) * wp.float64(f)
-        square = summed(square)
+        square = sum_warp(square)
         if i % lanes == 0:
             wp.atomic_add(loud, 0, 0, square)
 
@@ -177,7 +177,7 @@ class CapturedFrame:
         self,
         problem: Problem,
         preconditioner: Preconditioner,
-        inversion: Inversion,
+        inversion: InversionCounter,
         skin: ContactSurface,
         tolerance: float,
         part: StrainedPart | None = None,
@@ -189,7 +189,7 @@ class CapturedFrame:
         if part is not None:
             part.prepare()
             self._knowing = UpdatedPreconditioner(preconditioner, problem, part.size)
-        self._workspace = Workspace(problem, self._knowing or preconditioner, 1, allocate_memory(problem, 1))
+        self._workspace = LbfgsWorkspace(problem, self._knowing or preconditioner, 1, allocate_memory(problem, 1))
         self._workspace.columns["tolerance"].fill_(tolerance)
         self._workspace.prepare()
         self._before = allocate_state(problem, 1, allocate_memory(problem, 1))
@@ -198,7 +198,7 @@ class CapturedFrame:
         self._tried, self._going, self._inverted = (wp.zeros(1, dtype=wp.int32, device=name) for _ in range(3))
         self._given, self._up = self._allocate_pair(INPUT_SIZE)
         self._out, self._down = self._allocate_pair(HEADER_SIZE + problem.rows)
-        self._imprint = skin.build_footprints(wp.array(ptr=self._given.ptr, dtype=wp.vec4d, shape=(1,), device=name))
+        self._imprint = skin.allocate_footprints(wp.array(ptr=self._given.ptr, dtype=wp.vec4d, shape=(1,), device=name))
         self._graph: wp.Graph | None = None
 
     @property
@@ -212,22 +212,26 @@ class CapturedFrame:
         return self._workspace.columns["u"]
 
     @property
-    def before(self) -> LbfgsState:
+    def previous_state(self) -> LbfgsState:
         """State that the last solution started from."""
         return self._before
 
-    def take(
-        self, u: np.ndarray, past: np.ndarray | None, pairs: Mapping[str, np.ndarray], bent: UpdatedModel | None = None
+    def load_state(
+        self,
+        u: np.ndarray,
+        last_u: np.ndarray | None,
+        history: Mapping[str, np.ndarray],
+        model: UpdatedModel | None = None,
     ) -> None:
         """Load another state: displacements u (3N, 1) [m], the ones before them, and the L-BFGS history, if any."""
         columns = self._workspace.columns
-        self._load_updated_model(bent)
+        self._load_updated_model(model)
         columns["u"].assign(u)
-        self._past.assign(u if past is None else past)
+        self._past.assign(u if last_u is None else last_u)
         for name in ("s", "w", "known"):
             columns[name].zero_()
         columns["head"].fill_(PAIRS - 1)
-        for name, rows_first in pairs.items():
+        for name, rows_first in history.items():
             columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
 
     def update_model(self, steps: float) -> None:
@@ -239,17 +243,17 @@ class CapturedFrame:
     def _load_updated_model(self, bent: UpdatedModel | None) -> None:
         if self._knowing is not None:
             self.bent = bent
-            self._knowing.load(bent)
+            self._knowing.load_model(bent)
 
-    def push(self, point: np.ndarray, radius: float, force: np.ndarray, share: float) -> np.ndarray:
+    def solve_push(self, point: np.ndarray, radius: float, force: np.ndarray, extrapolation: float) -> np.ndarray:
         """Solve for a push at point (3,) with a footprint's radius [m] and a force (3,) [N].
 
         Return (HEADER_SIZE + 3N,).
 
-        The start is the present state, extrapolated by `share` times its change from the one before. The returned array
-        is overwritten by the next frame.
+        The start is the present state, extrapolated by `extrapolation` times its change from the one before. The
+        returned array is overwritten by the next frame.
         """
-        self._up.numpy()[:] = (*point, radius, *force, share)
+        self._up.numpy()[:] = (*point, radius, *force, extrapolation)
         device = self._device
         if self._graph is not None:
             wp.capture_launch(self._graph)
@@ -267,9 +271,9 @@ class CapturedFrame:
     def _launch_frame(self) -> None:
         a, k, device, imprint = self._workspace.columns, build_kernels(self._device), self._device, self._imprint
         wp.copy(self._given, self._up)
-        for kind, array in self._before.moved.items():
-            wp.copy(array, self._workspace.state.moved[kind])
-        self._skin.put(imprint)
+        for kind, array in self._before.movable.items():
+            wp.copy(array, self._workspace.state.movable[kind])
+        self._skin.compute_footprints(imprint)
         names = ("t", "predicted", "residual", "loud", "sg", "wg", "steps", "cut", "status")
         outputs = [*(a[name] for name in names), self._tried, self._going, self._inverted]
         device.launch(k.reset, (1,), [], outputs)

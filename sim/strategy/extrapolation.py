@@ -27,17 +27,17 @@ def as_pushes(loads: Loads) -> np.ndarray | None:
     return np.column_stack([push.point, push.force, push.footprint])
 
 
-def compute_shares(now: np.ndarray, last: np.ndarray, before: np.ndarray) -> np.ndarray:
+def compute_factors(push: np.ndarray, last: np.ndarray, previous: np.ndarray) -> np.ndarray:
     """Compute the factors a (B,) of three successive pushes (B, 7); zero without force, or if the last two are equal.
 
     Lengths are measured against the last footprint, forces against the last force.
     """
-    forces = np.stack([now, last, before])[:, :, 3:6]
+    forces = np.stack([push, last, previous])[:, :, 3:6]
     size = np.sqrt((forces * forces).sum(axis=2))
     unit = np.repeat(last[:, 6:], 7, axis=1)
     unit[:, 3:6] = size[1][:, None]
     unit[unit == 0.0] = 1.0
-    way, further = (last - before) / unit, (now - last) / unit
+    way, further = (last - previous) / unit, (push - last) / unit
     square = (way * way).sum(axis=1)
     known = size.all(axis=0) & (square > 0.0)
     share = (further * way).sum(axis=1) / np.where(known, square, 1.0)
@@ -58,15 +58,15 @@ def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -
     if now is None or not has_warm_state(warm, last):
         return last
     came, before = warm[PUSHES_KEY][:, 0], warm[PUSHES_KEY][:, 1]
-    return last + compute_shares(now, came, before) * (last - warm[BEFORE_KEY].T)
+    return last + compute_factors(now, came, before) * (last - warm[BEFORE_KEY].T)
 
 
 def compute_directions(
-    now: np.ndarray | None, last: np.ndarray | None, warm: Mapping[str, Any]
+    push: np.ndarray | None, last: np.ndarray | None, warm: Mapping[str, Any]
 ) -> dict[str, np.ndarray]:
     """Collect the warm-start entries of solutions to pushes (B, 7); they started from the solutions `last` (3N, B)."""
-    if now is None:
+    if push is None:
         return {}
-    if last is None or PUSHES_KEY not in warm or warm[PUSHES_KEY].shape != (len(now), 2, 7):
-        return {PUSHES_KEY: np.stack([now, now], axis=1)}
-    return {PUSHES_KEY: np.stack([now, warm[PUSHES_KEY][:, 0]], axis=1), BEFORE_KEY: last.T}
+    if last is None or PUSHES_KEY not in warm or warm[PUSHES_KEY].shape != (len(push), 2, 7):
+        return {PUSHES_KEY: np.stack([push, push], axis=1)}
+    return {PUSHES_KEY: np.stack([push, warm[PUSHES_KEY][:, 0]], axis=1), BEFORE_KEY: last.T}

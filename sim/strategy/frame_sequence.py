@@ -15,7 +15,7 @@ import numpy as np
 from ..deformation import Cost, Deformation, Outcome
 from ..diagnostics.deformed_tissue import Diagnostics
 from ..discretisation.footprint import ContactSurface
-from ..discretisation.inverted_elements import Inversion
+from ..discretisation.inverted_elements import InversionCounter
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..discretisation.term import Cases
@@ -26,14 +26,14 @@ from ..minimisers.lbfgs import HISTORY_KEYS, restore_history, to_rows_first
 from ..minimisers.lbfgs_kernels import DONE
 from ..minimisers.lbfgs_state import LbfgsState
 from .captured_frame import HEADER_SIZE, INVERTED, RESIDUAL, STATUS, STEPS, SUMS, CapturedFrame
-from .extrapolation import BEFORE_KEY, PUSHES_KEY, as_pushes, compute_directions, compute_shares, has_warm_state
+from .extrapolation import BEFORE_KEY, PUSHES_KEY, as_pushes, compute_directions, compute_factors, has_warm_state
 from .strategy import Strategy
 
 # Cyclic permutations, left and right, for a cross product in a fifth of the time of NumPy's.
 YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
-class Kept(Mapping[str, Any]):
+class DeviceWarmStart(Mapping[str, Any]):
     """Warm-start data of a solution, whose L-BFGS history stays on the device until it is read or overwritten.
 
     `bent` is the next frame's model of strained tissue. `lock` is that of the `FrameSequence`: another thread may read
@@ -88,7 +88,7 @@ class FrameSequence:
     def __init__(
         self,
         problem: Problem,
-        inversion: Inversion,
+        inversion: InversionCounter,
         frame: CapturedFrame,
         diagnostics: Diagnostics,
         lock: RLock,
@@ -100,8 +100,8 @@ class FrameSequence:
         self._nodes = np.arange(problem.rows // 3)
         self._last: Callable[[], Deformation | None] = _return_none
         # Warm-start data whose history is in the frame's present state, and in the state that it started from.
-        self._here: Callable[[], Kept | None] = _return_none
-        self._there: Callable[[], Kept | None] = _return_none
+        self._here: Callable[[], DeviceWarmStart | None] = _return_none
+        self._there: Callable[[], DeviceWarmStart | None] = _return_none
 
     def solve_frame(self, loads: Loads, start: Deformation, guess: Callable[[], np.ndarray]) -> Deformation | None:
         """Solve for a push from a start.
@@ -124,17 +124,17 @@ class FrameSequence:
         self._make_way()
         way = compute_directions(now, last, start.warm)
         share = (
-            compute_shares(now, way[PUSHES_KEY][:, 1], start.warm[PUSHES_KEY][:, 1])[0]
+            compute_factors(now, way[PUSHES_KEY][:, 1], start.warm[PUSHES_KEY][:, 1])[0]
             if has_warm_state(start.warm, last)
             else 0.0
         )
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
         self._last = self._here = _return_none
-        found = self._frame.push(point, radius, force, share)
-        if found[STATUS] != DONE or self._inversion.find_doubtful(found[INVERTED]):
+        found = self._frame.solve_push(point, radius, force, share)
+        if found[STATUS] != DONE or self._inversion.find_suspect(found[INVERTED]):
             return None
         self._frame.update_model(found[STEPS])
-        warm = Kept(way, self._frame.state, self._lock, self._frame.bent)
+        warm = DeviceWarmStart(way, self._frame.state, self._lock, self._frame.bent)
         arm = found[SUMS + 1 : SUMS + 4] / found[SUMS] - point
         displacement = found[HEADER_SIZE:].reshape(1, -1, 3).copy()
         displacement.setflags(write=False)  # a later start uses the copy on the device
@@ -164,18 +164,18 @@ class FrameSequence:
         cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
         u = self._problem.device.upload(last)
-        if self._problem.compute_gap(u)[1].any() or self._inversion.find_doubtful(self._inversion.count(u)).any():
+        if self._problem.compute_gap(u)[1].any() or self._inversion.find_suspect(self._inversion.count(u)).any():
             return False
         here = self._here()
         if here is not None:
             here.copy_to_host()
         self._last = self._here = _return_none
         past = start.warm[BEFORE_KEY].T if has_warm_state(start.warm, last) else None
-        self._frame.take(last, past, restore_history(cases, len(last)), self._get_updated_model(start.warm))
+        self._frame.load_state(last, past, restore_history(cases, len(last)), self._get_updated_model(start.warm))
         return True
 
     def _get_updated_model(self, warm: Mapping[str, Any]) -> UpdatedModel | None:
-        if isinstance(warm, Kept):
+        if isinstance(warm, DeviceWarmStart):
             return warm.bent
         part = self._frame.part
         return None if part is None else restore_updated_model(warm, self._problem.device, len(self._nodes), part.size)
@@ -186,17 +186,22 @@ class FrameSequence:
         if there is not None:
             there.copy_to_host()
         if here is not None and here.state is not None:
-            here.state = self._frame.before
+            here.state = self._frame.previous_state
         self._there = self._here
 
 
 def build_frame_sequence(
-    strategy: Strategy, space: Discretisation, skin: ContactSurface, diagnostics: Diagnostics, lock: RLock, source: str
+    strategy: Strategy,
+    space: Discretisation,
+    surface: ContactSurface,
+    diagnostics: Diagnostics,
+    lock: RLock,
+    source: str,
 ) -> FrameSequence:
     """Build the frame solver from the strategy of a plan that follows frames, for pushes on a surface."""
     problem, preconditioner, inversion = strategy.problem, strategy.preconditioner, strategy.inversion
-    part = build_strained_part(problem, preconditioner, space) if strategy.plan.strained else None
-    frame = CapturedFrame(problem, preconditioner, inversion, skin, strategy.accuracy.tolerance, part)
+    part = build_strained_part(problem, preconditioner, space) if strategy.plan.updates_model else None
+    frame = CapturedFrame(problem, preconditioner, inversion, surface, strategy.accuracy.tolerance, part)
     return FrameSequence(problem, inversion, frame, diagnostics, lock, source)
 
 

@@ -33,7 +33,7 @@ BUDGET = MemoryBudget()
 
 
 @dataclass(frozen=True)
-class Needed:
+class MemoryEstimate:
     """Device memory for a number of loads [bytes].
 
     Parameters
@@ -42,7 +42,7 @@ class Needed:
         Number of mesh nodes, and element type.
     device
         Device of the FEM.
-    set_up, kept, column
+    setup, constant, per_load
         Peak during set-up; constant part afterwards; further part per load of a batch.
     batch
         Loads solved together.
@@ -53,23 +53,23 @@ class Needed:
     nodes: int
     element: str
     device: Device
-    set_up: int
-    kept: int
-    column: int
+    setup: int
+    constant: int
+    per_load: int
     batch: int
     free: int
 
     @property
     def peak(self) -> int:
         """Peak memory [bytes]; the workspace of a batch may be wider than the batch."""
-        return max(self.set_up, self.kept + find_workspace_width(self.device, self.batch) * self.column)
+        return max(self.setup, self.constant + find_workspace_width(self.device, self.batch) * self.per_load)
 
     def __str__(self) -> str:
         loads = f"{self.batch} loads together" if self.batch > 1 else "one load at a time"
         taken, free = format_gigabytes(self.peak), format_gigabytes(self.free)
         return f"{self.nodes:,} nodes ({self.element}), {loads}: about {taken} of {self.device.name}, {free} free"
 
-    def check_fits(self, budget: MemoryBudget = BUDGET) -> Needed:
+    def check_fits(self, budget: MemoryBudget = BUDGET) -> MemoryEstimate:
         """Return this object if its peak fits in the free memory.
 
         Raises
@@ -77,26 +77,26 @@ class Needed:
         InputError
             Too little free memory; the message names the demand, the free memory, and what would fit.
         """
-        room = budget.share * self.free
+        room = budget.fraction * self.free
         if self.peak <= room:
             return self
-        fitting = find_widest_workspace(self.device, int((room - self.kept) / self.column))
-        fits = self.set_up <= room and fitting > 0
+        fitting = find_widest_workspace(self.device, int((room - self.constant) / self.per_load))
+        fits = self.setup <= room and fitting > 0
         raise InputError(f"{self}: {f'a --batch of {fitting} fits.' if fits else MESH_REMEDY}")
 
 
-def estimate_needed(
+def estimate_fem_memory(
     anatomy: Anatomy,
     element: str | None,
     accuracy: Accuracy,
     device: str,
     batch: int | None,
     loads: int,
-    share: int = 1,
-) -> Needed | None:
+    processes: int = 1,
+) -> MemoryEstimate | None:
     """Estimate the GPU memory of `Fem` for a number of loads; None on the CPU, where each batch is checked instead.
 
-    Without a `batch`, the largest one that fits is taken. `share` processes share the GPU equally.
+    Without a `batch`, the largest one that fits is taken. `processes` processes share the GPU equally.
 
     Raises
     ------
@@ -107,28 +107,28 @@ def estimate_needed(
     if not where.on_cuda:
         return None
     space = discretise(anatomy.mesh, element)
-    free = measure_free_bytes(where) // share
+    free = measure_free_bytes(where) // processes
     inverted = _find_invertible(_list_unknowns(space, anatomy), where)
-    return compute_needed(space, where, inverted, batch, loads, free)
+    return compute_memory(space, where, inverted, batch, loads, free)
 
 
-def compute_needed(
+def compute_memory(
     space: Discretisation,
     device: Device,
-    inverted: int,
+    inverted_rows: int,
     batch: int | None,
     loads: int,
     free: int,
     budget: MemoryBudget = BUDGET,
-) -> Needed:
-    """Compute the memory for a discretisation whose preconditioner inverts `inverted` unknowns, with `free` bytes."""
+) -> MemoryEstimate:
+    """Compute the memory if the preconditioner inverts `inverted_rows` unknowns; `free` is the free memory [bytes]."""
     rows, width = 3 * space.count, wp.types.type_size_in_bytes(device.scalar)
     tables = FIXED_BYTES + BYTES_PER_NODE[space.element] * space.count * width // 4
-    taken, left = _estimate_inverse_bytes(inverted, device)
+    taken, left = _estimate_inverse_bytes(inverted_rows, device)
     column = estimate_column_bytes(rows, device)
     if batch is None:
         batch = choose_batch_size(rows, device, free - tables - left, budget)
-    return Needed(
+    return MemoryEstimate(
         len(space.mesh.nodes), space.element, device, tables + taken, tables + left, column, min(batch, loads), free
     )
 
@@ -149,8 +149,8 @@ def _find_invertible(unknowns: tuple[int, ...], device: Device) -> int:
 
 def _estimate_inverse_bytes(unknowns: int, device: Device) -> tuple[int, int]:
     """Estimate the memory of a dense inverse [bytes]: peak during construction, and afterwards."""
-    from ..linalg.block_inverse import exchange_bytes
+    from ..linalg.block_inverse import estimate_bytes
     from ..linalg.dense_inverse import estimate_inverse_bytes
 
     left = estimate_inverse_bytes(unknowns, device)
-    return exchange_bytes(unknowns) + left, left
+    return estimate_bytes(unknowns) + left, left

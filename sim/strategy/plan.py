@@ -10,10 +10,10 @@ import warp as wp
 from ..accuracy import Accuracy
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
-from ..discretisation.term import Local
+from ..discretisation.term import LocalBarrier
 from ..effects import Effect
-from ..linalg.multifrontal import Factor
-from ..linalg.multigrid import TwoLevel
+from ..linalg.multifrontal import SparseFactor
+from ..linalg.multigrid import TwoLevelCycle
 from ..linalg.pcg import BlockJacobi, Preconditioner
 from ..linalg.preconditioner import get_preconditioner_name, is_exact
 from ..local_solvers.batch_elimination import BatchElimination, build_batch_elimination, has_small_opening
@@ -60,36 +60,36 @@ class SolverPlan:
     ----------
     preconditioner
         Name of the preconditioner, from `get_preconditioner_name`.
-    many, single
+    batched, single
         Local solver that is tried first for `PLAN_LIMITS.min_shared_cases` loads or more, and for one; or None.
-    contact
+    contact_solver
         Solver that is tried first for loads with tools moved by pose; None without such tools.
     uses_lbfgs
         True if L-BFGS is tried before Newton-CG.
-    frames, strained
+    captures_frames, updates_model
         True if a load that follows another is solved by a captured graph on the GPU; True if this graph updates the
         stiffness of strained tissue.
-    evaluations, outer, load_steps
+    max_evaluations, max_outer, max_load_steps
         Limits: residual evaluations before Newton-CG, Newton iterations, load steps.
     batch
         Maximum number of loads solved together.
     """
 
     preconditioner: str
-    many: SolverStep | None
+    batched: SolverStep | None
     single: SolverStep | None
-    contact: SolverStep | None
+    contact_solver: SolverStep | None
     uses_lbfgs: bool
-    frames: bool
-    strained: bool
-    evaluations: int
-    outer: int
-    load_steps: int
+    captures_frames: bool
+    updates_model: bool
+    max_evaluations: int
+    max_outer: int
+    max_load_steps: int
     batch: int
 
     def choose_local(self, count: int) -> SolverStep | None:
         """Return the local solver that is tried first for `count` loads together, if any."""
-        return self.many if count >= PLAN_LIMITS.min_shared_cases else self.single if count == 1 else None
+        return self.batched if count >= PLAN_LIMITS.min_shared_cases else self.single if count == 1 else None
 
     def list_steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
         """List the solvers for `count` loads together, in order; `imposed` if the loads prescribe motion."""
@@ -101,53 +101,55 @@ class SolverPlan:
     def explain(self) -> tuple[str, ...]:
         """Describe the plan in sentences."""
         lines = [f"The undeformed stiffness is prepared once ({self.preconditioner}); every solver starts from it."]
-        if self.frames:
-            knows = ". It updates the stiffness of the tissue that the last load strained" if self.strained else ""
+        if self.captures_frames:
+            knows = ". It updates the stiffness of the tissue that the last load strained" if self.updates_model else ""
             lines.append(f"A load that follows another is solved as {SolverStep.FRAME.value}{knows}.")
-        if self.contact:
-            lines.append(f"Tools are moved by pose. Every load begins with {self.contact.value}.")
+        if self.contact_solver:
+            lines.append(f"Tools are moved by pose. Every load begins with {self.contact_solver.value}.")
             lines.append(f"{SolverStep.NEWTON.value} solves the loads that remain.")
         elif not self.uses_lbfgs:
-            lines.append(f"Every load is solved by {SolverStep.NEWTON.value}, in at most {self.outer} iterations.")
+            lines.append(f"Every load is solved by {SolverStep.NEWTON.value}, in at most {self.max_outer} iterations.")
         else:
-            if self.many:
-                lines.append(f"Batches of {PLAN_LIMITS.min_shared_cases} loads and more begin with {self.many.value}.")
+            if self.batched:
+                lines.append(
+                    f"Batches of {PLAN_LIMITS.min_shared_cases} loads and more begin with {self.batched.value}."
+                )
             if self.single:
                 lines.append(f"A single load begins with {self.single.value}.")
-            lines.append(f"{SolverStep.LBFGS.value} takes what is left, in at most {self.evaluations} evaluations.")
-            lines.append(f"{SolverStep.NEWTON.value} solves what remains, in at most {self.outer} iterations.")
+            lines.append(f"{SolverStep.LBFGS.value} takes what is left, in at most {self.max_evaluations} evaluations.")
+            lines.append(f"{SolverStep.NEWTON.value} solves what remains, in at most {self.max_outer} iterations.")
             lines.append(f"Loads that prescribe motion are solved by {SolverStep.NEWTON.value} alone.")
-        if self.load_steps:
+        if self.max_load_steps:
             lines.append(
                 "A load without equilibrium is solved again from the undeformed state, and then in load steps: at most "
-                f"{self.load_steps}."
+                f"{self.max_load_steps}."
             )
         together = f"Up to {self.batch} loads are" if self.batch > 1 else "One load is"
         lines.append(f"{together} solved at a time.")
         return tuple(lines)
 
 
-def plan_for(
+def choose_plan(
     problem: Problem,
     preconditioner: Preconditioner,
     space: Discretisation,
     accuracy: Accuracy,
     batch: int,
     live: bool = False,
-    avoid: Collection[SolverStep] = (),
+    excluded: Collection[SolverStep] = (),
 ) -> SolverPlan:
     """Choose the solvers of a problem; no other place decides this.
 
     `batch` loads are solved together unless a solver takes them one by one; `live` loads come one at a time. Solvers in
-    `avoid` are not used, except Newton-CG, which always remains.
+    `excluded` are not used, except Newton-CG, which always remains.
     """
     cuda, exact = problem.device.on_cuda, is_exact(preconditioner)
-    elastic = problem.plain  # local solvers handle elastic terms only
+    elastic = problem.can_accelerate  # local solvers handle elastic terms only
     small = elastic and has_small_opening(space, problem.constraint)
-    strained = small and exact and space.element == "smoothed" and SolverStep.STRAINED not in avoid
+    strained = small and exact and space.element == "smoothed" and SolverStep.STRAINED not in excluded
     single = None
     if elastic and not cuda:
-        if space.element == "p2" and isinstance(preconditioner, TwoLevel):
+        if space.element == "p2" and isinstance(preconditioner, TwoLevelCycle):
             single = SolverStep.CLAMPED
         elif live and strained:
             single = SolverStep.STRAINED
@@ -155,29 +157,29 @@ def plan_for(
     if problem.barriers:
         # The contact model supports one barrier, and a preconditioner that is the same for every state.
         alike = not isinstance(preconditioner, BlockJacobi)
-        one = len(problem.barriers) == 1 and isinstance(problem.barriers[0], Local)
+        one = len(problem.barriers) == 1 and isinstance(problem.barriers[0], LocalBarrier)
         contact = SolverStep.CONTACT if one and alike else SolverStep.NEWTON
-    following = cuda and exact and elastic and can_follow(space, accuracy) and wp.is_conditional_graph_supported()
-    quick = not problem.steep and not problem.barriers and accuracy.outer >= PLAN_LIMITS.min_outer_iterations
-    single, contact = None if single in avoid else single, SolverStep.NEWTON if contact in avoid else contact
+    following = cuda and exact and elastic and can_capture(space, accuracy) and wp.is_conditional_graph_supported()
+    quick = not problem.is_steep and not problem.barriers and accuracy.outer >= PLAN_LIMITS.min_outer_iterations
+    single, contact = None if single in excluded else single, SolverStep.NEWTON if contact in excluded else contact
     most = PLAN_LIMITS.max_cuda_evaluations if cuda else PLAN_LIMITS.max_evaluations
     most = most if accuracy.evaluations is None else min(most, accuracy.evaluations)
     return SolverPlan(
         preconditioner=get_preconditioner_name(preconditioner),
-        many=SolverStep.NEAR if small and exact and SolverStep.NEAR not in avoid else None,
+        batched=SolverStep.NEAR if small and exact and SolverStep.NEAR not in excluded else None,
         single=single,
-        contact=contact,
-        uses_lbfgs=quick and most > 0 and SolverStep.LBFGS not in avoid,
-        frames=following and most >= MAX_FRAME_EVALUATIONS and SolverStep.FRAME not in avoid,
-        strained=strained,
-        evaluations=most,
-        outer=accuracy.outer,
-        load_steps=accuracy.steps,
+        contact_solver=contact,
+        uses_lbfgs=quick and most > 0 and SolverStep.LBFGS not in excluded,
+        captures_frames=following and most >= MAX_FRAME_EVALUATIONS and SolverStep.FRAME not in excluded,
+        updates_model=strained,
+        max_evaluations=most,
+        max_outer=accuracy.outer,
+        max_load_steps=accuracy.steps,
         batch=1 if single is SolverStep.CLAMPED else batch,  # each load has its own local subproblem
     )
 
 
-def can_follow(space: Discretisation, accuracy: Accuracy) -> bool:
+def can_capture(space: Discretisation, accuracy: Accuracy) -> bool:
     """Return True if frames can be captured: nodes are mesh vertices, and the iteration budget admits L-BFGS."""
     return not len(space.edges) and accuracy.outer >= PLAN_LIMITS.min_outer_iterations
 
@@ -187,10 +189,10 @@ def build_local_solvers(
 ) -> tuple[Callable[[], BatchElimination | None], Alone | None]:
     """Build a plan's local solvers: a function that builds the one for many loads at its first call; that for one."""
     build = partial(build_batch_elimination, problem, preconditioner, effects, space)
-    near = cache(build if plan.many else lambda: None)
+    near = cache(build if plan.batched else lambda: None)
     if plan.single is SolverStep.CLAMPED:
         return near, ClampedElimination(problem, preconditioner, effects, space)
     if plan.single is SolverStep.STRAINED:
-        assert isinstance(preconditioner, Factor)
+        assert isinstance(preconditioner, SparseFactor)
         return near, StrainedDescent(problem, preconditioner, build_strained_part(problem, preconditioner, space))
     return near, None

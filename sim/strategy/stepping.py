@@ -60,7 +60,7 @@ GAP_CONTINUATION = GapContinuation()  # Default.
 
 
 @dataclass(frozen=True, eq=False)
-class Shares:
+class LoadProgress:
     """Progress of cases whose load, or whose tools' motion, is applied in steps; all arrays are changed in place.
 
     Parameters
@@ -80,11 +80,11 @@ class Shares:
         """Return cases at the fraction 0, with a `first` step of this length."""
         return cls(np.zeros(len(gaps)), np.full(len(gaps), first), gaps)
 
-    def limit(self, longest: np.ndarray, stepping: LoadStepping) -> tuple[np.ndarray, np.ndarray]:
-        """Limit steps to the `longest` (b,); return which (b,) bool were shorter, and which cases continue."""
-        shorter = self.step < longest
-        np.minimum(self.step, longest, out=self.step)
-        long_enough = self.step >= stepping.min_step * np.minimum(1.0, 4.0 * longest)
+    def limit_steps(self, max_steps: np.ndarray, stepping: LoadStepping) -> tuple[np.ndarray, np.ndarray]:
+        """Limit steps to the `max_steps` (b,); return which (b,) bool were shorter, and which cases continue."""
+        shorter = self.step < max_steps
+        np.minimum(self.step, max_steps, out=self.step)
+        long_enough = self.step >= stepping.min_step * np.minimum(1.0, 4.0 * max_steps)
         return shorter, (self.reached < 1.0) & long_enough
 
     def propose_shares(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
@@ -92,11 +92,11 @@ class Shares:
         aim = np.minimum(self.reached[rows] + self.step[rows], 1.0)
         return aim, float(((aim - self.reached[rows]) * self.gaps[rows]).max())
 
-    def take(self, rows: np.ndarray, aim: np.ndarray, good: np.ndarray) -> None:
-        """Accept the steps of those rows (k,) that are `good`: they reach their aim (k,)."""
-        self.reached[rows[good]] = aim[good]
+    def take_steps(self, rows: np.ndarray, target: np.ndarray, good: np.ndarray) -> None:
+        """Accept the steps of those rows (k,) that are `good`: they reach their target (k,)."""
+        self.reached[rows[good]] = target[good]
 
-    def resize(self, rows: np.ndarray, good: np.ndarray, growth: np.ndarray, cut: float, wider: float) -> None:
-        """Grow the steps of rows (k,) that are `good`; shorten the others by `cut`, and widen their gaps by `wider`."""
-        self.gaps[rows] *= np.where(good, 1.0, wider)
-        self.step[rows] *= np.where(good, np.clip(growth, 0.5, 2.0), cut)
+    def resize_steps(self, rows: np.ndarray, good: np.ndarray, growth: np.ndarray, shrink: float, widen: float) -> None:
+        """Grow the steps of rows (k,) that are `good`; multiply the others by `shrink`, and their gaps by `widen`."""
+        self.gaps[rows] *= np.where(good, 1.0, widen)
+        self.step[rows] *= np.where(good, np.clip(growth, 0.5, 2.0), shrink)

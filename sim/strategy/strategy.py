@@ -12,9 +12,9 @@ import warp as wp
 
 from ..accuracy import Accuracy
 from ..deformation import Outcome
-from ..discretisation.inverted_elements import Inversion
+from ..discretisation.inverted_elements import InversionCounter
 from ..discretisation.problem import Problem
-from ..discretisation.term import Cases, Local
+from ..discretisation.term import Cases, LocalBarrier
 from ..linalg.pcg import Preconditioner
 from ..local_solvers.batch_elimination import BatchElimination
 from ..local_solvers.contact_descent import ContactDescent
@@ -27,9 +27,9 @@ from ..minimisers.newton_cg import NewtonCG
 from ..minimisers.residual import measure_residual
 from ..runtime.columns import gather_columns, scatter_columns
 from ..runtime.device import Device
-from ..runtime.views import run_in_order, to_host, view
+from ..runtime.views import run_in_order, to_host, to_view
 from .plan import Alone, SolverPlan, SolverStep
-from .stepping import GAP_CONTINUATION, LOAD_STEPPING, GapContinuation, LoadStepping, Shares
+from .stepping import GAP_CONTINUATION, LOAD_STEPPING, GapContinuation, LoadProgress, LoadStepping
 
 EMPTY_HISTORY: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS history.
 
@@ -58,7 +58,7 @@ class SolverResult:
         """True (B,) for good outcomes."""
         return np.array([outcome.good for outcome in self.outcome], bool)
 
-    def put(self, index: np.ndarray, other: SolverResult, device: Device) -> None:
+    def put_cases(self, index: np.ndarray, other: SolverResult, device: Device) -> None:
         """Overwrite the results of some cases (k,) with those of `other`; outer steps add up."""
         scatter_columns(device, other.u, index, self.u)
         self.iterations[index] += other.iterations
@@ -80,9 +80,9 @@ class Strategy:
         Tolerance and iteration limits.
     plan
         Solvers to try, in order.
-    near
+    build_batch_solver
         Function that returns the plan's local solver for many loads, built at the first call.
-    alone
+    single_solver
         Local solver for one load.
     stepping, gaps
         Control of load steps, and of the tools' gaps.
@@ -90,11 +90,11 @@ class Strategy:
 
     problem: Problem
     preconditioner: Preconditioner
-    inversion: Inversion
+    inversion: InversionCounter
     accuracy: Accuracy
     plan: SolverPlan
-    near: Callable[[], BatchElimination | None] = lambda: None
-    alone: Alone | None = None
+    build_batch_solver: Callable[[], BatchElimination | None] = lambda: None
+    single_solver: Alone | None = None
     stepping: LoadStepping = LOAD_STEPPING
     gaps: GapContinuation = GAP_CONTINUATION
 
@@ -106,17 +106,17 @@ class Strategy:
     @cached_property
     def contact(self) -> ContactDescent | None:
         """Solver that treats nodes in contact separately from the tissue; None if the plan has none."""
-        if self.plan.contact is not SolverStep.CONTACT:
+        if self.plan.contact_solver is not SolverStep.CONTACT:
             return None
         (barrier,) = self.problem.barriers
-        assert isinstance(barrier, Local)
+        assert isinstance(barrier, LocalBarrier)
         found = ContactDescent(self.problem, self.preconditioner, barrier)
-        return replace(found, strains=CUDA_STRAIN_LIMITS, replays=True) if self.problem.device.on_cuda else found
+        return replace(found, strains=CUDA_STRAIN_LIMITS, uses_graphs=True) if self.problem.device.on_cuda else found
 
     def get_local_solver(self, count: int) -> BatchElimination | Alone | None:
         """Return the local solver for `count` loads, if there is one."""
         step = self.plan.choose_local(count)
-        return None if step is None else self.near() if step is SolverStep.NEAR else self.alone
+        return None if step is None else self.build_batch_solver() if step is SolverStep.NEAR else self.single_solver
 
     @cached_property
     def _touched(self) -> Preconditioner:
@@ -150,19 +150,19 @@ class Strategy:
                 cases = replace(cases, restarted=astray.copy())
                 problem.begin(cases)
             result = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), history)
-            lost = np.where(result.good, self.inversion.find_doubtful(result.inverted), self._find_unsolved(result))
+            lost = np.where(result.good, self.inversion.find_suspect(result.inverted), self._find_unsolved(result))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
                 some = replace(cases.select(again), restarted=np.ones(len(again), bool))
                 problem.begin(some)
-                result.put(again, self._solve_whole_load(some), device)
+                result.put_cases(again, self._solve_whole_load(some), device)
         result.outcome[astray & result.good] = Outcome.CONVERGED_ANEW
         lost = np.flatnonzero(self._find_unsolved(result))
         if len(lost):
             found = self._raise_load(cases.select(lost), result, lost)
             astray[lost] |= found.reached > result.reached[lost]
-            result.put(lost, found, device)
+            result.put_cases(lost, found, device)
         return replace(result, path_fraction=result.reached, restarted=astray) if problem.barriers else result
 
     def _find_loaded_cases(self, count: int) -> np.ndarray:
@@ -173,17 +173,17 @@ class Strategy:
             if not term.passive:
                 term.add_gradient(rest, loud)
         with run_in_order(self.problem.device):
-            acts = to_host((view(loud) != 0.0).any(0))
+            acts = to_host((to_view(loud) != 0.0).any(0))
         if not acts.all():
-            acts = np.logical_or.reduce([acts, *(term.find_buried(rest) for term in self.problem.barriers)])
-        return acts | self.problem.compute_gap(rest)[1] if self.problem.constraint.imposes else acts
+            acts = np.logical_or.reduce([acts, *(term.find_penetrating(rest) for term in self.problem.barriers)])
+        return acts | self.problem.compute_gap(rest)[1] if self.problem.constraint.has_motion else acts
 
     def _mask_idle(self, start: wp.array) -> wp.array:
         """Return the start (3N, b) [m], zero where no load acts: a float32 descent would not reach zero."""
         acts = self._find_loaded_cases(start.shape[1])
         if not acts.all():
             with run_in_order(self.problem.device):
-                view(start := wp.clone(start))[:, ~acts] = 0.0
+                to_view(start := wp.clone(start))[:, ~acts] = 0.0
         return start
 
     def _select_guesses(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -194,7 +194,7 @@ class Strategy:
             if inverted.any():
                 fewer = self.inversion.count(device.upload(other))
                 guess, inverted = np.where(fewer < inverted, other, guess), np.minimum(fewer, inverted)
-        return guess, self.inversion.find_doubtful(inverted)
+        return guess, self.inversion.find_suspect(inverted)
 
     def _find_unsolved(self, result: SolverResult) -> np.ndarray:
         """Return the cases (B,) that another solver may solve; at round-off none comes closer to equilibrium."""
@@ -210,11 +210,11 @@ class Strategy:
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         # The undeformed state satisfies the constraints, unless the batch imposes motion.
-        imposed = problem.constraint.imposes or (start is not None and bool(problem.compute_gap(start)[1].any()))
+        imposed = problem.constraint.has_motion or (start is not None and bool(problem.compute_gap(start)[1].any()))
         start = device.allocate(problem.rows, count) if start is None else start
         if problem.barriers:
             return self._move_tools(cases, start)
-        if problem.paced:  # history would not help the next frame
+        if problem.depends_on_step:  # history would not help the next frame
             history = None
         if SolverStep.LBFGS not in self.plan.list_steps(count, imposed):
             return self._run_newton(start, self.accuracy.outer)
@@ -225,21 +225,21 @@ class Strategy:
             wp.clone(start), np.full(count, Outcome.BUDGET, object), none, never, np.zeros(count), none.copy(), 0
         )
         gained: Mapping[str, np.ndarray] = {}
-        left = self.plan.evaluations
+        left = self.plan.max_evaluations
         for descent, known in descents:
             found = descent.descend(start, np.full(len(index), self.accuracy.tolerance), left, known)
             left -= int(found.steps.max(initial=0))
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == NOT_FINITE] = Outcome.CONVERGED, Outcome.NOT_FINITE
-            result.put(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
+            result.put_cases(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
             gained = found.warm_start
-            index = index[found.left]
+            index = index[found.unfinished]
             if len(index) == 0:
                 break
             problem.begin(cases.select(index))
-            start = gather_columns(device, found.u, found.left)
+            start = gather_columns(device, found.u, found.unfinished)
         else:
-            result.put(index, self._run_newton(start, self.accuracy.outer), device)
+            result.put_cases(index, self._run_newton(start, self.accuracy.outer), device)
         return replace(result, warm_start=gained)
 
     def _solve_contact(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
@@ -249,7 +249,7 @@ class Strategy:
         """
         problem, touch, device = self.problem, self.contact, self.problem.device
         problem.begin(cases)
-        if touch is None or problem.constraint.imposes or problem.compute_gap(start)[1].any():
+        if touch is None or problem.constraint.has_motion or problem.compute_gap(start)[1].any():
             return self._close_gaps(cases, start, outer, gaps)
         start, count, few = self._mask_idle(start), len(cases.loads), min(self.gaps.max_contact_iterations, outer)
         found = touch.descend(start, np.full(count, self.accuracy.tolerance), few)
@@ -263,11 +263,11 @@ class Strategy:
         near = np.flatnonzero(~result.good & (found.residual <= self.gaps.newton_residual))
         for some in batched(near):
             problem.begin(cases.select(some))
-            result.put(some, self._run_newton(gather_columns(device, found.u, some), few), device)
+            result.put_cases(some, self._run_newton(gather_columns(device, found.u, some), few), device)
         left = np.flatnonzero(~result.good)
         for some in batched(left):
             begun = gather_columns(device, start, some)
-            result.put(some, self._close_gaps(cases.select(some), begun, outer, gaps), device)
+            result.put_cases(some, self._close_gaps(cases.select(some), begun, outer, gaps), device)
         return result
 
     def _close_gaps(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
@@ -280,7 +280,7 @@ class Strategy:
         for times in self.gaps.closing_factor ** np.arange(widest, 0.0, -1.0):
             self.problem.begin(cases)
             for term in self.problem.barriers:
-                term.widen(float(times))
+                term.widen_gap(float(times))
             found = self._run_newton(self._mask_idle(start), outer, max(self.gaps.tolerance, self.accuracy.tolerance))
             start, iterations, linear = found.u, iterations + found.iterations, linear + found.linear_iterations
         self.problem.begin(cases)
@@ -339,7 +339,7 @@ class Strategy:
         )
         if len(acting):
             part = gather_columns(device, start, acting)
-            result.put(acting, self._solve_in_steps(cases.select(acting), part, moved, 1.0, most), device)
+            result.put_cases(acting, self._solve_in_steps(cases.select(acting), part, moved, 1.0, most), device)
         return result
 
     def _solve_in_steps(
@@ -352,8 +352,8 @@ class Strategy:
         the way round-off is accepted as well.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
-        gaps = np.maximum.reduce([np.zeros(count), *(term.count_gaps(cases) for term in problem.barriers)])
-        shares = Shares.start(first, gaps)
+        gaps = np.maximum.reduce([np.zeros(count), *(term.compute_path_in_gaps(cases) for term in problem.barriers)])
+        shares = LoadProgress.start(first, gaps)
         u, left, done = wp.clone(start), most, 1
         none, outcome = np.zeros(count, int), np.full(count, Outcome.BUDGET, object)
         result = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
@@ -362,7 +362,7 @@ class Strategy:
         outer = outer if problem.barriers else min(self.stepping.max_iterations, outer)
         while left >= 0:
             strides = [term.compute_stride(aimed(cases, shares.reached), u) for term in problem.barriers]
-            shorter, going = shares.limit(np.minimum.reduce([np.ones(count), *strides]), self.stepping)
+            shorter, going = shares.limit_steps(np.minimum.reduce([np.ones(count), *strides]), self.stepping)
             rows = np.flatnonzero(going & (result.iterations < self.accuracy.most))
             patience = self.stepping.patience * self.accuracy.inner * done
             if len(rows) == 0 or result.linear_iterations > patience:
@@ -373,9 +373,9 @@ class Strategy:
             found = self._solve_contact(part, gather_columns(device, u, rows), outer, travel)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
-            shares.take(rows, aim, good)
+            shares.take_steps(rows, aim, good)
             growth = wanted / np.maximum(found.iterations, 1)
-            shares.resize(rows, good, growth, self.stepping.failure_factor, self.gaps.failure_factor)
+            shares.resize_steps(rows, good, growth, self.stepping.failure_factor, self.gaps.failure_factor)
             scatter_columns(device, found.u, rows[good], u, np.flatnonzero(good))
             result.iterations[rows] += found.iterations
             result.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
@@ -389,7 +389,7 @@ class Strategy:
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
         if problem.barriers and len(short) < len(reached):
             problem.begin(aimed(cases, np.ones(len(reached))))
-            buried = np.logical_or.reduce([term.find_buried(u) for term in problem.barriers])
+            buried = np.logical_or.reduce([term.find_penetrating(u) for term in problem.barriers])
             pierced = (problem.find_overlaps(u)[0] | buried) & (reached == 1.0)
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0
         if len(short):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..deformation import Outcome
-from ..discretisation.inverted_elements import Inversion
+from ..discretisation.inverted_elements import InversionCounter
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
 from .strategy import SolverResult
@@ -17,7 +17,7 @@ class NoMotionStep:
     """Replacement of a `Strategy` for time steps of zero length: neither masses nor tools move, whatever acts."""
 
     problem: Problem
-    inversion: Inversion
+    inversion: InversionCounter
 
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
         """Return the last of the guesses (3N, B) [m] unchanged; undeformed without guesses."""
@@ -35,7 +35,7 @@ MAX_DYNAMIC_STEP = 8.0
 MAX_PRECONDITIONERS = 3  # Preconditioners that are cached; each is as large as the static one.
 
 
-def quantise(steps: np.ndarray) -> np.ndarray:
+def quantise_time_steps(steps: np.ndarray) -> np.ndarray:
     """Return the powers of two (B,) [s] nearest to steps (B,) [s], by ratio.
 
     Steps of `MAX_DYNAMIC_STEP` or more become infinite; zero steps stay zero.
@@ -45,12 +45,12 @@ def quantise(steps: np.ndarray) -> np.ndarray:
     return np.where(within, powers, np.where(steps > 0.0, np.inf, 0.0))
 
 
-def group_alike(steps: np.ndarray, most: int) -> list[tuple[float, np.ndarray]]:
-    """Group steps (B,) [s] of about equal length into batches of at most `most`: the step and the rows (k,) of each."""
-    paces = quantise(steps)
+def group_time_steps(steps: np.ndarray, max_size: int) -> list[tuple[float, np.ndarray]]:
+    """Group about equal steps (B,) [s] into batches of at most `max_size`: the step and the rows (k,) of each."""
+    paces = quantise_time_steps(steps)
     return [
-        (float(pace), rows[first : first + most])
+        (float(pace), rows[first : first + max_size])
         for pace in np.unique(paces)
         for rows in [np.flatnonzero(paces == pace)]
-        for first in range(0, len(rows), most)
+        for first in range(0, len(rows), max_size)
     ]

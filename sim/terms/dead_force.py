@@ -74,14 +74,14 @@ def build_kernels(device: Device) -> DeadForceKernels:
 
 
 @dataclass(frozen=True, eq=False)
-class Forces:
+class NodalForces:
     """Nodal forces on the device: nodes (k,) int32, unique, and force (3k, b) [N]."""
 
     nodes: wp.array
     force: wp.array
 
 
-def build_pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> Forces | None:
+def build_pushed_forces(surface: ContactSurface, device: Device, loads: Loads) -> NodalForces | None:
     """Return the nodal forces of pushing tools on a body's surface; None if no tool pushes.
 
     Raises
@@ -92,15 +92,15 @@ def build_pushed_forces(skin: ContactSurface, device: Device, loads: Loads) -> F
     causes = loads.get_all(Pushed)
     if not causes:
         return None
-    force = device.allocate(3 * len(skin.nodes), len(loads))
+    force = device.allocate(3 * len(surface.nodes), len(loads))
     for cause in causes:
-        footprints = skin.press(cause.point, cause.footprint)
+        footprints = surface.find_footprints(cause.point, cause.footprint)
         inputs = [footprints.weight, footprints.sums, device.upload(cause.force, wp.float64)]
         device.launch(build_kernels(device).spread, footprints.weight.shape, inputs, [force])
-    return Forces(skin.numbers, force)
+    return NodalForces(surface.numbers, force)
 
 
-def build_nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | None:
+def build_nodal_forces(vertex_count: int, device: Device, loads: Loads) -> NodalForces | None:
     """Return the forces prescribed at mesh vertices, on loaded vertices only; None if there are none.
 
     Raises
@@ -111,10 +111,10 @@ def build_nodal_forces(vertices: int, device: Device, loads: Loads) -> Forces | 
     cause = loads.get(Nodal)
     if cause is None:
         return None
-    check_field("Nodal.force", cause.force, vertices)
+    check_field("Nodal.force", cause.force, vertex_count)
     nodes = np.flatnonzero(cause.force.any(axis=(0, 2)))
     force = cause.force[:, nodes].reshape(len(loads), 3 * len(nodes)).T
-    return Forces(device.upload(nodes, wp.int32), device.upload(force))
+    return NodalForces(device.upload(nodes, wp.int32), device.upload(force))
 
 
 class DeadForce:
@@ -125,31 +125,31 @@ class DeadForce:
     name
         Name, unique in the problem.
     assemble
-        Function Loads -> `Forces`, or None without forces: then no kernel is launched.
+        Function Loads -> `NodalForces`, or None without forces: then no kernel is launched.
     device
         Device of the arrays.
     """
 
     constant, passive, steep = True, False, False
 
-    def __init__(self, name: str, assemble: Callable[[Loads], Forces | None], device: Device):
+    def __init__(self, name: str, assemble: Callable[[Loads], NodalForces | None], device: Device):
         self.name = name
         self._assemble = assemble
         self._device = device
-        self._forces: Forces | None = None
+        self._forces: NodalForces | None = None
 
     def begin(self, cases: Cases) -> None:
         """Assemble the nodal forces of every load case."""
-        self.take(self._assemble(cases.loads))
+        self.set_forces(self._assemble(cases.loads))
 
-    def take(self, forces: Forces | None) -> None:
+    def set_forces(self, forces: NodalForces | None) -> None:
         """Set the forces of the batch."""
         self._forces = forces
 
     def keep(self, columns: np.ndarray) -> None:
         """Keep the forces of these load cases only."""
         if self._forces is not None:
-            self._forces = Forces(self._forces.nodes, gather_columns(self._device, self._forces.force, columns))
+            self._forces = NodalForces(self._forces.nodes, gather_columns(self._device, self._forces.force, columns))
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """Add the energy: E -= f . u."""

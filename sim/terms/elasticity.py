@@ -14,7 +14,7 @@ from ..discretisation.element import Elements, assemble_hooke_stiffness
 from ..discretisation.term import Cases
 from ..runtime.columns import Workspaces
 from ..runtime.device import Device
-from ..runtime.threads import choose_threads, run_together
+from ..runtime.threads import choose_threads, run_concurrently
 from .element_kernels import build_kernels, build_spreading_kernel
 from .laws.law import Law
 from .state_source import StateSource
@@ -74,8 +74,8 @@ class ElasticTerm:
         self._sources = sources
         self._cases: Cases | None = None
         count = own = coefficients.shape[1]
-        size = elements.table.shape[1] if elements.size is None else 0
-        sizes = np.zeros(0, np.int32) if elements.size is None else elements.size
+        size = elements.table.shape[1] if elements.sizes is None else 0
+        sizes = np.zeros(0, np.int32) if elements.sizes is None else elements.sizes
         self._rest, self._tissue = (elements, *lame.T), (law, coefficients)
         for source in sources:
             law, count = source.build_law(law, count), count + source.count
@@ -108,11 +108,11 @@ class ElasticTerm:
         self._definite: wp.array | None = None
 
     @property
-    def marks(self) -> np.ndarray:
+    def keys(self) -> np.ndarray:
         """Unique key (T q, k) of each quadrature point: key of its element, and index in it."""
         elements = self._rest[0]
         count, points = elements.weight.shape
-        return np.column_stack([np.repeat(elements.marks, points, axis=0), np.tile(np.arange(points), count)])
+        return np.column_stack([np.repeat(elements.keys, points, axis=0), np.tile(np.arange(points), count)])
 
     @property
     def width(self) -> int:
@@ -120,7 +120,7 @@ class ElasticTerm:
         return max((source.width for source in self._sources), default=0)
 
     @property
-    def bounded(self) -> bool:
+    def prevents_inversion(self) -> bool:
         """Return True if the law requires J > 0."""
         return self._kernels.bound_step is not None
 
@@ -164,7 +164,7 @@ class ElasticTerm:
         """Return the linear elastic stiffness (3N, 3N), the tangent of every law in the undeformed configuration."""
         return assemble_hooke_stiffness(*self._rest)
 
-    def curvature(self) -> sp.csc_array:
+    def assemble_stiffness(self) -> sp.csc_array:
         """Assemble K(u) (3N, 3N) [N/m] of one load case from element stiffnesses."""
         assert self._at is not None
         elements = self._rest[0]
@@ -176,18 +176,18 @@ class ElasticTerm:
         self._apart.add_curvature(self._device.upload(np.tile(np.eye(size), (count, 1))), out)
         place = np.repeat(dof, size, axis=1).ravel(), np.tile(dof, size).ravel()
         entries = out.numpy().ravel().astype(np.float64)
-        return sp.csc_array(sp.coo_array((entries, place), shape=(3 * elements.nodes,) * 2))
+        return sp.csc_array(sp.coo_array((entries, place), shape=(3 * elements.node_count,) * 2))
 
     @cached_property
     def _apart(self) -> "ElasticTerm":
         """Copy of the term whose elements share no nodes."""
         elements, law, coefficients = self._rest[0], *self._tissue
         table = np.arange(elements.table.size, dtype=np.int32).reshape(elements.table.shape)
-        apart = replace(elements, table=table, nodes=table.size)
+        apart = replace(elements, table=table, node_count=table.size)
         return ElasticTerm(self.name, law, apart, coefficients, np.column_stack(self._rest[1:]), self._device)
 
-    def second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
-        """Return second-order tensors as `Strained.second_order`, by fourth-order central differences of the stress."""
+    def compute_second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
+        """Return tensors as `StrainTerm.compute_second_order`, by fourth-order central differences of the stress."""
         elements, (law, coefficients) = self._rest[0], self._tissue
         tissues, kind = np.unique(coefficients, axis=0, return_inverse=True)
         one = _build_unit_element(elements)
@@ -195,7 +195,7 @@ class ElasticTerm:
         both = (unit[:, None] + unit).reshape(-1, 9)
         size = GRADIENT_STEP * np.concatenate([both, -both, 2.0 * both, -2.0 * both, np.zeros((1, 9))])
         # u of node k + 1 is column k of the displacement gradient
-        u = np.zeros((3 * one.nodes, len(size)))
+        u = np.zeros((3 * one.node_count, len(size)))
         u[3:12] = size.reshape(-1, 3, 3).transpose(2, 1, 0).reshape(9, -1)
         tensors = []
         for each in tissues:
@@ -210,11 +210,11 @@ class ElasticTerm:
             tensors.append(0.5 * (whole - own[:, None] - own).transpose(2, 0, 1))
         return elements, np.array(tensors), kind.ravel()
 
-    def elements_on(self, nodes: np.ndarray) -> np.ndarray:
+    def find_elements_on(self, nodes: np.ndarray) -> np.ndarray:
         """Return the elements (k,) whose nodes are all marked in `nodes` (N,) bool."""
         elements = self._rest[0]
         places = np.arange(elements.table.shape[1])
-        used = places < (len(places) if elements.size is None else elements.size[:, None])
+        used = places < (len(places) if elements.sizes is None else elements.sizes[:, None])
         return np.flatnonzero((nodes[elements.table] | ~used).all(axis=1))
 
     @cached_property
@@ -223,18 +223,18 @@ class ElasticTerm:
 
         return build_kernels(*self._of)
 
-    def raise_strain(self, some: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
-        """Raise `out` to the elements' strain, as `Strained.raise_strain`."""
+    def update_max_strain(self, elements: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
+        """Raise `out` to the elements' strain, as `StrainTerm.update_max_strain`."""
         inputs = [u, columns, *self._shape]
-        self._launch_on_some(self._strain_kernels.strain, some, inputs, out, np.maximum)
+        self._launch_on_some(self._strain_kernels.strain, elements, inputs, out, np.maximum)
 
     def add_stiffening(
-        self, some: wp.array, u: wp.array, columns: wp.array, least: wp.array, place: wp.array, out: wp.array
+        self, elements: wp.array, u: wp.array, columns: wp.array, min_strain: wp.array, index: wp.array, out: wp.array
     ) -> None:
-        """Add the elements' stiffness increments, as `Strained.add_stiffening`."""
+        """Add the elements' stiffness increments, as `StrainTerm.add_stiffening`."""
         coefficients = self._numbers.get_array(u.shape[1]) if self._sources else self._constants
-        inputs = [u, columns, least, place, *self._shape, self._weight, coefficients]
-        self._launch_on_some(self._strain_kernels.stiffen, some, inputs, out, np.add)
+        inputs = [u, columns, min_strain, index, *self._shape, self._weight, coefficients]
+        self._launch_on_some(self._strain_kernels.stiffen, elements, inputs, out, np.add)
 
     def _launch_on_some(self, kernel: wp.Kernel, some: wp.array, inputs: list, out: wp.array, joined: np.ufunc) -> None:
         """Launch a kernel on some elements (k,) in parallel blocks with separate outputs, and combine these."""
@@ -244,7 +244,7 @@ class ElasticTerm:
         parts = [some[first:stop] for first, stop in pairwise(ends) if first < stop]
         outputs = [out, *(wp.zeros_like(out) for _ in parts[1:])]
         columns = len(inputs[1])
-        run_together(
+        run_concurrently(
             [
                 partial(self._device.launch, kernel, (len(part), columns), [part, *inputs], [own])
                 for part, own in zip(parts, outputs, strict=True)
@@ -289,7 +289,7 @@ class ElasticTerm:
         self, kernel: wp.Kernel, inputs: Callable[[_Part], list], outputs: Sequence[wp.array], columns: int
     ) -> None:
         """Launch a kernel on all blocks in parallel, each with a separate output."""
-        run_together(
+        run_concurrently(
             [
                 partial(self._device.launch, kernel, (part.count, columns), inputs(part), [out])
                 for part, out in zip(self._parts, outputs, strict=True)
@@ -303,7 +303,7 @@ def _build_unit_element(elements: Elements) -> Elements:
     slope = np.zeros((1, points, most, 3))
     slope[:, :, :4] = np.vstack([-np.ones(3), np.eye(3)])
     table = np.minimum(np.arange(most, dtype=np.int32), 3)[None]
-    size = None if elements.size is None else np.full(1, 4, np.int32)
+    size = None if elements.sizes is None else np.full(1, 4, np.int32)
     weight, mark = np.full((1, points), 1.0 / points), np.zeros((1, 1), int)
     return Elements(table, slope, weight, 4, np.zeros(1, int), mark, size)
 

@@ -15,9 +15,9 @@ class ElementFunctions:
     """Displacement gradient; coefficients at a point and in the undeformed state, and the type of their array."""
 
     gradient: wp.Function
-    at: wp.Function
-    at_rest: wp.Function
-    numbers: Any
+    get_coefficients: wp.Function
+    get_rest_coefficients: wp.Function
+    array_type: Any
 
 
 @cache

@@ -56,7 +56,8 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
     stress, stress_change, density = law.stress, law.stress_change, law.energy
     kept = MIN_VOLUME_RATIO
     functions = build_functions(law, device, size, count)
-    gradient_of, at, at_rest, numbers = functions.gradient, functions.at, functions.at_rest, functions.numbers
+    gradient_of, numbers = functions.gradient, functions.array_type
+    at, at_rest = functions.get_coefficients, functions.get_rest_coefficients
 
     @wp.func
     def spread(

@@ -6,32 +6,32 @@ from functools import lru_cache
 import numpy as np
 import warp as wp
 
-from ..discretisation.element import EIGHT_POINTS, EIGHT_WEIGHTS, compute_quadratic_shapes, compute_quadratic_slopes
+from ..discretisation.element import EIGHT_POINTS, EIGHT_WEIGHTS, compute_quadratic_gradients, compute_quadratic_shapes
 from ..discretisation.space import Discretisation
 from ..effects import Gravity
 from ..geometry.surface import normalise_vectors
 from ..geometry.tetmesh import QUADRATIC_EDGES
 from ..loads import Loads, Posture
 from ..runtime.device import Device
-from .dead_force import DeadForce, Forces
+from .dead_force import DeadForce, NodalForces
 
 STANDARD_GRAVITY = 9.80665  # [m/s^2]
 
 
-def change_of_weight(effect: Gravity, space: Discretisation, device: Device) -> DeadForce:
+def build_gravity_term(effect: Gravity, space: Discretisation, device: Device) -> DeadForce:
     """Return the term of `Gravity` on the nodes of `space`: dead loads, current weight minus weight in the scan."""
     return DeadForce("gravity", build_weight_change(effect, space, device), device)
 
 
 def build_weight_change(
-    effect: Gravity, space: Discretisation, device: Device, kept: int = 64
-) -> Callable[[Loads], Forces | None]:
+    effect: Gravity, space: Discretisation, device: Device, cache_size: int = 64
+) -> Callable[[Loads], NodalForces | None]:
     """Return a function loads -> nodal forces f_a = s (w_a(now) - w_a(scan)), or None without a `Posture`.
 
     w_a = g d integral of (rho - rho_csf [x is below the level]) N_a(x) dV in the undeformed configuration, with the
     shape functions N_a. The part of an element below the level is cut out exactly: the total is
     g d (rho V - rho_csf V_under). Forces are continuous in the level. (A curved element is cut as if its
-    edges were straight.) The weights of the last `kept` postures are cached, since a solver uses the same loads
+    edges were straight.) The weights of the last `cache_size` postures are cached, since a solver uses the same loads
     several times.
     """
     table, count = space.table, space.count
@@ -39,7 +39,7 @@ def build_weight_change(
     whole = integrate_nodal_volumes(space, np.arange(len(table)), ones)
     volume = sum_by_node(table, whole, count)
 
-    @lru_cache(kept)
+    @lru_cache(cache_size)
     def weights(*posture: float) -> np.ndarray:
         """Return the weight (N, 3) [N] of each node in a posture: direction, then level [m]."""
         direction, level = np.array(posture[:3]), posture[3]
@@ -52,14 +52,14 @@ def build_weight_change(
         mass = effect.density * volume - effect.csf_density * under
         return STANDARD_GRAVITY * mass[:, None] * direction
 
-    def forces(loads: Loads) -> Forces | None:
+    def forces(loads: Loads) -> NodalForces | None:
         cause = loads.get(Posture)
         if cause is None:
             return None
         scan = weights(*normalise_gravity(np.array([effect.direction]))[0], effect.csf_level)
         now = [weights(*row) for row in np.column_stack([normalise_gravity(cause.direction), cause.csf_level]).tolist()]
         change = cause.share[:, None, None] * (np.reshape(now, (-1, count, 3)) - scan)
-        return Forces(device.upload(np.arange(count), wp.int32), device.upload(change.reshape(-1, 3 * count).T))
+        return NodalForces(device.upload(np.arange(count), wp.int32), device.upload(change.reshape(-1, 3 * count).T))
 
     return forces
 
@@ -80,7 +80,7 @@ def integrate_nodal_volumes(space: Discretisation, owner: np.ndarray, parts: np.
     if space.table.shape[1] == 4:
         return space.mesh.volumes[owner, None] * np.einsum("mq,mqa->ma", weight, points)
     shape = compute_quadratic_shapes(points, QUADRATIC_EDGES)
-    slope = compute_quadratic_slopes(points.reshape(-1, 4)).reshape(*shape.shape, 3)
+    slope = compute_quadratic_gradients(points.reshape(-1, 4)).reshape(*shape.shape, 3)
     jacobian = np.einsum("mai,mqaj->mqij", space.nodes[space.table[owner]], slope)
     return np.einsum("mq,mqa->ma", weight * np.linalg.det(jacobian) / 6.0, shape)
 

@@ -171,11 +171,11 @@ class InertiaTerm:
         )
 
     def rest_curvature(self) -> None:
-        """Return None, the limit of an infinite step; see `curvature_at_pace` for finite ones."""
+        """Return None, the limit of an infinite step; see `compute_step_stiffness` for finite ones."""
 
-    def curvature_at_pace(self, step: float) -> sp.csc_array:
+    def compute_step_stiffness(self, time_step: float) -> sp.csc_array:
         """Return the tangent stiffness w M (3N, 3N) [N/m] for a time step [s]."""
-        weight = (1.0 + self._damping * step) / step**2
+        weight = (1.0 + self._damping * time_step) / time_step**2
         return sp.csc_array(sp.diags_array(np.repeat(weight * self._masses, 3)))
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:

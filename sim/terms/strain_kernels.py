@@ -25,7 +25,8 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKern
     constants = wp.types.vector(length=count, dtype=scalar)
     stress_change = law.stress_change
     functions = build_functions(law, device, size, count)
-    gradient_of, at, at_rest, numbers = functions.gradient, functions.at, functions.at_rest, functions.numbers
+    gradient_of, numbers = functions.gradient, functions.array_type
+    at, at_rest = functions.get_coefficients, functions.get_rest_coefficients
 
     @forward_kernel(module="unique")
     def strain(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.bodies.open_cortex import compute_distances, find_border_edges
+from sim.bodies.open_cortex import compute_edge_distances, find_border_edges
 from sim.errors import InputError
 from sim.geometry.surface import compute_areas, compute_vertex_normals
 
@@ -71,7 +71,7 @@ class Patch:
 
     def compute_edge_distance(self, points: np.ndarray) -> np.ndarray:
         """Compute distances (B,) [m] from `points` (B, 3) to the edge."""
-        return compute_distances(self.rim, points)
+        return compute_edge_distances(self.rim, points)
 
     def place(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Map uniform numbers (n, 3) to points (n, 3) [m], uniform by area, and their unit inward normals (n, 3)."""

@@ -21,7 +21,7 @@ from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh, compute_digest
 from sim.loads import Cause, Displaced, Loads, Nodal, Posture, Prescribed, Pushed, Touching
 from sim.runtime.file_limits import MAX_ARRAY_BYTES, MAX_INFLATION
-from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.outside_files import to_path, wrap_errors
 from sim.runtime.partial_files import to_unfinished_path
 from sim.tools import BuiltIn, read_tool_statement
 
@@ -137,7 +137,7 @@ class Dataset:
         InputError
             Damaged rows.
         """
-        with read_as(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
+        with wrap_errors(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
             if "answers/reaction" not in file:
                 return None
             rows = [
@@ -164,7 +164,7 @@ class Dataset:
         """Read some vertices' displacements, and check that `good` rows move less than possible under a `force`."""
         size = float(np.linalg.norm(np.ptp(self.anatomy.mesh.nodes, axis=0)))
         chosen, damaged, absurd = [], [], []
-        with read_as(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
+        with wrap_errors(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
             for first in range(0, max(len(good), 1), CHUNK_ROWS):
                 rows, whole = read_rows(file, group, len(self.anatomy.mesh.nodes), first, first + CHUNK_ROWS)
                 field = rows["displacement"]
@@ -211,7 +211,7 @@ def read_dataset(path: str | Path) -> Dataset:
             else "make one with `sulcus simulate`"
         )
         raise InputError(f"{path}: no such file; {remedy}.")
-    with read_as(path, "a data set", REMEDY), h5py.File(path, "r") as file:
+    with wrap_errors(path, "a data set", REMEDY), h5py.File(path, "r") as file:
         stated = read_provenance(file)
         if stated.get("format") not in (FORMAT, OLD_FORMAT):
             raise InputError(

@@ -23,7 +23,7 @@ def split_forces(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
 
 def compute_nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
     """Compute forces (B, 3 m) at the patch's nodes, for one newton, by the FEM's own integral over the footprint."""
-    weights = patch.skin.press(pushed.point, pushed.footprint).to_matrix(len(patch.points))
+    weights = patch.skin.find_footprints(pushed.point, pushed.footprint).to_matrix(len(patch.points))
     return distribute_forces(weights.toarray(), pushed)
 
 

@@ -17,9 +17,9 @@ from sim.errors import InputError
 from sim.loads import Loads, Touching
 from sim.runtime.atomic_files import check_disk_space, check_output, write_stream_atomically
 from sim.runtime.journal import Batch, DamageWarning, Journal, check_same_description, open_journal
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 from sim.runtime.partial_files import to_unfinished_path
-from sim.runtime.processes import LostError
+from sim.runtime.processes import LostProcessError
 from sim.runtime.timing import listen_to_stages, time_stage
 from sim.runtime.versions import get_version
 
@@ -172,7 +172,7 @@ def simulate(
     with listen_to_stages() as seconds, open_journal(partial, run) as journal:
         try:
             solved = _fill(journal, work, deformer, finished, progress)
-        except LostError as error:
+        except LostProcessError as error:
             raise InputError(f"{error} What was solved is kept: the same command resumes.") from error
         with time_stage(STAGES["answers"]):
             _write(path, work, {**stated, **_compute_rates(path, solved, seconds)}, journal)
@@ -303,7 +303,7 @@ def _read_batch(file: h5py.File, work: SimulationWork, batch: Batch) -> tuple[np
 
 def _read_earlier_loads(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
     """Read the loads of a finished file; check that they and `loads` share their first rows, and the provenance."""
-    with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
+    with wrap_errors(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
         recorded = read_provenance(file)
         if recorded.get("format") == OLD_FORMAT:
             raise InputError(f"{path}: is of an earlier version, whose files do not go on: choose another --out.")
@@ -330,7 +330,7 @@ def _find_whole_batches(path: Path, work: SimulationWork) -> set[Batch]:
     A last short batch is excluded, unless it is the last again: it would have been solved in another batch.
     """
     held, damaged = set(), []
-    with read_as(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
+    with wrap_errors(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
         rows = {name: len(read_stored(file, f"{name}/checksum", "u")) for name in work.counts}
         for batch in work.batches:
             numbers = work.list_rows(batch)

@@ -15,7 +15,7 @@ from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.runtime.memory import check_fits
 from sim.runtime.processes import process_pool, run_on_each
-from sim.strategy.memory_needed import Needed, estimate_needed
+from sim.strategy.memory_needed import MemoryEstimate, estimate_fem_memory
 
 from .load_histories import get_relaxation_series, solve_histories
 from .tasks import SolverPool
@@ -50,9 +50,9 @@ class LazyFem:
         return Fem(self.anatomy, self.effects, self.accuracy, self.device, self.batch, self.element)
 
     @property
-    def needed(self) -> Needed | None:
+    def needed(self) -> MemoryEstimate | None:
         """Required GPU memory; None on the CPU."""
-        return estimate_needed(
+        return estimate_fem_memory(
             self.anatomy, self.element, self.accuracy, self.device, self.batch, self.loads, self.share
         )
 
@@ -109,7 +109,7 @@ def place_on_device(device: str, asked: LazyFem) -> LazyFem:
     return replace(asked, device=device)
 
 
-def estimate_memory(asked: LazyFem, task: None) -> Needed | None:
+def estimate_memory(asked: LazyFem, task: None) -> MemoryEstimate | None:
     """Return the GPU memory that the FEM needs."""
     return asked.needed
 
@@ -130,7 +130,7 @@ def choose_even_batch(most: int, loads: int, devices: int) -> int:
     return max(1, -(-loads // (max(rounds, 1) * devices)))
 
 
-def _check_all_fit(needed: Sequence[Needed | None], said: Callable[[str], object]) -> None:
+def _check_all_fit(needed: Sequence[MemoryEstimate | None], said: Callable[[str], object]) -> None:
     for each in dict.fromkeys(map(str, filter(None, needed))):
         said(f"{each}.")
     for each in filter(None, needed):

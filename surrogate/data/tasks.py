@@ -9,7 +9,7 @@ from sim.anatomy import Anatomy
 from sim.deformation import Deformer
 from sim.loads import Loads, Nodal, Touching
 from sim.runtime.journal import Batch
-from sim.runtime.processes import Child, map_unordered
+from sim.runtime.processes import ChildProcess, map_unordered
 
 from .cortex_patch import open_patch
 from .solution_rows import to_rows
@@ -33,7 +33,7 @@ class SolverPool:
     """Processes that each have a deformer of the same body."""
 
     anatomy: Anatomy
-    children: Sequence[Child]
+    children: Sequence[ChildProcess]
 
 
 def solve_batches(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -> Iterator[tuple[LoadBatch, bytes]]:

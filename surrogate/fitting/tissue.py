@@ -9,7 +9,7 @@ import numpy as np
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 
 FINE_RATIOS = np.geomspace(0.4, 3.2, 33)
 """Ratios of tumour to brain stiffness, equally probable a priori."""
@@ -136,7 +136,7 @@ def load_tissue(path: str | Path, digest: str) -> FittedTissue:
     InputError
         A file that is missing, not of this version, damaged, or of another anatomy.
     """
-    with read_as(path, "fitted tissue", "Make it again by `sulcus fit`."):
+    with wrap_errors(path, "fitted tissue", "Make it again by `sulcus fit`."):
         stored = json.loads(Path(path).read_text(encoding="utf-8-sig"))
         if stored["format"] != FORMAT or stored["skull"] != list(SKULLS):
             raise InputError(f"{path}: is not a fitted tissue of this version: make it again by `sulcus fit`.")

@@ -8,7 +8,7 @@ from scipy.special import gammaincinv
 
 from sim.anatomy import Anatomy
 from sim.errors import InputError
-from sim.geometry.locate import Located
+from sim.geometry.locate import LocatedPoints
 
 from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, Presses
 from .ensemble import Ensemble, compute_surface_motion
@@ -169,7 +169,7 @@ def sample_seen_patch(
     weights = random.dirichlet(np.ones(3), count)
     vertices = triangles[triangle]
     at, moved = (np.einsum("nc,nci->ni", weights, field[vertices]) for field in (nodes, motion))
-    place = Located(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(count)]))
+    place = LocatedPoints(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(count)]))
     return build_motion_evidence(place, at, moved, np.full(count, SIGMA))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cholesky, get_lapack_funcs
 
-from sim.geometry.locate import Located
+from sim.geometry.locate import LocatedPoints
 
 from ..array_functions import compute_squared_distances
 
@@ -60,7 +60,7 @@ class Evidence:
         [m]: standard deviation of the rigid error's translation along each axis.
     """
 
-    place: Located
+    place: LocatedPoints
     at: np.ndarray
     axis: np.ndarray
     value: np.ndarray
@@ -73,7 +73,7 @@ class Evidence:
 
     def select(self, chosen: np.ndarray) -> Evidence:
         """Select rows by a mask (m,) or by numbers."""
-        place = Located(self.place.vertices[chosen], self.place.weights[chosen])
+        place = LocatedPoints(self.place.vertices[chosen], self.place.weights[chosen])
         arrays = {name: getattr(self, name)[chosen] for name in ("at", "axis", "value", "sigma", "point")}
         return replace(self, place=place, **arrays)
 
@@ -134,7 +134,7 @@ class Evidence:
         (m / 3, v) if rows are of three axes, one after the other, else (m, 3 v): of all axes of a vertex.
         """
         copies = self.copies
-        place = Located(self.place.vertices[::copies], self.place.weights[::copies])
+        place = LocatedPoints(self.place.vertices[::copies], self.place.weights[::copies])
         row, corner = np.nonzero(place.weights)
         vertices, number = np.unique(place.vertices[row, corner], return_inverse=True)
         weights = np.zeros((len(place.weights), len(vertices)))
@@ -209,10 +209,10 @@ def smooth_root(points: np.ndarray, length: float = NOISE.correlation_length) ->
 
 
 def build_motion_evidence(
-    place: Located, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT_ERROR
+    place: LocatedPoints, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT_ERROR
 ) -> Evidence:
     """Build evidence from undeformed points (n, 3) [m] and their motions (n, 3) [m]; three rows a point."""
     count = len(at)
     point = np.repeat(np.arange(count), 3)
-    place, axis = Located(place.vertices[point], place.weights[point]), np.tile(np.eye(3), (count, 1))
+    place, axis = LocatedPoints(place.vertices[point], place.weights[point]), np.tile(np.eye(3), (count, 1))
     return Evidence(place, at[point], axis, motion.ravel(), sigma[point], point, shift)

@@ -12,7 +12,7 @@ from sim.anatomy import Anatomy
 from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 from sim.runtime.threads import limit_to_one_thread
 from sim.runtime.versions import get_version
 
@@ -62,7 +62,7 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
     InputError
         A file that is missing, not a locator of this version, damaged, or of another anatomy.
     """
-    with read_as(path, "a locator", REMEDY), Path(path).open("rb") as raw:
+    with wrap_errors(path, "a locator", REMEDY), Path(path).open("rb") as raw:
         archive = Archive(raw, REMEDY)
         header = json.loads(archive.read_text("header"))
         if header["format"] != FORMAT or tuple(header["kinds"]) != KINDS:

@@ -10,7 +10,7 @@ from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
 from sim.geometry.closest_point import find_closest_points
-from sim.geometry.locate import Located, locate
+from sim.geometry.locate import LocatedPoints, locate
 from sim.geometry.surface import compute_vertex_normals, normalise_vectors
 
 from ..array_functions import compute_squared_distances
@@ -190,7 +190,7 @@ def _build_normal_rows(
     )
     at = np.einsum("nc,nci->ni", weights, nodes[vertices])
     # A fourth vertex of weight 0 gives the layout of a tetrahedron.
-    place = Located(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(len(at))]))
+    place = LocatedPoints(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(len(at))]))
     value = np.einsum("ni,ni->n", cloud - at, normal)
     return Evidence(place, at, normal, value, sigma, number)
 
@@ -199,7 +199,7 @@ def _join_evidence(parts: list[Evidence]) -> Evidence:
     def joined(of, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         return {name: np.concatenate([getattr(of(part), name) for part in parts]) for name in names}
 
-    place = Located(**joined(lambda part: part.place, ("vertices", "weights")))
+    place = LocatedPoints(**joined(lambda part: part.place, ("vertices", "weights")))
     arrays = joined(lambda part: part, ("at", "axis", "value", "sigma", "point"))
     return Evidence(place=place, shift=parts[0].shift, **arrays)
 

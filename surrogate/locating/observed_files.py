@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sim.errors import InputError
-from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.outside_files import to_path, wrap_errors
 
 from .observation import Observation
 
@@ -66,7 +66,7 @@ def read_columns(
     remedy = f"Give a CSV file with the header {known}."
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {remedy}")
-    with read_as(path, "a table of points", remedy):
+    with wrap_errors(path, "a table of points", remedy):
         text = path.read_text(encoding="utf-8-sig")
     lines = text.splitlines()
     if len(lines) > MAX_ROWS or any(len(line) > MAX_LINE_LENGTH for line in lines):

@@ -8,7 +8,7 @@ import numpy as np
 from sim.geometry.tetmesh import compute_digest
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 from sim.runtime.versions import get_version
 
 from .npz_archive import Archive
@@ -46,7 +46,7 @@ def keep_arrays(
         A file that cannot be read, or that the check rejects.
     """
     if path is not None and path.exists():
-        with read_as(path, kind, REMEDY), path.open("rb") as raw:
+        with wrap_errors(path, kind, REMEDY), path.open("rb") as raw:
             found = Archive(raw, REMEDY).read_arrays(names)
             check(found)
             return found

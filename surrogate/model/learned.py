@@ -10,7 +10,7 @@ from operator import add, attrgetter
 import numpy as np
 
 from sim.anatomy import Anatomy
-from sim.arguments import check_whole_numbers
+from sim.arguments import check_integers
 from sim.bodies.tip_distance import build_tip_gauge
 from sim.deformation import Cost, Deformation, Outcome
 from sim.errors import InputError
@@ -188,7 +188,7 @@ class Learned:
                 )
         away = find_nearest(pushed.point[doubtful], self._patch.points)[1]
         if (away > pushed.footprint[doubtful]).any():  # away from nodes, but perhaps not from triangles
-            self._patch.skin.check_tools_touch(pushed.point, pushed.footprint)
+            self._patch.skin.check_contact(pushed.point, pushed.footprint)
 
     def _check_nodes(self, nodes: np.ndarray) -> None:
         inside = (nodes >= 0) & (nodes < len(self._is_predicted))
@@ -223,7 +223,7 @@ class Learned:
             )
         begun = time.perf_counter()
         pushed, past = self._convert_loads(loads, start)
-        nodes = self.nodes if at is None else check_whole_numbers("at", at)
+        nodes = self.nodes if at is None else check_integers("at", at)
         self._check_nodes(nodes)
         with limit_to_one_thread() if len(loads) == 1 else nullcontext():
             return self._sum_parts(loads, pushed, nodes, begun, past, build_warm_encoders(self._regressors, start))

@@ -14,7 +14,7 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.geometry.tetmesh import compute_digest
 from sim.runtime.atomic_files import write_atomically
-from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.outside_files import to_path, wrap_errors
 from sim.runtime.versions import get_version
 from sim.tools import read_tool_statement
 
@@ -104,7 +104,7 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
     path = to_path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; make a model with `sulcus train`.")
-    with read_as(path, "a model", REMEDY), path.open("rb") as raw:
+    with wrap_errors(path, "a model", REMEDY), path.open("rb") as raw:
         archive = Archive(raw, REMEDY)
         header = _read_header(archive)
         if header["format"] != FORMAT:
@@ -153,7 +153,7 @@ def read_learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None
 def _open_header(path: str | Path) -> Iterator[dict[str, Any]]:
     """Open the header of a model file; errors within the block are reported with the file's name."""
     path = to_path(path)
-    with read_as(path, "a model", REMEDY), path.open("rb") as raw:
+    with wrap_errors(path, "a model", REMEDY), path.open("rb") as raw:
         yield _read_header(Archive(raw, REMEDY))
 
 

@@ -216,7 +216,7 @@ class RigidContact:
             begun = self._place_box(last)
             far = np.linalg.norm(there.corners - begun.corners, axis=1).max()
             if (few := int(np.ceil(far / stride))) < steps:
-                back = begun.middle - there.middle
+                back = begun.centre - there.centre
                 ways = [there.move((1.0 - k / few) * back) for k in range(1, few + 1)] or [there]
                 return [begun, *ways], self.core[3] + MEAN_GAP, last[self._width :]
         ways = [(k / steps - 1.0) * depth * direction for k in range(1, steps + 1)]
@@ -233,10 +233,10 @@ class RigidContact:
 
         begun is the result at the first station; None: no contact before.
         """
-        from sim.discretisation.nearest_points import Nearest
+        from sim.discretisation.nearest_points import NearestSearch
 
         facets, nodes, table, rows = self._select_facets(stations, radius)
-        nearest = Nearest(len(facets))
+        nearest = NearestSearch(len(facets))
         compliance = self.compliance[np.ix_(rows, rows)].astype(np.float64)
         own = compliance.reshape(len(nodes), 3, len(nodes), 3)[np.arange(len(nodes)), :, np.arange(len(nodes))]
         least, own = SEARCH.min_compliance * np.einsum("nii->", own) / max(3 * len(nodes), 1), own[table]
@@ -252,15 +252,15 @@ class RigidContact:
             settled = begun is None
             for iteration in range(SEARCH.max_iterations if station is stations[-1] else SEARCH.path_iterations):
                 corners = (self.points[nodes] + moved)[table]
-                near = nearest.to(station, corners)
+                near = nearest.find_nearest(station, corners)
                 entered = np.flatnonzero(near.distance < radius - tolerance)
                 if len(entered):
-                    share_of, way = near.share[entered], near.normal[entered]
+                    share_of, way = near.barycentric[entered], near.normal[entered]
                     gives = np.einsum("sc,scj,sj->s", share_of**2, np.einsum("si,scij->scj", way, own[entered]), way)
                     entered = entered[gives > least]
                 if settled and not len(entered):
                     break
-                facet, share = np.concatenate([facet, entered]), np.concatenate([share, near.share[entered]])
+                facet, share = np.concatenate([facet, entered]), np.concatenate([share, near.barycentric[entered]])
                 distance, normal = station.compute_distances(corners[facet], share)
                 lever = np.zeros((len(facet), len(nodes), 3))
                 lever[np.arange(len(facet))[:, None], table[facet]] = share[:, :, None] * normal[:, None]
@@ -283,9 +283,9 @@ class RigidContact:
         """Select facets (S,) within reach of a tool; return their nodes (n,), positions (S, 3), compliance rows."""
         around, wide = self._rounds
         reach = SEARCH.candidate_distance * radius
-        far = wide + reach + np.linalg.norm(stations[0].half)
+        far = wide + reach + np.linalg.norm(stations[0].half_sizes)
         ends = [stations[k] for k in sorted({0, len(stations) // 2, len(stations) - 1})]
-        some = np.flatnonzero(np.any([np.linalg.norm(around - each.middle, axis=1) < far for each in ends], axis=0))
+        some = np.flatnonzero(np.any([np.linalg.norm(around - each.centre, axis=1) < far for each in ends], axis=0))
         corners = self.points[self.triangles[some]]
         near = np.any([each.find_nearest(corners).distance < reach for each in ends], axis=0)
         nodes, table = np.unique(self.triangles[some[near]], return_inverse=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from sim.bodies.tip_distance import build_tip_gauge
 from sim.errors import InputError
-from sim.loads import Loads, Pushed, select_rows
+from sim.loads import Loads, Pushed, select_cases
 
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
@@ -95,7 +95,7 @@ class HeldOutMisses:
     def select(self, some: np.ndarray) -> HeldOutMisses:
         """Select loads by number or (B,) bool."""
         known, outside = Measured(*(each[some] for each in self.known)), Outside(*(each[some] for each in self.outside))
-        return HeldOutMisses(select_rows(self.pushed, some), known, outside, self.features[some], self.error[some])
+        return HeldOutMisses(select_cases(self.pushed, some), known, outside, self.features[some], self.error[some])
 
     @property
     def extrapolated(self) -> np.ndarray:
@@ -216,7 +216,7 @@ class TrainingSolutions:
     def select_examples(self, rows: np.ndarray) -> Examples:
         """Select rows (B,) bool as examples, to fit models on."""
         force = None if self.force is None else self.force[rows]
-        return Examples(select_rows(self.pushed, rows), self.tumour[rows], self.cortex[rows], force)
+        return Examples(select_cases(self.pushed, rows), self.tumour[rows], self.cortex[rows], force)
 
     def compute_vertex_errors(self, model: Learned, rows: np.ndarray) -> np.ndarray:
         """Compute errors (k, n) [m] of a model at the tumour's vertices, on selected rows (B,) bool."""
@@ -226,7 +226,7 @@ class TrainingSolutions:
         self, model: Learned, rows: np.ndarray, tumour: np.ndarray | None = None, tip: np.ndarray | None = None
     ) -> ModelErrors:
         """Compute a model's errors on rows (B,) bool; those at the tumour or of the tip (k,) [m] may be given."""
-        asked = select_rows(self.pushed, rows)
+        asked = select_cases(self.pushed, rows)
 
         def of(error: np.ndarray) -> HeldOutMisses:
             return collect_missed(model, self.patch, asked, error)

@@ -20,7 +20,7 @@ from sim.loads import Pushed
 from sim.minimisers.second_order import compute_second_order
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.journal import open_journal
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 from sim.runtime.versions import get_version
 
 from ..array_functions import Rounded, round_to_half
@@ -232,7 +232,7 @@ class Expansion:
             Data without a tissue.
         """
         if self.kept is not None and self.kept.exists():
-            with read_as(self.kept, "a table of the series", REMEDY), self.kept.open("rb") as raw:
+            with wrap_errors(self.kept, "a table of the series", REMEDY), self.kept.open("rb") as raw:
                 modes = [f"modes{k}" for k in range(len(self._known))]
                 file = Archive(raw, REMEDY).read_arrays([*modes, "pairs", "second", "second_modes", "table", "seconds"])
                 bases = [Basis(nodes, file[name]) for name, nodes in zip(modes, self._known, strict=True)]

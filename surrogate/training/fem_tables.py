@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 from sim.fem import Fem
 from sim.geometry.surface import compute_edge_lengths
 from sim.loads import Loads, Pushed
-from sim.minimisers.power_series import SeriesReading
+from sim.minimisers.power_series import OutputFunctionals
 from sim.runtime.journal import Journal
 from sim.tools import Ball, BuiltIn, get_core
 
@@ -85,7 +85,7 @@ def tabulate(
     fem: Fem,
     places: np.ndarray,
     radii: np.ndarray,
-    reading: SeriesReading,
+    reading: OutputFunctionals,
     progress: Callable[[int, int], object] = lambda done, total: None,
     journal: Journal | None = None,
 ) -> np.ndarray:

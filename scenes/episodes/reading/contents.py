@@ -14,7 +14,7 @@ import numpy as np
 
 from sim.errors import InputError
 from sim.runtime.file_limits import MAX_ARRAY_BYTES, MAX_INFLATION
-from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.outside_files import to_path, wrap_errors
 
 from .schema import ARRAYS, FORMATS, FRAMES, PICTURES, REQUIRED_ARRAYS, SOLVED, Array
 
@@ -24,7 +24,7 @@ REMEDY = f"{HINT}make it again, or leave it out."  # Remedy in error messages.
 
 def open_episode(path: Path) -> h5py.File:
     """Open an episode's file; InputError if it is missing or not HDF5."""
-    with read_as(path, "an episode", REMEDY):
+    with wrap_errors(path, "an episode", REMEDY):
         return h5py.File(path, "r")
 
 
@@ -140,7 +140,7 @@ def read_contents(path: str | Path) -> EpisodeContents:
         than the file.
     """
     path = to_path(path)
-    with read_as(path, "an episode", REMEDY), h5py.File(path, "r") as file:
+    with wrap_errors(path, "an episode", REMEDY), h5py.File(path, "r") as file:
         return inspect_contents(file, path)
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from sim.errors import InputError
 from sim.runtime.device import find_device
 from sim.runtime.file_limits import limit_memory
-from sim.runtime.outside_files import read_as
-from sim.runtime.processes import LostError, map_apart
+from sim.runtime.outside_files import wrap_errors
+from sim.runtime.processes import LostProcessError, map_parallel
 
 from ...play.reference import build_reference_fem, is_history_dependent, solve_reference_frames
 from ..make import OpenedEpisode, open_body, to_body_path
@@ -34,7 +34,7 @@ def solve_again(report: Report, count: int, device: str = "auto") -> Report:
     Frames are spread evenly. For history-dependent solutions, all solved frames before them are solved too, in order.
     """
     try:
-        with read_as(report.path, "an episode", REMEDY), h5py.File(report.path, "r") as file:
+        with wrap_errors(report.path, "an episode", REMEDY), h5py.File(report.path, "r") as file:
             contents = inspect_contents(file, report.path)
             missing = [name for name in ("plan", "seed", "episode", "body") if name not in contents.said]
             if missing or "tumour_fem" not in contents.shapes:
@@ -85,14 +85,14 @@ def validate_files(
     left = list(dict.fromkeys(paths))
     look_at = partial(_run_limited, look)
     try:
-        for path, report in map_apart(look_at, tuple(left), workers):
+        for path, report in map_parallel(look_at, tuple(left), workers):
             left.remove(path)
             yield report
-    except LostError:
+    except LostProcessError:
         for path in left:
             try:
-                yield from (report for _, report in map_apart(look_at, [path]))
-            except LostError:
+                yield from (report for _, report in map_parallel(look_at, [path]))
+            except LostProcessError:
                 yield Report(path, ["reading it crashes the process: it is damaged. Make it again, or leave it out."])
 
 

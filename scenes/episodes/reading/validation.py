@@ -12,7 +12,7 @@ from ar.optics.lens import Lens
 from ar.overlay.outlines import compute_silhouette
 from sim.anatomy import Anatomy
 from sim.errors import InputError
-from sim.runtime.outside_files import read_as
+from sim.runtime.outside_files import wrap_errors
 
 from ..checksums import CHECKSUM_ATTRIBUTE, find_broken
 from .bodies import find_anatomy, find_surface_rows
@@ -118,7 +118,7 @@ def validate_episode(path: Path) -> Report:
     problems: list[str] = []
     skipped: list[str] = []
     try:
-        with read_as(path, "an episode", REMEDY), h5py.File(path, "r") as file:
+        with wrap_errors(path, "an episode", REMEDY), h5py.File(path, "r") as file:
             contents = inspect_contents(file, path)
             for check in (check_units, check_numbers, check_poses, check_images):
                 problems += check(file, contents)

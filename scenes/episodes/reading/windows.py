@@ -12,7 +12,7 @@ import numpy as np
 
 from ar.screen import decode_colour, decode_depth, decode_labels
 from sim.errors import InputError
-from sim.runtime.outside_files import read_as, to_path
+from sim.runtime.outside_files import to_path, wrap_errors
 
 from .contents import REMEDY, EpisodeContents, OpenFiles, get_array, read_contents
 from .schema import ARRAYS, COLOUR, DEPTH, PICTURES, SOLVED
@@ -36,7 +36,7 @@ def read_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: ran
     frames = range(contents.frames) if frames is None else frames
     if name in PICTURES:
         return np.stack([read_one_image(file, contents, name, frame) for frame in frames])
-    with read_as(contents.path, "an episode", REMEDY):
+    with wrap_errors(contents.path, "an episode", REMEDY):
         array = get_array(file, name)
         if ARRAYS[name].axes[0] == SOLVED and name != "fem_frames":
             return _read_solved_rows(array, contents, frames)
@@ -72,7 +72,7 @@ def read_one_image(file: h5py.File, contents: EpisodeContents, name: str, frame:
 
 def read_image_bytes(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> bytes:
     """Read the stored bytes of one image; InputError if the file is damaged."""
-    with read_as(contents.path, "an episode", REMEDY):
+    with wrap_errors(contents.path, "an episode", REMEDY):
         return np.asarray(get_array(file, f"pictures/{name}")[frame], np.uint8).tobytes()
 
 

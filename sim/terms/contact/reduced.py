@@ -8,24 +8,24 @@ import warp as wp
 
 from ...discretisation.term import BlockFunctions, Term
 from ...runtime.device import Device
-from ...runtime.views import view
-from .tool_blocks import ContactStage, NearPairs, build_functions
+from ...runtime.views import to_view
+from .tool_blocks import ContactStruct, NearPairs, build_functions
 
 
 class DenseTerm(Term, Protocol):
     """Term on few nodes, whose tangent stiffness is a small dense matrix."""
 
-    def build_stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
+    def build_structs(self, columns: np.ndarray) -> tuple[ContactStruct, NearPairs]:
         """Return surface and tools of some load cases (k,), and the workspace for near pairs."""
         ...
 
-    def add_matrix(self, u: wp.array, definite: wp.array, place: wp.array, out: wp.array) -> None:
-        """Add K(u) (3N, b) to out (b, 3m, 3m), float64, between nodes with index `place` (N, b) >= 0."""
+    def add_matrix(self, u: wp.array, definite: wp.array, index: wp.array, out: wp.array) -> None:
+        """Add K(u) (3N, b) to out (b, 3m, 3m), float64, between nodes with index `index` (N, b) >= 0."""
         ...
 
 
-class Reduced:
-    """Reduced barrier, a `Reduction`.
+class ReducedToolBarrier:
+    """Reduced barrier, a `ReducedBarrier`.
 
     Parameters
     ----------
@@ -44,28 +44,28 @@ class Reduced:
 
     @property
     def functions(self) -> BlockFunctions:
-        """Warp functions as `Reduction.functions`."""
+        """Warp functions as `ReducedBarrier.functions`."""
         return build_functions(self._device, self._nodes)
 
-    def build_stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
-        """Return the structs as `Reduction.build_stage`."""
-        return self._term.build_stage(columns)
+    def build_structs(self, columns: np.ndarray) -> tuple[ContactStruct, NearPairs]:
+        """Return the structs as `ReducedBarrier.build_stage`."""
+        return self._term.build_structs(columns)
 
-    def slope(self, w: Any) -> Any:
-        """Return the gradient as `Reduction.slope`."""
+    def compute_gradient(self, w: Any) -> Any:
+        """Return the gradient as `ReducedBarrier.slope`."""
         at, force = self._arrays(w.shape[1])[:2]
-        view(at)[:] = w
+        to_view(at)[:] = w
         force.zero_()
         self._term.add_gradient(at, force)
-        return view(force) + 0.0  # a copy
+        return to_view(force) + 0.0  # a copy
 
-    def curvature(self, w: Any, place: Any, size: int, definite: np.ndarray) -> Any:
-        """Return the tangent stiffness as `Reduction.curvature`."""
+    def compute_stiffness(self, w: Any, index: Any, size: int, definite: np.ndarray) -> Any:
+        """Return the tangent stiffness as `ReducedBarrier.curvature`."""
         at, _, numbers = self._arrays(w.shape[1])
-        view(at)[:], view(numbers)[:] = w, place
+        to_view(at)[:], to_view(numbers)[:] = w, index
         out = wp.zeros((w.shape[1], 3 * size, 3 * size), dtype=wp.float64, device=self._device.name)
         self._term.add_matrix(at, self._device.upload(definite.astype(np.int32), wp.int32), numbers, out)
-        return view(out)
+        return to_view(out)
 
     def _allocate_buffers(self, columns: int) -> tuple[wp.array, wp.array, wp.array]:
         """Allocate displacements and forces (3n, b), and node indices (n, b)."""

@@ -65,9 +65,9 @@ class Wall:
 
     nodes: wp.array(dtype=wp.int32)
     normal: wp.array(dtype=wp.vec3d)
-    bend: wp.array(dtype=wp.mat33d)
+    curvature: wp.array(dtype=wp.mat33d)
     inward: wp.array(dtype=wp.vec3d)
-    inside: wp.array(dtype=wp.float64)
+    inside_distance: wp.array(dtype=wp.float64)
     activation: wp.array(dtype=wp.float64)
     area: wp.array(dtype=wp.float64)
     gap: wp.float64
@@ -77,15 +77,15 @@ class Wall:
 
 
 @wp.func
-def place(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
+def to_bone(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
     """Return (h + R, r + R) of node s at displacement x; a widened barrier makes the bone recede by as much."""
     gap = wall.gap + (wall.widening - wp.float64(1.0)) * wall.activation[s]
-    h = gap - wp.dot(wall.normal[s], x) - wp.float64(0.5) * wp.dot(x, wall.bend[s] * x)
-    return wp.vec2d(h + wall.edge, wall.inside[s] + wp.dot(wall.inward[s], x) + wall.edge)
+    h = gap - wp.dot(wall.normal[s], x) - wp.float64(0.5) * wp.dot(x, wall.curvature[s] * x)
+    return wp.vec2d(h + wall.edge, wall.inside_distance[s] + wp.dot(wall.inward[s], x) + wall.edge)
 
 
 @wp.func
-def share(p: wp.vec2d) -> wp.vec2d:
+def distance_gradient(p: wp.vec2d) -> wp.vec2d:
     """Return the gradient of d with respect to (h, r): a unit vector away from the bone."""
     if wp.max(p[0], p[1]) > wp.float64(0.0):
         return wp.normalize(wp.vec2d(wp.max(p[0], wp.float64(0.0)), wp.max(p[1], wp.float64(0.0))))
@@ -97,20 +97,20 @@ def share(p: wp.vec2d) -> wp.vec2d:
 @wp.func
 def distance(wall: Wall, p: wp.vec2d) -> wp.float64:
     """Return the distance d to the bone [m]."""
-    return wp.dot(share(p), p) - wall.edge
+    return wp.dot(distance_gradient(p), p) - wall.edge
 
 
 @wp.func
-def turned(wall: Wall, s: int, x: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.vec3d:
+def to_displacement(wall: Wall, s: int, x: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.vec3d:
     """Return the displacement direction that reduces h by `along` and increases r by `across`."""
-    return along * (wall.normal[s] + wall.bend[s] * x) + across * wall.inward[s]
+    return along * (wall.normal[s] + wall.curvature[s] * x) + across * wall.inward[s]
 
 
 @wp.func
-def slope(wall: Wall, s: int, x: wp.vec3d, p: wp.vec2d) -> wp.vec3d:
+def get_approach(wall: Wall, s: int, x: wp.vec3d, p: wp.vec2d) -> wp.vec3d:
     """Return m = -grad d: d decreases by m . du."""
-    at = share(p)
-    return turned(wall, s, x, at[0], -at[1])
+    at = distance_gradient(p)
+    return to_displacement(wall, s, x, at[0], -at[1])
 
 
 @wp.func
@@ -120,21 +120,21 @@ def stiffness(wall: Wall, s: int) -> wp.float64:
 
 
 @wp.func
-def block_of(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
+def stiffness_block(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
     """Return the block w k (b'' m (x) m + b' d''); if `definite`, without the edge curvature, which may be negative."""
-    p = place(wall, s, x)
-    d, m, at = distance(wall, p), slope(wall, s, x, p), share(p)
+    p = to_bone(wall, s, x)
+    d, m, at = distance(wall, p), get_approach(wall, s, x, p), distance_gradient(p)
     width = wall.widening * wall.activation[s]
     pressure = barrier_slope(d, width)
-    K = barrier_curvature(d, width) * wp.outer(m, m) - pressure * at[0] * wall.bend[s]
+    K = barrier_curvature(d, width) * wp.outer(m, m) - pressure * at[0] * wall.curvature[s]
     if definite == 0 and wp.min(at[0], at[1]) > wp.float64(0.0):
-        round = turned(wall, s, x, at[1], at[0])
+        round = to_displacement(wall, s, x, at[1], at[0])
         K += pressure / wp.dot(at, p) * wp.outer(round, round)
     return stiffness(wall, s) * K
 
 
 @wp.func
-def fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.float64:
+def step_fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.float64:
     """Return the largest t <= 1 with distance - t falls - t^2 bends / 2 >= (1 - MAX_STEP_FRACTION) distance.
 
     Bends >= 0.
@@ -165,7 +165,7 @@ def build_kernels(device: Device) -> SkullKernels:
     ):
         """Add the energy: E += sum over nodes of w k b(d)."""
         s, c = wp.tid()
-        d, width = distance(wall, place(wall, s, motion(u, wall.nodes[s], c))), wall.widening * wall.activation[s]
+        d, width = (distance(wall, to_bone(wall, s, motion(u, wall.nodes[s], c))), wall.widening * wall.activation[s])
         if d < width:
             wp.atomic_add(out, c, stiffness(wall, s) * barrier(d, width))
 
@@ -179,9 +179,9 @@ def build_kernels(device: Device) -> SkullKernels:
         """Add the gradient: g -= w k b'(d) m."""
         s, c = wp.tid()
         x = motion(u, wall.nodes[s], c)
-        p = place(wall, s, x)
+        p = to_bone(wall, s, x)
         f = -stiffness(wall, s) * barrier_slope(distance(wall, p), wall.widening * wall.activation[s])
-        m = slope(wall, s, x, p)
+        m = get_approach(wall, s, x, p)
         for k in range(3):
             out[3 * wall.nodes[s] + k, c] += scalar(f * m[k])
 
@@ -196,7 +196,7 @@ def build_kernels(device: Device) -> SkullKernels:
     ):
         """Add the tangent stiffness times p: f += K_ii p_i."""
         s, c = wp.tid()
-        f = block_of(wall, s, motion(u, wall.nodes[s], c), definite[c]) * motion(p, wall.nodes[s], c)
+        f = stiffness_block(wall, s, motion(u, wall.nodes[s], c), definite[c]) * motion(p, wall.nodes[s], c)
         for k in range(3):
             out[3 * wall.nodes[s] + k, c] += scalar(f[k])
 
@@ -210,7 +210,7 @@ def build_kernels(device: Device) -> SkullKernels:
     ):
         """Add the diagonal blocks K_ii."""
         s, c = wp.tid()
-        K = block_of(wall, s, motion(u, wall.nodes[s], c), definite[c])
+        K = stiffness_block(wall, s, motion(u, wall.nodes[s], c), definite[c])
         block = mat()
         for row in range(3):
             for column in range(3):
@@ -228,11 +228,11 @@ def build_kernels(device: Device) -> SkullKernels:
         """Bound t by d(u + t du) >= (1 - kept) d: no node crosses the bone; d is convex in h and r."""
         s, c = wp.tid()
         x, along = motion(u, wall.nodes[s], c), motion(du, wall.nodes[s], c)
-        p = place(wall, s, x)
+        p = to_bone(wall, s, x)
         d = distance(wall, p)
         if d > wp.float64(PARABOLA_FRACTION) * wall.widening * wall.activation[s]:
-            bends = share(p)[0] * wp.dot(along, wall.bend[s] * along)
-            wp.atomic_min(out, c, scalar(fraction(d, wp.dot(slope(wall, s, x, p), along), bends)))
+            bends = distance_gradient(p)[0] * wp.dot(along, wall.curvature[s] * along)
+            wp.atomic_min(out, c, scalar(step_fraction(d, wp.dot(get_approach(wall, s, x, p), along), bends)))
 
     return SkullKernels(add_energy, add_gradient, add_curvature, add_diagonal, bound_step)
 
@@ -261,14 +261,14 @@ class Skull:
         self._device, self._kernels, self._bone, self._settings = device, build_kernels(device), bone, settings
         self._wall = Wall()
         self._wall.nodes = device.upload(bone.nodes, wp.int32)
-        self._wall.bend = device.upload(bone.bend, wp.mat33d)
+        self._wall.curvature = device.upload(bone.curvature, wp.mat33d)
         for name in ("normal", "inward"):
             setattr(self._wall, name, device.upload(getattr(bone, name), wp.vec3d))
-        for name in ("inside", "activation", "area"):
+        for name in ("inside_distance", "activation", "area"):
             setattr(self._wall, name, device.upload(getattr(bone, name), wp.float64))
         self._wall.gap, self._wall.edge, self._wall.shear = bone.gap, bone.edge, shear
-        self.widen(1.0)
-        covered = bone.inside < 0.0
+        self.widen_gap(1.0)
+        covered = bone.inside_distance < 0.0
         nodes, normal, times = bone.nodes[covered], bone.normal[covered], (bone.area / bone.activation)[covered]
         blocks = (settings.stiffness_ratio * shear * times)[:, None, None] * normal[:, :, None] * normal[:, None, :]
         row = (3 * nodes[:, None, None] + np.arange(3)[:, None]).repeat(3, axis=2)
@@ -279,7 +279,7 @@ class Skull:
         """Return 1 for every load case: the skull does not move."""
         return np.ones(len(cases.loads))
 
-    def count_gaps(self, cases: Cases) -> np.ndarray:
+    def compute_path_in_gaps(self, cases: Cases) -> np.ndarray:
         """Return the initial barrier width in units of its normal width (b,): larger if the start is undeformed."""
         known = np.zeros(len(cases.loads), bool)
         if cases.displacement is not None:
@@ -288,7 +288,7 @@ class Skull:
             known &= ~cases.restarted
         return np.where(known, self._settings.next_width, self._settings.first_width) / self._bone.activation.min()
 
-    def find_buried(self, u: wp.array) -> np.ndarray:
+    def find_penetrating(self, u: wp.array) -> np.ndarray:
         """Return False for every load case: the skull never penetrates the body."""
         return np.zeros(u.shape[1], bool)
 
@@ -296,9 +296,9 @@ class Skull:
         """Return False for every load case: the skull is not a tool."""
         return np.zeros((2, u.shape[1]), bool)
 
-    def widen(self, times: float) -> None:
+    def widen_gap(self, factor: float) -> None:
         """Widen the barrier by a factor and soften it by the same factor; the bone recedes by the added width."""
-        self._wall.widening = times
+        self._wall.widening = factor
 
     def compute_reaction(self, u: wp.array) -> np.ndarray:
         """Return an empty array (b, 0, 6): there are no tools."""
@@ -306,7 +306,7 @@ class Skull:
 
     def begin(self, cases: Cases) -> None:
         """Reset the barrier to its own width."""
-        self.widen(1.0)
+        self.widen_gap(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
         """Do nothing: the skull is the same in all load cases."""

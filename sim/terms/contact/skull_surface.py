@@ -64,9 +64,9 @@ class Bone:
     ----------
     nodes
         Node numbers (k,).
-    normal, bend
+    normal, curvature
         Unit vectors (k, 3) towards the bone; their derivatives (k, 3, 3) [1/m] along it, positive semi-definite.
-    inside, inward
+    inside_distance, inward
         Distances (k,) [m] inside the craniotomy, negative under bone; unit vectors (k, 3) into it, zero if too
         far.
     activation, area
@@ -79,8 +79,8 @@ class Bone:
 
     nodes: np.ndarray
     normal: np.ndarray
-    bend: np.ndarray
-    inside: np.ndarray
+    curvature: np.ndarray
+    inside_distance: np.ndarray
     inward: np.ndarray
     activation: np.ndarray
     area: np.ndarray
@@ -119,8 +119,8 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
     return Bone(
         nodes=nodes,
         normal=normal[nodes],
-        bend=compute_bend(space.nodes[nodes], normal[nodes], settings),
-        inside=inside[nodes],
+        curvature=compute_curvature(space.nodes[nodes], normal[nodes], settings),
+        inside_distance=inside[nodes],
         inward=way[nodes],
         activation=activation[nodes],
         area=_compute_nodal_areas(space)[nodes],
@@ -136,7 +136,7 @@ def _compute_nodal_areas(space: Discretisation) -> np.ndarray:
     return np.bincount(space.surface.ravel(), (area[:, None] * shares).ravel(), space.count)
 
 
-def compute_bend(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BONE_SETTINGS) -> np.ndarray:
+def compute_curvature(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BONE_SETTINGS) -> np.ndarray:
     """Estimate derivatives (k, 3, 3) [1/m], symmetric, of unit normals (k, 3) along a wall at points (k, 3) [m].
 
     Least-squares fit of n_j - n_i = H (x_j - x_i) in the tangent plane, to the nearest points with similar
@@ -174,12 +174,16 @@ def compute_edge_radius(nodes: np.ndarray, rim: np.ndarray) -> float:
 
 
 def measure_inside_opening(
-    anatomy: Anatomy, points: np.ndarray, normal: np.ndarray, blur: float, far: float = BONE_SETTINGS.max_edge_distance
+    anatomy: Anatomy,
+    points: np.ndarray,
+    normal: np.ndarray,
+    blur: float,
+    cutoff: float = BONE_SETTINGS.max_edge_distance,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return distances (n,) [m] of surface points (n, 3) [m] inside the craniotomy, and inward directions (n, 3).
 
     Distances are negative under bone. Directions are unit vectors perpendicular to the unit normals (n, 3), or zero
-    more than `far` blurs from the edge.
+    more than `cutoff` blurs from the edge.
 
     A Gaussian of standard deviation `blur` [m] at distance r inside a straight edge sees an open fraction
     Phi(r / blur), which is inverted.
@@ -188,7 +192,7 @@ def measure_inside_opening(
     triangles = mesh.surface[find_triangles_about_opening(anatomy)]
     a, b, c = np.moveaxis(mesh.nodes[triangles], 1, 0)
     twice, middle, bare = np.cross(b - a, c - a), (a + b + c) / 3.0, opened[triangles].mean(axis=1)
-    seen = KDTree(points).sparse_distance_matrix(KDTree(middle), BlurRange.reach * blur, output_type="coo_matrix")
+    seen = KDTree(points).sparse_distance_matrix(KDTree(middle), BlurRange.cutoff * blur, output_type="coo_matrix")
     # exclude the opposite side of a thin body
     facing = np.einsum("ki,ki->k", normal[seen.row], twice[seen.col]).clip(0.0)
     seen.data = facing * np.exp(-0.5 * (seen.data / blur) ** 2)
@@ -198,8 +202,8 @@ def measure_inside_opening(
     # gradient of `share`, up to a positive factor
     uphill = seen @ (middle * bare[:, None]) - share[:, None] * (seen @ middle)
     across = normalise_vectors(uphill - (uphill * normal).sum(axis=1, keepdims=True) * normal)
-    inside = ndtri(share).clip(-far, far)
-    return blur * inside, np.where(np.abs(inside[:, None]) < far, across, 0.0)
+    inside = ndtri(share).clip(-cutoff, cutoff)
+    return blur * inside, np.where(np.abs(inside[:, None]) < cutoff, across, 0.0)
 
 
 def find_triangles_about_opening(anatomy: Anatomy) -> np.ndarray:

@@ -5,19 +5,19 @@ from functools import cache
 import warp as wp
 
 from ...discretisation.term import BlockFunctions
-from ...runtime.blocks import get_block_shape, largest, wait
+from ...runtime.blocks import get_block_shape, get_max, wait
 from ...runtime.device import Device
-from .tool_functions import BULGE_BOUND, MAX_STEP_FRACTION, Scale, Surface, Tools
+from .tool_functions import BULGE_BOUND, MAX_STEP_FRACTION, BarrierScale, Surface, Tools
 from .tool_functions import build_functions as at_triangles
 
 
 @wp.struct
-class ContactStage:
+class ContactStruct:
     """Surface, tools and barrier, and the maximum number of sample rows per triangle."""
 
     surface: Surface
     tools: Tools
-    scale: Scale
+    scale: BarrierScale
     rows: wp.int32
 
 
@@ -43,7 +43,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
 
     @wp.func
     def look(
-        x: wp.array2d(dtype=wp.float64), reach: wp.float64, stage: ContactStage, near: NearPairs, c: int, me: int
+        x: wp.array2d(dtype=wp.float64), reach: wp.float64, stage: ContactStruct, near: NearPairs, c: int, me: int
     ) -> int:
         """Find the pairs within `reach`; return the maximum number of their sample rows."""
         if me == 0:
@@ -61,7 +61,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
     @wp.func
     def add_force(
         x: wp.array2d(dtype=wp.float64),
-        stage: ContactStage,
+        stage: ContactStruct,
         near: NearPairs,
         c: int,
         me: int,
@@ -85,7 +85,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
     @wp.func
     def add_matrix(
         x: wp.array2d(dtype=wp.float64),
-        stage: ContactStage,
+        stage: ContactStruct,
         near: NearPairs,
         definite: int,
         place: wp.array2d(dtype=wp.int32),
@@ -108,7 +108,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
     def longest(
         x: wp.array2d(dtype=wp.float64),
         way: wp.array2d(dtype=wp.float64),
-        stage: ContactStage,
+        stage: ContactStruct,
         near: NearPairs,
         c: int,
         me: int,
@@ -117,7 +117,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         far = wp.float64(0.0)
         for i in range(me, x.shape[0] // 3, threads):
             far = wp.max(far, wp.length(wp.vec3d(way[3 * i, c], way[3 * i + 1, c], way[3 * i + 2, c])))
-        farthest = largest(far)
+        farthest = get_max(far)
         if me == 0:
             near.least[c] = wp.float64(1.0)
         tools = stage.tools.radius.shape[0]
@@ -134,4 +134,4 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         wait()
         return near.least[c]
 
-    return BlockFunctions(ContactStage, NearPairs, add_force, add_matrix, longest)
+    return BlockFunctions(ContactStruct, NearPairs, add_force, add_matrix, longest)

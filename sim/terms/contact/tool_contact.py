@@ -18,9 +18,9 @@ from ...loads import Retracted, Touching
 from ...runtime.device import Device
 from ...tools import Tool, list_cores
 from .enclosure import find_enclosing_columns
-from .reduced import Reduced
-from .tool_blocks import ContactStage, NearPairs
-from .tool_functions import Scale, Surface, Tools
+from .reduced import ReducedToolBarrier
+from .tool_blocks import ContactStruct, NearPairs
+from .tool_functions import BarrierScale, Surface, Tools
 from .tool_kernels import build_kernels
 from .tool_path import CONTACT_SAMPLING, ContactSampling, ToolPath, approach
 
@@ -88,7 +88,7 @@ class ToolContactTerm:
             device.upload(np.array([core.radius + self._sag for core in cores]), wp.float64),
         ]
         self._asked, self._gap, self._shear = gap, (1.0 - touch.max_sag) * gap, shear
-        self.widen(1.0)
+        self.widen_gap(1.0)
         self._pose: np.ndarray | None = None
         # a step needs the same poses several times
         self._stood = lru_cache(4)(self._build_tools)
@@ -105,12 +105,12 @@ class ToolContactTerm:
         of_tools = np.minimum.reduceat(clear.numpy(), self._first, axis=0).T + self._sag
         return way.compute_stride(self._shapes, of_tools.clip(0.0), self._touch)
 
-    def count_gaps(self, cases: Cases) -> np.ndarray:
+    def compute_path_in_gaps(self, cases: Cases) -> np.ndarray:
         """Return the travel of the farthest-moved tool in units of the gap (B,)."""
         way = self._way(cases)
         return np.zeros(len(cases.loads)) if way is None else way.travel(self._shapes).max(axis=1) / self._gap
 
-    def find_buried(self, u: wp.array) -> np.ndarray:
+    def find_penetrating(self, u: wp.array) -> np.ndarray:
         """Return a mask (b,) of load cases with a tool's centre, or a corner of its cores, inside the body."""
         if self._pose is None:
             return np.zeros(u.shape[1], bool)
@@ -132,16 +132,16 @@ class ToolContactTerm:
             found.append((out.numpy() < -self._asked - self._sag).any(axis=0))
         return np.stack(found)
 
-    def widen(self, times: float) -> None:
+    def widen_gap(self, factor: float) -> None:
         """Widen the barrier by a factor and soften it by the same factor."""
-        self._scale = Scale()
-        self._scale.gap, self._scale.stiffness = times * self._gap, self._shear / (times * self._gap)
+        self._scale = BarrierScale()
+        self._scale.gap, self._scale.stiffness = factor * self._gap, self._shear / (factor * self._gap)
 
     def begin(self, cases: Cases) -> None:
         """Place the tools at their fraction of the path, and reset the gap."""
         way = self._way(cases)
         self._set_pose(None if way is None else way.interpolate(cases.path_fraction))
-        self.widen(1.0)
+        self.widen_gap(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
         """Keep the tools of these load cases only."""
@@ -174,36 +174,36 @@ class ToolContactTerm:
         """Bound the step so that no point of the surface passes through a tool."""
         self._launch(self._kernels.bound_step, [u, du], out, u.shape[1])
 
-    def add_matrix(self, u: wp.array, definite: wp.array, place: wp.array, out: wp.array) -> None:
+    def add_matrix(self, u: wp.array, definite: wp.array, index: wp.array, out: wp.array) -> None:
         """Add the tangent stiffness as `DenseTerm.add_matrix`."""
-        self._launch(self._kernels.add_matrix, [u, definite, place], out, u.shape[1])
+        self._launch(self._kernels.add_matrix, [u, definite, index], out, u.shape[1])
 
     @cached_property
-    def touchable(self) -> np.ndarray:
+    def touchable_nodes(self) -> np.ndarray:
         """Nodes (n,), ascending, of the surface that tools can touch."""
         return np.unique(self._triangles)
 
-    def select_nodes(self, most: int) -> np.ndarray:
-        """Select the touchable nodes and those nearest to them; see `Local.select_nodes`."""
-        own = self.touchable
+    def select_nodes(self, max_nodes: int) -> np.ndarray:
+        """Select the touchable nodes and those nearest to them; see `LocalBarrier.select_nodes`."""
+        own = self.touchable_nodes
         far, _ = KDTree(self._nodes[own]).query(self._nodes)
         far[own] = -1.0
-        others = np.argsort(far, kind="stable")[len(own) : max(most, len(own))]
+        others = np.argsort(far, kind="stable")[len(own) : max(max_nodes, len(own))]
         return np.concatenate([own, np.sort(others)])
 
     @cached_property
-    def _alone(self) -> "tuple[ToolContactTerm, Reduced]":
-        """Term on the touchable nodes alone, and the same as a `Reduction`."""
-        nodes, own = self._nodes[self.touchable], np.searchsorted(self.touchable, self._triangles)
+    def _alone(self) -> "tuple[ToolContactTerm, ReducedToolBarrier]":
+        """Term on the touchable nodes alone, and the same as a `ReducedBarrier`."""
+        nodes, own = self._nodes[self.touchable_nodes], np.searchsorted(self.touchable_nodes, self._triangles)
         corners, exact = own[:, :3], replace(self._device, precision="float64")
         term = ToolContactTerm(
             self.name, self._shapes, self._way, nodes=nodes, triangles=own, whole=corners, bone=own[:0],
             gap=self._asked, shear=self._shear, device=exact, touch=self._touch,
         )  # fmt: skip
-        return term, Reduced(term, len(nodes), own.shape[1], exact)
+        return term, ReducedToolBarrier(term, len(nodes), own.shape[1], exact)
 
-    def reduce(self, columns: np.ndarray) -> Reduced | None:
-        """Return the reduced barrier as `Local.reduce`."""
+    def reduce(self, columns: np.ndarray) -> ReducedToolBarrier | None:
+        """Return the reduced barrier as `LocalBarrier.reduce`."""
         if self._pose is None:
             return None
         term, reduced = self._alone
@@ -211,15 +211,15 @@ class ToolContactTerm:
         term._scale = self._scale
         return reduced
 
-    def get_pressed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return active nodes and their tangent stiffness as `Local.get_pressed`."""
+    def get_active_stiffness(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return active nodes and their tangent stiffness as `LocalBarrier.get_active_stiffness`."""
         barrier = self.reduce(np.zeros(1, int))
         if barrier is None:
             return np.zeros(0, int), np.zeros((0, 0))
-        w = self._at[0].numpy().reshape(-1, 3)[self.touchable].reshape(-1, 1).astype(np.float64)
-        active = barrier.slope(w).reshape(-1, 3).any(axis=1)
+        w = self._at[0].numpy().reshape(-1, 3)[self.touchable_nodes].reshape(-1, 1).astype(np.float64)
+        active = barrier.compute_gradient(w).reshape(-1, 3).any(axis=1)
         place = np.where(active, active.cumsum() - 1, -1)[:, None]
-        return np.flatnonzero(active), barrier.curvature(w, place, int(active.sum()), np.ones(1, bool))[0]
+        return np.flatnonzero(active), barrier.compute_stiffness(w, place, int(active.sum()), np.ones(1, bool))[0]
 
     def compute_reaction(self, u: wp.array) -> np.ndarray:
         """Return force [N] and moment about its origin [N m] that each tool exerts at u (3N, b): (b, tools, 6)."""
@@ -258,11 +258,11 @@ class ToolContactTerm:
         out.origin = self._device.upload(of_cores[:, :, :3, 3], wp.vec3d)
         return out
 
-    def build_stage(self, columns: np.ndarray) -> tuple[ContactStage, NearPairs]:
+    def build_structs(self, columns: np.ndarray) -> tuple[ContactStruct, NearPairs]:
         """Build the arguments of the kernels; see `DenseTerm.build_stage`."""
         if self._pose is None:
             raise ValueError("no tool is there")
-        out, near, name = ContactStage(), NearPairs(), self._device.name
+        out, near, name = ContactStruct(), NearPairs(), self._device.name
         every = len(columns) == len(self._pose)
         out.tools = self._tools if every else self._get_tools(self._pose[columns])
         out.surface, out.scale = self._surface, self._scale
@@ -284,7 +284,7 @@ def build_tool_contact(
     space: Discretisation,
     shear: float,
     device: Device,
-    touch: ContactSampling = CONTACT_SAMPLING,
+    sampling: ContactSampling = CONTACT_SAMPLING,
 ) -> ToolContactTerm:
     """Return the contact term of an effect on tissue with a shear modulus [Pa]."""
     contact = isinstance(effect, ToolContact)
@@ -295,9 +295,9 @@ def build_tool_contact(
     touchable, reach = np.unique(triangles), _compute_node_reach(space.nodes, triangles)
     points, normals = space.nodes[touchable], compute_vertex_normals(space.nodes, triangles[:, :3])[touchable]
 
-    @lru_cache(touch.cached_poses)
+    @lru_cache(sampling.cached_poses)
     def came_from(number: int, pose: bytes) -> np.ndarray:
-        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, normals, reach, touch.max_march_steps)
+        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, normals, reach, sampling.max_steps)
 
     def clear(pose: np.ndarray) -> np.ndarray:
         """Return the poses from which tools (B, tools, 4, 4) approach."""
@@ -328,7 +328,7 @@ def build_tool_contact(
     bone = space.surface[solid[whole].all(axis=1)]
     return ToolContactTerm(
         name, tools, way, nodes=space.nodes, triangles=triangles, whole=whole, bone=bone,
-        gap=effect.gap, shear=shear, device=device, touch=touch,
+        gap=effect.gap, shear=shear, device=device, touch=sampling,
     )  # fmt: skip
 
 

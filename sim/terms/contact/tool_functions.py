@@ -40,7 +40,7 @@ class Surface:
 
 
 @wp.struct
-class Scale:
+class BarrierScale:
     """Width [m] and stiffness [Pa/m] of the barrier."""
 
     gap: wp.float64
@@ -53,7 +53,7 @@ class ToolDistance:
 
     distance: wp.float64
     normal: wp.vec3d
-    bend: wp.mat33d
+    curvature: wp.mat33d
 
 
 @wp.func
@@ -73,16 +73,16 @@ def distance_to_core(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDis
     out.normal = wp.vec3d(zero, zero, -one)  # on the core itself: opposite to the shaft
     if length > zero:
         out.normal = v / length
-        out.bend = (wp.diag(beyond) - wp.outer(out.normal, out.normal)) / length
+        out.curvature = (wp.diag(beyond) - wp.outer(out.normal, out.normal)) / length
     return out
 
 
 @wp.func
-def clear(room: wp.float64, pace: wp.float64, most: int) -> int:
-    """Return the offset, 1 to `most`, of the next point that may touch if `room` [m] shrinks by `pace` per point."""
+def skip(clearance: wp.float64, spacing: wp.float64, max_offset: int) -> int:
+    """Return the offset, 1 to `max_offset`, of the next point to test if `clearance` shrinks by `spacing` per point."""
     out = wp.int32(1)
-    if room > pace:
-        out = wp.int32(wp.min(room / pace, wp.float64(most)))
+    if clearance > spacing:
+        out = wp.int32(wp.min(clearance / spacing, wp.float64(max_offset)))
     return out
 
 
@@ -91,7 +91,7 @@ def curvature_at(touch: ToolDistance, gap: wp.float64, definite: int) -> wp.mat3
     """Return b'' n (x) n + b' dn; if `definite`, only the first term, which is positive semi-definite."""
     out = barrier_curvature(touch.distance, gap) * wp.outer(touch.normal, touch.normal)
     if definite == 0:
-        out += barrier_slope(touch.distance, gap) * touch.bend
+        out += barrier_slope(touch.distance, gap) * touch.curvature
     return out
 
 
@@ -186,7 +186,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
                 wp.atomic_add(out, 3 * surface.table[s, a] + k, c, scalar(total[a, k]))
 
     @wp.func
-    def weight_of(surface: Surface, scale: Scale, s: int) -> wp.float64:
+    def weight_of(surface: Surface, scale: BarrierScale, s: int) -> wp.float64:
         """Return stiffness times the area per sample point of a triangle [N/m]."""
         return scale.stiffness * surface.area[s] / wp.float64(surface.pieces[s] * surface.pieces[s])
 
@@ -234,7 +234,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         while j < most:
             d = distance_to_core(shape_of(i, j, n) * at, half, radius).distance
             total += barrier(d, gap)
-            j += clear(d - gap, pace, most)
+            j += skip(d - gap, pace, most)
         return total
 
     @wp.func
@@ -246,7 +246,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
             touch = distance_to_core(N * at, half, radius)
             if touch.distance < gap:
                 total += wp.outer(N, barrier_slope(touch.distance, gap) * touch.normal)
-            j += clear(touch.distance - gap, pace, most)
+            j += skip(touch.distance - gap, pace, most)
         return total
 
     @wp.func
@@ -254,7 +254,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         at: forces,
         surface: Surface,
         tools: Tools,
-        scale: Scale,
+        scale: BarrierScale,
         definite: int,
         place: wp.array2d(dtype=wp.int32),
         s: int,
@@ -278,7 +278,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
                             for row in range(3):
                                 q = 3 * (a * (a + 1) // 2 + b) + row
                                 total[q] = total[q] + N[a] * N[b] * H[row]
-            j += clear(touch.distance - scale.gap, pace, most)
+            j += skip(touch.distance - scale.gap, pace, most)
         if touched:
             R, weight = tools.rotation[k, c], weight_of(surface, scale, s)
             for a in range(size):
@@ -304,7 +304,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
             far = wp.length(N * along)
             if far > kept * room:
                 out = wp.min(out, kept * room / far)
-            j += clear(room - farthest / kept, pace, most)
+            j += skip(room - farthest / kept, pace, most)
         return out
 
     return ToolFunctions(

@@ -10,13 +10,13 @@ from .barrier import barrier_slope
 from .tool_functions import (
     BULGE_BOUND,
     MAX_STEP_FRACTION,
-    Scale,
+    BarrierScale,
     Surface,
     Tools,
     build_functions,
-    clear,
     curvature_at,
     distance_to_core,
+    skip,
 )
 
 
@@ -58,7 +58,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         u: wp.array2d(dtype=scalar),
         surface: Surface,
         tools: Tools,
-        scale: Scale,
+        scale: BarrierScale,
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
@@ -78,7 +78,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         u: wp.array2d(dtype=scalar),
         surface: Surface,
         tools: Tools,
-        scale: Scale,
+        scale: BarrierScale,
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
@@ -100,7 +100,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         definite: wp.array(dtype=wp.int32),
         surface: Surface,
         tools: Tools,
-        scale: Scale,
+        scale: BarrierScale,
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
@@ -118,7 +118,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
                         touch = distance_to_core(N * own, half, radius)
                         if touch.distance < scale.gap:
                             total += wp.outer(N, curvature_at(touch, scale.gap, definite[c]) * (N * along))
-                        j += clear(touch.distance - scale.gap, pace, most)
+                        j += skip(touch.distance - scale.gap, pace, most)
                 spread(surface, weight * total * wp.transpose(tools.rotation[k, c]), s, c, out)
 
     @forward_kernel(module="unique")
@@ -127,7 +127,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         definite: wp.array(dtype=wp.int32),
         surface: Surface,
         tools: Tools,
-        scale: Scale,
+        scale: BarrierScale,
         # outputs
         out: wp.array2d(dtype=mat),
     ):
@@ -151,7 +151,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
                                     for column in range(3):
                                         block[row, column] = scalar(N[a] * N[a] * H[row, column])
                                 wp.atomic_add(out, surface.table[s, a], c, block)
-                        j += clear(touch.distance - scale.gap, pace, most)
+                        j += skip(touch.distance - scale.gap, pace, most)
 
     @forward_kernel(module="unique")
     def add_matrix(
@@ -160,7 +160,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         place: wp.array2d(dtype=wp.int32),
         surface: Surface,
         tools: Tools,
-        scale: Scale,
+        scale: BarrierScale,
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
@@ -178,7 +178,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         u: wp.array2d(dtype=scalar),
         surface: Surface,
         tools: Tools,
-        scale: Scale,
+        scale: BarrierScale,
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
@@ -197,7 +197,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
                         push = -weight * barrier_slope(touch.distance, scale.gap) * touch.normal
                         force += push
                         moment += wp.cross(x + tools.centre[k], push)
-                        j += clear(touch.distance - scale.gap, pace, most)
+                        j += skip(touch.distance - scale.gap, pace, most)
                 force, moment = tools.rotation[k, c] * force, tools.rotation[k, c] * moment
                 for row in range(3):
                     wp.atomic_add(out, c, k, row, force[row])
@@ -209,7 +209,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         du: wp.array2d(dtype=scalar),
         surface: Surface,
         tools: Tools,
-        scale: Scale,
+        scale: BarrierScale,
         # outputs
         out: wp.array(dtype=scalar),
     ):

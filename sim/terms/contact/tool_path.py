@@ -23,7 +23,7 @@ class ContactSampling:
     max_stride
         Maximum motion of a tool into tissue per step, as a fraction of its radius, so that it cannot pass
         through.
-    max_march_steps
+    max_steps
         Maximum steps of a tool's approach through air, each as long as the clearance.
     cached_poses
         Number of poses whose approach is cached, since a solver requests them repeatedly.
@@ -32,7 +32,7 @@ class ContactSampling:
     max_sag: float = 0.25
     max_stretch: float = 1.3
     max_stride: float = 0.5
-    max_march_steps: int = 40
+    max_steps: int = 40
     cached_poses: int = 4096
 
 
@@ -44,36 +44,37 @@ CONTACT_SAMPLING = ContactSampling()
 class ToolPath:
     """Tool paths of B load cases: T_world_tool (B, tools, 4, 4) at the beginning and at the end."""
 
-    begin: np.ndarray
-    end: np.ndarray
+    start_pose: np.ndarray
+    end_pose: np.ndarray
 
-    def interpolate(self, share: np.ndarray) -> np.ndarray:
+    def interpolate(self, fraction: np.ndarray) -> np.ndarray:
         """Return poses (B, tools, 4, 4) at path fractions (B,), with spherical interpolation of rotations."""
-        count, tools = self.end.shape[:2]
-        share = np.repeat(share, tools)
-        before, after = self.begin.reshape(-1, 4, 4), self.end.reshape(-1, 4, 4)
+        count, tools = self.end_pose.shape[:2]
+        fraction = np.repeat(fraction, tools)
+        before, after = self.start_pose.reshape(-1, 4, 4), self.end_pose.reshape(-1, 4, 4)
         turn = Rotation.from_matrix(before[:, :3, :3].swapaxes(1, 2) @ after[:, :3, :3]).as_rotvec()
         out = after.copy()
-        on_the_way = share != 1.0  # the end pose is exact
-        partly = Rotation.from_rotvec(share[:, None] * turn).as_matrix()
+        on_the_way = fraction != 1.0  # the end pose is exact
+        partly = Rotation.from_rotvec(fraction[:, None] * turn).as_matrix()
         out[on_the_way, :3, :3] = (before[:, :3, :3] @ partly)[on_the_way]
-        moved = before[:, :3, 3] + share[:, None] * (after[:, :3, 3] - before[:, :3, 3])
+        moved = before[:, :3, 3] + fraction[:, None] * (after[:, :3, 3] - before[:, :3, 3])
         out[on_the_way, :3, 3] = moved[on_the_way]
         return out.reshape(count, tools, 4, 4)
 
     def travel(self, tools: tuple[Tool, ...]) -> np.ndarray:
         """Return the maximum motion (B, tools) [m] of any point of each tool."""
-        before, after = self.begin[:, :, :3], self.end[:, :, :3]
+        before, after = self.start_pose[:, :, :3], self.end_pose[:, :, :3]
         turn = (before[..., :3].swapaxes(2, 3) @ after[..., :3]).reshape(-1, 3, 3)
-        angle = Rotation.from_matrix(turn).magnitude().reshape(self.end.shape[:2])
+        angle = Rotation.from_matrix(turn).magnitude().reshape(self.end_pose.shape[:2])
         extent = np.array([compute_extent(tool) for tool in tools])
         return np.linalg.norm(after[..., 3] - before[..., 3], axis=2) + angle * extent
 
     def compute_stride(
-        self, tools: tuple[Tool, ...], clear: np.ndarray, touch: ContactSampling = CONTACT_SAMPLING
+        self, tools: tuple[Tool, ...], clearance: np.ndarray, sampling: ContactSampling = CONTACT_SAMPLING
     ) -> np.ndarray:
-        """Return the path fraction (B,), at most 1, that tools with clearance `clear` (B, tools) [m] may move."""
-        most = clear + touch.max_stride * np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
+        """Return the path fraction (B,), at most 1, that tools with clearance `clearance` (B, tools) [m] may move."""
+        radii = np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
+        most = clearance + sampling.max_stride * radii
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
 
 
@@ -82,25 +83,25 @@ def approach(
     pose: np.ndarray,
     points: np.ndarray,
     normals: np.ndarray,
-    reach: np.ndarray,
-    march: int = ContactSampling.max_march_steps,
+    radii: np.ndarray,
+    max_steps: int = ContactSampling.max_steps,
 ) -> np.ndarray:
     """Return the pose (4, 4), just clear of a surface, from which a tool moves straight to `pose` (4, 4).
 
     The direction is along its shaft, or along the surface's outward normal if that path is less than half as long: an
     instrument that lies flat in tissue was not inserted sideways. A tool that is clear at `pose` starts
-    there. The surface has vertices `points` (n, 3) [m] with unit `normals` (n, 3) and extends `reach` (n,) [m] around
-    each vertex. The approach through air takes `march` steps at most.
+    there. The surface has vertices `points` (n, 3) [m] with unit `normals` (n, 3) and extends `radii` (n,) [m] around
+    each vertex. The approach through air takes `max_steps` steps at most.
     """
     cores, R = list_cores(tool), pose[:3, :3]
-    along_shaft = _find_clear_pose(tool, pose, R, cores, points, reach, march)
-    touched = compute_distances(tool, pose, points) < reach
+    along_shaft = _find_clear_pose(tool, pose, R, cores, points, radii, max_steps)
+    touched = compute_distances(tool, pose, points) < radii
     outward = normals[touched].sum(axis=0)
     if not outward.any():
         return along_shaft
     T = Rotation.align_vectors(outward[None], np.array([[0.0, 0.0, 1.0]]))[0].as_matrix()
     balls = [Core(T.T @ R @ core.centre, np.zeros(3), core.radius + float(np.linalg.norm(core.half))) for core in cores]
-    along_normal = _find_clear_pose(tool, pose, T, balls, points, reach, march)
+    along_normal = _find_clear_pose(tool, pose, T, balls, points, radii, max_steps)
     shaft, normal = (np.linalg.norm(start[:3, 3] - pose[:3, 3]) for start in (along_shaft, along_normal))
     return along_normal if 2.0 * normal < shaft else along_shaft
 

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from ...errors import InputError
-from ...material import Tissue, get_portion
+from ...material import Tissue, get_lame
 from ...runtime.device import Device, Precision, find_device, forward_kernel
 
 
@@ -45,17 +45,17 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Warp functions of a law on arrays of displacement gradients; `of` is the default tissue."""
+    """Warp functions of a law on arrays of displacement gradients; `tissue` is the default tissue."""
 
     device: Device
     kernel: wp.Kernel
-    of: Tissue
+    tissue: Tissue
 
     def __call__(self, H: np.ndarray, D: np.ndarray | None = None, of: Tissue | None = None) -> Evaluated:
         """Evaluate at gradients H (n, 3, 3), with increments D (n, 3, 3)."""
-        return self.replace(H, D, (of or self.of).coefficients)
+        return self.evaluate(H, D, (of or self.tissue).coefficients)
 
-    def replace(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
+    def evaluate(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
         """Evaluate with other coefficients."""
         count, device = len(H), self.device
         energy = device.allocate(count)
@@ -102,7 +102,7 @@ class Finding:
     limit: float
 
     @property
-    def kept(self) -> bool:
+    def is_within_limit(self) -> bool:
         """True if the error is within its limit; False for NaN."""
         return self.error <= self.limit
 
@@ -124,7 +124,7 @@ def check_tissue(
     """
     with np.errstate(invalid="ignore"):  # infinity - infinity is NaN, which fails the check
         found = tuple(_iterate_findings(tissue, small_strain, strains))
-    broken = [str(finding) for finding in found if not finding.kept]
+    broken = [str(finding) for finding in found if not finding.is_within_limit]
     if broken:
         raise InputError(f"the law {tissue.law} does not hold: {'; '.join(broken)}.")
     return found
@@ -156,14 +156,14 @@ def _iterate_findings(tissue: Tissue, small_strain: bool, strains: TestStrains) 
     yield Finding("no energy and no stress at rest", max(_find_largest(still.stress), abs(still.energy[0])) / mu, 1e-9)
     small = random.normal(0.0, strains.small, (count, 3, 3))
     for carries in ("whole", "shape", "volume"):
-        share = get_portion(tissue, carries)
-        stress = double.replace(small, None, tissue.coefficients_at(*share)).stress
+        share = get_lame(tissue, carries)
+        stress = double.evaluate(small, None, tissue.coefficients_at(*share)).stress
         name = "" if carries == "whole" else f" where elements carry {carries} alone"
         yield Finding(
             f"Hooke's law at small strain{name}", _compute_error(stress, compute_hooke_stress(small, *share)), 1e-4
         )
     parts = [
-        double.replace(H, D, tissue.coefficients_at(*get_portion(tissue, carries))) for carries in ("shape", "volume")
+        double.evaluate(H, D, tissue.coefficients_at(*get_lame(tissue, carries))) for carries in ("shape", "volume")
     ]
     for name in ("energy", "stress", "change"):
         shape, volume = (getattr(part, name) for part in parts)

@@ -60,25 +60,25 @@ def rotation_excess(H: Any):
             U[i, least] = -U[i, least]
         R = U * wp.transpose(V)
     turn = wp.normalize(wp.quat_from_matrix(R))
-    Q = excess_of(turn)
+    Q = quaternion_excess(turn)
     for _ in range(2):
-        B = strain_of(H, Q)
+        B = rotated_strain(H, Q)
         half = spin(wp.identity(n=3, dtype=type(one)) + (B + wp.transpose(B)) / two, B) / two
         # Cayley's transform of [2 half]x is the quaternion (half, 1): it agrees with exp to second order.
         turn = wp.normalize(turn * wp.quaternion(half, one))
-        Q = excess_of(turn)
+        Q = quaternion_excess(turn)
     return Q
 
 
 @wp.func
-def excess_of(turn: Any):
+def quaternion_excess(turn: Any):
     """Return R - I of a unit quaternion."""
     X = cross_matrix(wp.vector(turn[0], turn[1], turn[2]))
     return type(turn[0])(2.0) * (turn[3] * X + X * X)
 
 
 @wp.func
-def strain_of(H: Any, Q: Any):
+def rotated_strain(H: Any, Q: Any):
     """Return R^T F - I from H = F - I and Q = R - I."""
     return H + wp.transpose(Q) + wp.transpose(Q) * H
 
@@ -87,7 +87,7 @@ def strain_of(H: Any, Q: Any):
 def energy(H: Any, c: Any):
     """Return the energy density psi [Pa] = mu |S - I|^2 + lambda/2 tr(S - I)^2."""
     mu, lam = c[0], c[1]
-    strain = strain_of(H, rotation_excess(H))
+    strain = rotated_strain(H, rotation_excess(H))
     t = wp.trace(strain)
     return mu * wp.ddot(strain, strain) + type(mu)(0.5) * lam * t * t
 
@@ -97,7 +97,7 @@ def stress(H: Any, c: Any):
     """Return the stress P [Pa] = 2 mu (F - R) + lambda tr(S - I) R."""
     mu, lam = c[0], c[1]
     Q = rotation_excess(H)
-    t = wp.trace(strain_of(H, Q))
+    t = wp.trace(rotated_strain(H, Q))
     return type(mu)(2.0) * mu * (H - Q) + lam * t * (wp.identity(n=3, dtype=type(mu)) + Q)
 
 
@@ -112,7 +112,7 @@ def stress_change(H: Any, D: Any, c: Any):
     identity = wp.identity(n=3, dtype=type(mu))
     Q = rotation_excess(H)
     R = identity + Q
-    strain = strain_of(H, Q)
+    strain = rotated_strain(H, Q)
     A = wp.transpose(R) * D
     w = spin(identity + strain, A)
     t = wp.trace(strain)
