@@ -11,7 +11,7 @@ from scenes.page.fem_worker import FemWorker
 def test_paused_page_shows_fem_solution_that_arrives_later(demo, monkeypatch):
     """The frame is drawn before its FEM solution exists, and no further frame updates the tumour."""
     asked = []
-    monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
+    monkeypatch.setattr(demo.fem_worker, "request_frame", lambda number, touch: asked.append((number, touch)))
     demo.wish.set(plays=False, number=90)
     fem = demo.browser.meshes["finite elements"]
     rest = np.array(fem.vertices)
@@ -19,9 +19,9 @@ def test_paused_page_shows_fem_solution_that_arrives_later(demo, monkeypatch):
     seen = []
 
     def moved():
-        seen.append(demo.referee.truth)
+        seen.append(demo.fem_worker.truth)
         if len(seen) == 5:
-            FemWorker.ask(demo.referee, *asked[0])
+            FemWorker.request_frame(demo.fem_worker, *asked[0])
         return np.linalg.norm(fem.vertices - rest, axis=1).max() > 5e-4
 
     run_until(demo, monkeypatch, moved)
@@ -31,7 +31,7 @@ def test_paused_page_shows_fem_solution_that_arrives_later(demo, monkeypatch):
 def test_fem_worker_solves_the_newest_request(theatre, scene):
     referee = FemWorker(theatre, scene, threading.Lock())
     for number in range(60):
-        referee.ask(number, None)
+        referee.request_frame(number, None)
     assert wait_for(lambda: referee.truth is not None and referee.truth.number == 59)
     truth = referee.truth
     assert truth is not None and truth.deformation.time[0] == truth.loads.times[0] == scene.times[59]

@@ -42,7 +42,7 @@ def test_pareto_front_has_rows_not_dominated():
     rows += [ReportRow("none", "f", state="it has no bound")]
     assert find_front(rows) == {"fast", "near", "between"}
     chart = build_error_chart(rows)
-    assert {dot.name for dot in chart.dots if not dot.pale} == {"fast", "near", "between"}
+    assert {dot.name for dot in chart.dots if not dot.is_pale} == {"fast", "near", "between"}
     assert len(chart.front) == 3 and build_error_chart(rows[-1:]) is None
 
 
@@ -57,14 +57,12 @@ def test_time_summary_has_p99_only_with_1000_values():
 def test_report_table_has_values_under_their_headings(tmp_path):
     """Values read from the page: load sets, shares, minutes of solves and of training."""
     one = compute_distance_figures(np.full((4, 2), 1e-3), np.full((4, 2, 3), 1e-2), np.arange(4.0))
-    sets = {
+    own = {
         name: replace(one, mm=replace(one.mm, mean=mean), loads=loads)
         for name, mean, loads in (("discs", 0.1, 7), ("sectors", 0.2, 8), ("beyond", 0.3, 9))
     }
     shares = {"flagged": {"discs": 0.01, "sectors": 0.02, "beyond": 1.0}, "covered": {"discs": 0.94, "beyond": 0.53}}
-    row = ReportRow(
-        "svr", "learnt", reference=one, own_fem=sets, **shares, median=1.5, p99=2.5, set_up=3.5, memory=0.25
-    )
+    row = ReportRow("svr", "learnt", reference=one, own_fem=own, **shares, median=1.5, p99=2.5, set_up=3.5, memory=0.25)
     row = replace(row, loads=600, units=60, series=9000, inside=12, solving=180.0, learning=120.0, timed=1000)
     row = replace(row, bare=0.0125, reference=replace(one, worst=replace(one.worst, mean=7.5)))
     row = replace(row, outcomes={"CONVERGED": 3, "INVERTED": 1}, adapt=70.0)

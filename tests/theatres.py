@@ -154,7 +154,7 @@ class Silent:
     def __init__(self, theatre, scene, turn):
         pass
 
-    def ask(self, number, touch):
+    def request_frame(self, number, touch):
         pass
 
     def close(self):

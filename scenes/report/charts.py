@@ -122,7 +122,7 @@ def _scatter(
             row.name,
             row.family if row.against == ERROR else DIFFERENT_LAW,
             *places[row.name],
-            pale=row.name not in best,
+            is_pale=row.name not in best,
             y_range=_find_central_range(row.load_mm),
             hint=_describe(row),
         )
