@@ -1,6 +1,7 @@
 """FEM solutions of the page: newest request and displayed frame."""
 
 import threading
+import time
 
 import numpy as np
 from visitor import run_until, wait_for
@@ -11,7 +12,7 @@ from scenes.page.fem_worker import FemWorker
 def test_paused_page_shows_fem_solution_that_arrives_later(demo, monkeypatch):
     """The frame is drawn before its FEM solution exists, and no further frame updates the tumour."""
     asked = []
-    monkeypatch.setattr(demo.fem_worker, "request_frame", lambda number, touch: asked.append((number, touch)))
+    monkeypatch.setattr(demo.fem_worker, "request_frame", lambda number, touch, rest: asked.append((number, touch)))
     demo.wish.set(plays=False, number=90)
     fem = demo.browser.meshes["finite elements"]
     rest = np.array(fem.vertices)
@@ -38,3 +39,22 @@ def test_fem_worker_solves_the_newest_request(theatre, scene):
     assert truth.deformation.outcome[0].good and truth.seconds > 0.0
     referee.close()
     assert not referee.thread.is_alive()
+
+
+def test_fem_worker_rests_between_comparisons(theatre, scene):
+    """After a solve it waits in proportion to its duration, unless a request asks for none; closing ends the wait."""
+    referee = FemWorker(theatre, scene, threading.Lock())
+    referee.request_frame(20, None)
+    assert wait_for(lambda: referee.truth is not None)
+    begun, duration = time.perf_counter(), referee.solve_time
+    referee.request_frame(21, None, rest=1.0 + 1.0 / duration)
+    assert wait_for(lambda: referee.truth.number == 21)
+    assert time.perf_counter() - begun > 0.9
+    referee.request_frame(22, None, rest=1e6)
+    time.sleep(0.5)
+    assert referee.truth.number == 21
+    referee.request_frame(23, None)
+    assert wait_for(lambda: referee.truth.number == 23)
+    referee.request_frame(24, None, rest=1e6)
+    referee.close()
+    assert referee.truth.number == 23 and not referee.thread.is_alive()

@@ -71,7 +71,7 @@ def write_html(path: str | Path, patient: PatientSetup, scene: Scene, learner: s
     found = choose_model(patient, learner)
     page = build_html(patient, scene, found).encode()
     if found.cortex and len(page) > MAX_BYTES:
-        found = build_exported_model(found.name, found.model, cortex=False)
+        found = build_exported_model(found.name, found.model, with_cortex=False)
         page = build_html(patient, scene, found).encode()
     if len(page) > MAX_BYTES:
         raise InputError(
@@ -96,7 +96,7 @@ def choose_model(patient: PatientSetup, learner: str | None = None) -> ExportedM
     found, reasons = [], []
     for name in patient.models if learner is None else [learner]:
         try:
-            found.append(build_exported_model(name, patient.models[name], cortex=True))
+            found.append(build_exported_model(name, patient.models[name], with_cortex=True))
         except InputError as error:
             reasons.append(str(error))
     if not found:
@@ -104,7 +104,7 @@ def choose_model(patient: PatientSetup, learner: str | None = None) -> ExportedM
     return min(found, key=lambda one: _count_bytes(one.sheet))
 
 
-def build_exported_model(name: str, model: Learned, cortex: bool) -> ExportedModel:
+def build_exported_model(name: str, model: Learned, with_cortex: bool) -> ExportedModel:
     """Trace a model of the tumour, or of the cortex too.
 
     Raises
@@ -114,12 +114,12 @@ def build_exported_model(name: str, model: Learned, cortex: bool) -> ExportedMod
     """
     if model.tool is not None:
         raise InputError(f"{name} is a model of poses, but the page pushes by a force: export another learner.")
-    sheet = build_graph(name, model, cortex)
+    sheet = build_graph(name, model, with_cortex)
     if _count_bytes(sheet) > MAX_MODEL_BYTES:
         raise InputError(
             f"{name} has {_count_bytes(sheet) / 1e6:.0f} MB of numbers, too many for a page: export another learner."
         )
-    return ExportedModel(name, model, sheet, cortex)
+    return ExportedModel(name, model, sheet, with_cortex)
 
 
 def _count_bytes(sheet: Sheet) -> int:

@@ -32,13 +32,15 @@ AS_BRAIN = "the tissue of the brain"  # Default tissue of a region.
 AS_LEARNED = f"as in the models' training data, or {AS_BRAIN}"  # Default tissue of a region with models.
 
 
-def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, default_regions: str = AS_BRAIN) -> None:
+def add_tissue_arguments(
+    parser: argparse.ArgumentParser, full_help: bool = False, default_regions: str = AS_BRAIN
+) -> None:
     """Declare --material, the constants of its laws, and --region, whose `default_regions` are reported.
 
-    The help describes each tissue if `whole`, else names it.
+    The help describes each tissue if `full_help`, else names it.
     """
     sets = f"{', '.join(MATERIALS)}; see docs/concepts/physics.md"
-    if whole:
+    if full_help:
         each = (f"{name} holds for {preset.time_scale}. Source: {preset.source}" for name, preset in MATERIALS.items())
         sets = ". ".join(each)
     parser.add_argument(

@@ -143,6 +143,8 @@ class ReportRow:
         Share of the loads of "discs" and "beyond" whose largest error is within the bound at 0.95.
     load_mm, cortex_mm
         Mean distance from the reference of each compared load [mm], at the tumour and at the open cortex.
+    pose
+        Distances from the reference where the tool is moved as there, instead of pushed with the same force.
     failed
         Test loads without a solution; they are excluded from all figures.
     outcomes
@@ -189,6 +191,7 @@ class ReportRow:
     covered: Mapping[str, float] = field(default_factory=dict)
     load_mm: tuple[float, ...] = ()
     cortex_mm: tuple[float, ...] = ()
+    pose: ErrorFigures | None = None
     failed: int = 0
     outcomes: Mapping[str, int] = field(default_factory=dict)
     median: float | None = None

@@ -45,6 +45,8 @@ class ReportStudy:
         timed.
     fine
         True if the reference mesh is refined by halving every edge.
+    poses
+        True if models are compared with tools moved as in the reference, too.
     reference_element
         Element of the reference.
     """
@@ -56,6 +58,7 @@ class ReportStudy:
     beyond: int = 120
     timed: int = 1000
     fine: bool = False
+    poses: bool = False
     reference_element: str = "p2"
 
     @cached_property
