@@ -338,10 +338,10 @@ def split_contributions(
     found, first = {}, 0
     for name, column in columns.items():
         last = first + column.shape[1]
-        found[name] = compute_field_size((column @ slope[first:last]).reshape(off.shape))
+        found[name] = compute_rms_of_largest((column @ slope[first:last]).reshape(off.shape))
         first = last
-    found[COMBINED] = compute_field_size(off - (design @ slope).reshape(off.shape))
-    found[MESH] = compute_field_size(estimate_mesh_deviations(scene, samples)[:, None, None] * motion)
+    found[COMBINED] = compute_rms_of_largest(off - (design @ slope).reshape(off.shape))
+    found[MESH] = compute_rms_of_largest(estimate_mesh_deviations(scene, samples)[:, None, None] * motion)
     return found | {REGISTRATION: 3.0**0.5 * REGISTRATION_PRIOR.range[1], SEGMENTATION: SEGMENTATION_PRIOR.range[1]}
 
 
@@ -358,7 +358,7 @@ def collect_contributor_values(samples: Sequence[PatientSample], scene: Scene) -
     return found if scene.tool is None else found | {TOOL: table[:, 3:]}
 
 
-def compute_field_size(field: np.ndarray) -> float:
+def compute_rms_of_largest(field: np.ndarray) -> float:
     """Compute the root mean square over draws of the largest vector length in each draw; vectors (draws, n, 3)."""
     return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
 

@@ -77,21 +77,21 @@ def sample_value(distribution: object, random: np.random.Generator) -> float | s
     return spread.choice[int(random.choice(len(spread.choice), p=weights))]
 
 
-def check_distribution(value: object, name: str, limits: ValueLimits | None, words: tuple[str, ...] = ()) -> None:
+def check_distribution(value: object, name: str, limits: ValueLimits | None, choices: tuple[str, ...] = ()) -> None:
     """Check that every value that can be sampled is valid.
 
     Parameters
     ----------
     limits
         Allowed range of numbers; None for words.
-    words
+    choices
         Allowed words; empty: any word.
 
     Raises
     ------
     InputError
         A reversed or infinite range, invalid weights, a value outside the limits, or a word that is not in
-        `words`.
+        `choices`.
     """
     spread = to_distribution(value)
     given = [kind for kind in ("uniform", "log", "normal", "choice") if getattr(spread, kind) is not None]
@@ -113,7 +113,7 @@ def check_distribution(value: object, name: str, limits: ValueLimits | None, wor
         if spread.log is not None and not low > 0.0:
             raise InputError(f"{name}: a logarithmic range starts above 0, not at {low:g}.")
     for each in values:
-        _check_value(each, name, limits, words)
+        _check_value(each, name, limits, choices)
 
 
 def _check_choice(spread: Distribution, name: str) -> None:

@@ -28,10 +28,10 @@ def build_action_space() -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (6,), np.float32)
 
 
-def build_observation_space(kind: str, size: tuple[int, int]) -> spaces.Space:
+def build_observation_space(observation_kind: str, size: tuple[int, int]) -> spaces.Space:
     """Return the observation space of one of `KINDS`, with images of a width and height [pixel]."""
     states = spaces.Box(-STATE_BOUND, STATE_BOUND, (STATE_SIZE,), np.float32)
-    if kind == "states":
+    if observation_kind == "states":
         return states
     width, height = size
     return spaces.Dict(

@@ -32,7 +32,7 @@ from ..script.scene import Scene
 from ..script.shipped_files import get_template_path
 from ..script.tool import Probe
 from .packing import pack_arrays
-from .scene_arrays import build_arrays, describe_stage
+from .scene_arrays import build_arrays, describe_camera_and_tool
 
 MAX_BYTES = 2_000_000  # Largest size of the file [bytes].
 MAX_MODEL_BYTES = 32_000_000  # Size of a model's arrays above which they do not fit, compressed [bytes].
@@ -131,7 +131,7 @@ def build_html(patient: PatientSetup, scene: Scene, exported: ExportedModel) -> 
     stage, model = patient.build_stage(scene).without_fine_cortex, exported.model
     nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
     table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})
-    described = describe_stage(stage, scene.viewpoint.build_camera(stage.site))
+    described = describe_camera_and_tool(stage, scene.viewpoint.build_camera(stage.site))
     most = described["force"]["most"] = round(FORCE_RANGE * model.envelope.force[1], 2)
     described |= {
         "arrays": table,

@@ -324,9 +324,9 @@ def describe_solvers(deformer: Deformer) -> tuple[str, ...]:
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 
 
-def to_model_path(anatomy: Path, kind: str = "model") -> Path:
+def to_model_path(anatomy: Path, scene_name: str = "model") -> Path:
     """Return the path of models next to MESH.vtu: MESH.model.npz by default, MESH.SCENE.npz for models of one scene."""
-    return anatomy.with_suffix(f".{kind}.npz")
+    return anatomy.with_suffix(f".{scene_name}.npz")
 
 
 def load_models(path: Path, anatomy: Anatomy) -> dict[str, Learned]:

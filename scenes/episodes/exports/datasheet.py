@@ -49,12 +49,12 @@ def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str
         ]
 
 
-def format_range_row(key: str, found: Sequence[Any]) -> str:
+def format_range_row(key: str, values: Sequence[Any]) -> str:
     """Format the table row of a varied parameter."""
-    if all(is_number(one) for one in found):
-        return f"| `{key}` | {format_cell(min(found))} | {format_cell(max(found))} | {len(found)} |"
-    often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, found)).most_common(8))
-    return f"| `{key}` | {often} | | {len(found)} |"
+    if all(is_number(one) for one in values):
+        return f"| `{key}` | {format_cell(min(values))} | {format_cell(max(values))} | {len(values)} |"
+    often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, values)).most_common(8))
+    return f"| `{key}` | {often} | | {len(values)} |"
 
 
 def is_number(value: Any) -> bool:
