@@ -42,7 +42,7 @@ def test_fem_worker_solves_the_newest_request(theatre, scene):
 
 
 def test_fem_worker_rests_between_comparisons(theatre, scene):
-    """After a solve it waits in proportion to its duration, unless a request asks for none; closing ends the wait."""
+    """The worker waits in proportion to the last solve, unless a request asks for no rest; closing ends the wait."""
     referee = FemWorker(theatre, scene, threading.Lock())
     referee.request_frame(20, None)
     assert wait_for(lambda: referee.truth is not None)

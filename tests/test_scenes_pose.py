@@ -53,14 +53,14 @@ def test_motion_that_no_force_gives_is_excluded():
 @pytest.mark.parametrize("factor", [1.0, 2.0])
 def test_stiffness_of_body_is_irrelevant_if_tool_is_moved(study, factor):
     """A body of twice the stiffness moves half as far under a force, and as far under a tool that is moved."""
-    body, (pushed,) = study.anatomy, study.played.get_all(Pushed)
+    body, (pushed,) = study.anatomy, study.test_loads.get_all(Pushed)
     fem = Fem(body, build_push_effects(body, replace(TISSUE, young=factor * TISSUE.young)), TRAIN, "cpu", element="p2")
 
     def solve(rows, force):
         loads = Loads((Pushed(pushed.point[rows], force, pushed.footprint[rows]),))
-        return fem.deform(loads).displacement[:, study.drawn]
+        return fem.deform(loads).displacement[:, study.read_nodes]
 
-    tumour = np.isin(study.drawn, body.tumour_nodes)
+    tumour = np.isin(study.read_nodes, body.tumour_nodes)
     pushed_far = solve(np.arange(2), pushed.force)[:, tumour]
     ratio = np.linalg.norm(pushed_far, axis=2).mean() / (
         np.linalg.norm(get_reference(study).displacement[:, tumour], axis=2).mean()

@@ -40,9 +40,9 @@ from surrogate.training.train import train
 
 def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path, monkeypatch):
     """Trained here on the training rows; the report's file has wrong solutions of the held-out loads."""
-    training, pushed, nodes = study.discs.train, study.pushed, study_box.tumour_nodes
+    training, pushed, nodes = study.disc_split.train, study.pushed, study_box.tumour_nodes
     truth = study.dataset.read_displacement(nodes)[study.dataset.good]
-    path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
+    path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.disc_split.test])
     monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})
     with limit_to_one_thread():
@@ -55,11 +55,11 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
     )
     within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
     guess = every[:, None, None] * basis.decode(machine.predict(compute_tool_features(study.patch, within)))
-    played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.played.get(Pushed).point]
-    exact = get_reference(study).displacement[:, np.isin(study.drawn, nodes)]
+    played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.test_loads.get(Pushed).point]
+    exact = get_reference(study).displacement[:, np.isin(study.read_nodes, nodes)]
     mean = 1e3 * np.linalg.norm(guess[played] - exact, axis=2).mean(axis=1)
     np.testing.assert_allclose(row.load_mm, mean, rtol=1e-3)
-    wanted = 1e3 * np.linalg.norm(guess[study.discs.test] - wild[nodes], axis=2)
+    wanted = 1e3 * np.linalg.norm(guess[study.disc_split.test] - wild[nodes], axis=2)
     mm = row.own_fem["discs"].mm
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
     assert row.loads == training.sum()
@@ -73,8 +73,8 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
 
 
 def test_played_loads_lie_in_the_held_out_discs(study):
-    every = replace(study, loads=10_000).played.get(Pushed)
-    some, split = study.played.get(Pushed), study.discs
+    every = replace(study, loads=10_000).test_loads.get(Pushed)
+    some, split = study.test_loads.get(Pushed), study.disc_split
     assert len(every.point) == split.test.sum() and len(some.point) == 2
     for pushed in (every, some):
         into = np.linalg.norm(pushed.point[:, None] - split.centres, axis=2).min(axis=1)

@@ -133,7 +133,7 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
             *list_learner_specs(series),
         )
         after = 0 if not full else len(study.dataset.loads) + len(study.dataset.unit_good)
-        total = len(study.played) + len(study.outside) + after + len(specs)
+        total = len(study.test_loads) + len(study.loads_beyond) + after + len(specs)
         found = []
         with tqdm(total=total, desc=study.data.stem, unit="step", file=sys.stderr) as bar:
             solve_reference(study, bar.update)
@@ -225,7 +225,7 @@ def _describe_study(study: ReportStudy) -> tuple[str, ...]:
     good = int(truth.good.sum())
     return (
         f"Data: {len(study.converged)} {preset} loads on {len(study.anatomy.mesh.nodes)} vertices, "
-        f"{study.element} elements, {study.tissue}; {study.discs.summarise()}.",
+        f"{study.element} elements, {study.tissue}; {study.disc_split.summarise()}.",
         f"Reference: quadratic tetrahedra (p2) on {mesh}, the data's tissue, to 1e-8 in double precision, read at the "
         f"same material points. {good} of {len(truth.good)} loads of the left-out discs converged, "
         f"{truth.seconds.mean():.2g} s each. Beyond the training range, in equal parts: {', '.join(KINDS)}.",

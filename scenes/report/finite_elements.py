@@ -87,7 +87,7 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> ReportRow:
     """
     body = find_body(study, spec.mesh)
     fem, set_up = time_work(_build_fem, study, spec, body)
-    loads = study.played if spec.mesh == OWN_MESH else move_pushes_onto(body, study.played)
+    loads = study.test_loads if spec.mesh == OWN_MESH else move_pushes_onto(body, study.test_loads)
     law, element = spec.law or get_law_name(study.tissue) or "default", spec.element or study.element
     row = ReportRow(
         spec.name,
@@ -118,14 +118,14 @@ def measure_family(study: ReportStudy, spec: FamilySpec) -> ReportRow:
     model, set_up = time_work(build, study.anatomy)
     command = f"sulcus render press --deformer {spec.name}"
     row = ReportRow(spec.name, KINDS[spec.name], set_up=set_up, command=command)
-    row = _measure_loads(study, row, model, study.played)
-    debulked, first = debulk_tumour(study.anatomy), study.played.select(np.array([0]))
+    row = _measure_loads(study, row, model, study.test_loads)
+    debulked, first = debulk_tumour(study.anatomy), study.test_loads.select(np.array([0]))
     return replace(row, adapt=time_work(lambda: build(debulked).deform(first, at=debulked.tumour_nodes))[1])
 
 
 def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: Loads) -> ReportRow:
     """Return the row with errors and times of the loads, one by one."""
-    own, drawn = study.anatomy, study.drawn
+    own, drawn = study.anatomy, study.read_nodes
     same = model.anatomy is own
     located = None if same else locate(model.anatomy.mesh, own.mesh.nodes[drawn])
     model.deform(loads.select(np.array([0])), at=drawn if same else None)  # kernels are compiled at their first launch

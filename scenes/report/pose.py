@@ -20,16 +20,16 @@ MAX_STEP_RATIO = 0.5  # Maximum change of a force in an iteration, relative to t
 def measure_pose_error(study: ReportStudy, solve: Solve) -> ErrorFigures | None:
     """Compute errors at the tumour where every footprint's mean motion is that of the reference.
 
-    None without a converged load. `solve` returns displacements (n, m, 3) [m] at `study.drawn` of compared loads (n,)
+    None without a converged load. `solve` returns displacements (n, m, 3) [m] at `study.read_nodes` of test loads (n,)
     by number, under forces (n, 3) [N].
     """
-    truth, mesh, (pushed,) = get_reference(study), study.anatomy.mesh, study.played.get_all(Pushed)
-    weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint)[:, study.drawn]
+    truth, mesh, (pushed,) = get_reference(study), study.anatomy.mesh, study.test_loads.get_all(Pushed)
+    weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint)[:, study.read_nodes]
     weights = weights.toarray() / weights.sum(axis=1)[:, None]
     good = truth.good.copy()
     field = find_field_of_motion(solve, pushed.force, compute_motion(weights, truth.displacement), weights, good)
-    rows, tumour = np.flatnonzero(good), np.isin(study.drawn, study.anatomy.tumour_nodes)
-    return compute_figures(field[rows][:, tumour], truth.displacement[rows][:, tumour], study.played.select(rows))
+    rows, tumour = np.flatnonzero(good), np.isin(study.read_nodes, study.anatomy.tumour_nodes)
+    return compute_figures(field[rows][:, tumour], truth.displacement[rows][:, tumour], study.test_loads.select(rows))
 
 
 def compute_motion(weights: np.ndarray, field: np.ndarray) -> np.ndarray:

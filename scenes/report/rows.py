@@ -132,11 +132,11 @@ def list_learner_specs(series: bool = True) -> tuple[LearnerSpec, ...]:
     return tuple(LearnerSpec(name) for name in LEARNERS if series or name not in SERIES_MODELS)
 
 
-def measure_in_process(turn: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
-    """Measure a row in its own process, which starts immediately and measures once it enters `turn`."""
+def measure_in_process(slot: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
+    """Measure a row in its own process, which starts immediately and measures once it enters `slot`."""
     try:
         # Data that the study has already read are not copied to the process.
-        with process_pool(["cpu"], prepare_rows, replace(study)) as children, turn:
+        with process_pool(["cpu"], prepare_rows, replace(study)) as children, slot:
             return run_on_each(children, measure_row, [spec])[0]
     except LostError:
         return ReportRow(spec.name, FAMILY_NAMES[type(spec)], state="its process was killed, probably out of memory")
