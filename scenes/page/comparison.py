@@ -96,12 +96,12 @@ def describe_change(fem: FemResult, player: Player, solution: Deformation, disab
 class PageState:
     """State of the page: the request, its solution, the frame, and the FEM comparison.
 
-    `target` is the request that the frame is on the way to, `request` the one that it fulfils, `look` the display.
+    `goal` is the request that the frame is on the way to, `request` the one that it fulfils, `look` the display.
     If nothing changes for `still_time` [s], the page is still, from `still_at` on [s]. Images in motion are coarse if
     the `render_time` of a sharp one is above `max_render_time` [s].
     """
 
-    target: tuple | None = None
+    goal: tuple | None = None
     request: tuple | None = None
     shown: FemResult | None = None
     shows_undeformed: bool = False

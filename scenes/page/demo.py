@@ -232,7 +232,7 @@ class Demo:
             self.busy.begin_work("preparing the finite elements")
             if state.frame is None and not state.shows_undeformed:
                 self._show_undeformed(state)
-        elif state.target == self.asked and state.frame is not None:
+        elif state.goal == self.asked and state.frame is not None:
             self.busy.begin_work(f"on the way to frame {number}: frame {state.frame.number} is solved")
         else:
             self.busy.begin_work(describe_solve(scene, "fem", *request))
@@ -255,8 +255,7 @@ class Demo:
         look = self.wish.look
         player = replace(self._get_player(self.asked, look), coarse=state.choose_resolution())
         tool_touch = touch or player.get_touch(solution.number)
-        self.reached, state.target = solution.number, self.asked
-        state.request = solution.number, name, touch, disabled
+        self.reached, state.goal, state.request = solution.number, self.asked, (solution.number, name, touch, disabled)
         state.look, state.shown, state.shown_fem = look, solution, None
         state.load = compute_loads_digest(self._build_loads(solution.number, touch) if disabled else solution.loads)
         frame = player.draw_frame(solution.number, tool_touch, solution.loads, solution.deformation, solution.seconds)
