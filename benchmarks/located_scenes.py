@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.play.deformers import PatientSetup, open_theatre
-from scenes.play.observer import Observer, TumourEstimate
+from scenes.play.observer import PointObserver, TumourEstimate
 from scenes.script.observation_models import PointObservation
 from scenes.script.scene import find_scene
 from scenes.script.shipped_files import get_template_path
@@ -37,21 +37,21 @@ def estimates(theatre: PatientSetup, name: str, sights: int) -> dict[str, list[T
         for seed in range(sights):
             for error, sight in ERRORS.items():
                 seen = replace(sight, seed=seed, points=COUNTS[seed % len(COUNTS)])
-                found[error].append(Observer(theatre.site, theatre.locator, seen).estimate(number, positions))
+                found[error].append(PointObserver(theatre.site, theatre.locator, seen).estimate(number, positions))
     return found
 
 
 def row(answers: list[TumourEstimate]) -> list[str]:
     """Summarise the estimates of one scene."""
     given = [answer for answer in answers if answer.location is not None]
-    moved = 1e3 * np.mean([answer.true_motion for answer in answers])
+    moved = 1e3 * np.mean([answer.true_distance for answer in answers])
     doubted = sum(answer.location.slipped for answer in given if answer.location)
     refused = len(answers) - len(given)
     if not given:
         return [f"{moved:.2f}", "", "", "", "0", str(refused)]
-    off = 1e3 * np.mean([answer.off for answer in given])
+    off = 1e3 * np.mean([answer.error for answer in given])
     p95 = 1e3 * np.mean([answer.location.p95 for answer in given if answer.location])
-    held = 100.0 * np.mean([answer.held for answer in given])
+    held = 100.0 * np.mean([answer.is_covered for answer in given])
     return [f"{moved:.2f}", f"{off:.2f}", f"{p95:.2f}", f"{held:.0f}", str(doubted), str(refused)]
 
 

@@ -15,7 +15,7 @@ from sim.runtime.versions import get_version
 
 from .commands.guidance import format_guidance
 from .commands.interrupt import INTERRUPTED_CODE
-from .options.help import CommandParser, replace_former
+from .options.help import CommandParser, replace_former_options
 
 # Commands with their descriptions, by section. A command's module is imported only when it is called: `sulcus solve`
 # does not wait for torch.
@@ -89,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command. Returns 0 (done), 1 (the result misses a requirement) or 2 (bad input)."""
     if argv is None:
         limit_threads()
-    arguments = join_points(replace_former(sys.argv[1:] if argv is None else argv))
+    arguments = join_points(replace_former_options(sys.argv[1:] if argv is None else argv))
     asked = arguments[0] if arguments else None
     if asked == "bench":
         print("sulcus bench: is now `python -m benchmarks NAME`, from a checkout of the repository.", file=sys.stderr)

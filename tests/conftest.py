@@ -284,10 +284,10 @@ def play(request, theatre):
 def still(box):
     """An observer and the body at rest, with errors as they are by default, and many points."""
     from scenes.play.deformers import PatientSetup
-    from scenes.play.observer import Observer
+    from scenes.play.observer import PointObserver
     from scenes.script.observation_models import PointObservation
 
-    return Observer(PatientSetup(box, None, {}, "cpu").site, None, PointObservation(points=400)), box.mesh.nodes
+    return PointObserver(PatientSetup(box, None, {}, "cpu").site, None, PointObservation(points=400)), box.mesh.nodes
 
 
 @pytest.fixture(scope="session")

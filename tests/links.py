@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 import numpy as np
 
 from scenes.link.frame import HEADER, pack_message, read_header, to_stamp
-from scenes.link.outgoing import Outgoing
+from scenes.link.outgoing import ResultEncoder
 from scenes.link.pose_responder import PoseResponder
 from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 from scenes.link.session import LinkSession
@@ -60,8 +60,8 @@ async def linked(
     follower, registration=None, eye=None, tracking=1e-4, names=NAMES, source=None, stale=2.0, note=lambda line: None
 ):
     answering = PoseResponder(follower.motion, follower.tool, tracking, registration)
-    speaks = Outgoing(follower.motion.stage, registration is not None)
-    session = LinkSession(answering, speaks, ReceivedTransforms(names, stale), eye, note=note)
+    speaks = ResultEncoder(follower.motion.stage, registration is not None)
+    session = LinkSession(answering, speaks, ReceivedTransforms(names, stale), eye, log=note)
     ready = asyncio.get_running_loop().create_future()
     serving = asyncio.create_task(session.serve(HOST, 0, np.inf, ready, source))
     try:

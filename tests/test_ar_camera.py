@@ -25,7 +25,7 @@ from ar.rendering.renderer import Lamp, Renderer, render
 from scenes.play.player import Player
 from scenes.script.camera_paths import HandHeld
 from scenes.script.scene import find_scene
-from scenes.tracked.filming import USUAL_CALIBRATION, VIEW, Taking, mount_targets, register_with_error, render_shots
+from scenes.tracked.filming import USUAL_CALIBRATION, VIEW, Artefacts, mount_targets, register_with_error, render_frames
 from scenes.tracked.follower import Follower, TumourState
 from scenes.tracked.tool_motion import ToolMotion
 from sim.anatomy import Anatomy
@@ -291,13 +291,13 @@ def player():
 
 def test_rolling_shutter_increases_tracking_error_on_video(player):
     mounts = mount_targets(player)
-    shots = list(render_shots(player, mounts, Taking(noise=0.0)))
+    shots = list(render_frames(player, mounts, Artefacts(noise=0.0)))
     calibration = player.scene.viewpoint.calibration
     assert calibration is not None
     still = replace(player.scene.viewpoint, calibration=replace(calibration, readout=0.0))
     other = replace(player, stage=replace(player.stage, scene=replace(player.scene, viewpoint=still)))
-    plain = next(iter(render_shots(other, mounts, Taking(noise=0.0))))
-    rows = np.abs(plain.colour.astype(int) - shots[0].colour).mean(axis=(1, 2))
+    plain = next(iter(render_frames(other, mounts, Artefacts(noise=0.0))))
+    rows = np.abs(plain.image.astype(int) - shots[0].image).mean(axis=(1, 2))
     assert rows[290:310].mean() < 0.4 * max(rows[:100].mean(), rows[500:].mean())  # the middle row has its time
     follower = Follower(
         calibration,
@@ -307,14 +307,14 @@ def test_rolling_shutter_increases_tracking_error_on_video(player):
     )
     known, all_known = None, []
     for shot in shots:
-        known = follower.step(cv2.cvtColor(shot.colour, cv2.COLOR_RGB2GRAY), shot.time, known)
+        known = follower.step(cv2.cvtColor(shot.image, cv2.COLOR_RGB2GRAY), shot.time, known)
         all_known.append(known)
     # How the camera moves is not known from one picture.
-    assert all_known[0].state is TumourState.UNSURE and "rolling shutter" in all_known[0].words
-    assert all(each.relied and each.parts["shutter"] > 0.0 for each in all_known[1:])
+    assert all_known[0].state is TumourState.UNSURE and "rolling shutter" in all_known[0].warning
+    assert all(each.is_reliable and each.sources["shutter"] > 0.0 for each in all_known[1:])
     at_once = replace(follower, calibration=replace(calibration, readout=0.0))
-    alike = at_once.step(cv2.cvtColor(shots[1].colour, cv2.COLOR_RGB2GRAY), shots[1].time)
-    assert alike.relied and "shutter" not in alike.parts
-    assert all_known[1].band > 1.5 * alike.band
+    alike = at_once.step(cv2.cvtColor(shots[1].image, cv2.COLOR_RGB2GRAY), shots[1].time)
+    assert alike.is_reliable and "shutter" not in alike.sources
+    assert all_known[1].bound > 1.5 * alike.bound
     # A hand that was fast a moment ago may be again.
-    assert all_known[-1].pace >= 0.5 * max(each.pace for each in all_known[1:])
+    assert all_known[-1].image_speed >= 0.5 * max(each.image_speed for each in all_known[1:])

@@ -14,7 +14,7 @@ def test_tracker_clock_error_increases_the_covariance(error, expected):
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     still, none = build_pose_stream(times, poses.copy(), np.zeros((len(times), 6, 6))), np.zeros((len(times), 6, 6))
     poses[:, 0, 3] = 0.2 * times
-    found = ExternalTracker(build_pose_stream(times, poses, none), still, Clock(0.0, error)).find_tool(0.5)
+    found = ExternalTracker(build_pose_stream(times, poses, none), still, Clock(0.0, error)).find_tool_pose(0.5)
     assert found.covariance[0, 0] == pytest.approx(expected**2, abs=1e-12)
     assert np.abs(found.covariance[1:, 1:]).max() < 1e-12
 

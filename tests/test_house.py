@@ -148,7 +148,7 @@ def test_import_reader_finds_known_imports():
     assert "surrogate.regressors.baselines.Ann" in imports(HOUSE / "surrogate/training/learners.py")
     assert "sim.terms.dead_force.DeadForce" in imports(HOUSE / "sim/compile.py")
     assert "sim.terms.dead_force.DeadForce" not in imports(HOUSE / "sim/compile.py", everywhere=False)
-    assert "scenes.play.checks.measure" in imports(HOUSE / "scenes/commands/check.py") and len(FILES) > 80
+    assert "scenes.play.checks.measure_frames" in imports(HOUSE / "scenes/commands/check.py") and len(FILES) > 80
 
 
 @pytest.mark.parametrize("room", ROOMS)

@@ -14,7 +14,7 @@ from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.head_pose import HeadPose
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.tool import Probe
-from scenes.script.tool_paths import IDLE_HEIGHT, Touch, compute_lift
+from scenes.script.tool_paths import IDLE_HEIGHT, Touch, compute_tool_height
 from scenes.script.viewpoint import OBLIQUE_VIEWPOINT, TARGET_DEPTH, Viewpoint
 from sim.compile import check_causes
 from sim.errors import InputError
@@ -168,14 +168,14 @@ class TestCamera:
 def test_the_cortex_wears_the_scan(template):
     scene = small()
     assert template.intensity is not None
-    plain, dressed = (Stage(scene, template.site, scan).plain for scan in (None, template.intensity))
+    plain, dressed = (Stage(scene, template.site, scan).without_fine_cortex for scan in (None, template.intensity))
     rest = template.anatomy.mesh.nodes
-    assert plain.build_visible(rest).solid is None
-    layer = dressed.build_visible(rest + 0.001)
+    assert plain.build_visible_cortex(rest).solid is None
+    layer = dressed.build_visible_cortex(rest + 0.001)
     assert layer.solid is not None and layer.rest is not None
     # Read at the material points, 2 mm under the surface, wherever they are now.
-    assert np.allclose(layer.rest, dressed.build_visible(rest).rest)
-    depth = np.linalg.norm(layer.rest - dressed.build_visible(rest).vertices, axis=1)
+    assert np.allclose(layer.rest, dressed.build_visible_cortex(rest).rest)
+    depth = np.linalg.norm(layer.rest - dressed.build_visible_cortex(rest).vertices, axis=1)
     assert np.allclose(depth, 2e-3)
 
 
@@ -203,4 +203,4 @@ def test_an_unknown_scene_is_named_with_the_known_ones():
 
 
 def test_no_force_is_seen_to_act_through_the_air():
-    assert compute_lift(0.0) == IDLE_HEIGHT and compute_lift(0.005) == compute_lift(0.3) == 0.0
+    assert compute_tool_height(0.0) == IDLE_HEIGHT and compute_tool_height(0.005) == compute_tool_height(0.3) == 0.0

@@ -12,4 +12,4 @@ def test_agreement_keeps_last_30_accurate_positions():
     for number in range(80):
         deviation = 3e-3 if number % 2 else 1e-3
         found = found.add_image("tool", Pose(shifted(1e-5 * number), deviation**2 * np.eye(6), 0.0, 4), body, None)
-    np.testing.assert_allclose(found.places["tool"][:, 0], 1e-5 * np.arange(20, 80, 2))
+    np.testing.assert_allclose(found.positions["tool"][:, 0], 1e-5 * np.arange(20, 80, 2))

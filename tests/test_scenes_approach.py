@@ -12,7 +12,7 @@ from test_sim_head_masks import grid, head, nifti
 from theatres import short
 
 from scenes.cli import main
-from scenes.options.placement_options import add_opening_arguments, get_trajectory_option, to_opening_options
+from scenes.options.placement_options import add_craniotomy_arguments, get_trajectory_path, to_craniotomy_args
 from scenes.play.deformers import PatientSetup
 from scenes.script.approach import Approach, parse_approach
 from scenes.script.craniotomy_frame import CraniotomyFrame, build_craniotomy_frame
@@ -59,13 +59,13 @@ def test_tool_follows_entry_and_direction_of_trajectory(site, tmp_path, right, u
     """For both drawing orders of the line; the scene's own positions and tilts are added."""
     entry, way, line = planned(site, right, up, tilt)
     approach = parse_approach(read_markup(marked(tmp_path, line[::-1] if swapped else line)), site)
-    touch = approach.follow(press(0.3))(2.0)
+    touch = approach.shift_path(press(0.3))(2.0)
     assert (
         np.linalg.norm(site.find_nearest(site.origin + touch.x * site.right + touch.y * site.up).point - entry) < 1e-4
     )
     np.testing.assert_allclose(site.compute_direction(touch), way, atol=1e-9)
     assert touch.force == pytest.approx(0.3)
-    aside = approach.follow(lambda time: Touch(2e-3, 1e-3, tilt=(0.2, 0.0)))(0.0)
+    aside = approach.shift_path(lambda time: Touch(2e-3, 1e-3, tilt=(0.2, 0.0)))(0.0)
     assert aside.x == pytest.approx(touch.x + 2e-3) and aside.y == pytest.approx(touch.y + 1e-3)
     assert np.tan(aside.tilt[0]) == pytest.approx(np.tan(touch.tilt[0]) + np.tan(0.2))
 
@@ -127,11 +127,11 @@ def test_trajectory_outside_the_craniotomy_is_rejected(site, tmp_path):
 
 def test_trajectory_option_moves_the_tool_of_the_scene(site, tmp_path, capsys):
     """Scene `press`; near the rim a message names the stop at the bone; scenes without a tool are unchanged."""
-    from scenes.options.theatre_options import add_theatre, build_requested_scene
+    from scenes.options.patient_options import add_patient, build_requested_scene
 
     def asked(name: str, line: np.ndarray):
         parser = argparse.ArgumentParser()
-        add_theatre(parser)
+        add_patient(parser)
         words = parser.parse_args(
             ["--trajectory", str(marked(tmp_path, line))], argparse.Namespace(program="sulcus demo")
         )
@@ -160,17 +160,17 @@ def test_render_command_rejects_trajectory_off_the_cortex(site, tmp_path, capsys
 
 def test_opening_options_give_trajectory_only_for_lines(site, tmp_path):
     parser = argparse.ArgumentParser()
-    add_opening_arguments(parser)
+    add_craniotomy_arguments(parser)
     line = planned(site, 0.0, 0.0, (0.0, 0.0))[2]
     for points, kind, found in ((line, "Line", True), (line[:1], "Fiducial", False)):
         path = marked(tmp_path, points, kind)
         for option in ("--opening-at", "--opening-over"):
-            assert get_trajectory_option(parser.parse_args([option, str(path)])) == (path if found else None)
-    assert get_trajectory_option(parser.parse_args([])) is None
+            assert get_trajectory_path(parser.parse_args([option, str(path)])) == (path if found else None)
+    assert get_trajectory_path(parser.parse_args([])) is None
     words = ["--nodes=5300", "--opening-at=1.0,2.0,3.0", "--fine-opening"]
-    assert to_opening_options(parser.parse_args(words[1:])) == words
-    assert to_opening_options(parser.parse_args([])) == words[:1]
+    assert to_craniotomy_args(parser.parse_args(words[1:])) == words
+    assert to_craniotomy_args(parser.parse_args([])) == words[:1]
 
 
 def test_approach_at_origin_leaves_the_path_unchanged():
-    assert Approach(0.0, 0.0).follow(short().path)(0.7) == short().path(0.7)
+    assert Approach(0.0, 0.0).shift_path(short().path)(0.7) == short().path(0.7)

@@ -67,13 +67,13 @@ def test_body_has_the_sampled_stiffness_of_its_regions(plan, tmp_path):
     young = {label: tissue.young for label, tissue in body.tissue.regions.items()}
     oedema = young.pop(PART_LABELS["oedema"])
     assert young == {TUMOUR_LABEL: 6000.0, PART_LABELS["necrosis"]: 3000.0} and 800.0 <= oedema <= 1200.0
-    assert oedema == 2000.0 * body.drawn["bodies.tissue.oedema_ratio"]
-    assert "bodies.tissue.ventricles_ratio" not in body.drawn
+    assert oedema == 2000.0 * body.parameters["bodies.tissue.oedema_ratio"]
+    assert "bodies.tissue.ventricles_ratio" not in body.parameters
 
 
 def test_tissue_of_older_body_file_has_no_oedema_region(plan, tmp_path):
     write_body(tmp_path / "made", plan, 1, 0, "cpu")
-    older = {name: value for name, value in read_body(tmp_path / "made").drawn.items() if "oedema" not in name}
+    older = {name: value for name, value in read_body(tmp_path / "made").parameters.items() if "oedema" not in name}
     assert PART_LABELS["oedema"] not in get_tissue(older).regions
 
 

@@ -17,9 +17,9 @@ def test_path_names_of_the_command_line_match_camera_paths():
 
 
 def test_distance_option_sets_the_viewpoint_distance_in_metres():
-    camera_options.add_camera(parser := ArgumentParser())
+    camera_options.add_camera_options(parser := ArgumentParser())
     args = parser.parse_args(["--distance", "250"])
-    assert camera_options.add_targets(args, find_scene("press")).viewpoint.distance == 0.25
+    assert camera_options.use_tracked_camera(args, find_scene("press")).viewpoint.distance == 0.25
 
 
 def test_calibrated_camera_works_in_render_check_and_collect(theatre, tmp_path, capsys):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenes.script.camera_paths import PATHS, Focus, HandHeld, Microscope, Orbit, sample_wandering
+from scenes.script.camera_paths import PATHS, Focus, HandHeld, Microscope, Orbit, sample_hand_motion
 from scenes.script.viewpoint import OBLIQUE_VIEWPOINT
 from sim.errors import InputError
 
@@ -45,7 +45,7 @@ def test_hand_motion_is_deterministic_per_seed(site):
 
 
 def test_hand_held_path_has_given_amplitude_and_breathing(site):
-    ways = np.array([sample_wandering(seed, time) for seed in range(6) for time in np.arange(0.0, 60.0, 0.05)])
+    ways = np.array([sample_hand_motion(seed, time) for seed in range(6) for time in np.arange(0.0, 60.0, 0.05)])
     assert ways.std(axis=0) == pytest.approx(np.ones(6), rel=0.15) and np.abs(ways.mean(axis=0)).max() < 0.1
     calm = replace(OBLIQUE_VIEWPOINT, path=HandHeld(0, shift=0.0, turn=0.0, breath=2e-3))
     start, top, back, low = (calm.build_camera(site, time).centre for time in (0.0, 1.0, 2.0, 3.0))

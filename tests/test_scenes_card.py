@@ -9,7 +9,7 @@ from tiny_episodes import write_episode
 
 from scenes import write_card
 from scenes.cli import main
-from scenes.episodes.exports.card import keep_card
+from scenes.episodes.exports.card import update_card
 from scenes.episodes.run_folder import list_finished
 
 
@@ -56,7 +56,7 @@ def test_card_lists_episodes_and_failures_of_data_set(folder, tmp_path, capsys):
 
 def test_card_is_updated_when_episodes_are_added(box, tmp_path, monkeypatch):
     def kept(changed):
-        return keep_card(tmp_path, list_finished(tmp_path), changed)
+        return update_card(tmp_path, list_finished(tmp_path), changed)
 
     assert kept(True) is None and not list(tmp_path.iterdir())  # no episode is whole
     write_episode(tmp_path / "episode_000000.h5", box)
@@ -69,7 +69,7 @@ def test_card_is_updated_when_episodes_are_added(box, tmp_path, monkeypatch):
     with monkeypatch.context() as held:  # the folder was listed once, by who gives the numbers
         for name in ("glob", "iterdir"):
             held.setattr(Path, name, lambda *given: pytest.fail("the folder was listed again"))
-        assert keep_card(tmp_path, {0}, False) is None
+        assert update_card(tmp_path, {0}, False) is None
     assert kept(False) is None and len(made) == 5
     assert made == {name: (tmp_path / name).stat().st_mtime_ns for name in made}
     assert kept(True) is None and made["DATASHEET.md"] < (tmp_path / "DATASHEET.md").stat().st_mtime_ns

@@ -13,9 +13,9 @@ from ar.overlay.hud import format_millimetres
 from ar.overlay.marks import Cover, Marks
 from ar.rendering.renderer import Picture
 from scenes.cli import main
-from scenes.play.checks import SceneFigures, measure
-from scenes.play.frame_text import annotate
-from scenes.play.player import measure_gauge
+from scenes.play.checks import SceneFigures, measure_frames
+from scenes.play.frame_text import annotate_image
+from scenes.play.player import measure_tip_gauge
 from scenes.play.reference import solve_reference_frames
 from scenes.play.stage import OPENING, TOOL
 from scenes.script.scene import SCENES, Bounds, find_scene
@@ -67,7 +67,7 @@ def truth(theatre, play, frames):
 
 
 def broken(play, frames, truth, camera=None):
-    figures = measure(play, play.get_camera if camera is None else lambda time: camera, frames, truth)
+    figures = measure_frames(play, play.get_camera if camera is None else lambda time: camera, frames, truth)
     return set(figures.find_violations(Bounds())), figures
 
 
@@ -94,8 +94,8 @@ def test_each_bound_has_a_violation_message():
 
 def test_volume_outside_the_skull_is_reported_as_leaked(play, frames, truth):
     leaky = replace(truth, leaked=np.linspace(0.0, 0.35, len(truth)))
-    assert measure(play, play.get_camera, frames, leaky).leaked == 0.35
-    assert measure(play, play.get_camera, frames, truth).leaked == truth.leaked.max() < 1e-5
+    assert measure_frames(play, play.get_camera, frames, leaky).leaked == 0.35
+    assert measure_frames(play, play.get_camera, frames, truth).leaked == truth.leaked.max() < 1e-5
 
 
 @by_each
@@ -110,7 +110,7 @@ def drawn(play, frame, positions, camera=None, tip=None, opening=OPENING):
     """A frame whose picture was drawn from other positions, by another camera, or with another tip."""
     stage, at = play.stage, frame.tip if tip is None else tip
     tumour, rest = (stage.build_tumour(each) for each in (positions, play.site.anatomy.mesh.nodes))
-    gauge = measure_gauge(at, tumour)
+    gauge = measure_tip_gauge(at, tumour)
     if tip is None:
         gauge = replace(gauge, read=frame.distance, error=frame.tumour_error.bound)
     shown = composite(
@@ -120,7 +120,7 @@ def drawn(play, frame, positions, camera=None, tip=None, opening=OPENING):
         cover=Cover((TOOL,), opening=opening),
         marks=Marks(gauge=gauge, before=rest),
     )
-    annotate(shown, frame.number, frame.remark)
+    annotate_image(shown, frame.number, frame.remark)
     return replace(frame, shown=shown.colour)
 
 
@@ -151,10 +151,8 @@ class TestThePictureItself:
     def test_image_of_tumour_shifted_by_1_mm_fails(self, play, frames, truth):
         """Image and solution agree, and both differ from FEM."""
         away = shifted(frames[2], 1e-3 * play.site.right)
-        sentences, figures = self.pixels(
-            play, frames, truth, drawn(play, away, play.compute_positions(away.deformation))
-        )
-        assert about(sentences, "outline") and figures.drawn > 2.0
+        sentences, rows = self.pixels(play, frames, truth, drawn(play, away, play.compute_positions(away.deformation)))
+        assert about(sentences, "outline") and rows.drawn > 2.0
 
     def test_image_of_an_earlier_frame_fails(self, play, frames, truth):
         late = replace(frames[2], shown=frames[1].shown)

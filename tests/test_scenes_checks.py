@@ -13,13 +13,13 @@ from ar.overlay.marks import BEFORE_COLOUR, Cover, Marks
 from ar.overlay.outlines import compute_ink, find_text
 from ar.overlay.styles import STYLES
 from scenes.cli import main
-from scenes.play.checks import measure
+from scenes.play.checks import measure_frames
 from scenes.play.deformers import open_theatre
 from scenes.play.drape import DRAPE_COLOUR
-from scenes.play.frame_text import annotate
+from scenes.play.frame_text import annotate_image
 from scenes.play.observer import ELLIPSOID_COLOUR
-from scenes.play.player import measure_gauge
-from scenes.play.scene_costs import add_cost_label
+from scenes.play.player import measure_tip_gauge
+from scenes.play.scene_costs import draw_cost_panel
 from scenes.play.stage import CORTEX_COLOUR, DRAPE, OPENING, TOOL, TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.scene import Bounds, find_scene
 from scenes.script.viewpoint import OBLIQUE_VIEWPOINT
@@ -84,14 +84,14 @@ def build_tool_frame(size=(640, 360), style="window"):
 
 def broken(frame, play):
     """What is wrong with a frame, if the model's own answer is the truth."""
-    found = measure(play, play.get_camera, [frame], frame.deformation)
+    found = measure_frames(play, play.get_camera, [frame], frame.deformation)
     return [sentence for sentence in found.find_violations(Bounds(visible=0.3)) if "does not say its" not in sentence]
 
 
 @pytest.mark.parametrize("style", [style for style in STYLES if style != "none"])
 def test_every_style_passes_the_checks(style):
     frame, play = build_tool_frame(style=style), player((640, 360), style)
-    assert measure(play, play.get_camera, [frame], frame.deformation).find_violations(Bounds(visible=0.3)) == []
+    assert measure_frames(play, play.get_camera, [frame], frame.deformation).find_violations(Bounds(visible=0.3)) == []
     tool = frame.picture.segmentation == TOOL
     words = (np.abs(frame.shown.astype(int) - frame.picture.colour).max(axis=2) > 2) & tool
     assert words.sum() < 0.1 * tool.sum()  # the lines at the head may stand there
@@ -104,7 +104,7 @@ def again(frame, play, opening, gauge=None, style="window"):
         stage.build_tumour(at) for at in (play.compute_positions(frame.deformation), play.site.anatomy.mesh.nodes)
     )
     if gauge is None:
-        gauge = replace(measure_gauge(frame.tip, tumour), read=frame.distance, error=frame.tumour_error.bound)
+        gauge = replace(measure_tip_gauge(frame.tip, tumour), read=frame.distance, error=frame.tumour_error.bound)
     band = frame.tumour_error.bound or 0.0
     over = composite(
         frame.picture,
@@ -114,7 +114,7 @@ def again(frame, play, opening, gauge=None, style="window"):
         cover=Cover((TOOL,), opening=opening),
         marks=Marks(band, gauge=gauge, before=rest),
     )
-    annotate(over, frame.number, frame.remark)
+    annotate_image(over, frame.number, frame.remark)
     return replace(frame, shown=over.colour)
 
 
@@ -149,14 +149,14 @@ def test_tip_distance_text_must_be_complete_and_near_the_tip():
 
 def test_cost_label_does_not_cover_the_tool_in_a_low_image():
     frame = build_tool_frame()
-    changed = (add_cost_label(frame, "series-gp") != frame.shown).any(axis=2)
+    changed = (draw_cost_panel(frame, "series-gp") != frame.shown).any(axis=2)
     assert changed.sum() > 5000 and not changed[frame.picture.segmentation == TOOL].any()
 
 
 def test_cost_label_does_not_cover_the_legend():
     for size in ((640, 360), (640, 480)):
         frame = build_tool_frame(size, "depth")
-        changed = (add_cost_label(frame, "series-gp") != frame.shown).any(axis=2)
+        changed = (draw_cost_panel(frame, "series-gp") != frame.shown).any(axis=2)
         assert (frame.taken == SHEET_VALUE).any() and changed.any() and not changed[frame.taken == SHEET_VALUE].any()
 
 
@@ -164,9 +164,9 @@ def test_gauge_reports_tip_inside_the_tumour():
     play = player((640, 360))
     rest = play.stage.tumour_at_rest
     middle, corners = rest.vertices.mean(axis=0), rest.vertices[rest.triangles]
-    assert measure_gauge(middle, rest).inside and not measure_gauge(middle + [0.03, 0.0, 0.0], rest).inside
+    assert measure_tip_gauge(middle, rest).inside and not measure_tip_gauge(middle + [0.03, 0.0, 0.0], rest).inside
     assert is_enclosing(corners[:, ::-1], middle) and not is_enclosing(corners, middle + [0.0, 0.0, 0.5])
-    assert str(measure_gauge(middle, rest)).startswith("inside, ")
+    assert str(measure_tip_gauge(middle, rest)).startswith("inside, ")
 
 
 def test_frame_drawn_twice_gives_identical_image():

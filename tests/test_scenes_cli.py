@@ -17,7 +17,7 @@ from benchmarks.__main__ import BENCHMARKS
 from scenes.cli import COMMANDS, limit_threads
 from scenes.page.demo import Demo
 from scenes.page.scene_solvers import SceneSolvers
-from scenes.play.waiting_notice import Busy
+from scenes.play.waiting_notice import WaitingNotice
 from sim.bodies.meshfile import write_anatomy, write_mesh
 
 
@@ -45,7 +45,7 @@ def test_demo_page_opens_during_compilation_and_then_plays(name, box, tmp_path, 
         done.append("compiled")
 
     monkeypatch.setattr("ar.overlay.composite.load_kernels", slow)
-    monkeypatch.setattr(Busy, "begin_work", lambda busy, what: done.append(what) or opened.set())
+    monkeypatch.setattr(WaitingNotice, "begin_work", lambda busy, what: done.append(what) or opened.set())
     monkeypatch.setattr(SceneSolvers, "predict", lambda *words: done.append("answered") or predicted(*words))
     monkeypatch.setattr(Demo, "run", lambda page, seconds: done.append("plays"))
     path = put(theatre_of(box), tmp_path / "box.vtu")

@@ -15,7 +15,7 @@ from scenes.link.messages import encode_string
 @asynccontextmanager
 async def served(receive=lambda number, header, content: None, most=16, longest=1 << 16):
     clients = LinkClients(receive, lambda kind: longest if kind == "TRANSFORM" else 0, most)
-    server = await asyncio.start_server(clients.converse, HOST, 0)
+    server = await asyncio.start_server(clients.serve_connection, HOST, 0)
     try:
         yield clients, server.sockets[0].getsockname()[1]
     finally:

@@ -38,7 +38,7 @@ def test_deformers_are_ranked_on_common_loads():
     tally.record_time("unjudged", "a", 1e-3)
     rows = [(row.name, round(row.milliseconds, 9), round(row.millimetres, 9), row.loads) for row in tally.rows]
     assert rows == [("quick", 1.0, 0.2, 2), ("slow", 4.0, 0.03, 2), ("lost", 5.0, 0.2, 2)]
-    assert [row.best for row in tally.rows] == [True, True, False]
+    assert [row.is_optimal for row in tally.rows] == [True, True, False]
     words = format_cost_plot(tally.rows)
     assert "over the same 2 loads" in words and words.count("class=best") == 2
 
@@ -47,9 +47,9 @@ def test_deformers_without_common_load_are_not_ranked():
     """One was timed without force, the other at full force: their medians are not comparable."""
     tally = AccuracyTimeTable()
     shown(tally, "resting", "ab", 1.0, 0.002)
-    assert [row.best for row in tally.rows] == [None]
+    assert [row.is_optimal for row in tally.rows] == [None]
     shown(tally, "pressing", "c", 1.0, 0.2)
-    assert [row.best for row in tally.rows] == [None, None]
+    assert [row.is_optimal for row in tally.rows] == [None, None]
     words = format_cost_plot(tally.rows)
     assert "not comparable" in words and "best" not in words
 
@@ -83,7 +83,7 @@ class TestVerdict:
 
     def test_comparison_warns_when_solver_did_not_converge(self):
         said = [
-            format_comparison(replace(self.JUDGED, doubt=doubt), False, "waits")
+            format_comparison(replace(self.JUDGED, warning=doubt), False, "waits")
             for doubt in ("", describe_outcome(Outcome.BUDGET))
         ]
         assert ["do not rely on it" in each for each in said] == [False, True]

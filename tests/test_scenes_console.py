@@ -16,7 +16,7 @@ from theatres import template_theatre
 
 from scenes.link.console import limit_rate, print_safely
 from scenes.link.frame import to_stamp
-from scenes.link.messages import transform
+from scenes.link.messages import encode_transform
 from scenes.script.scene import find_scene
 from scenes.tracked.registration_file import read_registration
 
@@ -46,7 +46,7 @@ def test_status_changes_are_logged_once(follower):
             async with peers(port) as (one,):
                 await noted("comes; clients: 1")
                 for _ in range(20):
-                    one.send("TRANSFORM", NAMES.tool, transform(np.eye(4)))
+                    one.send("TRANSFORM", NAMES.tool, encode_transform(np.eye(4)))
                 await noted("rejected: TRANSFORM StylusTipToReference", "the identity")
                 while "20 the identity" not in await one.said("Sulcus"):
                     pass
@@ -85,7 +85,7 @@ def test_link_reports_slow_solver_and_drops_old_results(follower):
     async def track(tracker):
         for number in count():
             sent[BEGUN + number] = time.monotonic()
-            tracker.send("TRANSFORM", NAMES.tool, transform(beside), BEGUN + number)
+            tracker.send("TRANSFORM", NAMES.tool, encode_transform(beside), BEGUN + number)
             await asyncio.sleep(0.03)
 
     async def scene():

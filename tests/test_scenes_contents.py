@@ -46,7 +46,7 @@ def test_read_contents_rejects_damaged_episode_files(name, box, tmp_path):
     path = write_episode(tmp_path / "x.h5", box)
     spoil(path, how)
     if words is None:
-        assert len(str(read_contents(path).said["plan"])) == 60_000
+        assert len(str(read_contents(path).attributes["plan"])) == 60_000
         return
     with pytest.raises(InputError, match=words) as caught:
         read_contents(path)

@@ -8,7 +8,7 @@ from theatres import short, sinking, small
 
 from ar.page.parts import Dropdown, Fold, Slider
 from scenes.page.controls import build_controls, is_animated
-from scenes.page.effect_costs import build_effect_fold
+from scenes.page.effect_costs import build_effect_switches
 from scenes.page.requests import Requests
 from scenes.page.side_panels import TIP
 from scenes.script.scene import find_scene
@@ -31,7 +31,7 @@ class TestControls:
     def test_effect_switches_have_readable_labels(self, theatre):
         for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
             found = build_controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), *ACTIONS)
-            folds = *found, build_effect_fold(theatre, small(name), Requests("fem", Touch()), print)
+            folds = *found, build_effect_switches(theatre, small(name), Requests("fem", Touch()), print)
             switches = [inner for control in folds if isinstance(control, Fold) for inner in control.controls]
             assert switches and all(inner.words and inner.words != inner.label for inner in switches)
 
@@ -56,27 +56,27 @@ class TestControls:
         assert seen[:3] == ["window", "contour", "fill"] and overlay.start == overlay.options[0]
 
     def test_camera_and_slice_choices_are_offered(self, theatre):
-        wish = Requests("fem", Touch())
-        found = {control.label: control for control in build_controls(short(), theatre.site, ("fem",), wish, *ACTIONS)}
+        asks = Requests("fem", Touch())
+        found = {control.label: control for control in build_controls(short(), theatre.site, ("fem",), asks, *ACTIONS)}
         camera, slices = found["camera"], found["slices"]
         assert isinstance(camera, Dropdown) and isinstance(slices, Dropdown)
         seen = []
         for option in camera.options:
             camera.changed(option)
-            seen.append(wish.path)
+            seen.append(asks.path)
         assert seen == ["", "stays", "hand-held", "microscope", "orbit"]
         slices.changed(TIP)
         tilt, distance = cast(Fold, found["camera position"]).controls
         assert isinstance(tilt, Slider) and isinstance(distance, Slider) and distance.start == 300.0
         tilt.changed(20.0)
         distance.changed(200.0)
-        assert wish.look == ("window", "orbit", TIP, pytest.approx(-np.radians(20.0)), pytest.approx(0.2), None)
+        assert asks.look == ("window", "orbit", TIP, pytest.approx(-np.radians(20.0)), pytest.approx(0.2), None)
         registration = cast(Dropdown, found["registration"])
         assert registration.options == ("perfect registration", "clinical registration, 1.6 mm per axis")
         registration.changed(registration.options[1])
-        assert registration.start == registration.options[0] and wish.look.registration == "clinical"
+        assert registration.start == registration.options[0] and asks.look.registration == "clinical"
         assert "slices" not in {
-            each.label for each in build_controls(sinking(), theatre.site, ("fem",), wish, *ACTIONS)
+            each.label for each in build_controls(sinking(), theatre.site, ("fem",), asks, *ACTIONS)
         }
 
     def test_is_animated_is_true_for_time_dependent_scenes(self, theatre):

@@ -14,7 +14,7 @@ from scenes.page.comparison import PageState
 from scenes.page.controls import PLAN
 from scenes.page.demo import Demo
 from scenes.page.requests import HAND, SCRIPT
-from scenes.page.text import plan_words
+from scenes.page.text import format_solver_list
 from scenes.script.tool_paths import Touch
 from sim.fem import Fem
 from surrogate.model.learned import Learned
@@ -48,7 +48,7 @@ def test_demo_plays_and_shows_difference_from_fem(demo, theatre):
     text = report(demo)
     assert "difference from FEM: mean" in text
     assert "|fast model (linear)|: inside the range" in text and "tip to tumour" in text and "time [ms]: " in text
-    truth = demo.referee.truth
+    truth = demo.fem_worker.truth
     assert truth.number == demo.wish.number
     nodes = theatre.anatomy.tumour_nodes
     scene = demo.stage.scene
@@ -69,11 +69,11 @@ def test_demo_shows_the_solver_plan_of_fem(demo, monkeypatch):
     assert not folder.visible
     demo.wish.set(plays=False)
     assert wait_for(lambda: demo.run(0.3) and folder.visible)
-    assert demo.referee.plan and plan_words(demo.referee.plan) in text.content
-    assert "Newton-CG" in text.content and text.content.count("<li>") == len(demo.referee.plan)
+    assert demo.fem_worker.plan and format_solver_list(demo.fem_worker.plan) in text.content
+    assert "Newton-CG" in text.content and text.content.count("<li>") == len(demo.fem_worker.plan)
     demo.wish.set(deformer="fem")
     assert wait_for(lambda: demo.run(0.3) and "result of the FEM solver" in report(demo) and folder.visible)
-    monkeypatch.setattr(demo.referee, "plan", ())
+    monkeypatch.setattr(demo.fem_worker, "plan", ())
     assert wait_for(lambda: demo.run(0.3) and not folder.visible)
 
 
@@ -183,7 +183,7 @@ def test_scene_change_keeps_the_page_address(demo):
     assert wait_for(lambda: demo.run(0.5) and "force 0." in report(demo))
     assert demo.stage.scene is demo.first and page.inputs["scene"].value == "press"
     assert (
-        demo.wish.deformer == demo.theatre.select_default(demo.first) != "fem"
+        demo.wish.deformer == demo.patient.select_default(demo.first) != "fem"
     )  # its own, not that of the scene before
 
 
@@ -207,16 +207,16 @@ def test_style_change_does_not_solve_the_load_again(demo, monkeypatch):
 
     moment = PageState()
     demo.update_page(moment)
-    before = moment.picture
+    before = moment.image
     monkeypatch.setattr(Learned, "deform", counted)
     demo.wish.set(style="contour")
     demo.update_page(moment)
-    assert before is not None and (moment.picture != before).any() and asked == []
-    before = moment.picture
+    assert before is not None and (moment.image != before).any() and asked == []
+    before = moment.image
     for path, moves in (("orbit", True), ("stays", False)):
         demo.wish.set(path=path)
         demo.update_page(moment)
-        assert (moment.picture != before).any() == moves and asked == []
+        assert (moment.image != before).any() == moves and asked == []
 
 
 def test_images_are_coarse_in_motion_and_sharp_at_rest(demo):

@@ -8,7 +8,7 @@ import pytest
 
 from scenes.episodes.draws import ValueLimits
 from scenes.episodes.families import FamilyMotions
-from scenes.episodes.plan import PlanContents, plan_from
+from scenes.episodes.plan import PlanContents, parse_plan
 from sim.errors import InputError
 
 
@@ -53,6 +53,6 @@ def test_plan_value_beyond_limits_is_rejected_with_its_limits(key):
     step = max(1, round(1e-3 * key.about.high)) if isinstance(key.default, int) or key.name == "size" else 1e-3
     for value in (key.about.low - step, key.about.high + step):
         with pytest.raises(InputError) as refused:
-            plan_from(with_value(key, value), "mine")
+            parse_plan(with_value(key, value), "mine")
         assert f"{key.name}: {value}" in str(refused.value) and f"{key.about}" in str(refused.value)
-    plan_from(with_value(key, key.about.high), "mine")  # what is possible is taken
+    parse_plan(with_value(key, key.about.high), "mine")  # what is possible is taken

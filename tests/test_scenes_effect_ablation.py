@@ -12,7 +12,7 @@ import warp as wp
 from theatres import short, sinking, theatre_of
 
 from scenes.cli import main
-from scenes.play.effect_ablation import ALL, build_record, list_device_arrays, measure_effects, remove_effect, run
+from scenes.play.effect_ablation import ALL, build_record, list_arrays, measure_effects, remove_effect, solve_frames
 from scenes.play.effect_record import read_effect_records
 from scenes.script.scene import find_scene
 from sim.bodies.meshfile import write_anatomy
@@ -67,19 +67,19 @@ def test_measure_effects_returns_one_row_per_effect(small_theatre):
 
 
 def test_measured_bytes_are_equal_in_repeated_runs(small_theatre):
-    held = [run(replace(small_theatre, models={}), sinking(), 3).held for _ in range(3)]
+    held = [solve_frames(replace(small_theatre, models={}), sinking(), 3).memory_bytes for _ in range(3)]
     assert held[0] == held[1] == held[2] > 100_000
     assert held[0] == pytest.approx(counted(small_theatre, sinking(), 3), rel=0.02)
 
 
 def counted(theatre, scene, every):
     """Bytes that a scene keeps, counted again: numbers of each array, and the size of a number."""
-    before = list_device_arrays()  # held: the number of an array that goes may be that of a new one
+    before = list_arrays()  # held: the number of an array that goes may be that of a new one
     fem, last = replace(theatre, models={}).build_fem(scene, scene.accuracy, live=True), None
     for time in scene.times[::every].tolist():
         last = fem.deform(scene.build_loads(theatre.site, scene.path(time), time), start=last)
     known = {id(array) for array in before}
-    new = [array for array in list_device_arrays() if id(array) not in known]
+    new = [array for array in list_arrays() if id(array) not in known]
     return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in new)
 
 
@@ -102,17 +102,17 @@ def test_effect_change_is_difference_between_solutions(small_theatre):
     """Independent check: an effect that causes the whole motion."""
     scene = sinking()
     found = {row.effect: row for row in measure_effects(small_theatre, scene, 2)}
-    alone = run(replace(small_theatre, models={}), scene, 2)
+    alone = solve_frames(replace(small_theatre, models={}), scene, 2)
     whole = alone.displacement[:, small_theatre.anatomy.tumour_nodes]
     largest = 1e3 * np.linalg.norm(whole, axis=2).mean(axis=1).max()
     assert found["Gravity"].tumour_mm == found[ALL].tumour_mm == pytest.approx(largest, rel=1e-6)
-    assert found[ALL].held_mb == pytest.approx(1e-6 * alone.held, rel=0.01)
+    assert found[ALL].held_mb == pytest.approx(1e-6 * alone.memory_bytes, rel=0.01)
 
 
 def test_ablation_rejects_scene_with_unsolved_frame(theatre):
     scene = replace(short(), accuracy=replace(short().accuracy, outer=1, inner=1, steps=0))
     with pytest.raises(InputError, match=r"the frame at 0\.\d+ s is not solved: stopped"):
-        run(theatre, scene, 1)
+        solve_frames(theatre, scene, 1)
 
 
 def test_ablation_counts_frames_with_inverted_elements(small_theatre, monkeypatch):
@@ -124,10 +124,10 @@ def test_ablation_counts_frames_with_inverted_elements(small_theatre, monkeypatc
 
 
 def test_list_device_arrays_finds_new_array_without_views():
-    before = list_device_arrays()
+    before = list_arrays()
     array = wp.zeros(1_000_000, dtype=wp.float32, device="cpu")
     view = array[:500_000]
-    new = [found for found in list_device_arrays() if all(found is not known for known in before)]
+    new = [found for found in list_arrays() if all(found is not known for known in before)]
     assert new == [array] and array.capacity == 4_000_000 and len(view) == 500_000
 
 

@@ -8,7 +8,7 @@ import pytest
 from theatres import short, template_theatre
 
 from scenes.page.background_study import BackgroundStudy
-from scenes.page.effect_costs import EFFECT_COSTS, METRICS, build_effect_fold, format_switch, measure_costs
+from scenes.page.effect_costs import EFFECT_COSTS, METRICS, build_effect_switches, format_switch_label, measure_costs
 from scenes.page.requests import Requests
 from scenes.play.effect_ablation import ALL, AblationRow, build_record, list_switchable_effects
 from scenes.play.effect_record import FORMAT, SUFFIX, read_effect_records, write_effect_record
@@ -27,7 +27,7 @@ def template():
 
 
 def words_of(theatre, scene):
-    fold = build_effect_fold(theatre, scene, Requests("fem", Touch()), print)
+    fold = build_effect_switches(theatre, scene, Requests("fem", Touch()), print)
     return {control.label: control.words for control in fold.controls}
 
 
@@ -75,8 +75,8 @@ def test_cost_record_round_trips(theatre, tmp_path):
     assert found.effects == {ALL: (240.04, 4.3), "ToolForce": (180.0, 4.25), "Gravity": (None, None)}
     note = words_of(replace(theatre, effect_records=read), short())[EFFECT_COSTS]
     assert "2 frames have inverted" in note and "Not solvable without gravity and CSF: it &lt;moves&gt;." in note
-    assert format_switch("Gravity", found.effects) == "gravity and CSF: cannot be disabled"
-    assert format_switch("ToolForce", found.effects) == "push of the tool: +180 ms, 4.25 mm"
+    assert format_switch_label("Gravity", found.effects) == "gravity and CSF: cannot be disabled"
+    assert format_switch_label("ToolForce", found.effects) == "push of the tool: +180 ms, 4.25 mm"
 
 
 PAIRS = [1.0], [240, None], [[1, 2], [3, 4]], [True, False], [1e300, 1], [1, float("nan")], ["1", "2"]

@@ -11,12 +11,12 @@ from visitor import Visitor, free_port, wait_for
 
 from scenes.episodes.episode import UNITS, collect
 from scenes.page.demo import Demo
-from scenes.play.checks import measure
+from scenes.play.checks import measure_frames
 from scenes.play.deformers import PatientSetup
 from scenes.play.effect_ablation import remove_effect
-from scenes.play.frame_text import format_acting
+from scenes.play.frame_text import format_active_loads
 from scenes.play.reference import solve_reference_frames
-from scenes.play.scene_costs import add_cost_label
+from scenes.play.scene_costs import draw_cost_panel
 from scenes.play.stage import CORTEX, TOOL, Stage
 from scenes.script.craniotomy_frame import HOLE_RATIO
 from scenes.script.scene import Bounds, find_scene
@@ -59,18 +59,18 @@ class TestCauses:
     def test_acting_forces_are_described_in_text(self, theatre):
         both = replace(short(), effects=(*EFFECTS, Gravity(), ToolForce()))
         height = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.04]])  # from -32 to 0 mm against gravity
-        words = format_acting(
+        words = format_active_loads(
             both.build_loads(theatre.site, Touch(force=0.2), 0.0), STILL, theatre.site.anatomy.mesh.nodes
         )
         assert "force 0.20 N" in words and "gravity towards the back, CSF level" in words
-        idle = format_acting(
+        idle = format_active_loads(
             both.build_loads(theatre.site, Touch(force=0.0), 0.0), STILL, theatre.site.anatomy.mesh.nodes
         )
         assert "the tool does not push" in idle and "force" not in idle
-        assert format_acting(Loads((), np.zeros(1)), STILL, height) == ""
+        assert format_active_loads(Loads((), np.zeros(1)), STILL, height) == ""
         lying = build_posture(np.array([-3.0, 0.0, 4.0]), -0.012)
         way = "gravity towards the crown, 37 deg left, CSF level "
-        assert format_acting(lying, STILL, height) == way + "62 %"
+        assert format_active_loads(lying, STILL, height) == way + "62 %"
 
 
 STUDIES = "measure costs", "refine the error"
@@ -86,13 +86,13 @@ class TestWithoutATool:
         monkeypatch.setattr(
             "scenes.play.scene_costs.draw_text_panel", lambda colour, text, **given: lines.extend(text) or colour
         )
-        add_cost_label(frames[-1], "fem")
+        draw_cost_panel(frames[-1], "fem")
         assert any(re.search(r"towards the left, 30 deg back, CSF level \d+ %", line) for line in lines)
         assert not any("0.00 N" in line for line in lines)
 
     def test_scene_without_tool_passes_the_checks(self, theatre, frames):
         play = player(theatre, sinking(), "fem")
-        figures = measure(
+        figures = measure_frames(
             play,
             play.get_camera,
             frames,
@@ -156,13 +156,13 @@ class TestSwitches:
         visitor.wire.close()
 
     def test_tumour_does_not_move_with_all_effects_off(self, demo):
-        demo.wish.switch("Gravity", False)
-        demo.wish.switch("ToolForce", False)
+        demo.wish.switch_effect("Gravity", False)
+        demo.wish.switch_effect("ToolForce", False)
         assert wait_for(
             lambda: demo.run(0.3) and "without gravity and CSF, push of the tool the" in demo.browser.shown[2]
         )
         assert "Nothing moves the tumour" in demo.browser.shown[2]
-        demo.wish.switch("Gravity", True)
+        demo.wish.switch_effect("Gravity", True)
         assert demo.wish.off == {"ToolForce"}
 
 
@@ -194,7 +194,7 @@ class TestBrainShift:
         theatre, scene = template_theatre(), small("brain_shift")
         site, held = theatre.site, replace(scene, effects=(Elasticity(), Held()))
         moved = theatre.anatomy.mesh.nodes + 8e-3 * site.right
-        drawn, true = (Stage(each, site).build_visible(moved).vertices for each in (scene, held))
+        drawn, true = (Stage(each, site).build_visible_cortex(moved).vertices for each in (scene, held))
         beyond = site.compute_axis_distance(true) - HOLE_RATIO * site.clearance
         low = (drawn - true) @ site.axis
         assert (low[beyond < 0.0] == 0.0).all() and (low[beyond > 2e-3] > 5e-3).all() and (beyond > 2e-3).sum() > 20

@@ -14,10 +14,10 @@ import pytest
 from distributed import Client, Scheduler, Security, SpecCluster
 from tiny_work import Trouble, held, played, tiny_run, to_body_path, tried
 
-from scenes.episodes.engine import RunStatistics, find_still_missing
+from scenes.episodes.engine import RunStatistics, list_missing_episodes
 from scenes.episodes.run_folder import (
     Failure,
-    begin,
+    begin_run,
     list_failed,
     list_failures,
     list_finished,
@@ -25,7 +25,7 @@ from scenes.episodes.run_folder import (
     read_failure,
     read_run,
 )
-from scenes.episodes.workers import connect_workers, start_own_workers
+from scenes.episodes.workers import connect_workers, start_local_workers
 from sim.errors import InputError
 
 PLAN = 'title = "tiny"\n'
@@ -33,7 +33,7 @@ PLAN = 'title = "tiny"\n'
 
 @pytest.fixture(scope="module")
 def workers():
-    with start_own_workers(["cpu", "cpu"]) as found:
+    with start_local_workers(["cpu", "cpu"]) as found:
         yield found
 
 
@@ -90,7 +90,7 @@ def test_full_disk_ends_the_run_with_a_message(workers, tmp_path):
 
 def test_each_worker_uses_one_gpu_and_is_replaced_after_failure(undisturbed, tmp_path):
     """After a failed GPU its process is replaced, and the episode is tried again."""
-    with start_own_workers(["cuda:0", "cuda:1"]) as workers:
+    with start_local_workers(["cuda:0", "cuda:1"]) as workers:
         tally = played(tmp_path, workers, 12, Trouble({3: "broken once"}, seconds=0.05))
     assert tally.made == 12 and tally.failed == tally.lost == 0 and held(tmp_path) == undisturbed
     lines = [line.split() for line in tried(tmp_path)]
@@ -119,7 +119,7 @@ def test_scheduler_rejects_clients_without_its_keys(workers):
 def test_running_scheduler_accepts_more_workers_and_may_stop(undisturbed, tmp_path):
     address = "tcp://127.0.0.1:9"
     with pytest.raises(InputError, match=f"--scheduler {address}: no Dask scheduler at this address"):
-        connect_workers(address, "cpu", patience=0.5).__enter__()
+        connect_workers(address, "cpu", timeout=0.5).__enter__()
     counts, added = [], []
     with ExitStack() as closing:
         own = closing.enter_context(SpecCluster({}, {"cls": Scheduler, "options": {"host": "127.0.0.1", "port": 0}}))
@@ -150,13 +150,13 @@ def test_running_scheduler_accepts_more_workers_and_may_stop(undisturbed, tmp_pa
 
         folder = tmp_path / "ended"
         ended = pytest.raises(InputError, match="scheduler ended")
-        with connect_workers(address, "cpu", patience=0.5) as workers, ended:
+        with connect_workers(address, "cpu", timeout=0.5) as workers, ended:
             played(folder, workers, 30, Trouble(seconds=0.1), ending)
 
 
 def test_run_folder_rejects_a_run_with_other_settings(tmp_path):
     folder = tmp_path / "new"
-    assert begin(folder, tiny_run(), PLAN) and not begin(folder, tiny_run(), PLAN)
+    assert begin_run(folder, tiny_run(), PLAN) and not begin_run(folder, tiny_run(), PLAN)
     for changed, words in (
         ({"digest": "other"}, "of another text or other anatomies of the plan tiny"),
         ({"seed": 2}, "Give --seed 1"),
@@ -164,31 +164,31 @@ def test_run_folder_rejects_a_run_with_other_settings(tmp_path):
         ({"versions": {**tiny_run().versions, "numpy": "3.0"}}, r"numpy .* and not 3\.0.*--force"),
     ):
         with pytest.raises(InputError, match=words):
-            begin(folder, tiny_run(**changed), PLAN)
+            begin_run(folder, tiny_run(**changed), PLAN)
     assert read_run(folder) == tiny_run()
     newer = tiny_run(versions={**tiny_run().versions, "numpy": "3.0"})
-    assert not begin(folder, newer, PLAN, force=True) and read_run(folder) == newer
+    assert not begin_run(folder, newer, PLAN, force=True) and read_run(folder) == newer
     (tmp_path / "mine.txt").write_text("mine")
     shutil.rmtree(folder)
     with pytest.raises(InputError, match=r"holds mine\.txt, and no run was begun"):
-        begin(tmp_path, tiny_run(), PLAN)
+        begin_run(tmp_path, tiny_run(), PLAN)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-    assert begin(tmp_path, tiny_run(), PLAN, force=True)
+    assert begin_run(tmp_path, tiny_run(), PLAN, force=True)
     (tmp_path / "run.json").write_text("mine")
     with pytest.raises(InputError, match="is not what `sulcus episodes` writes"):
-        begin(tmp_path, tiny_run(), PLAN)
+        begin_run(tmp_path, tiny_run(), PLAN)
 
 
 def test_missing_episodes_are_found_by_file_name(tmp_path):
     for number in (1, 3, 1234567):
         (tmp_path / f"episode_{number:06d}.h5").touch()
     (tmp_path / ".sulcus-0-0-episode_000002.h5").touch()
-    assert find_still_missing(tmp_path, list_finished(tmp_path), range(5), True) == (
+    assert list_missing_episodes(tmp_path, list_finished(tmp_path), range(5), True) == (
         RunStatistics(skipped=2),
         [0, 2, 4],
     )
-    assert find_still_missing(tmp_path, list_finished(tmp_path), range(1234567, 1234568), True)[1] == []
-    there, shuffled = find_still_missing(tmp_path, list_finished(tmp_path), range(100, 200), False)
+    assert list_missing_episodes(tmp_path, list_finished(tmp_path), range(1234567, 1234568), True)[1] == []
+    there, shuffled = list_missing_episodes(tmp_path, list_finished(tmp_path), range(100, 200), False)
     assert sorted(shuffled) == list(range(100, 200)) != shuffled and there == RunStatistics()
     assert not to_body_path(tmp_path, 0).exists()
 
@@ -199,9 +199,6 @@ def test_failed_episodes_are_listed_by_file_name_only(tmp_path, monkeypatch):
     assert list_failed(tmp_path) == {3, 5} and read_failure(tmp_path, 5) == Failure(5, "no 5", lost=False)
     assert read_failure(tmp_path, 4) is None
     monkeypatch.setattr(Path, "read_text", lambda *given: pytest.fail("a file was read"))
-    assert list_failed(tmp_path) == {3, 5} and find_still_missing(tmp_path, set(), range(4), True, again=True)[1] == [
-        0,
-        1,
-        2,
-        3,
-    ]
+    assert list_failed(tmp_path) == {3, 5} and list_missing_episodes(tmp_path, set(), range(4), True, retry=True)[
+        1
+    ] == [0, 1, 2, 3]

@@ -16,7 +16,7 @@ from scenes.cli import main
 from scenes.episodes.episode import DEPTH_SCALE, collect
 from scenes.episodes.reading.contents import read_contents
 from scenes.episodes.reading.schema import ARRAYS, PICTURES
-from scenes.episodes.reading.validation import mask_findings, validate_episode
+from scenes.episodes.reading.validation import check_mask, validate_episode
 from scenes.play.player import STAGES
 from scenes.play.stage import CORTEX, DRAPE, TOOL
 from scenes.script.tool_paths import press
@@ -74,7 +74,7 @@ class TestEpisode:
         _, file, _, _ = episode
         path = Path(file.filename)
         assert validate_episode(path).problems == []
-        assert mask_findings(file, read_contents(path), box) == ([], [])
+        assert check_mask(file, read_contents(path), box) == ([], [])
         assert set(file["pictures"]) <= set(PICTURES) and set(file) - {"pictures"} <= set(ARRAYS)
 
     def test_frame_is_recomputed_from_attributes_of_the_file(self, episode, box):

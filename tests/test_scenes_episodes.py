@@ -14,7 +14,7 @@ from tiny_work import tiny_run
 from scenes.cli import main
 from scenes.episodes.engine import write_sbatch_script
 from scenes.episodes.plan import load_plan
-from scenes.episodes.run_folder import Failure, begin, mark_failed, unmark
+from scenes.episodes.run_folder import Failure, begin_run, mark_failed, remove_failure
 
 
 @pytest.mark.parametrize(
@@ -43,14 +43,14 @@ def test_episodes_command_rejects_non_integer_counts(words, tmp_path, capsys):
 
 def test_folder_of_another_seed_is_rejected(tmp_path, capsys):
     digest = load_plan("small").digest
-    begin(tmp_path, tiny_run(digest=digest), "")
+    begin_run(tmp_path, tiny_run(digest=digest), "")
     assert main(["episodes", "small", "--count", "1", "--seed", "7", "--out", str(tmp_path), "--workers", "1"]) == 2
     assert "Give --seed 1" in capsys.readouterr().err
 
 
 def test_finished_run_has_a_data_sheet(box, tmp_path, capsys):
     folder, begun = tmp_path / "data", tiny_run(digest=load_plan("small").digest)
-    begin(folder, begun, "")
+    begin_run(folder, begun, "")
     words = ["episodes", "small", "--count", "2", "--seed", "1", "--out", str(folder), "--workers", "1", "--json"]
     for number in range(2):
         mark_failed(folder, Failure(number, "no", lost=False))
@@ -58,13 +58,13 @@ def test_finished_run_has_a_data_sheet(box, tmp_path, capsys):
     assert main(words) == 1 and not json.loads(capsys.readouterr().out)["card"]
     assert not (folder / "DATASHEET.md").exists()
     write_episode(folder / "episode_000000.h5", box)
-    unmark(folder, 0)
+    remove_failure(folder, 0)
     held = (folder / "episode_000000.h5").read_bytes()
     assert main(words) == 1 and json.loads(capsys.readouterr().out)["card"]
     assert "| all | 1 |" in (sheet := (folder / "DATASHEET.md").read_text()) and "1 could not be made" in sheet
     (folder / "croissant.json").write_text("mine")
     write_episode(folder / "episode_000001.h5", box)
-    unmark(folder, 1)
+    remove_failure(folder, 1)
     assert main(words) == 0 and "is not of a card" in capsys.readouterr().err
     assert (folder / "croissant.json").read_text() == "mine" and (folder / "episode_000000.h5").read_bytes() == held
 

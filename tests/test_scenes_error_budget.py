@@ -95,7 +95,7 @@ def test_latency_error_equals_tumour_motion_during_the_delay(filmed):
 def test_coverage_is_low_for_patients_with_larger_deviations(filmed):
     """Deviations are six times those from which the band is computed."""
     alike, others = (
-        compute_budget(filmed, 100, twins=replace(filmed, bodies=k * filmed.bodies), progress=lambda names: ()).held
+        compute_budget(filmed, 100, 0, replace(filmed, bodies=k * filmed.bodies), lambda names: ()).coverage
         for k in (1.0, 6.0)
     )
     assert alike is not None and others is not None and alike[0] > 0.9 and others[0] < 0.8
@@ -113,8 +113,8 @@ def test_deviation_of_coverage_is_computed_over_bodies(filmed):
     """One of two bodies is always covered, the other never: deviation of a ratio of two clusters."""
     bodies = np.stack([filmed.field, filmed.field + 0.1 * filmed.site.right])
     share, deviation = compute_budget(
-        filmed, 60, twins=replace(filmed, bodies=bodies, meshes=np.zeros(2)), progress=lambda names: ()
-    ).held
+        filmed, 60, test_scene=replace(filmed, bodies=bodies, meshes=np.zeros(2)), progress=lambda names: ()
+    ).coverage
     assert 0.3 < share < 0.7 and deviation == pytest.approx(2.0 * share * (1.0 - share))
 
 
@@ -185,12 +185,12 @@ def test_error_band_covers_twins_but_not_other_bodies(filmed):
 
 
 def test_error_parts_add_in_quadrature_and_largest_is_named(filmed):
-    budget = compute_budget(filmed, 100, twins=filmed)
+    budget = compute_budget(filmed, 100, test_scene=filmed)
     technical, clinical = (np.median(each.middle) for each in (budget.technical, budget.clinical))
     assert technical < clinical and set(budget.alone) == set(CLINICAL)
     squares = sum(np.mean(budget.alone[name].middle ** 2) for name in TECHNICAL)
     assert np.sqrt(np.mean(budget.technical.middle**2)) == pytest.approx(np.sqrt(squares), rel=0.2)
-    assert budget.find_largest("middle") == REGISTRATION and budget.held is not None and budget.held[0] > 0.8
+    assert budget.find_largest("middle") == REGISTRATION and budget.coverage is not None and budget.coverage[0] > 0.8
 
 
 def test_reference_outside_the_camera_view_is_rejected(filmed):

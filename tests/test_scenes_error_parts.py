@@ -17,7 +17,7 @@ from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 from scenes.script.scene import find_scene
 from scenes.tracked.external_tracker import CameraMount, ExternalTracker
 from scenes.tracked.follower import TumourState
-from scenes.tracked.run import Shown, write_rows
+from scenes.tracked.run import Overlay, write_tracking_table
 from scenes.tracked.tool_motion import NO_ERROR_WARNING, BrainMotion, ToolMotion
 from scenes.tracked.truth import OverlayError
 from sim.loads import Touching
@@ -45,8 +45,8 @@ def test_link_bound_of_registration_is_2_80_sigma(shift):
     pose = solve_reference_frames(follower.motion.stage).T_scan_tool[10] @ np.linalg.inv(follower.tool.T_cube_tool)
     heard = ReceivedTransforms(names, 1.0).add_transform(names.tool, in_mm(given.T_patient_scan @ pose), 1, 0.0, 0)
     found = PoseResponder(follower.motion, follower.tool, 5e-4, given).compute_result(heard, 0.0, 0.0)
-    assert found.known.parts["registration"] == pytest.approx(2.7955e-3, rel=1e-4)
-    assert found.known.band == pytest.approx(np.hypot(2.7955e-3, found.known.motion.error), rel=1e-4)
+    assert found.tracking.sources["registration"] == pytest.approx(2.7955e-3, rel=1e-4)
+    assert found.tracking.bound == pytest.approx(np.hypot(2.7955e-3, found.tracking.motion.error), rel=1e-4)
 
 
 def test_hand_eye_error_equals_shift_of_the_camera():
@@ -57,10 +57,10 @@ def test_hand_eye_error_equals_shift_of_the_camera():
         build_pose_stream(times, shifted(0.5, 0.8)[None], np.zeros((1, 6, 6))),
     )
     right, other = (
-        ExternalTracker(far, far, eye=CameraMount(each, np.outer(step, step)))
+        ExternalTracker(far, far, mount=CameraMount(each, np.outer(step, step)))
         for each in (T, move_about(T, np.zeros(3), step))
     )
-    found, there = right.find_reference(0.0), other.find_reference(0.0).T_camera_target
+    found, there = right.find_reference_pose(0.0), other.find_reference_pose(0.0).T_camera_target
     turn = Rotation.from_matrix(there[:3, :3] @ found.T_camera_target[:3, :3].T).as_rotvec()
     moved = np.append(there[:3, 3] - found.T_camera_target[:3, 3], turn)
     np.testing.assert_allclose(found.covariance, np.outer(moved, moved), rtol=0.0, atol=2e-3 * (moved @ moved))
@@ -92,7 +92,7 @@ def test_tool_error_comes_from_a_deeper_tool_pose():
     sinking, pose = Sinking(stage), np.eye(4)
     pose[:3, 3] = stage.site.origin
     first = ToolMotion(stage, sinking).compute_motion(pose, np.diag([1e-6, 1e-8, 1e-8]))
-    assert first.moved == pytest.approx(0.0, abs=1e-9) and first.tool == pytest.approx(1.96e-3, rel=1e-3)
+    assert first.distance == pytest.approx(0.0, abs=1e-9) and first.tool_error == pytest.approx(1.96e-3, rel=1e-3)
     ToolMotion(stage, sinking).compute_motion(pose, 1e-6 * np.eye(3), first)
     assert sinking.starts[0] is None and sinking.starts[2] is first.solution
 
@@ -103,7 +103,7 @@ def test_missing_error_bound_is_replaced_by_bound_of_model(bound, expected, doub
     monkeypatch.setattr("scenes.tracked.tool_motion.find_first_model", lambda deformer, answer: model)
     stage = template_theatre().build_stage(find_scene("palpate"))
     found = ToolMotion(stage, Sinking(stage)).compute_motion(np.eye(4), np.zeros((3, 3)))
-    assert (found.model, found.doubt) == (expected, doubt)
+    assert (found.model_error, found.warning) == (expected, doubt)
 
 
 def test_rows_of_an_overlay_are_in_millimetres(tmp_path):
@@ -112,13 +112,13 @@ def test_rows_of_an_overlay_are_in_millimetres(tmp_path):
     known = SimpleNamespace(
         camera=0,
         motion=BrainMotion(np.zeros(0), True, 4e-3, 3e-3, 4e-3),
-        band=6e-3,
-        parts=parts,
+        bound=6e-3,
+        sources=parts,
         time=1.0,
         state=TumourState.GOOD,
-        words="",
+        warning="",
     )
-    shown = Shown(known, np.zeros(0), 0.013, 1e-3 * np.arange(1, 4), 0.014)
-    write_rows(tmp_path / "rows.csv", [shown], [OverlayError(15.0, 16.0, 17e-3, 18e-3, True)])
+    shown = Overlay(known, np.zeros(0), 0.013, 1e-3 * np.arange(1, 4), 0.014)
+    write_tracking_table(tmp_path / "rows.csv", [shown], [OverlayError(15.0, 16.0, 17e-3, 18e-3, True)])
     cells = (tmp_path / "rows.csv").read_text().splitlines()[1].split(",")
     assert [float(cell) for cell in cells[2:16] + cells[17:21]] == pytest.approx([*range(1, 19)])

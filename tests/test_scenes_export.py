@@ -23,8 +23,6 @@ def test_markups_and_report_list_the_written_files(warp_out):
     assert [point["label"] for point in markup["controlPoints"]][:2] == ["tumour, in the scan", "tumour, now"]
     report = json.loads((warp_out / "warp.json").read_text())
     assert set(report["files"]) | {"warp.json"} == {path.name for path in warp_out.iterdir()}
-    assert report["sha256"] == {
-        one: hashlib.sha256((warp_out / one).read_bytes()).hexdigest() for one in report["files"]
-    }
+    assert report["sha256"] == {n: hashlib.sha256((warp_out / n).read_bytes()).hexdigest() for n in report["files"]}
     text = (warp_out / "README.txt").read_text()
     assert "Not a medical device" in text and "RAS" in text and "nothing folds" in text

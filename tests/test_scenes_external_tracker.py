@@ -25,16 +25,16 @@ from scenes.tracked.calibration_file import (
     read_calibration,
     read_hand_eye,
     read_intrinsic_covariance,
-    write_exactly_known,
+    write_exact_intrinsics,
 )
 from scenes.tracked.external_tracker import CameraMount, ExternalTracker
 from scenes.tracked.follower import Follower, TumourState
-from scenes.tracked.overlay_painter import format_head_lines
-from scenes.tracked.overlay_text import overlay_error
-from scenes.tracked.plausible import describe_penetration
-from scenes.tracked.pose_file import TrackedRow, read_stream, write_poses
+from scenes.tracked.overlay_painter import format_top_lines
+from scenes.tracked.overlay_text import format_overlay_error
+from scenes.tracked.plausible import describe_tool_penetration
+from scenes.tracked.pose_file import TrackedPose, read_pose_stream, write_poses
 from scenes.tracked.registration_file import read_registration
-from scenes.tracked.run import read_timed
+from scenes.tracked.run import read_timed_images
 from scenes.tracked.tool_motion import ToolMotion
 from scenes.tracked.tracked_tool import read_tool
 from scenes.tracked.truth import read_truth
@@ -132,11 +132,9 @@ def test_clock_offset_from_motion_has_a_valid_error():
     still = np.tile(others[:1], (len(samples), 1)) + 1e-5 * rng.normal(size=others.shape)
     with pytest.raises(ValueError, match="Move the tool"):
         estimate_clock_by_motion(times, places[:1] + 1e-5 * rng.normal(size=places.shape), samples, still)
-    turning = np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in samples])
+    turned = np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in samples])
     with pytest.raises(ValueError, match="more than one offset"):
-        estimate_clock_by_motion(
-            times, np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in times]), samples, turning
-        )
+        estimate_clock_by_motion(times, np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in times]), samples, turned)
     with pytest.raises(ValueError, match="images show what the poses have"):
         estimate_clock_by_motion(times[:3], places[:3], samples, others)
     with pytest.raises(ValueError, match="end before the images"):
@@ -174,7 +172,7 @@ def tips(follower, elsewhere, truth):
     """How far off the tool's tip is in the scan [m], and deviations, where it is known."""
     out = []
     for row, time in enumerate(truth.times):
-        beside = elsewhere.find_tool(time)
+        beside = elsewhere.find_tool_pose(time)
         if beside is not None:
             there = follower.registration.T_patient_scan @ [*truth.T_scan_tool[row][:3, 3], 1.0]
             place, spread = beside.point(follower.tool.T_cube_tool[:3, 3])
@@ -193,24 +191,25 @@ def test_tool_pose_in_video_matches_external_tracker(follower, stage, bodies):
     assert len(off) == len(truth.times) and off.max() < 6e-4 and (off < 3.0 * spread).all()
     assert late_off.max() > 5e-4 and late_off.max() > 2.0 * off.max()
     eye = CameraMount(np.linalg.inv(truth.T_camera_scan[0] @ np.linalg.inv(bodies["head"](0.0))), 1e-2 * NOISE)
-    looked = replace(right, eye=eye).find_reference(0.0)
+    looked = replace(right, mount=eye).find_reference_pose(0.0)
     true = truth.T_camera_scan[0] @ np.linalg.inv(follower.registration.T_patient_scan)
     step = twist(looked.T_camera_target, true)
     assert np.linalg.norm(step[:3]) < 1e-3 and step @ np.linalg.solve(looked.covariance, step) < chi2.ppf(0.999, 6)
-    riding = replace(eye, body=sampled(lambda time: np.eye(4), times, offset=DAY - 1.0 + late))
-    np.testing.assert_allclose(replace(right, eye=riding).find_reference(0.0).T_camera_target, looked.T_camera_target)
+    riding = replace(eye, poses=sampled(lambda time: np.eye(4), times, offset=DAY - 1.0 + late))
+    found = replace(right, mount=riding).find_reference_pose(0.0)
+    np.testing.assert_allclose(found.T_camera_target, looked.T_camera_target)
 
 
 def test_image_without_external_poses_is_stale(follower, bodies):
     times = np.arange(0.0, 0.45, 0.025)
     other = ExternalTracker(*(sampled(bodies[name], times) for name in ("tool", "patient")))
-    one, known, said = replace(follower, elsewhere=other), None, []
+    one, known, said = replace(follower, external=other), None, []
     one = replace(one, motion=replace(one.motion, deformer=Still()))
-    for each in read_timed(read_video(FILM / "film.mp4", 30.0)):
-        if each.picture.time > 0.9:
+    for each in read_timed_images(read_video(FILM / "film.mp4", 30.0)):
+        if each.source.time > 0.9:
             break
-        known = one.step(each.picture.grey, each.picture.time, known)
-        said.append((known.state, known.words))
+        known = one.step(each.source.grey, each.source.time, known)
+        said.append((known.state, known.warning))
     assert [state for state, _ in said[:4]] == [TumourState.REST] * 4
     assert said[5] == (TumourState.NO_TOOL, "tool stale, no pose for 0.2 s: the tumour as 0.3 s ago")
     assert said[4][0] is TumourState.NO_REFERENCE  # the film is over-exposed there
@@ -218,12 +217,12 @@ def test_image_without_external_poses_is_stale(follower, bodies):
 
 def followed(follower, other, until=1.0):
     """What is known of the film's first pictures, by another tracker, and with a brain that does not move."""
-    one, known, out = replace(follower, elsewhere=other), None, []
+    one, known, out = replace(follower, external=other), None, []
     one = replace(one, motion=replace(one.motion, deformer=Still()))
-    for each in read_timed(read_video(FILM / "film.mp4", 30.0)):
-        if each.picture.time > until:
+    for each in read_timed_images(read_video(FILM / "film.mp4", 30.0)):
+        if each.source.time > until:
             break
-        known = one.step(each.picture.grey, each.picture.time, known)
+        known = one.step(each.source.grey, each.source.time, known)
         out.append(known)
     return [known for known in out if known.state is not TumourState.NO_REFERENCE]
 
@@ -234,30 +233,30 @@ def test_external_poses_are_compared_with_visible_targets(follower, bodies, stag
     right = ExternalTracker(tool, patient)
     known = followed(follower, right)
     assert {each.state for each in known} <= {TumourState.GOOD, TumourState.REST} and len(known) > 5
-    np.testing.assert_allclose(known[-1].agreement.places["tool"], 0.0, atol=1.5e-3)
-    for each in followed(follower, right.swapped):
-        assert each.state is TumourState.UNSURE and each.band is None
-        assert "mm from its poses: are the two files of --poses swapped?" in each.words
+    np.testing.assert_allclose(known[-1].agreement.positions["tool"], 0.0, atol=1.5e-3)
+    for each in followed(follower, right.swapped_tracker):
+        assert each.state is TumourState.UNSURE and each.bound is None
+        assert "mm from its poses: are the two files of --poses swapped?" in each.warning
     aside = move_about(np.eye(4), np.zeros(3), np.array([0.05, 0.0, -0.03, 0.4, 0.0, 0.0]))  # bodies beside their cubes
-    mounted = replace(right, tool=sampled(lambda time: bodies["tool"](time) @ aside, times))
-    assert all(each.relied for each in followed(follower, mounted))
+    mounted = replace(right, tool_poses=sampled(lambda time: bodies["tool"](time) @ aside, times))
+    assert all(each.is_reliable for each in followed(follower, mounted))
     far = replace(
         right,
-        tool=sampled(
+        tool_poses=sampled(
             lambda time: (
                 bodies["tool"](time) @ move_about(np.eye(4), np.zeros(3), np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0]))
             ),
             times,
         ),
     )
-    assert "is seen 400 mm from its poses" in followed(follower, far, 0.2)[-1].words
-    quick = replace(right, tool=sampled(lambda time: bodies["tool"](0.8 + 8.0 * (time - 0.8)), times))
-    assert "moves by" in followed(follower, quick)[-1].words
+    assert "is seen 400 mm from its poses" in followed(follower, far, 0.2)[-1].warning
+    quick = replace(right, tool_poses=sampled(lambda time: bodies["tool"](0.8 + 8.0 * (time - 0.8)), times))
+    assert "moves by" in followed(follower, quick)[-1].warning
     eye = CameraMount(np.linalg.inv(truth_of_camera(stage) @ np.linalg.inv(bodies["head"](0.0))), NOISE)
-    looked = replace(right, eye=eye)
-    agreed = looked.compare_targets(0.0, known[0].tracked.poses, Agreement())
-    assert not agreed.doubt and set(agreed.places) == {"patient", "tool"}
-    assert "swapped" in looked.swapped.compare_targets(0.0, known[0].tracked.poses, Agreement()).doubt
+    looked = replace(right, mount=eye)
+    agreed = looked.compare_targets(0.0, known[0].targets.poses, Agreement())
+    assert not agreed.inconsistency and set(agreed.positions) == {"patient", "tool"}
+    assert "swapped" in looked.swapped_tracker.compare_targets(0.0, known[0].targets.poses, Agreement()).inconsistency
 
 
 def truth_of_camera(stage):
@@ -271,11 +270,11 @@ def test_clock_difference_of_external_poses_is_reported(follower, bodies):
     )
     last = followed(follower, ExternalTracker(tool, patient), 0.2)[-1]
     assert last.state is TumourState.NO_TOOL
-    assert last.words.startswith("tool not known, the patient's poses begin 99.4 s after this image (see --clock)")
+    assert last.warning.startswith("tool not known, the patient's poses begin 99.4 s after this image (see --clock)")
     late = followed(follower, ExternalTracker(tool, replace(patient, times=times - 100.0)), 0.2)[-1]
-    assert "the patient's poses end 96." in late.words
+    assert "the patient's poses end 96." in late.warning
     assert (
-        followed(follower, ExternalTracker(tool, patient, Clock(100.0)), 0.2)[-1].words.count(
+        followed(follower, ExternalTracker(tool, patient, Clock(100.0)), 0.2)[-1].warning.count(
             "the tool's poses end 96."
         )
         == 1
@@ -288,27 +287,27 @@ def test_tool_pose_deep_in_the_brain_is_reported(stage, follower):
     pose[:3, 3] = nodes.mean(axis=0)
     pose[:3, 2] *= -1.0
     pose[:3, 0] *= -1.0
-    assert "tip would be" in describe_penetration(follower.tool, pose, stage)
+    assert "tip would be" in describe_tool_penetration(follower.tool, pose, stage)
     away = pose @ follower.tool.T_cube_tool  # markers in the middle of the brain
-    assert "markers would be" in describe_penetration(follower.tool, away, stage)
+    assert "markers would be" in describe_tool_penetration(follower.tool, away, stage)
     pose[:3, 3] = stage.site.origin + 0.02 * stage.site.axis  # a tip 20 mm into the opening
     pose[:3, :3] = np.column_stack([stage.site.right, stage.site.up, -stage.site.axis])
-    assert not describe_penetration(follower.tool, pose, stage)
+    assert not describe_tool_penetration(follower.tool, pose, stage)
 
 
 class Still:
     """A deformer of a brain that does not move."""
 
     def deform(self, loads, start=None, at=None):
-        from scenes.tracked.rendered_video import Dent
+        from scenes.tracked.rendered_video import DentDeformer
 
-        found = Dent(template_theatre().anatomy, template_theatre().site).deform(loads)
+        found = DentDeformer(template_theatre().anatomy, template_theatre().site).deform(loads)
         return replace(found, displacement=0.0 * found.displacement)
 
 
 def written(path, stream):
     rows = [
-        TrackedRow(time % DAY, Verdict.GOOD, Pose(T, covariance, 0.0, 0), 0.0)
+        TrackedPose(time % DAY, Verdict.GOOD, Pose(T, covariance, 0.0, 0), 0.0)
         for time, T, covariance in zip(stream.times.tolist(), stream.poses, stream.covariances, strict=True)
     ]
     write_poses(path, rows, np.zeros(3))
@@ -319,7 +318,7 @@ def test_overlay_command_estimates_clock_of_pose_files(bodies, tmp_path, capsys)
     times, rng = np.arange(-0.5, 3.5, 0.025), np.random.default_rng(2)
     streams = ((name, sampled(bodies[name], times, rng, DAY - 1.0)) for name in ("tool", "patient"))
     files = [written(tmp_path / f"{name}.csv", stream) for name, stream in streams]
-    again = read_stream(files[0])
+    again = read_pose_stream(files[0])
     assert again.daily and again.times[-1] > DAY and again.covariances[0, 0, 0] == pytest.approx(1e-8)
     given = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]
     words = ["overlay", str(FILM / "film.mp4"), *given, "--tool", str(FILM / "tool.json"), "--poses", *files]
@@ -356,9 +355,9 @@ def test_calibration_error_in_band_unless_cancelled_by_reference(follower, stage
     )
     stored = {"format": "sulcus intrinsics 1", "covariance": np.diag(deviations**2).tolist()}
     (tmp_path / "k.json").write_text(json.dumps(stored))
-    known = replace(follower, intrinsic=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
+    known = replace(follower, intrinsic_covariance=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
     rng, off = np.random.default_rng(0), []
-    reference = known.tracked.poses["patient"].T_camera_target
+    reference = known.targets.poses["patient"].T_camera_target
     corners = build_patient_reference().faces[0].corners
     for step in deviations * rng.normal(size=(100, 9)):
         # What another camera would have seen, and what this one makes of it.
@@ -375,17 +374,17 @@ def test_calibration_error_in_band_unless_cancelled_by_reference(follower, stage
         seen, turned = fitted @ tumour, other.build_camera(reference)
         apart = camera.project(seen[None, :3])[0] - turned.project(tumour[None, :3])[0]
         off.append(apart[0] * seen[2] / focal)
-    assert known.parts["camera"] == pytest.approx(
+    assert known.sources["camera"] == pytest.approx(
         2.448 * np.linalg.svd(np.cov(np.transpose(off)))[1][0] ** 0.5, rel=0.25
     )
     bare = follower.step(first.grey, 0.0)
-    assert known.band > known.parts["camera"] > 1e-4 and "camera" not in bare.parts
-    assert format_head_lines(bare)[-1].startswith("error by tissue, camera and segmentation: not known")
-    assert format_head_lines(known)[-1].startswith("error by tissue and segmentation: not known")
-    write_exactly_known(tmp_path / "k.json", follower.calibration)
-    exact = replace(follower, intrinsic=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
-    assert exact.parts["camera"] == 0.0 and exact.band == pytest.approx(bare.band)
-    assert "The camera is reported to be exactly known." in overlay_error(exact)
+    assert known.bound > known.sources["camera"] > 1e-4 and "camera" not in bare.sources
+    assert format_top_lines(bare)[-1].startswith("error by tissue, camera and segmentation: not known")
+    assert format_top_lines(known)[-1].startswith("error by tissue and segmentation: not known")
+    write_exact_intrinsics(tmp_path / "k.json", follower.calibration)
+    exact = replace(follower, intrinsic_covariance=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
+    assert exact.sources["camera"] == 0.0 and exact.bound == pytest.approx(bare.bound)
+    assert "The camera is reported to be exactly known." in format_overlay_error(exact)
     (tmp_path / "k.json").write_text(json.dumps(stored | {"covariance": [[1.0]]}))
     with pytest.raises(InputError, match="none of 9 x 9"):
         read_intrinsic_covariance(tmp_path / "k.yaml")

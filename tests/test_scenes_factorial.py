@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scenes.analysis import factorial
-from scenes.analysis.factorial import LEVELS, FactorCombination, build_panels, compute_variance_shares, solve_cells
+from scenes.analysis.factorial import LEVELS, FactorCombination, build_panels, compute_variance_shares, solve_levels
 from scenes.cli import main
 
 FEW = {
@@ -19,7 +19,7 @@ FEW = {
 
 @pytest.fixture(scope="module")
 def few():
-    return list(solve_cells(FEW, 2000, "cpu"))
+    return list(solve_levels(FEW, 2000, "cpu"))
 
 
 def made(rule):
@@ -63,7 +63,7 @@ def test_factorial_study_solves_each_combination(few):
 
 
 def test_factorial_command_writes_table_and_plot(few, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(factorial, "solve_cells", lambda nodes, device: iter(few))
+    monkeypatch.setattr(factorial, "solve_levels", lambda nodes, device: iter(few))
     words = ["sensitivity", "--factorial", "--out", str(tmp_path / "all.csv")]
     assert main(words) == 0
     said = capsys.readouterr().out

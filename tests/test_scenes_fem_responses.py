@@ -7,7 +7,7 @@ import numpy as np
 from gym_examples import made, many, played
 
 import scenes.gym  # noqa: F401
-from scenes.gym.fem_responses import CutElements
+from scenes.gym.fem_responses import ResectionFem
 from scenes.gym.scripted import compute_scripted_actions
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK
@@ -22,15 +22,15 @@ def test_cut_body_is_reliable_if_both_fluid_levels_converge(box, tmp_path):
     setting, solved = open_setting(DEBULK, str(tmp_path / "box.vtu"), "auto", "cpu", (48, 36)), []
 
     def deform(loads, start):
-        answer = setting.answers.fem.deform(loads, start)
+        answer = setting.tissue_model.fem.deform(loads, start)
         solved.append(answer if not solved else replace(answer, outcome=(Outcome.BUDGET,)))
         return solved[-1]
 
-    fem = SimpleNamespace(deform=deform, get_remaining_body=setting.answers.fem.get_remaining_body)
+    fem = SimpleNamespace(deform=deform, get_remaining_body=setting.tissue_model.fem.get_remaining_body)
     pose = DEBULK.tool.pose(setting.site.origin, setting.site.axis, setting.site.right)
     for fluid, good in ((1.0, True), (0.95, False)):
-        answers = CutElements(setting.site, fem, setting.answers.ball)
-        assert answers.compute_responses([TissueRequest(pose, fluid=fluid, done=1)])[0].good == good
+        answers = ResectionFem(setting.site, fem, setting.tissue_model.ball)
+        assert answers.compute_responses([TissueRequest(pose, fluid=fluid, completed_steps=1)])[0].reliable == good
         solved.clear()
 
 

@@ -10,17 +10,17 @@ from theatres import template_theatre
 from ar.tracking.pose import Tracker
 from ar.tracking.synthetic_images import read_stamp
 from ar.tracking.targets import Detector, build_patient_reference, build_tool_cube
-from scenes.play.deformers import AtRest
+from scenes.play.deformers import RestDeformer
 from scenes.play.player import Player
 from scenes.script.scene import find_scene
 from scenes.tracked.filming import (
     USUAL_CALIBRATION,
     VIEW,
-    Taking,
-    Trouble,
+    Artefacts,
+    Disturbance,
     mount_targets,
     register_with_error,
-    render_shots,
+    render_frames,
 )
 from sim.errors import InputError
 
@@ -35,15 +35,15 @@ def player():
     """The scene palpate on a brain that stays at rest."""
     theatre = template_theatre()
     scene = replace(find_scene("palpate"), viewpoint=VIEW.calibrate(SMALL), duration=0.7)
-    return Player(theatre.build_stage(scene), AtRest(theatre.anatomy))
+    return Player(theatre.build_stage(scene), RestDeformer(theatre.anatomy))
 
 
 @pytest.fixture(scope="module")
 def shots(player):
     """Seven pictures, with a trouble of each kind but the first and the last."""
     kinds = ("reference", "tool", "bright", "smear", "gap")
-    troubles = tuple(Trouble(kind, 0.1 * n + 0.05, 0.1 * n + 0.15) for n, kind in enumerate(kinds))
-    return list(render_shots(player, mount_targets(player), Taking(troubles=troubles), every=3))
+    troubles = tuple(Disturbance(kind, 0.1 * n + 0.05, 0.1 * n + 0.15) for n, kind in enumerate(kinds))
+    return list(render_frames(player, mount_targets(player), Artefacts(disturbances=troubles), step=3))
 
 
 def grey(shot):
@@ -73,9 +73,9 @@ def test_disturbances_hide_only_the_named_targets(shots):
 
 def test_invalid_disturbance_is_rejected():
     with pytest.raises(InputError, match="no trouble is called 'fog'"):
-        Trouble("fog", 0.0, 1.0)
+        Disturbance("fog", 0.0, 1.0)
     with pytest.raises(InputError, match="two times in order"):
-        Trouble("gap", 1.0, 0.5)
+        Disturbance("gap", 1.0, 0.5)
 
 
 def test_registration_error_has_the_reported_covariance(player):

@@ -21,7 +21,7 @@ def stage():
 
 
 def test_craniotomy_of_the_template_has_60000_triangles(stage):
-    fine = stage.fine
+    fine = stage.fine_cortex
     is_open = np.isin(fine.vertices, np.unique(stage.anatomy.open_surface)).astype(float)
     whole = fine.surface.interpolate(is_open[:, None])[:, 0] > 1.0 - 1e-9
     assert 60_000 <= whole[fine.surface.triangles].all(axis=1).sum() < 90_000
@@ -30,27 +30,26 @@ def test_craniotomy_of_the_template_has_60000_triangles(stage):
 def test_scenes_of_a_patient_share_cortex_and_drape(stage):
     other = replace(stage, scene=find_scene("draw"))
     rest = stage.anatomy.mesh.nodes
-    drapes = [one.build_layers(rest, None)[1] for one in (stage, other, stage.plain)]
-    assert other.fine is stage.fine and drapes[0] is drapes[1] is not drapes[2]
+    drapes = [one.build_layers(rest, None)[1] for one in (stage, other, stage.without_fine_cortex)]
+    assert other.fine_cortex is stage.fine_cortex and drapes[0] is drapes[1] is not drapes[2]
 
 
 def test_visual_displacement_is_the_fem_surface_displacement(stage):
-    rest, fine = stage.anatomy.mesh.nodes, stage.fine
+    rest, fine = stage.anatomy.mesh.nodes, stage.fine_cortex
     shift = np.array([1e-3, -2e-3, 3e-3])
-    assert np.allclose(stage.build_visible(rest + shift).vertices - shift, stage.build_visible(rest).vertices)
+    build = stage.build_visible_cortex
+    assert np.allclose(build(rest + shift).vertices - shift, build(rest).vertices)
     turn = Rotation.from_rotvec([0.2, 0.1, -0.3])
-    assert np.allclose(
-        stage.build_visible(turn.apply(rest.copy())).vertices, turn.apply(stage.build_visible(rest).vertices)
-    )
+    assert np.allclose(build(turn.apply(rest.copy())).vertices, turn.apply(build(rest).vertices))
     # Anything else: depth below the interpolated FEM surface is what the relief and the rounding say.
     dent = rest + 5e-3 * np.exp(-((stage.site.compute_axis_distance(rest) / 8e-3) ** 2))[:, None] * stage.site.axis
     base = fine.surface.interpolate(dent[fine.vertices])
-    away = np.linalg.norm(stage.build_visible(dent).vertices - base, axis=1)
+    away = np.linalg.norm(stage.build_visible_cortex(dent).vertices - base, axis=1)
     assert (away <= fine.surface.depth + 1.5e-3).all() and np.median(np.abs(away - fine.surface.depth)) < 0.1e-3
 
 
 def test_sulci_are_a_few_millimetres_deep_and_darker(stage):
-    fine = stage.fine
+    fine = stage.fine_cortex
     depth = fine.surface.depth - CROWN_DEPTH
     inside = stage.site.compute_axis_distance(fine.surface.interpolate(stage.anatomy.mesh.nodes[fine.vertices]))
     inside = inside < stage.site.clearance
@@ -61,9 +60,9 @@ def test_sulci_are_a_few_millimetres_deep_and_darker(stage):
 
 
 def test_fine_vertices_stay_below_the_drape_and_inside_the_brain(stage):
-    fine = stage.fine
+    fine = stage.fine_cortex
     base = fine.surface.interpolate(stage.anatomy.mesh.nodes[fine.vertices])
-    found = stage.build_visible(stage.anatomy.mesh.nodes).vertices
+    found = stage.build_visible_cortex(stage.anatomy.mesh.nodes).vertices
     inside = stage.site.compute_axis_distance(base) < stage.site.clearance
     assert ((found - base) @ stage.site.axis)[inside].min() > -1e-9
 
@@ -85,12 +84,12 @@ def test_walls_of_a_cavity_have_no_gyri():
     loads = scene.build_loads(theatre.site, scene.path(5.0), 5.0)
     after = stage.select_stage(loads)
     assert after is not stage and len(after.anatomy.mesh.tets) < len(stage.anatomy.mesh.tets)
-    fine, nodes = after.fine, after.anatomy.mesh.nodes
+    fine, nodes = after.fine_cortex, after.anatomy.mesh.nodes
     cut = ~np.isin(fine.vertices, stage.anatomy.mesh.surface)
     share = fine.surface.interpolate(cut[:, None].astype(float))[:, 0]
     assert (share == 1.0).sum() > 50 and fine.surface.depth[share == 1.0] == pytest.approx(CROWN_DEPTH)
     assert np.ptp(fine.colour[share == 1.0], axis=0).max() < 1e-6
-    assert np.isfinite(after.build_visible(nodes).vertices).all()
+    assert np.isfinite(after.build_visible_cortex(nodes).vertices).all()
 
 
 def test_data_set_scenes_use_the_plain_appearance(stage):
@@ -98,7 +97,7 @@ def test_data_set_scenes_use_the_plain_appearance(stage):
     assert not PLAIN_APPEARANCE.natural and not Appearance(vessels=3).natural
     assert {name for name in SCENES if not find_scene(name).look.natural} == {"microscope"}
     plain = Stage(replace(small(), look=PLAIN_APPEARANCE), theatre.site, theatre.intensity)
-    layer = plain.build_visible(theatre.anatomy.mesh.nodes)
+    layer = plain.build_visible_cortex(theatre.anatomy.mesh.nodes)
     assert layer.solid is not None
     assert np.array_equal(layer.vertices, theatre.anatomy.mesh.nodes[plain.visible_vertices])
 
@@ -106,6 +105,6 @@ def test_data_set_scenes_use_the_plain_appearance(stage):
 def test_smooth_outline_stays_close_to_the_fem_tumour(stage):
     rough = stage.tumour_at_rest
     smooth = stage.smooth_tumour(rough)
-    surface = stage.round_tumour
+    surface = stage.rounded_tumour
     away = np.linalg.norm(smooth.vertices - surface.interpolate(rough.vertices), axis=1)
     assert np.median(away) < 0.15e-3 and away.max() < 0.4e-3 and len(smooth.triangles) > 4 * len(rough.triangles)

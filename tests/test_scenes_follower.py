@@ -16,59 +16,59 @@ from ar.tracking.registration import Registration
 from scenes.script.scene import find_scene
 from scenes.tracked.follower import PATIENT, FollowerSettings, TumourState, compute_tip_covariance
 from scenes.tracked.overlay_painter import Painter
-from scenes.tracked.run import to_aged
+from scenes.tracked.run import mark_stale
 from scenes.tracked.tracked_tool import TrackedTool
 from sim.tools import Ball
 
 
 def test_uncertain_registration_is_in_band_up_to_limit(follower):
-    first = next(iter(pictures())).picture
+    first = next(iter(pictures())).source
     for shift, state in ((1e-3, TumourState.REST), (3e-3, TumourState.UNSURE)):
         covariance = np.diag(np.repeat([shift**2, 0.0], 3))
         other = replace(follower, registration=replace(follower.registration, covariance=covariance))
         known = other.step(first.grey, 0.0)
-        assert known.state is state and known.parts["registration"] == pytest.approx(2.448 * shift, rel=1e-3)
-        assert known.band == pytest.approx(2.448 * shift, rel=0.02)
-        assert ("do not rely" in known.words) is (state is TumourState.UNSURE)
+        assert known.state is state and known.sources["registration"] == pytest.approx(2.448 * shift, rel=1e-3)
+        assert known.bound == pytest.approx(2.448 * shift, rel=0.02)
+        assert ("do not rely" in known.warning) is (state is TumourState.UNSURE)
 
 
 def test_registration_without_anatomy_is_not_reliable(follower):
-    first = next(iter(pictures())).picture
+    first = next(iter(pictures())).source
     other = replace(follower, registration=replace(follower.registration, scanned=None))
     known = other.step(first.grey, 0.0)
-    assert known.state is TumourState.UNSURE and "not checked whose registration" in known.words
-    assert known.band == follower.step(first.grey, 0.0).band
+    assert known.state is TumourState.UNSURE and "not checked whose registration" in known.warning
+    assert known.bound == follower.step(first.grey, 0.0).bound
 
 
 def test_repeated_image_or_stopped_camera_is_stale(follower):
-    few = [each.picture for each in islice(pictures(), 2)]
+    few = [each.source for each in islice(pictures(), 2)]
     known = follower.step(few[0].grey, 0.0)
-    assert follower.step(few[0].grey, 0.0, known).words.startswith("stale, the camera repeats an image")
+    assert follower.step(few[0].grey, 0.0, known).warning.startswith("stale, the camera repeats an image")
     assert follower.step(few[1].grey, 0.5, replace(known, interval=0.1)).state is TumourState.STALE
     assert follower.step(few[1].grey, 0.1, known).state is TumourState.REST
-    old = to_aged(known, 0.5)
-    assert old.state is TumourState.STALE and "0.5 s old" in old.words and to_aged(known, 0.1) is known
+    old = mark_stale(known, 0.5)
+    assert old.state is TumourState.STALE and "0.5 s old" in old.warning and mark_stale(known, 0.1) is known
 
 
 def test_reference_never_detected_gives_no_overlay(follower, stage):
     blank = np.full((720, 960, 3), 120, np.uint8)
     known = follower.step(blank[..., 0], 0.0)
-    assert known.state is TumourState.NO_REFERENCE and known.camera is None and "not seen yet" in known.words
+    assert known.state is TumourState.NO_REFERENCE and known.camera is None and "not seen yet" in known.warning
     painted = Painter(stage).paint(blank, known).colour
     foot = painted[600:]
     assert np.array_equal(painted[:600], blank[:600]) and not np.array_equal(foot, blank[600:])
-    seen = follower.step(next(iter(pictures())).picture.grey, 0.0)
+    seen = follower.step(next(iter(pictures())).source.grey, 0.0)
     hold = FollowerSettings().hold_time
     frozen, gone = (follower.step(blank[..., 0], time, seen) for time in (hold, hold + 0.01))
-    assert frozen.camera is seen.camera and frozen.words == "reference lost: drawn where it was"
-    assert frozen.band is None and not frozen.relied and gone.camera is None  # a band is promised of no frozen overlay
+    assert frozen.camera is seen.camera and frozen.warning == "reference lost: drawn where it was"
+    assert frozen.bound is None and not frozen.is_reliable and gone.camera is None  # no band of a frozen overlay
     with pytest.raises(ValueError, match="calibrate it at this size"):
         follower.step(blank[::2, ::2, 0], 0.0)
 
 
 def test_slow_video_is_stale_at_missing_images_only(follower):
     blank, known, states = np.full((720, 960), 120, np.uint8), None, []
-    first = next(iter(pictures())).picture.grey
+    first = next(iter(pictures())).source.grey
     for moment in (0.0, 0.3, 0.6, 0.9, 1.8, 2.1):
         known = follower.step(first, moment, known)
         states.append(known.state)
@@ -112,7 +112,8 @@ def looking(motion, **given):
 def test_pace_is_measured_across_the_view_and_decays():
     """Motion of 10 mm along the view, 10 mm across it, then none: each in 40 ms."""
     _, known = looking([shifted(0.0), shifted(0.0, 0.01), shifted(0.01, 0.01), shifted(0.01, 0.01)])
-    assert [each.pace for each in known] == [None, *(pytest.approx(pace) for pace in (0.0, 0.25, 0.25 * 0.1**0.04))]
+    speeds = [pytest.approx(speed) for speed in (0.0, 0.25, 0.25 * 0.1**0.04)]
+    assert [each.image_speed for each in known] == [None, *speeds]
 
 
 def test_band_has_no_registration_error_along_the_view():
@@ -123,4 +124,4 @@ def test_band_has_no_registration_error_along_the_view():
     for error, expected in ((sight, 0.0), (np.cross(sight, PARTS), 2.4477e-3)):
         own = six(1e-6 * np.outer(error, error) / (error @ error))
         _, (known,) = looking([np.eye(4)], registration=replace(scan, covariance=own))
-        assert known.parts["registration"] == pytest.approx(expected, rel=1e-4, abs=1e-7)
+        assert known.sources["registration"] == pytest.approx(expected, rel=1e-4, abs=1e-7)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenes.script.framing import BAND_MARGIN, MIN_VISIBLE, build_rims, compute_visible_share, find_framing
+from scenes.script.framing import BAND_MARGIN, MIN_VISIBLE, build_hole_edges, compute_visible_share, find_framing
 from scenes.script.viewpoint import OBLIQUE_VIEWPOINT, USUAL_VIEWPOINT, Viewpoint
 
 from .theatres import REAL, template_theatre
@@ -30,20 +30,21 @@ def test_outline_lies_in_craniotomy_and_band_in_image(size):
     view = Viewpoint(width=size[0], height=size[1])
     camera = view.build_camera(site)
     surface = site.anatomy.mesh.nodes[np.unique(site.anatomy.tumour_surface)]
-    assert compute_visible_share(camera, surface, build_rims(site)) >= MIN_VISIBLE - 0.03
-    assert count_inside(camera, np.vstack([grow(site.anatomy), *build_rims(site)])) == 1.0
+    assert compute_visible_share(camera, surface, build_hole_edges(site)) >= MIN_VISIBLE - 0.03
+    assert count_inside(camera, np.vstack([grow(site.anatomy), *build_hole_edges(site)])) == 1.0
     assert np.linalg.norm(camera.centre - view.find_target(site)) == pytest.approx(0.3)
-    assert compute_visible_share(OBLIQUE_VIEWPOINT.build_camera(site), surface, build_rims(site)) < 0.6  # another view
+    another = OBLIQUE_VIEWPOINT.build_camera(site)
+    assert compute_visible_share(another, surface, build_hole_edges(site)) < 0.6
 
 
 def test_view_has_the_largest_tilt_that_shows_the_cortex():
     site = template_theatre().site
     found = USUAL_VIEWPOINT.find_framing(site)
-    tilt = np.arccos(-found.outward @ site.axis)
-    assert 0.2 < tilt < 0.6 and found.visible >= MIN_VISIBLE
-    assert find_framing(site, 0.3, 4.0 / 3.0, (tilt + 0.2, 0.0)).visible < MIN_VISIBLE
+    tilt = np.arccos(-found.direction @ site.axis)
+    assert 0.2 < tilt < 0.6 and found.visible_share >= MIN_VISIBLE
+    assert find_framing(site, 0.3, 4.0 / 3.0, (tilt + 0.2, 0.0)).visible_share < MIN_VISIBLE
     down = find_framing(site, 0.3, 4.0 / 3.0, (0.0, 0.0))
-    assert down.outward == pytest.approx(-site.axis) and down.visible >= MIN_VISIBLE
+    assert down.direction == pytest.approx(-site.axis) and down.visible_share >= MIN_VISIBLE
 
 
 def test_calibrated_camera_shows_the_tumour_with_its_error_band():

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from scenes.cli import COMMANDS, main, make_parsers
-from scenes.options.help import FORMER, SECTIONS, CommandParser, replace_former
+from scenes.options.help import FORMER, SECTIONS, CommandParser, replace_former_options
 
 
 def test_help_has_sections_defaults_and_metavars():
@@ -40,12 +40,13 @@ def test_replacements_of_former_options_exist():
 
 
 def test_former_option_is_replaced_with_a_notice(capsys):
-    assert replace_former(["simulate", "a.vtu", "--preset=seed", "--poses"]) == [
+    assert replace_former_options(["simulate", "a.vtu", "--preset=seed", "--poses"]) == [
         "simulate", "a.vtu", "--tool-preset=seed", "--pose-control",
     ]  # fmt: skip
     said = capsys.readouterr().err.splitlines()
     assert said == ["sulcus simulate: --preset is now --tool-preset", "sulcus simulate: --poses is now --pose-control"]
-    assert replace_former(["anatomy", "--preset", "deep"]) == ["anatomy", "--preset", "deep"] and not replace_former([])
+    kept = ["anatomy", "--preset", "deep"]
+    assert replace_former_options(kept) == kept and not replace_former_options([])
 
 
 def test_command_accepts_a_former_option(capsys):

@@ -12,10 +12,10 @@ from conftest import make_box
 from tiny_work import tiny_run
 
 from scenes.episodes import bodies
-from scenes.episodes.incomplete_bodies import DATA, TABLE, check_resumed, is_begun
+from scenes.episodes.incomplete_bodies import DATA, TABLE, has_solved_loads, resume_data_set
 from scenes.episodes.make import make_body, to_body_path
-from scenes.episodes.plan import load_plan, plan_from
-from scenes.episodes.run_folder import begin
+from scenes.episodes.plan import load_plan, parse_plan
+from scenes.episodes.run_folder import begin_run
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 from sim.runtime.partial_files import to_partial_path, to_unfinished_path
@@ -103,10 +103,10 @@ def killed(folder, plan, after):
 def test_killed_body_resumes_with_identical_files(plan, undisturbed, solved, tmp_path):
     """Killed during the unit responses, and on another machine after all loads were solved."""
     elsewhere, tmp_path = tmp_path / "elsewhere", tmp_path / "here"
-    assert begin(tmp_path, tiny_run(), "")
+    assert begin_run(tmp_path, tiny_run(), "")
     killed(tmp_path, plan, 64)
     (left,) = to_body_path(tmp_path, 0).parent.iterdir()
-    assert not begin(tmp_path, tiny_run(), "") and is_begun(left)  # the next run, which removes what others left
+    assert not begin_run(tmp_path, tiny_run(), "") and has_solved_loads(left)  # the next run removes what others left
     killed(elsewhere, plan, 10**9)
     made = make_body(tmp_path, plan, 1, 0, "cpu")
     assert made.resumed and not made.failed and files_of(tmp_path) == undisturbed
@@ -119,7 +119,7 @@ def test_killed_body_resumes_with_identical_files(plan, undisturbed, solved, tmp
     for folder, there in ((tmp_path, {"0000"}), (elsewhere, {"0000", ".sulcus-00000000-1-0000"})):
         assert {path.name for path in to_body_path(folder, 0).parent.iterdir()} == there
     left.mkdir()
-    begin(tmp_path, tiny_run(), "")
+    begin_run(tmp_path, tiny_run(), "")
     assert not left.exists()  # of a body that is there nobody goes on with it
 
 
@@ -131,7 +131,7 @@ def full(*given, **more):
 def test_tabulated_series_is_reused_after_an_error(plan, tmp_path, monkeypatch):
     """The error occurs after the table is written; the model has the same bytes as without an error."""
     text = plan.text.replace('"linear"', '"series"').replace("loads = 70", "loads = 40")
-    again = replace(plan_from(text, "own", plan.folder), own=plan.own)
+    again = replace(parse_plan(text, "own", plan.folder), own=plan.own)
 
     with monkeypatch.context() as held:
         held.setattr(bodies, "save", full)
@@ -150,7 +150,7 @@ def test_temporary_error_keeps_solved_loads(plan, undisturbed, solved, tmp_path,
         with pytest.raises(InputError, match="just now"):
             make_body(tmp_path, plan, 1, 0, "cpu")
     partial = to_partial_path(to_body_path(tmp_path, 0))
-    assert is_begun(partial)
+    assert has_solved_loads(partial)
     (partial / "anatomy.vtu").write_text("half")
     (partial / "other").write_text("half")
     assert make_body(tmp_path, plan, 1, 0, "cpu").resumed and solved[1][0] == 0
@@ -162,14 +162,14 @@ def test_resume_uses_the_most_complete_data_set(tmp_path):
     for folder, size in zip(folders, (0, 10, 30, 50), strict=True):
         folder.mkdir()
         if size:
-            assert not check_resumed(folder / DATA, {"seed": "2"} if size == 50 else stated, [])
+            assert not resume_data_set(folder / DATA, {"seed": "2"} if size == 50 else stated, [])
             to_unfinished_path(folder / DATA).write_bytes(bytes(size))
     own = folders[0] / DATA
-    assert check_resumed(own, stated, folders) and to_unfinished_path(own).stat().st_size == 30
+    assert resume_data_set(own, stated, folders) and to_unfinished_path(own).stat().st_size == 30
     (folders[1] / DATA).write_bytes(b"whole")
     for folder in (folders[1], folders[3]):
         (folder / DATA).with_suffix(TABLE).write_text(folder.name)
-    assert check_resumed(own, stated, folders) and own.read_bytes() == b"whole"
+    assert resume_data_set(own, stated, folders) and own.read_bytes() == b"whole"
     assert own.with_suffix(TABLE).read_text() == "1"
-    assert not check_resumed(own, {"seed": "3"}, folders) and not is_begun(folders[0])
+    assert not resume_data_set(own, {"seed": "3"}, folders) and not has_solved_loads(folders[0])
     assert {path.name for path in folders[0].iterdir()} == {Path(DATA).with_suffix(".json").name}

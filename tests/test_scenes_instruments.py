@@ -60,7 +60,7 @@ def test_tools_without_instrument_use_their_own_mesh(stage):
 
 def test_plain_look_has_the_simple_tool_and_drape(stage):
     rest, tool = stage.anatomy.mesh.nodes, stage.scene.tool
-    simple, natural = (each.build_layers(rest, np.eye(4)) for each in (stage.plain, stage))
+    simple, natural = (each.build_layers(rest, np.eye(4)) for each in (stage.without_fine_cortex, stage))
     assert np.array_equal(simple[-1].vertices, tool.mesh.vertices) and len(simple) == 3
     assert {layer.id for layer in natural[2:]} == {TOOL} and len(natural[-1].vertices) > len(simple[-1].vertices)
     assert len(natural[1].triangles) > 5 * len(simple[1].triangles)
@@ -68,7 +68,7 @@ def test_plain_look_has_the_simple_tool_and_drape(stage):
 
 def test_folds_of_the_drape_leave_its_hole_open(stage):
     rest, camera = stage.anatomy.mesh.nodes, stage.camera
-    folded, plain = (each.render(camera, rest, None).segmentation for each in (stage, stage.plain))
+    folded, plain = (each.render(camera, rest, None).segmentation for each in (stage, stage.without_fine_cortex))
     changed = (folded == DRAPE) & (plain != DRAPE) & (plain != 0)
     assert changed.sum() < 0.01 * (plain == DRAPE).sum()
     assert np.ptp(stage.build_layers(rest, None)[1].colour[:, 1]) > 0.05

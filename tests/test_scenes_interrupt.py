@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.commands.interrupt import interrupt_on_termination, run_until_ended
+from scenes.commands.interrupt import interrupt_on_termination, run_until_signal
 
 COMMAND = """
 import argparse, sys, threading, time
@@ -91,9 +91,9 @@ def test_error_is_raised_and_signal_handlers_are_restored():
         raise TimeoutError("too late")
 
     with pytest.raises(TimeoutError, match="too late"):
-        run_until_ended(work)
+        run_until_signal(work)
     assert closed == [True]
-    assert run_until_ended(lambda closing: 7) == 7
+    assert run_until_signal(lambda closing: 7) == 7
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 

@@ -31,5 +31,5 @@ def test_hollow_tumour_landmark_is_labelled_as_nearest_tissue(box):
     nearest, cortex = list_landmarks(hollow, moved)
     assert nearest.name == NEAREST and cortex.name == "open cortex"
     np.testing.assert_allclose(
-        nearest.now, nearest.rest + locate(hollow.mesh, nearest.rest[None]).interpolate(moved[None])[0, 0]
+        nearest.deformed, nearest.rest + locate(hollow.mesh, nearest.rest[None]).interpolate(moved[None])[0, 0]
     )

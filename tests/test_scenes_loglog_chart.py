@@ -49,7 +49,7 @@ def test_chart_rejects_non_positive_values_and_no_panels(points):
 
 def test_dots_have_data_positions_and_given_opacity():
     points = ((1e1, 1e0), (1e2, 1e1), (1e3, 1e2))
-    dots = tuple(Dot("", "", x, y, pale=x == 1e2) for x, y in points)
+    dots = tuple(Dot("", "", x, y, is_pale=x == 1e2) for x, y in points)
     picture = draw_panels([ChartPanel("title", "x", "y", dots=dots)])
     full, pale = ink(picture, FULL), ink(picture, PALE_OPACITY * FULL + (1.0 - PALE_OPACITY) * 255.0)
     centre = (full.min(axis=0) + full.max(axis=0)) / 2.0
@@ -72,7 +72,7 @@ def test_pale_dot_in_a_dense_cluster_has_no_label():
     """In a cluster of 60 dots; the dot in full colour keeps its label."""
 
     def picture(pale, full, crowd=60):
-        pales = [Dot(pale, "g", 10.0 + 0.01 * k, 1.0 + 0.01 * k, pale=True) for k in range(crowd)]
+        pales = [Dot(pale, "g", 10.0 + 0.01 * k, 1.0 + 0.01 * k, is_pale=True) for k in range(crowd)]
         return draw_panels([ChartPanel("t", "x", "y", dots=(*pales, Dot(full, "g", 10.3, 1.3)))])
 
     def changed(one, other):

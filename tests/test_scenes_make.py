@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_scenes_run_folder import PLAN, fails
 
-from scenes.episodes.make import add_noise, make_body, sense_columns, to_body_path
+from scenes.episodes.make import add_noise, add_sensor_noise, make_body, to_body_path
 from scenes.episodes.plan import load_plan
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
@@ -56,7 +56,7 @@ def test_sensed_poses_have_the_given_rotation_and_shift_error():
     true[:3, :3], true[:3, 3] = Rotation.from_rotvec([1.0, -0.5, 0.3]).as_matrix(), (0.4, -0.2, 0.3)
     columns = {name: np.tile(true, (4000, 1, 1)) for name in ("T_world_tool", "T_camera_world")}
     noise = {"tool_mm": 0.5, "tool_deg": 0.3, "camera_mm": 2.0, "camera_deg": 1.5}
-    found = sense_columns(columns | {"force": np.zeros((4000, 3))}, noise | {"force_n": 0.02}, 0, 0)
+    found = add_sensor_noise(columns | {"force": np.zeros((4000, 3))}, noise | {"force_n": 0.02}, 0, 0)
     for name, whose in (("T_world_tool_tracked", "tool"), ("T_camera_world_tracked", "camera")):
         off = np.linalg.inv(true) @ found[name]  # along and about its own axes
         turns = np.degrees(Rotation.from_matrix(off[:, :3, :3]).as_rotvec())

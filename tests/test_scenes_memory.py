@@ -9,7 +9,7 @@ import warp as wp
 from conftest import make_box
 from witness import slippery
 
-from scenes.play.effect_ablation import list_device_arrays, remove_effect
+from scenes.play.effect_ablation import list_arrays, remove_effect
 from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.scene import SCENES, Scene, find_scene
 from sim.compile import compile_problem
@@ -59,7 +59,7 @@ def kept(scene: Scene) -> dict[str, int]:
     loads = scene.build_loads(SITE, scene.path(time), time).drop(Resected)
     u, out = device.allocate(3 * space.count, 1), device.allocate(3 * space.count, 1)
     flags = device.upload(np.zeros(1), wp.int32)
-    before = {id(array) for array in list_device_arrays()}
+    before = {id(array) for array in list_arrays()}
     problem = compile_problem(effects, BODY, device, space, skin)
     problem.begin(Cases(loads, np.zeros(1)))
     problem.energy(u)
@@ -68,7 +68,7 @@ def kept(scene: Scene) -> dict[str, int]:
         term.linearise(u, flags)
     problem.add_curvature(u, out)
     problem.end(u)
-    new = {id(array): array for array in list_device_arrays() if id(array) not in before}
+    new = {id(array): array for array in list_arrays() if id(array) not in before}
     owned = {term.name: reached(term, set(new)) for term in problem.terms}
     owned["constraint"] = reached(problem.constraint, set(new))
     assert sum(map(len, owned.values())) == len(new)  # each is kept by one, and nothing else keeps any

@@ -18,18 +18,18 @@ from scenes.link.frame import (
     to_time,
 )
 from scenes.link.messages import (
-    Code,
-    SentMesh,
+    EncodedMesh,
+    Status,
     encode_image,
     encode_points,
     encode_polydata,
     encode_status,
     encode_string,
+    encode_transform,
     read_image,
     read_points,
     read_position,
     read_transform,
-    transform,
 )  # fmt: skip
 from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 
@@ -67,7 +67,7 @@ def ours(message, version=1, **metadata):
 
 
 def test_pyigtl_reads_sent_messages():
-    assert theirs("TRANSFORM", "TumourToRas", transform(matrix())).matrix == pytest.approx(matrix(), abs=1e-5)
+    assert theirs("TRANSFORM", "TumourToRas", encode_transform(matrix())).matrix == pytest.approx(matrix(), abs=1e-5)
     assert theirs("STRING", "TipToTumour", encode_string("12.3 +- 0.4 mm")).string == "12.3 +- 0.4 mm"
     places = RANDOM.normal(size=(3, 3))
     read = theirs("POINT", "PointsNow", encode_points(["a", "b", "c"], places))
@@ -97,11 +97,11 @@ def test_pyigtl_messages_are_read(version):
 
 def test_polydata_and_status_messages_have_protocol_layout():
     corners = RANDOM.normal(size=(4, 3)).astype(np.float32)
-    body = encode_polydata(corners, SentMesh.from_triangles(np.array([[0, 1, 2], [0, 2, 3]])))
+    body = encode_polydata(corners, EncodedMesh.from_triangles(np.array([[0, 1, 2], [0, 2, 3]])))
     assert struct.unpack(">10I", body[:40]) == (4, 0, 0, 0, 0, 2, 32, 0, 0, 0)
     assert np.array_equal(np.frombuffer(body, ">f4", 12, 40).reshape(4, 3), corners)
     assert struct.unpack(">8I", body[88:]) == (3, 0, 1, 2, 3, 0, 2, 3)
-    body = encode_status(Code.NOT_READY, "no pose yet")
+    body = encode_status(Status.NOT_READY, "no pose yet")
     assert struct.unpack(">Hq20s", body[:30])[0] == 13 and body[30:] == b"no pose yet\0"
 
 
@@ -114,7 +114,7 @@ def test_position_message_has_translation_and_quaternion():
 
 
 def test_time_stamp_round_trips_exactly():
-    raw = pack_message("TRANSFORM", "A", transform(np.eye(4)), STAMP + 1)
+    raw = pack_message("TRANSFORM", "A", encode_transform(np.eye(4)), STAMP + 1)
     assert read_header(raw[:58]).stamp == STAMP + 1
 
 
@@ -168,11 +168,11 @@ def test_malformed_message_is_rejected(read, why):
 def test_pose_is_known_while_its_transforms_are_recent():
     names = TransformNames()
     heard = ReceivedTransforms(names, 0.3)
-    assert heard.find_relative(names.tool, 0.0) == "no StylusTipToReference yet"
+    assert heard.find_relative_transform(names.tool, 0.0) == "no StylusTipToReference yet"
     heard = heard.add_transform(names.tool, matrix(), STAMP, 1.0, 0)
-    found = heard.find_relative(names.tool, 1.2)
+    found = heard.find_relative_transform(names.tool, 1.2)
     assert found.stamp == STAMP and found.T[:3, 3] == pytest.approx([0.01, -0.02, 0.03])
-    assert heard.find_relative(names.tool, 1.4) == "no new StylusTipToReference for 0.4 s"
+    assert heard.find_relative_transform(names.tool, 1.4) == "no new StylusTipToReference for 0.4 s"
     for T, stamp, sender, why in (
         (np.eye(4), STAMP + 9, 0, "identity"),
         (np.diag([0.0, 0.0, 0.0, 1.0]), STAMP + 9, 0, "zeros, which trackers send"),
@@ -183,7 +183,7 @@ def test_pose_is_known_while_its_transforms_are_recent():
         with pytest.raises(BadMessageError, match=why):
             heard.add_transform(names.tool, T, stamp, 1.1, sender)
     assert (
-        heard.add_transform(names.tool, matrix(), STAMP, 2.0, 1).sent[names.tool].sender == 1
+        heard.add_transform(names.tool, matrix(), STAMP, 2.0, 1).newest[names.tool].sender == 1
     )  # the first one is silent
     clock_set = heard.add_transform(names.tool, matrix(), to_stamp(to_time(STAMP) - 60.0), 1.1, 0)
-    assert clock_set.sent[names.tool].arrived == 1.1
+    assert clock_set.newest[names.tool].arrived == 1.1

@@ -15,9 +15,9 @@ def test_observed_states_are_truth_plus_given_noise():
     episode, off = environment.unwrapped.episode, []
     for step in range(60):
         states, _, _, _, truth = environment.step(DOWN if step < 12 else 0.0 * DOWN)
-        place = episode.frame.T @ (episode.actual.place - episode.setting.site.origin)
+        place = episode.frame.T @ (episode.actual.position - episode.setting.site.origin)
         force = episode.frame.T @ truth["force"]
-        off.append((*(1e-2 * states[:3] - place), *(PALPATE.force * states[9:12] - force)))
+        off.append((*(1e-2 * states[:3] - place), *(PALPATE.max_force * states[9:12] - force)))
     assert np.linalg.norm(force) > 0.05
     deviation = np.std(off, axis=0)
     assert deviation[:3] == pytest.approx(np.full(3, POSITION_NOISE), rel=0.35)

@@ -11,13 +11,13 @@ from theatres import SIGHTED, short, small
 from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, bound_words, format_millimetres, wrap_line
 from ar.overlay.outlines import compute_ink, find_ink, has_text
 from scenes.cli import main
-from scenes.page.text import describe_estimate, format_page_legend, report
-from scenes.play.checks import is_within_surface, list_objections, measure
+from scenes.page.text import describe_estimate, format_page_legend, format_report
+from scenes.play.checks import is_within_surface, list_warnings, measure_frames
 from scenes.play.deformers import PatientSetup, open_theatre
 from scenes.play.observer import ELLIPSOID_COLOUR
 from scenes.play.player import REJECTED_WARNING
 from scenes.play.reference import solve_reference_frames
-from scenes.play.scene_costs import add_cost_label
+from scenes.play.scene_costs import draw_cost_panel
 from scenes.play.stage import TRUTH_COLOUR, TUMOUR_COLOUR
 from scenes.script.observation_models import PointObservation
 from scenes.script.scene import Bounds
@@ -80,8 +80,8 @@ def test_observer_omits_only_points_hidden_by_the_tool(still, play):
 def test_image_shows_estimate_truth_and_ellipsoid(play, frames):
     frame = frames[1]
     found = frame.estimate
-    assert found.location is not None and found.held and found.off < 0.7 * np.linalg.norm(found.true)
-    assert frame.moved == found.moved == pytest.approx(np.linalg.norm(found.location.centroid))
+    assert found.location is not None and found.is_covered and found.error < 0.7 * np.linalg.norm(found.true_motion)
+    assert frame.moved == found.motion_length == pytest.approx(np.linalg.norm(found.location.centroid))
     for ink, least in ((TUMOUR_COLOUR, 200), (ELLIPSOID_COLOUR, 10), (TRUTH_COLOUR, 10)):
         assert np.count_nonzero(find_ink(frame.shown, compute_ink(ink))) >= least
     nodes = play.site.anatomy.tumour_nodes
@@ -91,11 +91,11 @@ def test_image_shows_estimate_truth_and_ellipsoid(play, frames):
     assert np.array_equal(believed[others], positions[others])  # the camera sees the true cortex
     moved = compute_middle(play.site.anatomy, (believed - play.site.anatomy.mesh.nodes)[None])[0]
     assert moved == pytest.approx(found.motion, abs=1e-6)
-    assert "locate" in frame.seconds and frame.remark.endswith(f"estimate error {1e3 * found.off:.1f} mm")
+    assert "locate" in frame.seconds and frame.remark.endswith(f"estimate error {1e3 * found.error:.1f} mm")
 
 
 def test_checks_pass_and_report_estimate_coverage(play, frames, truth):
-    figures = measure(play, play.get_camera, frames, truth)
+    figures = measure_frames(play, play.get_camera, frames, truth)
     assert figures.find_violations(Bounds(overlap=0.5, error=3e-3, visible=0.1)) == []
     # One frame moves, and by nothing that the locator's dents are: 14 % of it are removed.
     assert figures.covered == 1.0 and 0.1 < figures.removed < 1.0 and figures.error_mm > 0.01
@@ -105,18 +105,18 @@ def test_checks_detect_wrong_estimates(play, frames, truth):
     frame, others = frames[1], [frames[0], *frames[2:]]
 
     def sentences(wrong):
-        figures = measure(play, play.get_camera, [others[0], wrong, *others[1:]], truth)
+        figures = measure_frames(play, play.get_camera, [others[0], wrong, *others[1:]], truth)
         return " ".join(figures.find_violations(Bounds(overlap=0.0, error=1.0, visible=0.1, covered=1.0)))
 
     plain = replace(play, stage=replace(play.stage, observer=None))
     undrawn = plain.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, 0.1)
     assert "the drawn outline" in sentences(replace(undrawn, estimate=frame.estimate))
-    astray = replace(frame.estimate, middle=frame.estimate.middle + 0.01)
+    astray = replace(frame.estimate, centroid=frame.estimate.centroid + 0.01)
     for wrong in (astray, replace(frame.estimate, location=None)):  # one that is refused has no ellipsoid
         assert "ellipsoid holds the tumour's middle in" in sentences(replace(frame, estimate=wrong))
     silent = replace(frame, remark="estimate error 9.9 mm")
     assert "does not show its frame number or" in sentences(silent)
-    other = replace(frame, estimate=replace(frame.estimate, true=np.full(3, 1.0)))
+    other = replace(frame, estimate=replace(frame.estimate, true_motion=np.full(3, 1.0)))
     assert sentences(other) == ""  # the truth is that of the finite elements
     assert sentences(frame) == ""
 
@@ -124,19 +124,19 @@ def test_checks_detect_wrong_estimates(play, frames, truth):
 def test_ellipsoid_encloses_95_percent_of_its_covariance(frames):
     found = frames[1].estimate
     closed, root = found.build_ellipsoid(), np.linalg.cholesky(found.location.centroid_covariance)
-    at, way = found.middle + found.motion, np.array([0.6, 0.0, 0.8])
+    at, way = found.centroid + found.motion, np.array([0.6, 0.0, 0.8])
     assert is_within_surface(closed, at + 2.7 * root @ way) and not is_within_surface(closed, at + 2.85 * root @ way)
-    assert replace(found, true=found.motion + 2.79 * root @ way).held  # chi-square of three, 95 %: 2.795
-    assert not replace(found, true=found.motion + 2.8 * root @ way).held
+    assert replace(found, true_motion=found.motion + 2.79 * root @ way).is_covered  # chi-square of three, 95 %: 2.795
+    assert not replace(found, true_motion=found.motion + 2.8 * root @ way).is_covered
 
 
 def test_estimate_without_motion_is_labelled(play, frames):
     found = frames[0].estimate
-    assert not found.noticed and frames[0].remark.startswith("no significant motion detected; ")
+    assert not found.is_significant and frames[0].remark.startswith("no significant motion detected; ")
     assert "No significant motion detected." in " ".join(describe_estimate(found))
     tried, guess = (replace(found, location=replace(found.location, calibrated=known)) for known in (True, False))
-    assert "guess" not in tried.words + " ".join(describe_estimate(tried))
-    assert "; rough estimate; " in guess.words and "It is a guess" in " ".join(describe_estimate(guess))
+    assert "guess" not in tried.remark + " ".join(describe_estimate(tried))
+    assert "; rough estimate; " in guess.remark and "It is a guess" in " ".join(describe_estimate(guess))
 
 
 @pytest.fixture(scope="module")
@@ -164,13 +164,14 @@ class Wild:
 def _estimated(observer, seen, positions):
     with pytest.raises(InputError) as refusal:
         observer.locator.locate(seen)
-    return replace(observer.estimate(0, positions), observation=seen, location=None, refusal=str(refusal.value))
+    return replace(observer.estimate(0, positions), observation=seen, location=None, rejection=str(refusal.value))
 
 
 def test_rejected_observation_shows_warning_and_no_ellipsoid(refused, monkeypatch):
     play, frame = refused
     found, said = frame.estimate, []
-    assert frame.doubt == REJECTED_WARNING and found.build_ellipsoid() is None and not found.held and frame.remark == ""
+    assert frame.doubt == REJECTED_WARNING and found.build_ellipsoid() is None
+    assert not found.is_covered and frame.remark == ""
     nodes = play.site.anatomy.tumour_nodes
     assert np.array_equal(play.estimate_positions(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
     assert not find_ink(frame.shown, compute_ink(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
@@ -178,23 +179,23 @@ def test_rejected_observation_shows_warning_and_no_ellipsoid(refused, monkeypatc
     monkeypatch.setattr(
         "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
     )
-    add_cost_label(frame, "fem")
-    assert any(line == f"estimate: rejected, {found.refusal}" for line in said)
-    assert "Observation rejected" in report(frame, play.stage, "fem", "", (), 100)
+    draw_cost_panel(frame, "fem")
+    assert any(line == f"estimate: rejected, {found.rejection}" for line in said)
+    assert "Observation rejected" in format_report(frame, play.stage, "fem", "", (), 100)
 
 
 def test_check_reports_locator_rejections_and_slips(refused, frames):
     """Rejections, slips and a tumour mostly at rest, each with its reason; otherwise nothing."""
     _, wild = refused
-    best = max(frames, key=lambda frame: np.linalg.norm(frame.estimate.true))
+    best = max(frames, key=lambda frame: np.linalg.norm(frame.estimate.true_motion))
     slipped = replace(best.estimate, location=replace(best.estimate.location, slipped=True))
-    still = replace(best, estimate=replace(best.estimate, true=np.zeros(3)))
-    assert list_objections([best, best]) == [] and list_objections([replace(best, estimate=None)]) == []
-    why = wild.estimate.refusal
-    assert list_objections([wild, best]) == [f"the locator rejects the observation in 1 of 2 frames: {why}"]
-    (doubt,) = list_objections([replace(best, estimate=slipped), best])
+    still = replace(best, estimate=replace(best.estimate, true_motion=np.zeros(3)))
+    assert list_warnings([best, best]) == [] and list_warnings([replace(best, estimate=None)]) == []
+    why = wild.estimate.rejection
+    assert list_warnings([wild, best]) == [f"the locator rejects the observation in 1 of 2 frames: {why}"]
+    (doubt,) = list_warnings([replace(best, estimate=slipped), best])
     assert "doubts its result in 1 of 2 frames" in doubt and "may have slipped" in doubt
-    (sparse,) = list_objections([still, best, still])
+    (sparse,) = list_warnings([still, best, still])
     assert "moves in 1 of 3 frames" in sparse and "give a smaller --every" in sparse
 
 
@@ -204,25 +205,25 @@ def test_label_separates_simulated_and_estimated_motion(frames, monkeypatch):
     monkeypatch.setattr(
         "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
     )
-    add_cost_label(replace(frame, named=False), "fem")
-    truth = 1e3 * np.linalg.norm(found.true)
+    draw_cost_panel(replace(frame, named=False), "fem")
+    truth = 1e3 * np.linalg.norm(found.true_motion)
     off = bound_words(found.location.p95, 1)
     assert said[0] == f"simulated tumour motion: {truth:.2f} mm"
-    assert said[1] == f"estimate: tumour moved {1e3 * found.moved:.2f} +- {off}"
+    assert said[1] == f"estimate: tumour moved {1e3 * found.motion_length:.2f} +- {off}"
     assert f"simulation: {frame.deformation.source}" in said and f"estimate: {found.source}" in said
     assert said[-1].startswith("lines: ") and not any("tumour moved" in line for line in said[2:])
-    foot = f"estimate moved {format_millimetres(found.moved, found.location.p95)}"
+    foot = f"estimate moved {format_millimetres(found.motion_length, found.location.p95)}"
     assert f"simulated motion {truth:.1f} mm; estimate" in frame.remark
     assert all(
         has_text(frame.shown, line, TEXT_SCALE) for line in wrap_line(foot, MAX_BOTTOM_WIDTH * frame.shown.shape[1])
     )
     said.clear()
-    add_cost_label(replace(frame, named=True), "fem")
+    draw_cost_panel(replace(frame, named=True), "fem")
     assert not any(line.startswith("lines: ") for line in said)
 
 
 def test_page_text_has_figures_and_errors_before_explanations(play, frames):
-    words = report(frames[1], play.stage, "fem", "", (), 100)
+    words = format_report(frames[1], play.stage, "fem", "", (), 100)
     order = "estimated tumour motion", "converged", "Tumour position error", "<b>estimate</b> from", "frame "
     places = [words.index(each) for each in order]
     assert places == sorted(places)
@@ -231,14 +232,14 @@ def test_page_text_has_figures_and_errors_before_explanations(play, frames):
 def test_observation_error_replaces_prior_error(play, frames):
     alone, of_frame = replace(play, motion_error=None), frames[1]
     frame = alone.draw_frame(of_frame.number, of_frame.touch, of_frame.loads, of_frame.deformation, 0.1)
-    assert frame.tumour_error == TumourError(None, "", frame.estimate.worst)
+    assert frame.tumour_error == TumourError(None, "", frame.estimate.error_bound)
     times = tuple(float(time) for time in play.scene.times[[0, -1]])
     flat = {"times": times, "worst": (3e-3, 3e-3), "middle": (2e-3, 2e-3), "moved": (1e-3, 1e-3)}
     flat |= {"registered": (3e-3, 3e-3), "motion": (1e-3, 1e-3)}
     known = Uncertainty("it", "", 9, 0, **flat, parts={"E": (1e-3, 1e-3)})
     knowing = replace(play, uncertainty=known)
     both = knowing.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, 0.1).tumour_error
-    assert both.prior == pytest.approx(3e-3) and both.bound == both.observed == frame.estimate.worst
+    assert both.prior == pytest.approx(3e-3) and both.bound == both.observed == frame.estimate.error_bound
 
 
 def test_page_legend_describes_lines_and_estimate(play, frames):
@@ -247,9 +248,9 @@ def test_page_legend_describes_lines_and_estimate(play, frames):
     assert "estimate" not in format_page_legend(replace(play.scene, observation_model=None))
     found = frames[1].estimate
     words = " ".join(describe_estimate(found))
-    assert f"error {1e3 * found.off:.1f} mm; the simulated centre is inside the 95 % region" in words
+    assert f"error {1e3 * found.error:.1f} mm; the simulated centre is inside the 95 % region" in words
     assert f"{len(found.observation.now)} points of the cortex, and where the tool touches; no force" in words
-    assert "is outside the" in " ".join(describe_estimate(replace(found, true=np.ones(3))))
+    assert "is outside the" in " ".join(describe_estimate(replace(found, true_motion=np.ones(3))))
 
 
 def test_missing_locator_message_names_the_command(box, tmp_path, capsys):

@@ -15,7 +15,7 @@ from scenes.options.outputs import (
     check_output_frames,
     check_output_path,
     find_foreign_files,
-    remove_data,
+    remove_outdated_data,
 )
 from sim.bodies.intensity import to_intensity_path
 from sim.bodies.meshfile import read_mesh, write_mesh
@@ -147,9 +147,9 @@ def test_force_removes_only_data_that_cannot_be_resumed(tmp_path):
     data = tmp_path / "me.h5"
     wanted = {"anatomy": "new", "effects": "e", "seed": "0"}
     put_data(data, **wanted, date="today")
-    remove_data(data, wanted)
+    remove_outdated_data(data, wanted)
     assert data.exists()
-    remove_data(data, {**wanted, "seed": "1"})
+    remove_outdated_data(data, {**wanted, "seed": "1"})
     assert not data.exists()
 
 

@@ -19,7 +19,7 @@ from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
 from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import TumourState
 from scenes.tracked.overlay_painter import Painter
-from scenes.tracked.run import Timed, draw_overlays, pace_images, read_timed
+from scenes.tracked.run import TimedImage, draw_overlays, pace_images, read_timed_images
 from scenes.tracked.tool_motion import ToolMotion
 from scenes.tracked.truth import compute_overlay_error, read_truth, summarise_errors
 from sim.errors import InputError
@@ -46,7 +46,7 @@ def calibration():
 
 
 def pictures():
-    return read_timed(read_video(FILM / "film.mp4", 30.0, colour=True))
+    return read_timed_images(read_video(FILM / "film.mp4", 30.0, colour=True))
 
 
 @pytest.fixture(scope="module")
@@ -55,33 +55,33 @@ def shown(follower, stage):
 
 
 def test_each_image_has_its_tracking_state_and_time(shown, truth):
-    assert [each.known.state for each in shown] == STATES
-    assert all(each.stamped for each in shown)
-    assert [each.known.time for each in shown] == pytest.approx(truth.times, abs=1e-4)
-    assert [each.known.camera is None for each in shown].count(True) == 5  # the reference is lost for longer
-    assert {each.known.words for each in shown if each.known.relied} == {""}
-    assert "tool lost: the tumour as 0.1 s ago" in shown[7].known.words
-    assert "no image for 0.3 s" in shown[15].known.words
-    lost = [shown[n].known.words for n in (4, 10, 11, 13)]
+    assert [each.result.state for each in shown] == STATES
+    assert all(each.has_stamp for each in shown)
+    assert [each.result.time for each in shown] == pytest.approx(truth.times, abs=1e-4)
+    assert [each.result.camera is None for each in shown].count(True) == 5  # the reference is lost for longer
+    assert {each.result.warning for each in shown if each.result.is_reliable} == {""}
+    assert "tool lost: the tumour as 0.1 s ago" in shown[7].result.warning
+    assert "no image for 0.3 s" in shown[15].result.warning
+    lost = [shown[n].result.warning for n in (4, 10, 11, 13)]
     assert lost == ["reference lost: nothing is drawn"] * 4
 
 
 def test_drawn_outline_matches_the_true_tumour(shown, truth, calibration, stage, follower):
     vertices, triangles = follower.tool.mesh
     for each in shown:
-        if not each.known.relied:
-            assert np.count_nonzero(find_ink(each.colour, INK)) < 5  # nothing looks as if it were known
+        if not each.result.is_reliable:
+            assert np.count_nonzero(find_ink(each.image, INK)) < 5  # nothing looks as if it were known
             continue
-        row = truth.find_image(each.known.time)
+        row = truth.find_image(each.result.time)
         camera, pose = calibration.build_camera(truth.T_camera_scan[row]), truth.T_scan_tool[row]
         true = stage.tumour_at_rest.vertices + truth.displacement[row]
         mask = compute_silhouette(camera, true, stage.tumour_at_rest.triangles)
         covered = compute_silhouette(camera, vertices @ pose[:3, :3].T + pose[:3, 3], triangles)
-        assert measure_outline_gap(each.colour, INK, mask, covered) < 2.5
+        assert measure_outline_gap(each.image, INK, mask, covered) < 2.5
 
 
 def test_overlay_is_not_drawn_over_the_drape(shown, truth, calibration, stage, follower):
-    each, known = next(islice(pictures(), 6, None)).picture, shown[6].known
+    each, known = next(islice(pictures(), 6, None)).source, shown[6].result
     painted = Painter(stage, follower.tool).paint(each.colour, known).colour
     camera, tumour = calibration.build_camera(truth.T_camera_scan[6]), stage.build_tumour(known.motion.positions)
     seen = stage.render(camera, known.motion.positions, None).segmentation
@@ -93,12 +93,12 @@ def test_overlay_is_not_drawn_over_the_drape(shown, truth, calibration, stage, f
 
 
 def test_overlay_error_lies_within_its_error_band(shown, truth, calibration, stage):
-    errors = [compute_overlay_error(each.known, truth, calibration, stage) for each in shown]
-    said = summarise_errors([each.known for each in shown], errors)
+    errors = [compute_overlay_error(each.result, truth, calibration, stage) for each in shown]
+    said = summarise_errors([each.result for each in shown], errors)
     assert said["pictures"] == 9 and said["wrong"] == 0 and said["held_percent"] == 100.0
     assert said["outline_px_p95"] < 0.5 and said["overlap_least"] > 0.98
     assert said["middle_mm_p95"] < 0.15 and 0.05 < said["band_mm_p50"] < 0.4
-    assert shown[4].known.band is None and errors[4] is errors[11] is None
+    assert shown[4].result.bound is None and errors[4] is errors[11] is None
 
 
 def test_tool_error_enters_the_band_through_a_deeper_tool(follower, truth, stage):
@@ -110,16 +110,16 @@ def test_tool_error_enters_the_band_through_a_deeper_tool(follower, truth, stage
 
     falling = Falling(stage.anatomy, stage.tumour_vertices, truth.T_scan_tool, truth.displacement)
     motion = ToolMotion(stage, falling).compute_motion(truth.T_scan_tool[5], np.diag([1e-8, 4e-6, 1e-8]))
-    assert motion.tool == pytest.approx(0.2 * 1.96 * 2e-3, rel=0.01)
+    assert motion.tool_error == pytest.approx(0.2 * 1.96 * 2e-3, rel=0.01)
 
 
 def test_paced_video_drops_images_at_slow_processing():
     picture = np.zeros((8, 8), np.uint8)
-    film = (Timed(Named(str(n), picture, 0.02 * n), False) for n in range(20))
+    film = (TimedImage(Named(str(n), picture, 0.02 * n), False) for n in range(20))
     seen, ages = [], []
     for taken, begun in pace_images(film):
-        ages.append(time.perf_counter() - begun - taken.picture.time)
-        seen.append(taken.picture.name)
+        ages.append(time.perf_counter() - begun - taken.source.time)
+        seen.append(taken.source.name)
         time.sleep(0.05)
     assert 5 < len(seen) < 14 and seen == sorted(seen, key=int) and seen[0] == "0"
     assert min(ages) > -1e-3 and np.median(ages) < 0.03

@@ -18,7 +18,7 @@ from scenes.cli import main
 from scenes.tracked.follower import TumourState
 from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.page import OverlayPage
-from scenes.tracked.seekable_video import SeekableFilm
+from scenes.tracked.seekable_video import SeekableVideo
 
 
 @contextmanager
@@ -33,7 +33,7 @@ def opened(follower, stage, frames=0):
 @pytest.fixture(scope="module")
 def page(follower, stage):
     """The page of the film, paused."""
-    film = SeekableFilm(FILM / "film.mp4", 30.0)
+    film = SeekableVideo(FILM / "film.mp4", 30.0)
     done = threading.Event()
     with opened(follower, stage, film.count) as page:
         page.plays = False
@@ -52,7 +52,7 @@ def page(follower, stage):
 
 
 def seek(page, number):
-    page.sought.append(number)
+    page.requested.append(number)
     return wait_for(lambda: page.browser.shown[0] == number and f"image {number} of" in page.browser.shown[2])
 
 
@@ -67,7 +67,7 @@ def seek(page, number):
 def test_page_text_has_tracking_state_and_both_errors(page, number, state, words):
     assert seek(page, number)
     said = page.browser.shown[2]
-    assert page.newest.known.state is state and words in said and "Tumour position error: not known" in said
+    assert page.newest.result.state is state and words in said and "Tumour position error: not known" in said
     if state is TumourState.GOOD:
         assert re.search(r'"number">tip to tumour \d+\.\d&nbsp;±&nbsp;\d\.\d&nbsp;mm<', said)
         assert "Overlay error (95 %): at most 0.2 mm" in said and "not given:" in said
@@ -100,16 +100,16 @@ def test_style_change_redraws_a_paused_image(page):
 
 
 def test_video_page_restarts_after_the_last_image(follower, stage):
-    film = SeekableFilm(FILM / "film.mp4", 30.0)
+    film = SeekableVideo(FILM / "film.mp4", 30.0)
     film.count = 40  # as a file may say
     with opened(follower, stage, film.count) as page:
 
         def played(start, count):
-            page.sought.append(start)
-            before, until = len(page.shown), time.monotonic() + 30.0
-            while len(page.shown) < before + count and time.monotonic() < until:
+            page.requested.append(start)
+            before, until = len(page.overlays), time.monotonic() + 30.0
+            while len(page.overlays) < before + count and time.monotonic() < until:
                 page.play(film, 1.5)  # what is known of a picture is so for one call
-            return [each.known.state for each in list(page.shown)[before : before + count]]
+            return [each.result.state for each in list(page.overlays)[before : before + count]]
 
         assert (
             played(14, 4) == [TumourState.GOOD, TumourState.GOOD, TumourState.GOOD, TumourState.REST]
@@ -117,8 +117,8 @@ def test_video_page_restarts_after_the_last_image(follower, stage):
         )
         # By now it is known how far apart its pictures are.
         assert played(14, 2) == [TumourState.GOOD, TumourState.STALE]
-        one = page.shown[0]
-    assert one.colour.size == one.known.motion.positions.size == 0 and one.middle.shape == (3,)
+        one = page.overlays[0]
+    assert one.image.size == one.result.motion.positions.size == 0 and one.centroid.shape == (3,)
 
 
 def test_camera_image_dims_when_stale_and_recovers(follower, stage):
@@ -141,7 +141,7 @@ def test_camera_image_dims_when_stale_and_recovers(follower, stage):
     with opened(follower, stage) as page:
         shown = page.watch(pictures())
         assert not page.browser.frame.visible and len(page.browser.controls.commands) == len(KEYS) - 2
-        assert len(shown) == 2 and {each.known.state for each in shown} <= {TumourState.REST, TumourState.STALE}
+        assert len(shown) == 2 and {each.result.state for each in shown} <= {TumourState.REST, TumourState.STALE}
         assert all(each.latency > 0.0 for each in shown)
         silent, unplugged, back, paused = fades
         assert "no image for 0.2 s" in silent[2] and silent[1].mean() < 0.4 * first.colour.mean()

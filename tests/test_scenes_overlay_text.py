@@ -13,7 +13,7 @@ from ar.overlay.outlines import compute_silhouette, find_outlines
 from ar.overlay.styles import Style
 from scenes.page.demo import render_page_image
 from scenes.play.deformers import open_theatre
-from scenes.play.player import Player, measure_gauge
+from scenes.play.player import Player, measure_tip_gauge
 from scenes.play.stage import TOOL
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
@@ -86,7 +86,7 @@ def lined(play, frame):
         mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles)
         cv2.polylines(lines, find_outlines(mask), True, (1,), 2)
     middles = np.stack([rest.vertices.mean(axis=0), now.vertices.mean(axis=0)])
-    for ends in (middles, np.stack([frame.tip, measure_gauge(frame.tip, now).nearest])):
+    for ends in (middles, np.stack([frame.tip, measure_tip_gauge(frame.tip, now).nearest])):
         start, end = np.rint(frame.camera.project(ends)[0]).astype(int).tolist()
         if start != end:  # no arrow without motion
             cv2.line(lines, start, end, (1,), 2)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from theatres import short
 
-from scenes.page.text import report
+from scenes.page.text import format_report
 from scenes.script.tool_paths import Touch
 from scenes.script.uncertainty import TumourError
 from sim.deformation import Outcome, build_start
@@ -38,7 +38,7 @@ def test_page_text_has_the_values_of_the_frame(theatre):
         "seconds": seconds,
     }
     frame = replace(player.draw(3, 0.1, Touch(force=0.25)), tumour_error=TumourError(None), moved_error=None, **known)
-    said = report(frame, player.stage, "linear", "", (), 7)
+    said = format_report(frame, player.stage, "linear", "", (), 7)
     for line in (
         ">tip to tumour 12.3&nbsp;mm<",
         "<p>tumour moved 1.23 mm (surrogate error 0.02 mm, motion error not known)</p><label ",
@@ -47,23 +47,24 @@ def test_page_text_has_the_values_of_the_frame(theatre):
         "time [ms]: deformation 12.3, rendering 4.5, overlay 0.7<",
     ):
         assert line in said
-    plain = report(replace(frame, distance_error=None), player.stage, "linear", "", (), 7)
+    plain = format_report(replace(frame, distance_error=None), player.stage, "linear", "", (), 7)
     assert "tip to tumour 12.3&nbsp;mm<" in plain and "tip to tumour within" not in plain
-    within = report(replace(frame, inside=True), player.stage, "linear", "", (), 7)
+    within = format_report(replace(frame, inside=True), player.stage, "linear", "", (), 7)
     assert ">tip inside the tumour, 12.3&nbsp;mm below its surface<" in within and ">tip to tumour" not in within
     known = TumourError(4.61e-3, "E"), TumourError(4.61e-3, "E", 1.11e-3)
-    prior, seen = (report(replace(frame, tumour_error=one), player.stage, "linear", "", (), 7) for one in known)
+    prior, seen = (format_report(replace(frame, tumour_error=one), player.stage, "linear", "", (), 7) for one in known)
     where, whole = "at most", "at any point of its surface"
     assert f"<p>Tumour position error (95 %): {where} 4.7 mm {whole}; the largest part is E.</p>" in prior
     assert f"<p>Tumour position error (95 %): {where} 1.2 mm {whole}; without cortex observation: 4.7 mm.</p>" in seen
-    guess = report(replace(frame, tumour_error=replace(known[0], guess=True)), player.stage, "linear", "", (), 7)
+    rough = replace(frame, tumour_error=replace(known[0], is_rough=True))
+    guess = format_report(rough, player.stage, "linear", "", (), 7)
     assert f"{where} 4.7 mm {whole}: rough estimate (few samples," in guess and "largest part" not in guess
     for said, off in ((prior, "4.7"), (seen, "1.2")):
         assert f"tip to tumour 12.3&nbsp;±&nbsp;{off}&nbsp;mm<" in said
-    surely = report(replace(frame, moved_error=5.31e-3, model_error=None), player.stage, "fem", "", (), 7)
+    surely = format_report(replace(frame, moved_error=5.31e-3, model_error=None), player.stage, "fem", "", (), 7)
     assert "<p>tumour moved 1.23 mm (motion error 5.4 mm)</p>" in surely
-    failed = report(frame, player.stage, "linear", '<p class="warn">no FEM</p>', (), 7)
+    failed = format_report(frame, player.stage, "linear", '<p class="warn">no FEM</p>', (), 7)
     assert failed.index("no FEM") < failed.index("details") < failed.index("frame 3 of 6")
     doubted = replace(frame, tumour_error=known[0], doubt="why", model_error=None)
-    assert "(error not known)" in report(doubted, player.stage, "linear", "", (), 7)
-    assert "tip to tumour 12.3&nbsp;mm<" in report(doubted, player.stage, "linear", "", (), 7)
+    assert "(error not known)" in format_report(doubted, player.stage, "linear", "", (), 7)
+    assert "tip to tumour 12.3&nbsp;mm<" in format_report(doubted, player.stage, "linear", "", (), 7)

@@ -8,7 +8,7 @@ import pytest
 from theatres import player
 
 from scenes.episodes.episode import collect
-from scenes.play.frame_text import format_acting
+from scenes.play.frame_text import format_active_loads
 from scenes.play.player import Player
 from scenes.script.scene import Scene, Viewpoint, find_scene
 from scenes.script.tool_paths import IDLE_HEIGHT, Touch
@@ -89,15 +89,15 @@ class TestPalpate:
     def test_model_without_force_output_shows_no_tool_force(self, palpated):
         """The model is trained on tool positions and predicts no force."""
         frame = palpated[6]
-        assert format_acting(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6))), NODES) == ""
+        assert format_active_loads(frame.loads, replace(frame.deformation, reaction=np.zeros((1, 0, 6))), NODES) == ""
 
     def test_predicted_tool_force_is_shown_with_its_error_bound(self, palpated):
         frame = palpated[6]
         reads = np.linalg.norm(frame.deformation.reaction[0, 0, :3])
         answer = replace(frame.deformation, reaction_bound=np.array([[0.012], [0.02]]), outcome=(Outcome.PREDICTED,))
-        assert format_acting(frame.loads, answer, NODES) == f"tool force {reads:.2f} +- 0.02 N (surrogate)"
+        assert format_active_loads(frame.loads, answer, NODES) == f"tool force {reads:.2f} +- 0.02 N (surrogate)"
         far = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-        assert format_acting(frame.loads, far, NODES) == f"tool force {reads:.2f} N"
+        assert format_active_loads(frame.loads, far, NODES) == f"tool force {reads:.2f} N"
 
     @pytest.mark.parametrize("force", [ForceModel(), None])
     def test_guarded_deformer_uses_fem_beyond_training_depth(self, theatre, palpated, force):

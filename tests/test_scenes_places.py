@@ -9,7 +9,7 @@ import pytest
 from scenes.cli import main
 from scenes.warp.deformed_anatomy import Cause, DeformedAnatomy
 from scenes.warp.landmarks import list_landmarks
-from scenes.warp.places import MIN_SPACING, SpacingSettings, compute_fields, find_finer_spacing, find_folds, list_places
+from scenes.warp.places import MIN_SPACING, SpacingSettings, compute_fields, find_finer_spacing, find_folds, list_points
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.errors import InputError
@@ -35,7 +35,7 @@ def fields(kinked):
 
 
 def test_part_error_is_the_larger_of_both_field_errors(kinked, fields):
-    places = list_places(kinked)
+    places = list_points(kinked)
     errors = places.compute_errors(fields)
     assert 0.05e-3 < errors[places.tumour].max() < 1e-3 and errors[places.cortex].max() < 1e-6
     # No field reaches beyond the grid.
@@ -57,7 +57,7 @@ def test_tumour_places_include_necrosis(kinked):
     region = mesh.region.copy()
     region[np.flatnonzero(region == TUMOUR_LABEL)[::2]] = NECROSIS_LABEL
     body = replace(kinked.anatomy, mesh=replace(mesh, region=region))
-    assert np.array_equal(list_places(choose_moment(body, kinked.displacement)).tumour, list_places(kinked).tumour)
+    assert np.array_equal(list_points(choose_moment(body, kinked.displacement)).tumour, list_points(kinked).tumour)
 
 
 def test_finer_spacing_follows_from_the_tumour_error(kinked, fields):
@@ -65,7 +65,7 @@ def test_finer_spacing_follows_from_the_tumour_error(kinked, fields):
     assert MIN_SPACING <= finer < fields.grid.spacing
     assert find_finer_spacing(kinked, fields, SpacingSettings(tolerance=1.0)) is None
     found = compute_fields(kinked, None, lambda more: None)
-    places = list_places(kinked)
+    places = list_points(kinked)
     worst = places.compute_errors(found)[places.tumour].max()
     assert worst <= SpacingSettings().tolerance and found.grid.spacing < 1e-3
     assert find_finer_spacing(kinked, found) is None
@@ -85,7 +85,7 @@ def dented(small_box):
 def test_dented_cortex_is_fitted_with_points_outside_the_mesh(dented):
     """With points inside tetrahedra alone the cortex has an error of 0.9 mm."""
     fields = compute_warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
-    places = list_places(dented)
+    places = list_points(dented)
     errors = places.compute_errors(fields)
     assert places.landmarks.sum() == 2 and not fields.has_folds
     assert errors[places.cortex].max() < 0.2e-3 and errors[places.landmarks].max() < 0.1e-3
@@ -93,7 +93,7 @@ def test_dented_cortex_is_fitted_with_points_outside_the_mesh(dented):
 
 def test_finer_spacing_follows_from_the_landmark_error(dented):
     fields = compute_warp_fields(dented.anatomy, dented.displacement, 1.5e-3)
-    places = list_places(dented)
+    places = list_points(dented)
     assert places.compute_errors(fields)[places.tumour].max() < SpacingSettings().tolerance / 10.0
     finer = find_finer_spacing(dented, fields)
     assert finer is not None and finer < 1.5e-3
@@ -110,7 +110,7 @@ def test_folds_of_fem_are_found_and_sorted_by_size(small_box):
     moment = choose_moment(small_box, moved)
     folds = find_folds(moment, compute_warp_fields(small_box, moved, 2e-3))
     assert len(folds) == 2 and folds[0].volume >= folds[1].volume and folds[0].tetrahedra > folds[1].tetrahedra
-    assert all(fold.off > 0.1e-3 for fold in folds)
+    assert all(fold.field_error > 0.1e-3 for fold in folds)
 
 
 def test_spacing_with_too_many_grid_nodes_is_rejected(small_box):
@@ -130,16 +130,16 @@ def test_fields_avoid_folds_of_fem_and_report_them(small_box, tmp_path, capsys):
     (fold,) = find_folds(moment, fields)
     assert not fields.has_folds and fields.min_determinants[2] < 0.0 and min(fields.min_determinants[:2]) > 0.0
     assert fold.tetrahedra == bad.sum() > 0 and fold.volume == pytest.approx(mesh.volumes[bad].sum())
-    assert np.linalg.norm(fold.middle - mesh.nodes[vertex]) < 8e-3 and fold.off > 0.2e-3
+    assert np.linalg.norm(fold.centre - mesh.nodes[vertex]) < 8e-3 and fold.field_error > 0.2e-3
     write_anatomy(tmp_path / "box.vtu", small_box)
     write_mesh(tmp_path / "folded.vtu", mesh, {"displacement": moved})
     words = ["warp", str(tmp_path / "box.vtu"), "--located", str(tmp_path / "folded.vtu"), "--spacing", "2"]
     assert main([*words, "--out", str(tmp_path / "out")]) == 0
-    x = f"{1e3 * fold.middle[0]:.1f}"
+    x = f"{1e3 * fold.centre[0]:.1f}"
     said = capsys.readouterr().err
     assert "the finite elements fold" in said and x in said and "mm3" in said
     report = json.loads((tmp_path / "out" / "warp.json").read_text())
-    assert report["folds"][0]["fields_off_mm"] == pytest.approx(1e3 * fold.off) and not report["fields_fold"]
+    assert report["folds"][0]["fields_off_mm"] == pytest.approx(1e3 * fold.field_error) and not report["fields_fold"]
     text = (tmp_path / "out" / "README.txt").read_text()
     assert "WARNING: the finite elements fold" in text and "they were unfolded" in text and "nothing folds" not in text
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from conftest import make_box
 
-from scenes.episodes.checksums import find_broken
+from scenes.episodes.checksums import find_errors
 from scenes.episodes.make import make_body, make_episode, to_episode_path
-from scenes.episodes.plan import load_plan, plan_from
+from scenes.episodes.plan import load_plan, parse_plan
 from scenes.episodes.scripted import sample_episode
 from scenes.play.deformers import open_theatre
 from sim.anatomy import TUMOUR_LABEL
@@ -74,14 +74,14 @@ tool_mm = 1
 )
 def test_invalid_plan_is_rejected_with_its_reason(text, said):
     with pytest.raises(InputError, match=said):
-        plan_from(f'title = "x"\n{text}', "mine")
+        parse_plan(f'title = "x"\n{text}', "mine")
 
 
 def test_unknown_plan_is_rejected_with_known_names(tmp_path):
     with pytest.raises(InputError, match="there is no plan 'big': choose hard, small, standard"):
         load_plan("big")
     (tmp_path / "own.toml").write_text(TINY)
-    assert load_plan(str(tmp_path / "own.toml")).digest == plan_from(TINY, "own").digest
+    assert load_plan(str(tmp_path / "own.toml")).digest == parse_plan(TINY, "own").digest
 
 
 def test_plan_with_too_long_name_or_text_is_rejected(tmp_path):
@@ -99,7 +99,7 @@ def test_plan_digest_depends_on_its_anatomy_file(box, tmp_path):
         load_plan(str(path))
     write_anatomy(tmp_path / "box.vtu", box)
     plan = load_plan(str(path))
-    assert load_plan(str(path)).digest == plan.digest != plan_from(text, "own").digest
+    assert load_plan(str(path)).digest == plan.digest != parse_plan(text, "own").digest
     write_anatomy(tmp_path / "box.vtu", make_box(cells=(6, 6, 4), spacing=12e-3))
     assert load_plan(str(path)).digest != plan.digest
     assert "box.vtu: has changed since the plan was read" in make_body(tmp_path / "set", plan, 1, 0, "cpu").failed
@@ -107,7 +107,7 @@ def test_plan_digest_depends_on_its_anatomy_file(box, tmp_path):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    folder, plan = tmp_path_factory.mktemp("set"), plan_from(TINY, "tiny")
+    folder, plan = tmp_path_factory.mktemp("set"), parse_plan(TINY, "tiny")
     assert not make_body(folder, plan, 1, 0, "cpu").failed
     return folder, plan, make_episode(folder, plan, 1, 5, "cpu")
 
@@ -116,7 +116,7 @@ def test_episode_stores_plan_seed_and_parameters(made):
     folder, plan, episode = made
     assert episode.path == to_episode_path(folder, 5) and episode.frames == 5 and not episode.failed
     with h5py.File(episode.path) as file:
-        assert file.attrs["plan"] == TINY and file.attrs["plan_digest"] == plan.digest and not find_broken(file)
+        assert file.attrs["plan"] == TINY and file.attrs["plan_digest"] == plan.digest and not find_errors(file)
         assert (file.attrs["seed"], file.attrs["episode"], file.attrs["solved_every"]) == (1, 5, 3)
         drawn = sample_episode(plan.contents, 1, 5)
         stated = json.loads(file.attrs["parameters"])
@@ -147,13 +147,13 @@ def test_changed_value_breaks_a_checksum(made, tmp_path):
     path.write_bytes(made[2].path.read_bytes())
     with h5py.File(path, "r+") as file:
         file["tumour_predicted"][1, 0, 0] += 1e-9
-        assert find_broken(file) == ["/tumour_predicted: is not as it was written"]
+        assert find_errors(file) == ["/tumour_predicted: is not as it was written"]
         file.attrs["seed"] = 2
-        assert "attributes" in find_broken(file)[1]
+        assert "attributes" in find_errors(file)[1]
 
 
 def test_body_that_cannot_be_meshed_fails_with_reason(tmp_path):
-    plan = plan_from(f"{TINY}[bodies]\nanatomies = 'drawn'\n[bodies.tumour]\nradius_mm = 35\ncover_mm = 1\n", "big")
+    plan = parse_plan(f"{TINY}[bodies]\nanatomies = 'drawn'\n[bodies.tumour]\nradius_mm = 35\ncover_mm = 1\n", "big")
     body = make_body(tmp_path, plan, 1, 0, "cpu")
     assert "none of 6 anatomies that were drawn can be meshed; the last: a " in body.failed
     assert not list(tmp_path.glob("bodies/*"))
@@ -169,7 +169,7 @@ def test_memory_shortage_is_raised_and_marks_no_failed_body(tmp_path, monkeypatc
 
     monkeypatch.setattr("scenes.episodes.make.write_body", full)
     with pytest.raises(InputError, match="are free"):
-        make_body(tmp_path, plan_from(TINY, "tiny"), 1, 0, "cpu")
+        make_body(tmp_path, parse_plan(TINY, "tiny"), 1, 0, "cpu")
     assert not list(tmp_path.glob("bodies/*"))
 
 

@@ -8,24 +8,24 @@ from test_scenes_overlay import INK, pictures
 from ar.overlay.outlines import find_ink
 from scenes.tracked.follower import TumourState
 from scenes.tracked.overlay_painter import Painter
-from scenes.tracked.plausible import describe_implausible
+from scenes.tracked.plausible import describe_implausible_registration
 
 
 def test_implausible_registration_and_tool_are_unreliable(follower, stage):
-    first = next(iter(pictures())).picture
+    first = next(iter(pictures())).source
     T = follower.registration.T_patient_scan.copy()
     T[:3, 3] += [0.0, 0.0, -0.4]
     other = replace(follower, registration=replace(follower.registration, T_patient_scan=T))
     known = other.step(first.grey, 0.0)
-    assert known.state is TumourState.UNSURE and known.band is None and "mm from the reference" in known.words
+    assert known.state is TumourState.UNSURE and known.bound is None and "mm from the reference" in known.warning
     painted = Painter(stage, follower.tool).paint(first.colour, known).colour
     assert np.count_nonzero(find_ink(painted, INK)) < 5
     near = follower.step(first.grey, 0.0)
     behind = replace(near.camera, T_camera_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ near.camera.T_camera_world)
-    assert "behind the camera" in describe_implausible(follower.registration, stage, behind)
+    assert "behind the camera" in describe_implausible_registration(follower.registration, stage, behind)
     long = follower.tool.T_cube_tool @ [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.4], [0, 0, 0, 1.0]]
     away = replace(follower, tool=replace(follower.tool, T_cube_tool=long))
     known = away.step(first.grey, 0.0)
-    assert known.state is TumourState.UNSURE and "never nearer than 200" in known.words and not known.near
-    assert near.near and away.step(first.grey, 0.1, near).near  # it has been there
-    assert "head" not in away.step(first.grey, 0.1, near).words
+    assert known.state is TumourState.UNSURE and "never nearer than 200" in known.warning and not known.was_near
+    assert near.was_near and away.step(first.grey, 0.1, near).was_near  # it has been there
+    assert "head" not in away.step(first.grey, 0.1, near).warning

@@ -11,8 +11,8 @@ from ar.overlay.gauge import Gauge
 from scenes.commands.link import parse_address
 from scenes.link.console import format_address
 from scenes.link.frame import to_stamp
-from scenes.link.messages import encode_points, transform
-from scenes.link.pose_responder import NO_TARGETS, PoseResult, add_lateness, place_camera
+from scenes.link.messages import encode_points, encode_transform
+from scenes.link.pose_responder import NO_TARGETS, PoseResult, interpolate_camera_pose, mark_late
 from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 from scenes.tracked.follower import TrackingResult, TumourState
 from scenes.tracked.tool_motion import BrainMotion
@@ -28,12 +28,12 @@ def test_sent_tumour_has_the_position_and_time_of_its_pose(follower, registratio
             header, body = await slicer.next("POLYDATA", "TumourInScan")
             rest = corners_of(body)
             assert rest == pytest.approx(1e3 * follower.motion.stage.tumour_at_rest.vertices, abs=1e-3)
-            tracker.send("TRANSFORM", "ProbeToTracker", transform(beside[row]), NOW)
+            tracker.send("TRANSFORM", "ProbeToTracker", encode_transform(beside[row]), NOW)
             while "no StylusTipToReference yet; other transforms received: ProbeToTracker" not in await slicer.said(
                 "Sulcus"
             ):
                 pass
-            tracker.send("TRANSFORM", NAMES.tool, transform(beside[row]), stamp)
+            tracker.send("TRANSFORM", NAMES.tool, encode_transform(beside[row]), stamp)
             for each in (slicer, other):
                 while (found := await each.next("POLYDATA", "TumourNow"))[0].stamp != stamp:
                     pass
@@ -70,7 +70,7 @@ def test_sent_tumour_has_the_position_and_time_of_its_pose(follower, registratio
 def test_invalid_pose_is_rejected_and_counted(follower, registration, beside, change, why):
     async def scene():
         async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
-            tracker.send("TRANSFORM", NAMES.tool, transform(change(beside[10])), NOW)
+            tracker.send("TRANSFORM", NAMES.tool, encode_transform(change(beside[10])), NOW)
             assert why in await tracker.said()
             while why not in (words := await tracker.said("Sulcus")):
                 pass
@@ -90,9 +90,9 @@ def test_unverified_registration_is_used_with_warning(follower, registration, be
         async with linked(follower, own) as port, peers(port, 1) as (tracker,):
             if sent:
                 assert "no ReferenceToRas yet" in await tracker.said("Sulcus")
-                tracker.send("TRANSFORM", NAMES.registration, transform(into), NOW)
+                tracker.send("TRANSFORM", NAMES.registration, encode_transform(into), NOW)
             tracker.send("POINT", "P", encode_points(["a"], 1e3 * follower.motion.stage.tumour_at_rest.vertices[:1]))
-            tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
+            tracker.send("TRANSFORM", NAMES.tool, encode_transform(beside[10]), NOW)
             while not len(found := corners_of((await tracker.next("POLYDATA", "TumourDoubtful"))[1])):
                 pass
             assert found == pytest.approx(expected, abs=2e-2)
@@ -112,12 +112,12 @@ def test_unverified_registration_is_used_with_warning(follower, registration, be
 def test_distant_tool_is_marked_unreliable(follower, registration, beside):
     async def scene():
         async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
-            tracker.send("TRANSFORM", NAMES.tool, transform(beside[10]), NOW)
+            tracker.send("TRANSFORM", NAMES.tool, encode_transform(beside[10]), NOW)
             await tracker.next("TRANSFORM", "TumourToRas")
             for number, (away, good) in enumerate(((500.0, True), (9000.0, False)), 1):
                 far = beside[10].copy()
                 far[2, 3] += away
-                tracker.send("TRANSFORM", NAMES.tool, transform(far), NOW + number)
+                tracker.send("TRANSFORM", NAMES.tool, encode_transform(far), NOW + number)
                 while (found := await tracker.next("STRING", "TipToTumour"))[0].stamp != NOW + number:
                     pass
                 words = found[1][4:].decode()
@@ -128,11 +128,13 @@ def test_distant_tool_is_marked_unreliable(follower, registration, beside):
 
 @pytest.mark.parametrize("state", [TumourState.GOOD, TumourState.UNSURE])
 def test_old_result_is_marked_stale_without_band(stage, state):
-    known = TrackingResult(0.0, state, "words", NO_TARGETS, BrainMotion(stage.anatomy.mesh.nodes), band=1e-3)
-    assert add_lateness(PoseResult(NOW, known), 0.2, 0.3).known is known
-    old = add_lateness(PoseResult(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
+    known = TrackingResult(0.0, state, "words", NO_TARGETS, BrainMotion(stage.anatomy.mesh.nodes), bound=1e-3)
+    assert mark_late(PoseResult(NOW, known), 0.2, 0.3).tracking is known
+    old = mark_late(PoseResult(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
     assert (
-        old.known.state is TumourState.STALE and old.known.band is old.gauge is None and "0.4 s old" in old.known.words
+        old.tracking.state is TumourState.STALE
+        and old.tracking.bound is old.gauge is None
+        and "0.4 s old" in old.tracking.warning
     )
 
 
@@ -142,7 +144,7 @@ def test_implausible_tool_position_is_marked_doubtful(follower, registration, be
 
     async def scene():
         async with linked(follower, registration) as port, peers(port, 1) as (tracker,):
-            tracker.send("TRANSFORM", NAMES.tool, transform(far), NOW)
+            tracker.send("TRANSFORM", NAMES.tool, encode_transform(far), NOW)
             while not len(corners_of((await tracker.next("POLYDATA", "TumourDoubtful"))[1])):
                 pass
             assert "mm from the head" in (await tracker.next("STRING", "TipToTumour"))[1].decode()
@@ -183,8 +185,8 @@ def off(placed, time):
 def at(heard, time, now=None, stamped=True):
     middle = camera(0.0)[:3, :3] @ TUMOUR + 1e-3 * camera(0.0)[:3, 3]
     stamp = to_stamp(BEGUN + time) if stamped else 0
-    return place_camera(
-        heard.list_transforms(heard.names.camera), time if now is None else now, stamp, middle, heard.stale
+    return interpolate_camera_pose(
+        heard.list_transforms(heard.names.camera), time if now is None else now, stamp, middle, heard.max_age
     )
 
 
@@ -195,9 +197,9 @@ def test_interpolated_pose_reports_remaining_error():
         time = times[-1 - late] + (share - 1.0) * STEP
         placed = at(heard, time)
         newest = replace(placed, T=heard.list_transforms(heard.names.camera)[-1].T)
-        assert off(placed, time) <= placed.movable < 0.2e-3 and off(placed, time) < 0.1 * off(newest, time)
+        assert off(placed, time) <= placed.motion_error < 0.2e-3 and off(placed, time) < 0.1 * off(newest, time)
     ahead = at(heard, times[-1] + 0.03)
-    assert off(ahead, times[-1] + 0.03) <= ahead.movable < 4e-3
+    assert off(ahead, times[-1] + 0.03) <= ahead.motion_error < 4e-3
 
 
 def test_newest_pose_has_camera_motion_as_error():
@@ -212,7 +214,7 @@ def test_newest_pose_has_camera_motion_as_error():
     ):
         placed = at(heard, time, stamped=stamped)
         assert np.allclose(placed.T[:3, :3], camera(times[-1])[:3, :3])
-        assert placed.movable == pytest.approx(way * apart / STEP, rel=1e-4)
+        assert placed.motion_error == pytest.approx(way * apart / STEP, rel=1e-4)
     assert at(heard_of(times), times[-1] + 1.0) == "no {name} within 0.3 s of the image's time"
     assert "alone" in at(heard_of(times[-1:]), times[-1])
 

@@ -8,7 +8,7 @@ from theatres import short
 
 from scenes.analysis.uncertainty import (
     apply_sample,
-    compute_error,
+    compute_motion_errors,
     find_mesh_prior,
     get_skull_model,
     list_skulls,
@@ -57,5 +57,5 @@ class TestPriors:
         assert find_mesh_prior(sinking, "bonded").range[1] == 0.05
         motion = np.ones((3, 2, 3))
         np.testing.assert_allclose(
-            compute_error(motion, motion[0], sample_mesh_errors(press, draws))[:, 0, 0], [0.05, 0.12, 0.12]
+            compute_motion_errors(motion, motion[0], sample_mesh_errors(press, draws))[:, 0, 0], [0.05, 0.12, 0.12]
         )

@@ -38,9 +38,9 @@ def test_single_precision_rigid_matrix_is_converted_to_metres():
 def test_poses_in_tracker_frame_are_converted_to_reference():
     names = TransformNames(tool="StylusTipToTracker")
     heard = ReceivedTransforms(names, 0.3).add_transform(names.tool, matrix(), STAMP, 1.0, 0)
-    assert heard.find_relative(names.tool, 1.0) == "no ReferenceToTracker yet"
+    assert heard.find_relative_transform(names.tool, 1.0) == "no ReferenceToTracker yet"
     heard = heard.add_transform(names.reference, matrix((0.0, 0.0, 100.0)), STAMP, 0.9, 0)
-    found = heard.find_relative(names.tool, 1.0)
+    found = heard.find_relative_transform(names.tool, 1.0)
     expected = np.linalg.inv(to_rigid(matrix((0.0, 0.0, 100.0)))) @ to_rigid(matrix())
     assert pytest.approx(expected) == found.T and found.arrived == 0.9
-    assert heard.find_relative(names.tool, 1.25) == "no new ReferenceToTracker for 0.3 s"
+    assert heard.find_relative_transform(names.tool, 1.25) == "no new ReferenceToTracker for 0.3 s"

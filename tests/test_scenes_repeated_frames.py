@@ -9,7 +9,7 @@ import pytest
 
 from scenes.episodes.make import make_body, make_episode
 from scenes.episodes.plan import load_plan
-from scenes.episodes.reading.repeated_frames import solve_again, validate_files
+from scenes.episodes.reading.repeated_frames import solve_frames_again, validate_files
 from scenes.episodes.reading.validation import Report, validate_episode
 from sim.bodies.meshfile import write_anatomy
 
@@ -42,11 +42,11 @@ def episode(request, small_box, tmp_path_factory):
 
 def test_repeated_solution_detects_a_changed_frame(episode):
     """Only the changed one of frames 0, 2 and 5 is named."""
-    report = solve_again(Report(episode), 3, "cpu")
+    report = solve_frames_again(Report(episode), 3, "cpu")
     assert report.problems == [] and report.again == 3 and report.again_mm < 0.1
     with h5py.File(episode, "a") as file:
         file["tumour_fem"][2, 0, 2] += 4e-4
-    (said,) = solve_again(Report(episode), 3, "cpu").problems
+    (said,) = solve_frames_again(Report(episode), 3, "cpu").problems
     assert said.startswith("frame 2, solved again: 0.")
 
 

@@ -15,7 +15,7 @@ from scenes.page.demo import Demo
 from scenes.page.fem_worker import FemWorker
 from scenes.page.requests import HAND, SCRIPT
 from scenes.page.view import move_bodies
-from scenes.play.deformers import AtRest, PatientSetup
+from scenes.play.deformers import PatientSetup, RestDeformer
 from scenes.play.effect_ablation import remove_effect
 from scenes.play.player import Frame, Player
 from scenes.play.replay import IN_ORDER, FrameCache, ReplayOrder, ReplaySession, plan_replay_order
@@ -97,8 +97,8 @@ class TestReel:
             while reached != number:
                 reached, found = reel.approach_frame(number)
                 assert found == tuple(range(reached + 1)) and reached <= number
-            assert ran.total() - before < (101 if number == 99 else -(-100 // IN_ORDER.kept))
-        assert len(ran) == 100 and len(reel.kept) <= IN_ORDER.kept
+            assert ran.total() - before < (101 if number == 99 else -(-100 // IN_ORDER.max_stored))
+        assert len(ran) == 100 and len(reel.kept) <= IN_ORDER.max_stored
 
     def test_frame_cache_computes_at_most_one_frame_per_call(self) -> None:
         ran: list[int] = []
@@ -108,9 +108,7 @@ class TestReel:
 
     def test_long_jump_starts_at_the_nearest_cached_frame(self) -> None:
         ran: list[tuple[int, int | None]] = []
-        reel = FrameCache(
-            50, lambda number, before: ran.append((number, before)) or number, ReplayOrder(6, back=True, kept=64)
-        )
+        reel = FrameCache(50, lambda number, before: ran.append((number, before)) or number, ReplayOrder(6, True, 64))
 
         def way(number: int) -> list[tuple[int, int | None]]:
             ran.clear()
@@ -122,9 +120,7 @@ class TestReel:
         assert way(15) == [(15, 14)] and way(17) == [(17, 15)] and way(12) == []
         assert way(40) == [(18, 12), (24, 18), (30, 24), (36, 30), (40, 36)]
         assert way(20) == [(20, 18)] and way(5) == [(5, 6)]
-        reel = FrameCache(
-            50, lambda number, before: ran.append((number, before)) or number, ReplayOrder(6, back=True, kept=1)
-        )
+        reel = FrameCache(50, lambda number, before: ran.append((number, before)) or number, ReplayOrder(6, True, 1))
         assert way(48)[-1] == (48, 42) and way(29) == [(42, 48), (36, 42), (30, 36), (29, 30)]
         assert list(reel.kept) == [0]
 
@@ -138,10 +134,11 @@ def test_replay_order_depends_on_contact_and_history(theatre) -> None:
 
     def course(name: str, anatomy: Anatomy, **values: object) -> ReplayOrder | None:
         scene = replace(find_scene(name), **values)
-        return plan_replay_order(Player(PatientSetup(anatomy, None, {}, "cpu").build_stage(scene), AtRest(anatomy)))
+        stage = PatientSetup(anatomy, None, {}, "cpu").build_stage(scene)
+        return plan_replay_order(Player(stage, RestDeformer(anatomy)))
 
-    assert course("brain_shift", sliding) == ReplayOrder(6, back=True, kept=64)
-    assert course("brain_shift", sliding, frames_per_second=10.0) == ReplayOrder(2, back=True, kept=64)
+    assert course("brain_shift", sliding) == ReplayOrder(6, True, 64)
+    assert course("brain_shift", sliding, frames_per_second=10.0) == ReplayOrder(2, backward=True, max_stored=64)
     assert course("brain_shift", box) is course("press", box) is None
     assert course("retract", box) is course("pulsation", sliding) is IN_ORDER
 
@@ -268,7 +265,7 @@ def test_fem_worker_solutions_equal_sequential_frames(theatre):
     full = straight(theatre.build_player("fem", scene))
     referee = FemWorker(theatre, scene, threading.Lock())
     for number in (12, 3, 8):
-        referee.ask(number, None)
+        referee.request_frame(number, None)
         while referee.truth is None or referee.truth.number != number:
             assert referee.failure is None and not time.sleep(0.01)
         assert same(referee.truth.deformation, full[number])

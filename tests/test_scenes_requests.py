@@ -10,7 +10,7 @@ from visitor import Visitor, report, wait_for
 
 from scenes.page.demo import MESSAGE_TIME
 from scenes.page.fem_worker import FemWorker
-from scenes.page.requests import HAND, SCRIPT, Requests, describe_holder
+from scenes.page.requests import HAND, SCRIPT, Requests, describe_tool_control
 from scenes.play.deformers import PatientSetup
 from scenes.play.player import Player
 from scenes.script.tool_paths import Touch
@@ -28,13 +28,13 @@ class TestWish:
     def played(wish):
         """The frame that is shown next, of three."""
         number = wish.read_current()[0]
-        wish.go_on(number, 3)
+        wish.step_playback(number, 3)
         return number
 
     def test_requested_frame_is_not_overridden_by_playback(self):
         wish = Requests("linear", Touch())
         wish.set(number=2)
-        wish.go_on(0, 3)
+        wish.step_playback(0, 3)
         assert wish.read_current()[0] == 2
 
     def test_manual_control_keeps_unchanged_values(self):
@@ -132,9 +132,9 @@ def test_loads_rejected_by_fem_are_skipped(theatre, scene, monkeypatch):
     player = theatre.build_player("linear", scene)  # as quick to have, and asked the same way
     monkeypatch.setattr(PatientSetup, "build_player", lambda *words: player)
     referee = FemWorker(theatre, scene, threading.Lock())
-    referee.ask(7, None)
+    referee.request_frame(7, None)
     assert wait_for(lambda: str(referee.failure) == "7 is refused.")
-    referee.ask(8, None)
+    referee.request_frame(8, None)
     assert wait_for(lambda: referee.truth is not None and referee.truth.number == 8)
     assert referee.failure is None and referee.thread.is_alive()
     referee.close()
@@ -160,7 +160,7 @@ def test_each_visitor_sees_who_controls_the_tool(running):
     other.set(page.inputs["place up [mm]"], 3.0)
     assert wait_for(lambda: "Visitor 2 controls" in read()[0] and "**You control" in read()[1])
     other.wire.close()
-    assert wait_for(lambda: read() == [describe_holder(1, 2, {1})])
+    assert wait_for(lambda: read() == [describe_tool_control(1, 2, {1})])
     assert "Visitor 2, who controlled the tool, has left" in read()[0]
     one.set(page.inputs["tool"], SCRIPT)
     assert wait_for(lambda: read() == ["Automatic playback"])

@@ -13,7 +13,7 @@ from ar.overlay.outlines import compute_silhouette
 from scenes.cli import main
 from scenes.episodes.episode import collect
 from scenes.page.demo import Demo
-from scenes.play.frame_text import format_acting
+from scenes.play.frame_text import format_active_loads
 from scenes.script.debulking import Debulking
 from scenes.script.head_pose import build_drainage
 from scenes.script.tool_paths import Touch
@@ -58,7 +58,7 @@ def test_resection_scene_has_resection_effect_and_cause(theatre, scene):
     assert [type(effect) for effect in scene.get_effects_on(theatre.anatomy)][-1] is Resection
     loads = scene.build_loads(theatre.site, Touch(), 0.12)
     assert [type(cause) for cause in loads.causes] == [Posture, Resected]
-    assert loads.get(Resected).done.tolist() == [2] and "resection: 2 steps done" in format_acting(
+    assert loads.get(Resected).done.tolist() == [2] and "resection: 2 steps done" in format_active_loads(
         loads, build_start(np.zeros((1, 3, 3))), theatre.site.anatomy.mesh.nodes
     )
     assert theatre.list_deformers(scene) == ("fem",)

@@ -42,7 +42,7 @@ def test_pareto_front_has_rows_not_dominated():
     rows += [ReportRow("none", "f", state="it has no bound")]
     assert find_front(rows) == {"fast", "near", "between"}
     chart = build_error_chart(rows)
-    assert {dot.name for dot in chart.dots if not dot.pale} == {"fast", "near", "between"}
+    assert {dot.name for dot in chart.dots if not dot.is_pale} == {"fast", "near", "between"}
     assert len(chart.front) == 3 and build_error_chart(rows[-1:]) is None
 
 

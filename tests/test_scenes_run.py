@@ -18,7 +18,7 @@ from scenes.tracked.calibration_file import read_calibration
 from scenes.tracked.follower import Follower
 from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.registration_file import read_registration
-from scenes.tracked.run import draw_overlays, read_timed
+from scenes.tracked.run import draw_overlays, read_timed_images
 from scenes.tracked.tool_motion import ToolMotion
 
 FILM = Path(__file__).parent / "data" / "film"
@@ -37,27 +37,27 @@ def film(count):
 
 def test_masked_areas_have_no_overlay_and_report_their_share(parts):
     follower, painter = parts
-    (whole,) = draw_overlays(read_timed(film(1)), follower, painter)
-    camera, tumour = whole.known.camera, painter.stage.tumour_at_rest
+    (whole,) = draw_overlays(read_timed_images(film(1)), follower, painter)
+    camera, tumour = whole.tracking.camera, painter.stage.tumour_at_rest
     mask = compute_silhouette(camera, tumour.vertices, tumour.triangles)
     columns = np.flatnonzero(mask.any(axis=0))
     covered = np.zeros(mask.shape, np.uint8)
     covered[150:, : int(columns.mean())] = 255  # below the words of the head
-    (hidden,) = draw_overlays(read_timed(film(1), iter([Named("0.png", covered)])), follower, painter)
-    amber = [find_ink(each.colour, compute_ink((0.92, 0.50, 0.05))) for each in (whole, hidden)]
+    (hidden,) = draw_overlays(read_timed_images(film(1), iter([Named("0.png", covered)])), follower, painter)
+    amber = [find_ink(each.image, compute_ink((0.92, 0.50, 0.05))) for each in (whole, hidden)]
     assert amber[0][covered > 0].any() and not amber[1][covered > 0].any()
     np.testing.assert_array_equal(amber[0][covered == 0], amber[1][covered == 0])
     share = np.count_nonzero(mask & (covered > 0)) / np.count_nonzero(mask)
     assert 0.2 < share < 0.8
-    assert has_text(hidden.colour, f"{share:.0%} of the tumour is behind what lies in front", TEXT_SCALE)
-    assert hidden.known.band == whole.known.band and not hidden.known.relied
+    assert has_text(hidden.image, f"{share:.0%} of the tumour is behind what lies in front", TEXT_SCALE)
+    assert hidden.tracking.bound == whole.tracking.bound and not hidden.tracking.is_reliable
 
 
 def test_frozen_overlay_is_hidden_by_the_mask(parts):
     follower, painter = parts
-    (shown,) = draw_overlays(read_timed(film(1)), follower, painter)
-    blank = np.full(shown.colour.shape, 120, np.uint8)
-    lost = follower.step(blank[..., 0], 0.1, shown.known)
+    (shown,) = draw_overlays(read_timed_images(film(1)), follower, painter)
+    blank = np.full(shown.image.shape, 120, np.uint8)
+    lost = follower.step(blank[..., 0], 0.1, shown.tracking)
     covered = np.zeros(blank.shape[:2], bool)
     covered[:600] = True
     assert (painter.paint(blank, lost).colour[:600] != 120).any()
@@ -66,19 +66,19 @@ def test_frozen_overlay_is_hidden_by_the_mask(parts):
 
 def test_masks_match_images_by_number_and_size():
     black = Named("a.png", np.zeros((720, 960), np.uint8))
-    assert [each.covered.any() for each in read_timed(film(2), iter([black, black]))] == [False, False]
+    assert [each.occluded.any() for each in read_timed_images(film(2), iter([black, black]))] == [False, False]
     ones = black.grey.copy()
     ones[100:200] = 1  # a mask of 0 and 1
-    (shown,) = read_timed(film(1), iter([Named("a.PNG", ones)]))
-    np.testing.assert_array_equal(shown.covered, ones > 0)
+    (shown,) = read_timed_images(film(1), iter([Named("a.PNG", ones)]))
+    np.testing.assert_array_equal(shown.occluded, ones > 0)
     soft = replace(black, name="frame 0", grey=np.full_like(ones, 16))  # a video's black
-    assert not next(read_timed(film(1), iter([soft]))).covered.any()
+    assert not next(read_timed_images(film(1), iter([soft]))).occluded.any()
     with pytest.raises(ValueError, match="frame 1 has no mask"):
-        list(read_timed(film(2), iter([black])))
+        list(read_timed_images(film(2), iter([black])))
     with pytest.raises(ValueError, match="more masks than images"):
-        list(read_timed(film(1), iter([black, black])))
+        list(read_timed_images(film(1), iter([black, black])))
     with pytest.raises(ValueError, match=r"the mask b\.png"):
-        list(read_timed(film(1), iter([Named("b.png", black.grey[1:])])))
+        list(read_timed_images(film(1), iter([Named("b.png", black.grey[1:])])))
 
 
 def test_overlay_command_rejects_mask_video_with_missing_frames(tmp_path, capsys):

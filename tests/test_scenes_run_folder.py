@@ -11,7 +11,7 @@ from tiny_episodes import Wanted, write_episode
 from scenes.episodes.rates import write_rates
 from scenes.episodes.reading.contents import open_episode
 from scenes.episodes.reading.validation import validate_episode
-from scenes.episodes.run_folder import RunSettings, begin
+from scenes.episodes.run_folder import RunSettings, begin_run
 from sim.errors import InputError
 
 PLAN = 'title = "A box"\n[motion.press]\n[bodies]\nanatomies = "box.vtu"\n[bodies.learner]\nname = "none"\n'
@@ -34,11 +34,11 @@ def test_locked_episode_file_is_reported(box, tmp_path):
 
 def test_folder_without_write_access_is_reported(tmp_path, monkeypatch):
     run = RunSettings("own", "0", 1, "cpu", {})
-    begin(tmp_path / "set", run, PLAN)
+    begin_run(tmp_path / "set", run, PLAN)
     with monkeypatch.context() as held:
         held.setattr(Path, "open", fails)
         with pytest.raises(InputError, match=r"rates.*cannot be written"), write_rates(tmp_path / "set"):
             pass
     monkeypatch.setattr(Path, "mkdir", fails)
     with pytest.raises(InputError, match=r"set: cannot be written to"):
-        begin(tmp_path / "set", run, PLAN)
+        begin_run(tmp_path / "set", run, PLAN)

@@ -6,7 +6,7 @@ import numpy as np
 from theatres import player, short
 
 from ar.screen import shrink_image
-from scenes.play.scene_costs import add_cost_label, tile_images
+from scenes.play.scene_costs import draw_cost_panel, tile_images
 from scenes.play.stage import TOOL
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
@@ -14,7 +14,7 @@ from sim.deformation import Outcome
 
 def test_cost_label_does_not_cover_the_tool(play):
     frame = play.draw(51, 1.7, play.scene.path(1.7))
-    plain = add_cost_label(frame, "linear")
+    plain = draw_cost_panel(frame, "linear")
     assert plain.shape == frame.shown.shape
     changed, tool = (plain != frame.shown).any(axis=2), frame.picture.segmentation == TOOL
     assert changed.any() and tool.any() and not changed[tool].any()
@@ -26,10 +26,10 @@ def test_cost_label_has_source_time_and_motion(play, monkeypatch):
         "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
     )
     frame = replace(play, motion_error=None).draw(51, 1.7, play.scene.path(1.7))
-    add_cost_label(frame, "linear")
+    draw_cost_panel(frame, "linear")
     assert said[:2] == [f"linear: tumour moved {1e3 * frame.moved:.2f} mm", f"t 1.70 s, {frame.acts}"]
     assert said[-1] == frame.deformation.source
-    add_cost_label(replace(frame, moved=1.33e-3, moved_error=5.31e-3), "linear")
+    draw_cost_panel(replace(frame, moved=1.33e-3, moved_error=5.31e-3), "linear")
     assert "linear: tumour moved 1.33 +- 5.4 mm" in said
 
 
@@ -40,7 +40,7 @@ def test_cost_label_warns_of_extrapolated_solution(theatre, monkeypatch):
     )
     play = player(theatre, short(), "linear")
     for force in (0.2, 0.6):
-        add_cost_label(play.draw(0, 0.0, Touch(force=force)), "linear")
+        draw_cost_panel(play.draw(0, 0.0, Touch(force=force)), "linear")
     within, beyond = shown
     assert beyond[1] == Outcome.EXTRAPOLATED.value and len(beyond) == len(within) + 1
 

@@ -3,7 +3,7 @@ import pytest
 
 from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.scene import find_scene
-from scenes.script.scene_poses import DEPTHS, draw_scene_poses
+from scenes.script.scene_poses import DEPTHS, sample_scene_poses
 from scenes.script.shipped_files import get_template_path
 from scenes.script.tool_paths import Touch
 from sim.bodies.meshfile import read_anatomy
@@ -18,7 +18,7 @@ def site():
 
 def test_sampled_poses_cover_the_range_of_manual_control(site):
     scene = find_scene("spatula")
-    tool, loads = draw_scene_poses(scene, site, 64, 0)
+    tool, loads = sample_scene_poses(scene, site, 64, 0)
     assert tool == scene.tool.shape
     pose = loads.get(Touching).pose[:, 0]
     still = scene.compute_pose(site, Touch())
@@ -34,11 +34,11 @@ def test_sampled_poses_cover_the_range_of_manual_control(site):
 
 def test_larger_pose_sample_starts_with_the_smaller_sample(site):
     scene = find_scene("spatula")
-    few, more = (draw_scene_poses(scene, site, count, 3)[1].get(Touching).pose for count in (DEPTHS, 3 * DEPTHS + 1))
+    few, more = (sample_scene_poses(scene, site, count, 3)[1].get(Touching).pose for count in (DEPTHS, 3 * DEPTHS + 1))
     assert np.array_equal(few, more[:DEPTHS]) and not np.allclose(more[0], more[DEPTHS])
-    assert not np.allclose(few, draw_scene_poses(scene, site, DEPTHS, 4)[1].get(Touching).pose)
+    assert not np.allclose(few, sample_scene_poses(scene, site, DEPTHS, 4)[1].get(Touching).pose)
 
 
 def test_scene_without_moved_tool_is_rejected(site):
     with pytest.raises(InputError, match="the scene press moves no ball"):
-        draw_scene_poses(find_scene("press"), site, 8, 0)
+        sample_scene_poses(find_scene("press"), site, 8, 0)

@@ -12,7 +12,7 @@ from visitor import Visitor, free_port, wait_for
 
 from scenes.page.demo import Demo
 from scenes.page.fem_worker import FemWorker
-from scenes.play.deformers import AtRest, PatientSetup
+from scenes.play.deformers import PatientSetup, RestDeformer
 from scenes.play.player import Player
 from scenes.script.scene import Viewpoint, find_scene
 from scenes.script.tool_paths import lay
@@ -27,7 +27,7 @@ FRAMES = 16
 class Gated:
     """Finite elements that pass a gate before each answer, and count what they were asked for, by frame."""
 
-    still: AtRest
+    still: RestDeformer
     gate: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     solved: Counter = field(default_factory=Counter)
 
@@ -48,7 +48,7 @@ class Gated:
 @pytest.fixture
 def gated(monkeypatch):
     """The only finite elements, whoever asks for some."""
-    made = Gated(AtRest(make_box(cells=(6, 6, 4), spacing=12e-3)))
+    made = Gated(RestDeformer(make_box(cells=(6, 6, 4), spacing=12e-3)))
     monkeypatch.setattr(
         PatientSetup, "build_player", lambda theatre, name, scene: Player(theatre.build_stage(scene), made)
     )
@@ -147,7 +147,7 @@ def test_jump_to_solved_frame_stops_the_pending_solve(demo, gated):
     with Loop(demo) as page:
         ask_for_frame_12(demo, gated, page, 4)
         demo.wish.set(number=1)
-        assert wait_for(lambda: demo.referee.newest == (1, None))
+        assert wait_for(lambda: demo.fem_worker.newest == (1, None))
         gated.let(1)  # the step in hand
         assert wait_for(lambda: shows(page, 1))
         gated.let(100)
@@ -169,7 +169,7 @@ def test_pause_stops_the_pending_solve(demo, gated):
         gated.let(3)
         assert wait_for(lambda: shows(page, 2) and gated.solved[3])
         visitor.set(page.button, True)
-        assert wait_for(lambda: not demo.wish.plays and demo.referee.newest is None)
+        assert wait_for(lambda: not demo.wish.plays and demo.fem_worker.newest is None)
         gated.let(100)
         time.sleep(0.3)
         assert shows(page, 2) and set(gated.solved) == set(range(4)) and page.frame.value == 2
@@ -179,8 +179,8 @@ def test_pause_stops_the_pending_solve(demo, gated):
 def test_effect_switch_starts_new_solver_and_stops_old_one(demo, gated):
     with Loop(demo) as page:
         ask_for_frame_12(demo, gated, page, 3)
-        full = demo.referee
-        demo.wish.switch("Retraction", False)
+        full = demo.fem_worker
+        demo.wish.switch_effect("Retraction", False)
         assert wait_for(lambda: len(demo.cast.solvers) == 2 and full.newest is None)
         gated.let(1 + 13)  # the step in hand, and all frames without the effect
         assert wait_for(lambda: shows(page, 12) and "Switched off: the spatula" in page.shown[2])
@@ -264,12 +264,12 @@ def test_dropped_request_prepares_no_solver(gated, monkeypatch):
     gated.let(2)
     with turn:
         referee = FemWorker(theatre, ordered(), turn)
-        referee.ask(0, None)
+        referee.request_frame(0, None)
         time.sleep(0.1)
-        referee.drop()
+        referee.drop_request()
     time.sleep(0.1)
     assert made == []
-    referee.ask(0, None)
+    referee.request_frame(0, None)
     assert wait_for(lambda: referee.truth is not None) and len(made) == 1
     referee.close()
 

@@ -42,7 +42,7 @@ class TestScenes:
         scene = short()
         wide = replace(scene, viewpoint=replace(scene.viewpoint, width=480, height=360))
         player = theatre.build_player("linear", wide)
-        foot, kept = render_thumbnail(player, "linear").colour[-40:], []
+        foot, kept = render_thumbnail(player, "linear").image[-40:], []
         for frame in player.play_frames():
             words = frame.taken[-40:] > 0
             kept.append(words.any() and np.array_equal(foot[words], frame.shown[-40:][words]))

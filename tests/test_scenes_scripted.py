@@ -5,7 +5,7 @@ from gym_examples import DOWN, made, played
 from test_scenes_plan import TINY
 
 from scenes.episodes.make import choose_body
-from scenes.episodes.plan import plan_from
+from scenes.episodes.plan import parse_plan
 from scenes.episodes.scripted import sample_episode
 from scenes.gym.episode import REWARD
 from scenes.gym.tasks import PALPATE
@@ -16,7 +16,7 @@ def test_scripted_policy_reaches_goal_and_pressing_ends_episode():
     rows = played(made(), 3, 60)
     truth = rows[-1][2]
     assert truth["success"] and truth["violations"] == 0 and abs(truth["reached"] / truth["asked"] - 1.0) < 0.15
-    assert 0.0 < truth["model_error"] < 0.1e-3 and truth["pressure"] < PALPATE.pressure
+    assert 0.0 < truth["model_error"] < 0.1e-3 and truth["pressure"] < PALPATE.max_pressure
     environment = made()
     environment.reset(seed=3)
     terminated, rewards = False, []
@@ -30,7 +30,7 @@ def test_scripted_policy_reaches_goal_and_pressing_ends_episode():
 
 
 def test_episode_sampling_depends_on_seed_and_name_only():
-    plain, more = plan_from(TINY, "a"), plan_from(f"{TINY}tool_deg = [0, 1]\n[hand]\ntremor_mm = [0, 1]\n", "b")
+    plain, more = parse_plan(TINY, "a"), parse_plan(f"{TINY}tool_deg = [0, 1]\n[hand]\ntremor_mm = [0, 1]\n", "b")
     first, again = sample_episode(plain.contents, 4, 7), sample_episode(plain.contents, 4, 7)
     assert first == again and choose_body(plain, 4, 7) == first.body
     other = sample_episode(more.contents, 4, 7)

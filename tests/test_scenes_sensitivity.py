@@ -13,11 +13,11 @@ from scenes.analysis.sensitivity import (
     BodyVariant,
     LoadPerturbation,
     SensitivityStudy,
-    apply_aim,
-    change,
+    compute_change,
     list_variants,
     match_motion,
     measure_variants,
+    perturb_loads,
 )
 from scenes.cli import main
 from sim.accuracy import Accuracy
@@ -56,7 +56,7 @@ def found(anatomy):
     """All rows of the linear law, by factor and changed value."""
     study = SensitivityStudy(anatomy, draw("palpation", anatomy, 4, 0), LINEAR, TIGHT, "cpu")
     all_rows = list(measure_variants(study, list_variants(anatomy, LINEAR, ["smoothed"])))
-    return {(row.variant.factor, row.variant.now): row for row in all_rows}
+    return {(row.variant.factor, row.variant.changed): row for row in all_rows}
 
 
 def test_sensitivity_study_has_one_row_per_variant(found):
@@ -139,12 +139,12 @@ def test_change_uses_loads_converged_in_variant_and_default(pretender):
     default, answer = (replace(pretender, fails_above=most).deform(loads, at=nodes) for most in (0.25, 0.15))
     assert [outcome is Outcome.CONVERGED for outcome in default.outcome] == [True, True, False]
     doubled = replace(answer, displacement=2.0 * answer.displacement)
-    found = change(doubled, default, default.displacement)
+    found = compute_change(doubled, default, default.displacement)
     assert (found.solves, found.failed) == (1, 2)
     assert found.percent == pytest.approx(100.0)
     assert found.motion == pytest.approx(2.0)
     assert found.mean_mm == pytest.approx(1e3 * np.linalg.norm(default.displacement[0], axis=1).mean())
-    all_good = change(pretender.deform(loads, at=nodes), default, default.displacement)
+    all_good = compute_change(pretender.deform(loads, at=nodes), default, default.displacement)
     assert (all_good.solves, all_good.failed) == (2, 1)
 
 
@@ -152,7 +152,7 @@ def test_change_has_percentiles_over_loads_and_vertices():
     """p95 over every load x vertex; worst95 over the loads, each by its farthest vertex."""
     field = np.random.default_rng(0).normal(size=(40, 7, 3))
     default = replace(build_start(np.ones((40, 7, 3))), outcome=40 * (Outcome.CONVERGED,))
-    found = change(replace(default, displacement=1.0 + 1e-3 * field), default, default.displacement)
+    found = compute_change(replace(default, displacement=1.0 + 1e-3 * field), default, default.displacement)
     off = np.linalg.norm(field, axis=2)
     wanted = off.mean(), np.percentile(off, 95), np.percentile(off.max(axis=1), 95), off.max()
     assert (found.mean_mm, found.p95_mm, found.worst95_mm, found.largest_mm) == pytest.approx(wanted)
@@ -162,8 +162,8 @@ def test_aim_errors_have_the_given_angle_and_shift(anatomy):
     loads, patch = draw("palpation", anatomy, 5, 1), open_patch(anatomy)
     drawn = loads.get(Pushed)
     size = np.linalg.norm(drawn.force, axis=1)
-    turned = apply_aim(loads, LoadPerturbation(turn=0.2), patch).get(Pushed)
-    shifted = apply_aim(loads, LoadPerturbation(shift=1e-3), patch).get(Pushed)
+    turned = perturb_loads(loads, LoadPerturbation(turn=0.2), patch).get(Pushed)
+    shifted = perturb_loads(loads, LoadPerturbation(shift=1e-3), patch).get(Pushed)
     assert (len(turned.force), len(shifted.force)) == (10, 20)
     np.testing.assert_allclose(np.linalg.norm(turned.force, axis=1), np.tile(size, 2))
     cosine = np.einsum("bi,bi->b", turned.force, np.tile(drawn.force, (2, 1))) / np.tile(size, 2) ** 2

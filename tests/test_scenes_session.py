@@ -17,7 +17,7 @@ from links import HOST, NAMES, in_mm, linked, peers, played
 from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, measure_outline_gap
 from ar.tracking.image_sequences import read_video
 from scenes.link.frame import to_stamp
-from scenes.link.messages import encode_image, read_image, transform
+from scenes.link.messages import encode_image, encode_transform, read_image
 from scenes.link.received_transforms import TransformNames
 from scenes.link.session import OverlayCamera
 from scenes.play.stage import TUMOUR_COLOUR
@@ -77,7 +77,7 @@ async def lines_until(stream, *wanted):
 async def sending(peer, beside, beat=0.03):
     """Send a pose again and again, each at its time."""
     while True:
-        peer.send("TRANSFORM", NAMES.tool, transform(beside), to_stamp(time.time()))
+        peer.send("TRANSFORM", NAMES.tool, encode_transform(beside), to_stamp(time.time()))
         await asyncio.sleep(beat)
 
 
@@ -185,7 +185,7 @@ def test_camera_image_is_returned_with_tumour_overlay(follower, registration, tr
                 if where != "late":
                     moved = placed.copy()
                     moved[0, 3] += shift
-                    tracker.send("TRANSFORM", NAMES.camera, transform(moved), stamp)
+                    tracker.send("TRANSFORM", NAMES.camera, encode_transform(moved), stamp)
                 tracker.send("IMAGE", "Camera", encode_image(picture), stamp + (where == "fast") * to_stamp(0.005))
                 header, body = await tracker.next("IMAGE", "Overlay")
                 shown[where] = read_image(body)

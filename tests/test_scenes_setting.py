@@ -28,9 +28,11 @@ def test_reward_is_potential_difference_minus_penalties():
     step, most = REWARD.step_penalty, REWARD.max_potential_distance
     assert compute_reward(far, near, False, False) == pytest.approx(1.0 + 0.5 - step)
     assert compute_reward(near, near, False, False) == pytest.approx(-step)
-    assert compute_reward(near, replace(near, load=1.1), False, False) == pytest.approx(-step - REWARD.limit_penalty)
+    pressed = replace(near, load_ratio=1.1)
+    assert compute_reward(near, pressed, False, False) == pytest.approx(-step - REWARD.limit_penalty)
     assert compute_reward(near, near, False, True) == pytest.approx(REWARD.abort_reward - step)
-    assert compute_reward(near, replace(near, cut=2), False, False) == pytest.approx(2.0 * REWARD.share_reward - step)
+    cut = replace(near, cut_shares=2)
+    assert compute_reward(near, cut, False, False) == pytest.approx(2.0 * REWARD.share_reward - step)
     lost, farther = EpisodeScore(most, 1.0, 0, 0.5), EpisodeScore(2.0 * most, 5.0, 0, 0.5)  # beyond, all count alike
     beyond = compute_reward(farther, lost, False, False)
     assert beyond == pytest.approx(-step) != compute_reward(lost, near, False, False)
@@ -41,7 +43,7 @@ def test_debulk_goal_tracks_remaining_tumour(boxed):
     rows = played(environment, 0, 120, "debulk")
     setting = environment.unwrapped.episode.setting
     tumour, first = setting.site.anatomy.tumour_nodes, [truth for _, _, truth in rows if truth["steps_done"] == 1]
-    share = np.searchsorted(tumour, setting.shares[0])
+    share = np.searchsorted(tumour, setting.resection_shares[0])
     assert np.allclose(first[-2]["target"], first[-2]["tumour_nodes"][share].mean(axis=0), atol=1e-12)
     assert np.linalg.norm(first[-2]["target"] - first[0]["target"]) > 1e-6
     last = rows[-1][2]
@@ -72,8 +74,8 @@ def stiff(box, tmp_path_factory):
 
 def test_task_uses_the_tissue_of_the_models(stiff):
     setting = open_setting(PALPATE, str(stiff), "auto", "cpu", SIZE)
-    assert isinstance(setting.answers, PressedModel) and setting.scene.elasticity == STIFF
-    assert setting.answers.ball.tissue == BRAIN  # which lies over the tumour
+    assert isinstance(setting.tissue_model, PressedModel) and setting.scene.elasticity == STIFF
+    assert setting.tissue_model.ball.tissue == BRAIN  # which lies over the tumour
     exact = open_setting(DEBULK, str(stiff), "auto", "cpu", SIZE)  # drained brain: as many times as stiff
     assert exact.scene.elasticity.get_law(TUMOUR_LABEL) == replace(MATERIALS["drained"].tissue, young=6300.0)
 
@@ -86,7 +88,7 @@ def test_contact_ball_uses_tissue_at_the_cortex(stiff, box, tmp_path):
     }
     path = put(replace(theatre_of(box), anatomy=shallow, models=models), tmp_path / "shallow.vtu")
     setting = open_setting(PALPATE, str(path), "fem", "cpu", SIZE)
-    assert setting.answers.ball.tissue == STIFF.get_law(TUMOUR_LABEL)
+    assert setting.tissue_model.ball.tissue == STIFF.get_law(TUMOUR_LABEL)
 
 
 def test_inapplicable_model_is_rejected_with_reason(stiff):

@@ -26,11 +26,11 @@ from scenes.episodes.episode import EpisodeRecording, collect
 from scenes.play.deformers import PatientSetup
 from scenes.play.player import Player
 from scenes.play.stage import Stage
-from scenes.tracked.pose_file import TrackedRow, write_poses
+from scenes.tracked.pose_file import TrackedPose, write_poses
 from scenes.tracked.registration_file import describe_scan, write_registration
-from scenes.tracked.run import write_rows
+from scenes.tracked.run import write_tracking_table
 from scenes.tracked.tracked_tool import TrackedTool, read_tool, write_tool
-from scenes.tracked.truth import VideoGroundTruth, write_table, write_truth
+from scenes.tracked.truth import VideoGroundTruth, write_truth, write_truth_table
 from sim.bodies.meshfile import read_anatomy, write_mesh
 from sim.tools import Ball
 from surrogate.data.simulate import simulate
@@ -161,9 +161,8 @@ def test_episode_mask_matches_projected_tumour(folder, pretender):
     anatomy = read_anatomy(folder / "patient.vtu")
     theatre = PatientSetup(anatomy, None, {}, "cpu")
     play = Player(Stage(short(), theatre.site, None), replace(pretender, anatomy=anatomy))
-    collect(
-        folder / "press.h5", theatre, play, "fem", iter, recording=EpisodeRecording(None, overlay=False, dated=False)
-    )
+    bare = EpisodeRecording(None, overlay=False, with_times=False)
+    collect(folder / "press.h5", theatre, play, "fem", iter, recording=bare)
     with h5py.File(folder / "press.h5") as file:
         assert file.attrs["world_frame"] == "RAS [m]" and file.attrs["camera_frame"].startswith("OpenCV: x right")
         assert file["tumour_rest"].attrs["unit"] == "m"
@@ -184,9 +183,9 @@ def test_tables_and_headers_name_their_spaces(tmp_path):
     truth = VideoGroundTruth("digest", np.arange(2.0), poses, poses, still)
     write_truth(tmp_path / "truth.npz", truth)
     assert json.loads(str(np.load(tmp_path / "truth.npz")["header"]))["spaces"]["scan"] == "RAS [m]"
-    write_table(tmp_path / "truth.csv", truth, 1e-3 * TUMOUR[None])
-    write_poses(tmp_path / "track.csv", [TrackedRow(0.0, Verdict.LOST, None, 0.01)], np.zeros(3))
-    write_rows(tmp_path / "overlay.csv", [], [])
+    write_truth_table(tmp_path / "truth.csv", truth, 1e-3 * TUMOUR[None])
+    write_poses(tmp_path / "track.csv", [TrackedPose(0.0, Verdict.LOST, None, 0.01)], np.zeros(3))
+    write_tracking_table(tmp_path / "overlay.csv", [], [])
     (heads, *rows), (tracked, lost), (drawn,) = (
         list(csv.reader((tmp_path / name).read_text().splitlines()))
         for name in ("truth.csv", "track.csv", "overlay.csv")

@@ -9,7 +9,7 @@ from theatres import template_theatre
 
 from ar.overlay.outlines import compute_silhouette
 from benchmarks.studies.stereo_study import row
-from scenes.play.deformers import AtRest
+from scenes.play.deformers import RestDeformer
 from scenes.play.player import REJECTED_WARNING, Player
 from scenes.play.stereo_observer import StereoObserver
 from scenes.script.observation_models import StereoObservation
@@ -80,10 +80,10 @@ def test_stereo_points_move_with_cortex_within_their_errors(observer, moved, see
 def test_stereo_images_depend_on_the_seed(observer, moved, shot):
     again = observer_of()
     same, other = again.render_pair(30, moved), observer_of(replace(EXACT, seed=1)).render_pair(30, moved)
-    for one, two, three in zip(shot.pictures, same.pictures, other.pictures, strict=True):
+    for one, two, three in zip(shot.images, same.images, other.images, strict=True):
         assert np.array_equal(one, two) and np.abs(one.astype(float) - three).mean() > 2.0
-    assert not np.array_equal(observer.render_pair(31, moved).pictures[0], shot.pictures[0])
-    assert shot.pictures[1].mean() < 0.93 * shot.pictures[0].mean()
+    assert not np.array_equal(observer.render_pair(31, moved).images[0], shot.images[0])
+    assert shot.images[1].mean() < 0.93 * shot.images[0].mean()
 
 
 def test_tracking_error_moves_all_stereo_points_rigidly(observer, shot, seen):
@@ -103,7 +103,7 @@ def test_tracking_error_moves_all_stereo_points_rigidly(observer, shot, seen):
 def test_tool_hides_stereo_points_without_moving_others(observer, moved, seen):
     site, scene = observer.stage.site, observer.stage.scene
     inward, tip = site.axis, site.origin + 3e-3 * site.right - 2e-3 * site.axis
-    corners = observer.stage.compute_corners(scene.tool.pose(tip, inward, site.right))
+    corners = observer.stage.compute_tool_corners(scene.tool.pose(tip, inward, site.right))
     found = observer.observe(observer.render_pair(30, moved, corners), NONE)
     assert 20 < len(found.now) < len(seen.now)
     left = observer.render_pair(30, moved, corners).cameras[0]
@@ -125,11 +125,11 @@ def test_unnamed_stereo_points_lie_on_the_moved_cortex(moved, shot):
 def test_cortex_without_scan_has_vessels_for_stereo_tracking(observer):
     """Heads without T1 get the same vessels on uniform tissue."""
     bare = replace(observer, stage=replace(observer.stage, intensity=None))
-    assert len(bare.first.rest) > 60
+    assert len(bare.first_view.rest_positions) > 60
     plain = replace(
         bare, stage=replace(bare.stage, scene=replace(MICROSCOPE, observation_model=StereoObservation(vessels=False)))
     )
-    assert plain.stage.scan is None
+    assert plain.stage.scan_texture is None
 
 
 class TestRefusals:
@@ -139,7 +139,7 @@ class TestRefusals:
         return str(refused.value)
 
     def test_dark_eye_is_rejected(self, observer, shot):
-        dark = replace(shot, pictures=(shot.pictures[0], np.zeros_like(shot.pictures[1])))
+        dark = replace(shot, images=(shot.images[0], np.zeros_like(shot.images[1])))
         assert "the right eye sees nothing" in self.refusal(observer, dark)
 
     def test_motion_beyond_the_search_range_is_rejected(self, observer, rest):
@@ -148,12 +148,12 @@ class TestRefusals:
 
     def test_swapped_eyes_are_rejected(self, observer, shot, rest):
         assert "which is which" in self.refusal(observer, replace(shot, cameras=shot.cameras[::-1]))
-        later = self.refusal(observer, replace(shot, pictures=shot.pictures[::-1]))
+        later = self.refusal(observer, replace(shot, images=shot.images[::-1]))
         assert "check that eyes are not swapped" in later or "calibrate the pair again" in later
         swapped = observer_of()
         first = swapped.render_pair(-1, rest)
-        vars(swapped)["_first_shot"] = replace(first, pictures=first.pictures[::-1])
-        said = self.refusal(swapped, replace(shot, pictures=shot.pictures[::-1]))
+        vars(swapped)["_first_shot"] = replace(first, images=first.images[::-1])
+        said = self.refusal(swapped, replace(shot, images=shot.images[::-1]))
         assert "from the scan's" in said or "places of the cortex" in said or "pixels apart" in said
 
     def test_wrong_stereo_calibration_is_rejected(self, observer, shot, rest):
@@ -185,16 +185,16 @@ class TestRefusals:
 
 def test_tumour_is_located_and_dark_eye_is_rejected(observer, moved):
     found = observer.estimate(30, moved)
-    assert found.held and found.off < 0.6 * np.linalg.norm(found.true) and found.location.calibrated
+    assert found.is_covered and found.error < 0.6 * np.linalg.norm(found.true_motion) and found.location.calibrated
     stage = replace(observer.stage, observer=replace(observer, observation_model=replace(EXACT, darker=0.999)))
-    still = AtRest(stage.site.anatomy)
+    still = RestDeformer(stage.site.anatomy)
     player = Player(stage, still)
     answer = replace(still.deform(player.build_loads(0)), outcome=(Outcome.CONVERGED,))
     frame = player.draw_frame(0, player.get_touch(0), player.build_loads(0), answer, 0.0)
     assert (
         frame.doubt == REJECTED_WARNING and frame.estimate.location is None and not len(frame.estimate.observation.now)
     )
-    assert "sees nothing" in frame.estimate.refusal and frame.moved == 0.0
+    assert "sees nothing" in frame.estimate.rejection and frame.moved == 0.0
 
 
 def test_study_summary_counts_rejected_frames(observer, moved):
@@ -203,10 +203,10 @@ def test_study_summary_counts_rejected_frames(observer, moved):
         replace(observer, observation_model=replace(EXACT, darker=0.999)).estimate(3, moved),
     )
     found = row(4, [good, good, none])
-    assert (found.seed, found.frames, found.refused) == (4, 3, 1) and found.covered == float(good.held)
-    length = float(np.linalg.norm(good.true))
-    assert found.most_mm == pytest.approx(1e3 * length) and found.off_mm == pytest.approx(1e3 * good.off)
-    assert found.removed == pytest.approx(1.0 - (2.0 * good.off + length) / (3.0 * length))
+    assert (found.seed, found.frames, found.refused) == (4, 3, 1) and found.covered == float(good.is_covered)
+    length = float(np.linalg.norm(good.true_motion))
+    assert found.most_mm == pytest.approx(1e3 * length) and found.off_mm == pytest.approx(1e3 * good.error)
+    assert found.removed == pytest.approx(1.0 - (2.0 * good.error + length) / (3.0 * length))
 
 
 def test_microscope_benchmark_rejects_scene_without_stereo(capsys):

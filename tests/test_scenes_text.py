@@ -10,13 +10,13 @@ from theatres import short, sinking, small
 from scenes.page.text import (
     RESEARCH_ONLY,
     describe_fem,
+    describe_result,
     describe_scene,
     format_caption,
-    format_trust,
-    plan_words,
-    report,
+    format_report,
+    format_solver_list,
 )
-from scenes.play.deformers import GUARDED, explain_plan
+from scenes.play.deformers import GUARDED, describe_solvers
 from scenes.play.player import Player
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import press
@@ -28,7 +28,7 @@ from sim.material import Material
 
 class TestTrust:
     def test_page_reports_error_bound_inside_training_range(self):
-        said = format_trust(answer(Outcome.PREDICTED), "svr")
+        said = describe_result(answer(Outcome.PREDICTED), "svr")
         assert "Surrogate error (95 %): at most" in said and "1.00 mm" in said and "warn" not in said
 
     @pytest.mark.parametrize(
@@ -36,37 +36,38 @@ class TestTrust:
     )
     def test_page_warns_of_unreliable_solution_without_bound(self, outcome):
         """Shown in the warning colour, with the reason."""
-        said = format_trust(answer(outcome), "svr")
+        said = describe_result(answer(outcome), "svr")
         assert "Surrogate error" not in said and 'class="warn"' in said and "Do not rely on this result" in said
 
     def test_page_states_whether_guarded_used_model_or_fem(self):
-        assert format_trust(answer(Outcome.PREDICTED), GUARDED).startswith("<p><b>fast model</b>: inside the range")
-        assert "because the error bound of the fast model is too large</b>: converged" in format_trust(
+        shown = describe_result(answer(Outcome.PREDICTED), GUARDED)
+        assert shown.startswith("<p><b>fast model</b>: inside the range")
+        assert "because the error bound of the fast model is too large</b>: converged" in describe_result(
             answer(Outcome.CONVERGED), GUARDED
         )
 
     def test_page_text_has_no_names_of_the_code(self):
         for outcome in Outcome:
-            said = format_trust(answer(outcome), "fem")
+            said = describe_result(answer(outcome), "fem")
             assert "_" not in said and outcome.name not in said
 
     @pytest.mark.parametrize(("bound", "words"), [(1e-7, "0.01 mm"), (6e-6, "0.01 mm"), (1.231e-3, "1.24 mm")])
     def test_error_bound_is_rounded_up_in_page_text(self, bound, words):
         bounded = replace(answer(Outcome.PREDICTED), bound=np.full((2, 1), bound))
-        assert f"Surrogate error (95 %): at most {words} at any point" in format_trust(bounded, "svr")
+        assert f"Surrogate error (95 %): at most {words} at any point" in describe_result(bounded, "svr")
 
     def test_undeformed_brain_has_no_motion_and_error_text(self, theatre):
         scene = small(path=press(0.2), duration=1.0)
         player = Player(theatre.build_stage(scene), theatre.build_deformer("linear", scene))
         frames = [player.draw(0, time, player.scene.path(time)) for time in (0.0, 0.9)]
-        said = [report(frame, player.stage, "linear", "", (), 2) for frame in frames]
+        said = [format_report(frame, player.stage, "linear", "", (), 2) for frame in frames]
         assert "tumour moved" not in said[0] and "Nothing moves the tumour" in said[0]
         assert "tumour moved" in said[1] and "Nothing moves" not in said[1]
 
     def test_page_has_no_error_bound_without_motion(self):
         still = answer(Outcome.PREDICTED)
         still = replace(still, displacement=0.0 * still.displacement)
-        said = format_trust(still, "svr")
+        said = describe_result(still, "svr")
         assert "Nothing moves the tumour." in said and "Surrogate error" not in said
 
 
@@ -94,8 +95,9 @@ class TestWords:
         assert "Brain: brain.vtu; " in describe_scene(theatre, short(), "brain.vtu")
 
     def test_solver_plan_is_an_html_list_and_only_for_fem(self, theatre):
-        assert plan_words(("First <this>.", "Then that.")) == "<ul><li>First &lt;this&gt;.</li><li>Then that.</li></ul>"
-        assert plan_words(()) == "" == plan_words(explain_plan(theatre.models["linear"]))
+        shown = format_solver_list(("First <this>.", "Then that."))
+        assert shown == "<ul><li>First &lt;this&gt;.</li><li>Then that.</li></ul>"
+        assert format_solver_list(()) == "" == format_solver_list(describe_solvers(theatre.models["linear"]))
         scene = small("resection")
-        assert explain_plan(theatre.build_fem(scene, scene.accuracy)) == ()
-        assert explain_plan(theatre.build_fem(short(), LIVE)) == theatre.build_fem(short(), LIVE).plan.explain()
+        assert describe_solvers(theatre.build_fem(scene, scene.accuracy)) == ()
+        assert describe_solvers(theatre.build_fem(short(), LIVE)) == theatre.build_fem(short(), LIVE).plan.explain()

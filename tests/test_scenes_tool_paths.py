@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_scenes import sampled
 
-from scenes.script.tool_paths import IDLE_HEIGHT, Touch, draw, lay, palpate, press, slide, smooth
+from scenes.script.tool_paths import IDLE_HEIGHT, Touch, draw, lay, palpate, press, slide, smooth_step
 
 START, END = (-0.01, -0.004), (0.008, 0.006)
 PATHS = {
@@ -18,7 +18,7 @@ LENGTH = {"press": 2.5, "slide": 3.0, "draw": 3.5}
 class TestPaths:
     def test_smooth_is_the_minimum_jerk_profile(self):
         t = np.linspace(-0.5, 1.5, 2001)
-        s = np.array([smooth(x) for x in t])
+        s = np.array([smooth_step(x) for x in t])
         assert (s[t <= 0] == 0.0).all() and (s[t >= 1] == 1.0).all() and (np.diff(s) >= 0.0).all()
         assert np.allclose(s + s[::-1], 1.0)
         inner = t[(t > 0) & (t < 1)]

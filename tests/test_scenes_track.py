@@ -13,7 +13,7 @@ from ar.optics.calibration import Calibration
 from ar.tracking.targets import TIP_DISTANCE
 from scenes.cli import main
 from scenes.tracked.calibration_file import read_calibration, write_calibration
-from scenes.tracked.external_tracker import follow_body
+from scenes.tracked.external_tracker import track_video
 from scenes.tracked.pose_file import COVARIANCE, read_poses
 
 PLATE_AT = flat((20.0, 15.0, 5.0), (-0.08, 0.0, 0.28))
@@ -149,5 +149,5 @@ def test_incomplete_pose_row_is_rejected(tmp_path):
 def test_times_are_read_from_image_stamps():
     """The last time by the file's frame rate is 2.133 s, which is wrong."""
     film = Path(__file__).parent / "data" / "film"
-    rows = follow_body(film / "film.mp4", read_calibration(film / "camera.yaml"), "patient", "camera", 30.0)
+    rows = track_video(film / "film.mp4", read_calibration(film / "camera.yaml"), "patient", "camera", 30.0)
     assert [row.time for row in rows][-2:] == pytest.approx([2.1333, 2.2667], abs=1e-4)

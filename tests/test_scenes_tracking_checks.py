@@ -10,13 +10,13 @@ from theatres import template_theatre
 from scenes.cli import main
 from scenes.tracked.follower import Follower, TumourState
 from scenes.tracked.overlay_painter import Painter
-from scenes.tracked.rendered_video import build_synthetic_video
+from scenes.tracked.rendered_video import render_synthetic_video
 from scenes.tracked.tracking_checks import TrackingFigures, build_default_pipeline, measure_tracking
 
 
 @pytest.fixture(scope="module")
 def film():
-    return build_synthetic_video(template_theatre())
+    return render_synthetic_video(template_theatre())
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def parts(film):
 
 
 def as_known(known):
-    return replace(known, state=TumourState.GOOD, words="")
+    return replace(known, state=TumourState.GOOD, warning="")
 
 
 def made(kind, whole):
@@ -68,7 +68,7 @@ class Silent(Painter):
     """Does not say why."""
 
     def paint(self, colour, known, covered=None):
-        return super().paint(colour, replace(known, words=""), covered)
+        return super().paint(colour, replace(known, warning=""), covered)
 
 
 def test_unperturbed_tracking_passes_the_checks(film, parts):
@@ -107,7 +107,7 @@ def test_tracking_that_never_recovers_fails_the_checks():
 
 
 def test_check_exit_status_is_1_where_tracking_alone_fails(film, parts, monkeypatch, capsys):
-    names = {"rendered_video.build_synthetic_video": film, "tracking_checks.build_default_pipeline": parts}
+    names = {"rendered_video.render_synthetic_video": film, "tracking_checks.build_default_pipeline": parts}
     names["tracking_checks.measure_tracking"] = TrackingFigures(16, 1, 0, 0.0, 0.0)
     for name, found in names.items():
         monkeypatch.setattr(f"scenes.tracked.{name}", lambda *given, found=found: found)

@@ -16,7 +16,7 @@ from scenes.tracked.truth import OverlayError, compute_overlay_error, summarise_
 
 
 def test_summary_counts_tumours_beyond_their_band_by_1_mm():
-    known = [SimpleNamespace(relied=row < 3, band=2e-3) for row in range(4)]
+    known = [SimpleNamespace(is_reliable=row < 3, bound=2e-3) for row in range(4)]
     errors = [OverlayError(1.0, 0.9, 1e-3, worst, worst <= 2e-3) for worst in (1.9e-3, 2.9e-3, 3.1e-3, 9e-3)]
     found = summarise_errors(known, errors)
     assert (found["pictures"], found["wrong"]) == (3, 1) and found["held_percent"] == pytest.approx(100.0 / 3.0)

@@ -22,8 +22,8 @@ from scenes.analysis.uncertainty import (
     split_contributions,
 )
 from scenes.cli import main
-from scenes.play.frame_text import NOT_KNOWN_WORDS, find_worst, format_errors
-from scenes.play.scene_costs import add_cost_label
+from scenes.play.frame_text import NOT_KNOWN_WORDS, find_largest, format_errors
+from scenes.play.scene_costs import draw_cost_panel
 from scenes.script.priors import POISSON, SKULL, STIFFNESS, TOOL, PatientSample, sample_priors
 from scenes.script.scene import SCENES, find_scene
 from scenes.script.tool_paths import Touch
@@ -216,15 +216,15 @@ class TestStored:
         assert error.moved == pytest.approx(2.5e-3 * time / 0.2)
         assert found.evaluate(0.0, 1.5e-3).moved == pytest.approx(1.5e-3)
         assert found.evaluate(0.0, 1.5e-3).prior == pytest.approx(2.5e-3)
-        assert found.evaluate(0.0, 9e-3).largest == "surrogate"
+        assert found.evaluate(0.0, 9e-3).main_source == "surrogate"
 
     def test_perfect_registration_adds_no_error(self, theatre):
         found = stated(short(), theatre)
         perfect, clinical = (found.evaluate(0.0, 0.0, registration) for registration in ("perfect", "clinical"))
         assert (perfect.prior, clinical.prior) == (pytest.approx(1e-3), pytest.approx(2e-3))
-        assert perfect.largest != "registration" and clinical.largest == "registration"
-        assert perfect.registration_words == "perfect registration"
-        assert clinical.registration_words == "clinical registration, 1.6 mm per axis"
+        assert perfect.main_source != "registration" and clinical.main_source == "registration"
+        assert perfect.registration_text == "perfect registration"
+        assert clinical.registration_text == "clinical registration, 1.6 mm per axis"
 
     def test_older_uncertainty_file_gives_upper_estimates(self, theatre, tmp_path):
         path, scene = tmp_path / "box.uncertainty.json", short()
@@ -241,7 +241,7 @@ class TestStored:
         assert found.mean == pytest.approx(1.25) and found.surface == pytest.approx((3.5**2 - 1.0) ** 0.5 / 2.0)
         rest, moved = (found.evaluate(motion, 0.0, "perfect") for motion in (0.0, 2e-3))
         assert (rest.prior, rest.moved) == (pytest.approx(1e-3), 0.0)
-        assert (moved.prior, moved.moved) == (pytest.approx(3.5e-3), pytest.approx(2.5e-3)) and moved.guess
+        assert (moved.prior, moved.moved) == (pytest.approx(3.5e-3), pytest.approx(2.5e-3)) and moved.is_rough
         assert found.evaluate(0.0, 0.0, "clinical").prior == pytest.approx(2e-3)
         assert fit_motion_error(stated(short(), theatre, moved=(0.0, 0.0))) is None
 
@@ -297,7 +297,8 @@ class TestSaid:
 
     def test_worst_error_is_known_only_if_all_errors_are_known(self):
         errors = [TumourError(1e-3, "E"), TumourError(3e-3, "nu"), TumourError(2e-3, "E")]
-        assert find_worst(errors) == errors[1] and find_worst([*errors, NOT_KNOWN]) == find_worst([]) == NOT_KNOWN
+        assert find_largest(errors) == errors[1]
+        assert find_largest([*errors, NOT_KNOWN]) == find_largest([]) == NOT_KNOWN
 
     def test_image_has_both_errors_and_band_of_tumour_error(self, theatre, monkeypatch):
         scene = short()
@@ -318,23 +319,21 @@ class TestSaid:
         assert list(frame.head) == format_errors(frame.model_error, frame.tumour_error, True)
         assert all(has_text(frame.shown, line, TEXT_SCALE) for line in frame.head)
         # The panel of figures begins under them.
-        assert all(has_text(add_cost_label(frame, "linear"), line, TEXT_SCALE) for line in frame.head)
-        narrow = knowing.build_player("linear", scene).draw(3, 0.1, scene.path(0.1))
-        assert narrow.shown.shape == (240, 320, 3)
-        brief = format_errors(narrow.model_error, narrow.tumour_error, True, brief=True)
-        assert " ".join(narrow.head) == " ".join(brief)
-        moved = wrap_line(
-            f"moved {format_millimetres(narrow.moved, narrow.tumour_error.moved)}", MAX_BOTTOM_WIDTH * 320
-        )
-        for line in (*narrow.head, *moved, "frame 3"):
-            assert has_text(narrow.shown, line, TEXT_SCALE)
+        assert all(has_text(draw_cost_panel(frame, "linear"), line, TEXT_SCALE) for line in frame.head)
+        thin = knowing.build_player("linear", scene).draw(3, 0.1, scene.path(0.1))
+        assert thin.shown.shape == (240, 320, 3)
+        brief = format_errors(thin.model_error, thin.tumour_error, True, brief=True)
+        assert " ".join(thin.head) == " ".join(brief)
+        moved = wrap_line(f"moved {format_millimetres(thin.moved, thin.tumour_error.moved)}", MAX_BOTTOM_WIDTH * 320)
+        for line in (*thin.head, *moved, "frame 3"):
+            assert has_text(thin.shown, line, TEXT_SCALE)
 
     def test_manual_load_error_follows_motion_or_is_unknown(self, theatre):
         scene = short()
         player = replace(theatre, uncertainties={scene.name: stated(scene, theatre)}).build_player("linear", scene)
         held, doubtful = (player.draw(3, 0.1, Touch(force=force)) for force in (0.2, 0.6))
         expected = fit_motion_error(player.uncertainty).evaluate(held.moved, held.model_error, "perfect")
-        assert held.tumour_error == expected and expected.guess and expected.prior > 1e-3
+        assert held.tumour_error == expected and expected.is_rough and expected.prior > 1e-3
         assert doubtful.tumour_error == NOT_KNOWN
         assert held.model_error is not None and doubtful.model_error is None and doubtful.doubt
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from tiny_episodes import packed
 
-from scenes.episodes.reading.repeated_frames import solve_again
+from scenes.episodes.reading.repeated_frames import solve_frames_again
 from scenes.episodes.reading.validation import validate_episode
 
 
@@ -84,7 +84,7 @@ def test_each_defect_of_an_episode_is_reported(name, whole, tmp_path):
 
 
 def test_episode_without_plan_is_not_solved_again(whole):
-    report = solve_again(validate_episode(whole), 2, "cpu")
+    report = solve_frames_again(validate_episode(whole), 2, "cpu")
     assert not report.problems and any("solved again: it states no" in words for words in report.skipped)
     assert report.again == 0 and report.again_mm is None
 

@@ -10,7 +10,7 @@ from visitor import report, wait_for
 from ar.page.elements import build_tabs
 from ar.page.parts import ScenePicture
 from scenes.page.fem_worker import FemWorker
-from scenes.page.view import FEM_COLOUR, STALE_COLOUR, build_page_bodies, build_surroundings
+from scenes.page.view import FEM_COLOUR, STALE_COLOUR, build_page_bodies, build_static_bodies
 from scenes.script.craniotomy_frame import HOLE_RATIO
 
 
@@ -38,14 +38,14 @@ def test_comparison_of_previous_load_is_greyed_until_new_one(demo, monkeypatch):
     tints = []
     monkeypatch.setattr(demo.browser, "tint", lambda name, colour: tints.append(colour))
     asked = []
-    monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
+    monkeypatch.setattr(demo.fem_worker, "ask", lambda number, touch: asked.append((number, touch)))
     demo.wish.take_over(x=0.004, force=0.25)
     demo.run(0.5)
     assert wait_for(lambda: "force 0.25 N" in report(demo))
     said = demo.browser.shown[2]
     assert '<p class="stale">previous load: difference from FEM' in said and "<p>difference from FEM" not in said
     assert tints[-1] == STALE_COLOUR and len(asked) == 1
-    FemWorker.ask(demo.referee, *asked[0])
+    FemWorker.request_frame(demo.fem_worker, *asked[0])
     assert wait_for(lambda: demo.run(0.3) and "<p>difference from FEM" in demo.browser.shown[2])
     assert "previous load" not in report(demo) and tints[-1] == FEM_COLOUR
 
@@ -60,11 +60,11 @@ def test_page_3d_view_has_craniotomy_scan_and_slice_planes(theatre):
     assert np.array_equal(bodies["scan"].vertices, stage.tumour_at_rest.vertices)
     legend = build_tabs(bodies=list(bodies.values())).partition('<p class="key">')[2].partition("</p>")[0]
     assert 'rgb(20% 94% 42%)">&#9632;</b> tumour now</span>' in legend and legend.count("<span>") == 3
-    planes = [part for part in build_surroundings(stage) if isinstance(part, ScenePicture)]
+    planes = [part for part in build_static_bodies(stage) if isinstance(part, ScenePicture)]
     assert [plane.name for plane in planes] == ["axial", "coronal", "sagittal"]
     assert 0.05 < max((plane.colour[..., 3] > 0).mean() for plane in planes) < 0.55
     for intensity, count in ((stage.intensity, 3), (None, 0)):  # a texture of vessels is no scan
         drawn = replace(stage.scene, look=replace(stage.scene.look, vessels=3))
-        found = build_surroundings(replace(stage, scene=drawn, intensity=intensity))[-3:]
+        found = build_static_bodies(replace(stage, scene=drawn, intensity=intensity))[-3:]
         same = [np.array_equal(a.colour, b.colour) for a, b in zip(found, planes, strict=True) if hasattr(a, "colour")]
         assert same == [True] * count

@@ -2,12 +2,12 @@
 
 import time
 
-from scenes.play.waiting_notice import MIN_REPORTED_TIME, Busy
+from scenes.play.waiting_notice import MIN_REPORTED_TIME, WaitingNotice
 
 
 def test_long_wait_is_reported_and_short_wait_is_not():
     said: list[str] = []
-    busy = Busy(said.append)
+    busy = WaitingNotice(said.append)
     busy.begin_work("a quick load")
     busy.end_work()
     time.sleep(MIN_REPORTED_TIME + 0.3)

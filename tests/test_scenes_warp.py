@@ -11,7 +11,7 @@ import SimpleITK as sitk  # noqa: N813
 from warped import BLOBS, GRIDS, LPS, MAPPED, WIDTH, bump, places
 
 from scenes.cli import main
-from scenes.warp.images import read_picture, warp_values, write_warped
+from scenes.warp.images import read_patient_image, warp_values, write_warped_image
 from sim.bodies.meshfile import write_anatomy, write_mesh
 from sim.fields.warp_fields import compute_warp_fields
 from sim.geometry.locate import locate
@@ -23,15 +23,13 @@ def middles(box):
     """Where the finite elements take the middles of the spots (5, 3) [m], by themselves: no grid has a part in it."""
     moved = bump(box.mesh.nodes)
     offsets = np.random.default_rng(0).normal(0.0, WIDTH, (20_000, 3))
-    found = []
+    out = []
     for blob in BLOBS:
         at = locate(box.mesh, np.concatenate([blob + offsets, blob - offsets]))
         now = at.interpolate((box.mesh.nodes + moved)[None])[0]
         rest = compute_signed_volumes(box.mesh.nodes, at.vertices)
-        found.append(
-            np.average(now, axis=0, weights=compute_signed_volumes(box.mesh.nodes + moved, at.vertices) / rest)
-        )
-    return np.array(found)
+        out.append(np.average(now, axis=0, weights=compute_signed_volumes(box.mesh.nodes + moved, at.vertices) / rest))
+    return np.array(out)
 
 
 def centroids(image, near):
@@ -131,11 +129,9 @@ def test_warp_solves_a_load_and_reports_the_tip(folder, box, capsys):
     assert "finite elements" in report["moved_by"] and report["largest_displacement_mm"] > 0.2
     assert report["bound_mm"] is None and min(report["least_jacobian"].values()) > 0.0
     line = json.loads((folder / "load" / "tip_to_tumour.mrk.json").read_text())["markups"][0]
-    ends = np.array([point["position"] for point in line["controlPoints"]])
-    assert line["type"] == "Line" and np.isclose(
-        np.linalg.norm(ends[0] - ends[1]), report["tip_to_tumour_mm"], atol=1e-3
-    )
-    assert np.abs(ends[0, :2] - [-1.0, -2.0]).max() < 1.5  # LPS
+    tip = np.array([point["position"] for point in line["controlPoints"]])
+    assert line["type"] == "Line" and np.isclose(np.linalg.norm(tip[0] - tip[1]), report["tip_to_tumour_mm"], atol=1e-3)
+    assert np.abs(tip[0, :2] - [-1.0, -2.0]).max() < 1.5  # LPS
     text = (folder / "load" / "README.txt").read_text()
     assert all(word in text for word in ("not known", "a load of 0.1 N at", f"box.vtu, digest {box.digest}"))
     assert report["spaces"]["field_modeling.nrrd"] == "LPS, mm" and report["spaces"]["cause"] == "RAS, mm"
@@ -169,7 +165,7 @@ def test_warped_intensities_keep_scale_and_type(folder, box, fields):
     image = nibabel.Nifti1Image(np.arange(40 * 40 * 32).reshape(40, 40, 32).astype(np.int16) % 700, AFFINE)
     image.header.set_slope_inter(0.5, -10.0)
     nibabel.save(image, folder / "scaled.nii")
-    found = write_warped(folder, read_picture(folder / "scaled.nii", box, False), fields, "cubic")
+    found = write_warped_image(folder, read_patient_image(folder / "scaled.nii", box, False), fields, "cubic")
     before, after = nibabel.load(folder / "scaled.nii"), nibabel.load(folder / "scaled_deformed.nii.gz")
     assert after.get_data_dtype() == np.int16 and (after.dataobj.slope, after.dataobj.inter) == (0.5, -10.0)
     assert np.array_equal(after.affine, before.affine) and after.header["qform_code"] == before.header["qform_code"]
@@ -181,7 +177,7 @@ def test_voxels_from_outside_or_resection_are_zero_and_counted(box, fields):
     affine = np.diag([1e-3, 1e-3, 1e-3, 1.0])
     affine[:3, 3] = [-10e-3, -10e-3, -8e-3]  # its top lies below what is pushed into it
     out, counts = warp_values(np.full((20, 20, 6), 9, np.uint8), affine, fields, 1)
-    assert counts.outside > 200 and (out[counts.blank] == 0).all() and (out[~counts.blank] == 9).all()
+    assert counts.outside > 200 and (out[counts.unfilled] == 0).all() and (out[~counts.unfilled] == 9).all()
     cut = compute_warp_fields(
         box, dimple(box.mesh.nodes), 2e-3, box.remove_elements(np.flatnonzero(box.mesh.region == 2))
     )
@@ -264,7 +260,7 @@ def test_warp_warns_of_suspicious_images(folder, box, capsys):
     image.header.set_zooms((2.0, 2.0, 2.0))
     nibabel.save(image, folder / "part.nii.gz")  # neither sform nor qform
     said = {
-        name: " ".join(read_picture(folder / name, box, False, "RAS").warnings)
+        name: " ".join(read_patient_image(folder / name, box, False, "RAS").warnings)
         for name in ("empty.nii.gz", "part.nii.gz")
     }
     assert "another space" in said["empty.nii.gz"]
@@ -275,8 +271,8 @@ def test_small_tumour_label_map_gives_no_warning(folder, box):
     values = np.zeros((40, 40, 32), np.uint8)
     values[18:23, 18:23, 12:17] = 2
     save(folder / "small.nii.gz", values)
-    assert read_picture(folder / "small.nii.gz", box, True).warnings == ()
-    asked = " ".join(read_picture(folder / "small.nii.gz", box, False).warnings)
+    assert read_patient_image(folder / "small.nii.gz", box, True).warnings == ()
+    asked = " ".join(read_patient_image(folder / "small.nii.gz", box, False).warnings)
     assert "another space" in asked and "--labels" in asked
 
 
@@ -284,7 +280,7 @@ def test_intensities_given_as_labels_give_a_warning(folder, box):
     smooth = 300.0 + 200.0 * np.sin(np.indices((40, 40, 32)).sum(axis=0) / 9.0)
     for name, values, doubted in (("scan", smooth, True), ("many", 1.0 + smooth // 50.0, False)):
         save(folder / f"{name}.nii.gz", values.astype(np.int16))
-        said = " ".join(read_picture(folder / f"{name}.nii.gz", box, True).warnings)
+        said = " ".join(read_patient_image(folder / f"{name}.nii.gz", box, True).warnings)
         assert ("as intensities do: give them by --image" in said) == doubted
 
 
@@ -293,7 +289,7 @@ def test_empty_share_of_image_is_computed_by_volume(folder, box):
     values = np.ones((40, 40, 32), np.float32)
     values[tuple(index.T)] = 0.0  # one voxel round each vertex
     save(folder / "pitted.nii.gz", values)
-    assert not any("is 0" in warning for warning in read_picture(folder / "pitted.nii.gz", box, False).warnings)
+    assert not any("is 0" in warning for warning in read_patient_image(folder / "pitted.nii.gz", box, False).warnings)
 
 
 def test_lps_image_labelled_as_ras_gives_a_warning(folder, box):
@@ -306,7 +302,7 @@ def test_lps_image_labelled_as_ras_gives_a_warning(folder, box):
     affine[:3, 3] = [-60.0, -60.0, -50.0]
     for name, signs in (("right", [1.0, 1.0, 1.0, 1.0]), ("wrong", [-1.0, -1.0, 1.0, 1.0])):
         save(folder / f"{name}.nii.gz", values.astype(np.float32), np.diag(signs) @ affine)
-        warnings = read_picture(folder / f"{name}.nii.gz", moved, False).warnings
+        warnings = read_patient_image(folder / f"{name}.nii.gz", moved, False).warnings
         assert any("LPS marked as RAS" in warning for warning in warnings) == (name == "wrong")
 
 
@@ -338,7 +334,7 @@ def test_mgh_and_nrrd_images_equal_the_nifti_image(folder, box, fields, tmp_path
     nrrd.write(str(tmp_path / "c.nrrd"), values.astype(np.int64), header)
     found = {}
     for name in ("a.nii.gz", "b.mgz", "c.nrrd"):
-        warped = write_warped(tmp_path, read_picture(tmp_path / name, box, False), fields, "linear")
+        warped = write_warped_image(tmp_path, read_patient_image(tmp_path / name, box, False), fields, "linear")
         found[name] = nibabel.load(tmp_path / warped.name)
         assert warped.name == f"{name[0]}_deformed.nii.gz" and warped.moved > 100
     for image in found.values():

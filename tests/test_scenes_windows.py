@@ -9,7 +9,7 @@ import pytest
 from tiny_episodes import HEIGHT, SCALE, WIDTH, Wanted, packed, read_images, write_episode, write_three_episodes
 
 from scenes import read_episodes
-from scenes.episodes.reading.contents import OpenFiles
+from scenes.episodes.reading.contents import FileCache
 from sim.errors import InputError
 
 
@@ -78,7 +78,7 @@ def test_episode_files_are_opened_on_reading_up_to_a_limit(folder):
     other = pickle.loads(pickle.dumps(found))
     assert len(other.files) == 0 and other.files.most == 2 and other[3]["frame"] == found[3]["frame"]
     with pytest.raises(InputError, match="at least one"):
-        OpenFiles(0)
+        FileCache(0)
 
 
 def test_unknown_episode_keys_are_rejected_by_name(folder):

@@ -14,7 +14,7 @@ import pytest
 from tiny_work import held, played
 
 from scenes.episodes.run_folder import list_failures
-from scenes.episodes.workers import start_own_workers
+from scenes.episodes.workers import start_local_workers
 
 COUNT, KILLS = 80, 50
 CLIENT = """
@@ -103,7 +103,7 @@ def test_fifty_killed_processes_lose_or_repeat_no_episode(tmp_path):
         ended(client, False)
     assert kills == {"worker": 45, "client": 5} and COUNT > len(seen) > 5
     whole = tmp_path / "undisturbed"
-    with start_own_workers(["cpu"]) as workers:
+    with start_local_workers(["cpu"]) as workers:
         tally = played(folder, workers, COUNT)
         assert tally.made + tally.skipped == COUNT and tally.skipped >= len(seen) and not list_failures(folder)
         assert played(whole, workers, COUNT).made == COUNT

@@ -7,8 +7,8 @@ import sys
 from test_scenes_run_folder import PLAN
 from tiny_work import tiny_run
 
-from scenes.episodes.engine import find_still_missing
-from scenes.episodes.run_folder import RunSettings, begin, list_finished, read_run, to_episode_name
+from scenes.episodes.engine import list_missing_episodes
+from scenes.episodes.run_folder import RunSettings, begin_run, list_finished, read_run, to_episode_name
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.partial_files import remove_partial_files
 
@@ -31,7 +31,7 @@ def test_leftovers_of_dead_processes_only_are_removed(tmp_path):
             (tmp_path / name).touch()
         (tmp_path / f".sulcus-{machine}-{dead.pid}-0003").mkdir()
         (tmp_path / f".sulcus-{machine}-{dead.pid}-0003" / "body.vtu").touch()
-        begin(tmp_path, tiny_run(), PLAN)
+        begin_run(tmp_path, tiny_run(), PLAN)
         assert {name for name, stays in names.items() if stays} == {p.name for p in tmp_path.glob(".*")}
     remove_partial_files(tmp_path, max_age=-1.0)
     assert [path.name for path in tmp_path.glob(".*")] == [".sulcus-notes"]
@@ -43,7 +43,7 @@ DECADE = 10 * 365 * 86400.0
 def test_leftovers_are_identified_without_file_times(tmp_path, monkeypatch):
     run = RunSettings("own", "0", 1, "cpu", {})
     monkeypatch.setattr("time.time", lambda: 0.0)  # a clock that was set back
-    assert begin(tmp_path, run, PLAN) and not begin(tmp_path, run, PLAN) and read_run(tmp_path) == run
+    assert begin_run(tmp_path, run, PLAN) and not begin_run(tmp_path, run, PLAN) and read_run(tmp_path) == run
     left = tmp_path / ".sulcus-00000000-1-episode_000001.h5"  # another machine's, unfinished
     for path, time in (
         (tmp_path / to_episode_name(0), 2 * DECADE * 10),
@@ -53,5 +53,5 @@ def test_leftovers_are_identified_without_file_times(tmp_path, monkeypatch):
         path.touch()
         os.utime(path, (time, time))
     remove_partial_files(tmp_path)
-    tally, missing = find_still_missing(tmp_path, list_finished(tmp_path), range(3), True)
+    tally, missing = list_missing_episodes(tmp_path, list_finished(tmp_path), range(3), True)
     assert (tally.skipped, missing) == (2, [1]) and left.exists()

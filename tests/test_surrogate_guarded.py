@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from theatres import player, small
 
-from scenes.options.theatre_options import add_theatre, build_requested_theatre
+from scenes.options.patient_options import add_patient, open_patient
 from scenes.page.scene_solvers import ALL_ACTIVE, SceneSolvers
-from scenes.play.deformers import GUARDED, AtRest
+from scenes.play.deformers import GUARDED, RestDeformer
 from scenes.script.tool_paths import Touch
 from sim.deformation import Outcome
 from sim.errors import InputError
@@ -81,7 +81,7 @@ def test_each_load_is_compared_with_its_own_bound(guarded, loads, predicted, sol
 
 
 def test_failed_fem_solve_keeps_the_model_prediction(guarded, loads, predicted, box):
-    answer = replace(guarded, limit=0.0, fem=AtRest(box)).deform(loads)
+    answer = replace(guarded, limit=0.0, fem=RestDeformer(box)).deform(loads)
     assert np.array_equal(answer.displacement, predicted.displacement) and answer.outcome == predicted.outcome
     assert answer.bound == pytest.approx(predicted.bound, nan_ok=True)
 
@@ -128,13 +128,13 @@ def test_guard_limit_is_set_by_the_user(theatre):
     )
     assert "where its error may exceed 0.05 mm" in strict.describe_deformer(GUARDED, small())
     parser = argparse.ArgumentParser()
-    add_theatre(parser)
+    add_patient(parser)
     asked = parser.parse_args(["--guard", "0.05", "--device", "cpu"])
-    assert build_requested_theatre(asked).limit == pytest.approx(5e-5)
-    assert build_requested_theatre(parser.parse_args(["--device", "cpu"])).limit is None
+    assert open_patient(asked).limit == pytest.approx(5e-5)
+    assert open_patient(parser.parse_args(["--device", "cpu"])).limit is None
     for words in ("0", "-1", "nan"):
         with pytest.raises(InputError, match="give a positive number of millimetres"):
-            build_requested_theatre(parser.parse_args(["--guard", words, "--device", "cpu"]))
+            open_patient(parser.parse_args(["--guard", words, "--device", "cpu"]))
 
 
 def test_guarded_deformer_is_listed_with_description(theatre):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from limits import memory_below
 
-from scenes.options.outputs import read_statements as stated_beside
+from scenes.options.outputs import read_attributes as stated_beside
 from scenes.tracked.truth import read_truth
 from sim.errors import InputError
 from sim.geometry.tetmesh import compute_digest

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scenes.play.deformers import open_theatre
-from scenes.play.tip_reading import TipDistance, read_tip_distance
+from scenes.play.tip_reading import TipDistance, predict_tip_distance
 from scenes.play.tip_reading import measure_tip_distance as drawn_distance
 from scenes.script.scene import find_scene
 from scenes.script.tool import Blade, Probe
@@ -182,21 +182,21 @@ def test_frame_distance_uses_the_error_bound_of_its_model(model, pretender, gaug
     answer, truth = model.deform(loads), pretender.deform(loads)
     predicted = model.predict_distance(loads)
     apart = gauge.compute_distances(loads, answer.displacement, answer.nodes)[0]
-    assert read_tip_distance(model, loads, answer, tool, apart) == TipDistance(
+    assert predict_tip_distance(model, loads, answer, tool, apart) == TipDistance(
         predicted.value[0], predicted.bound[0, 0]
     )
-    assert read_tip_distance(pretender, loads, truth, tool, fresh[1][2]) == TipDistance(fresh[1][2], None)
+    assert predict_tip_distance(pretender, loads, truth, tool, fresh[1][2]) == TipDistance(fresh[1][2], None)
     high = gauge.compute_distances(loads, truth.displacement, truth.nodes, lift=2e-3)[0]
     assert drawn_distance(model.anatomy, loads, truth, tool, 2e-3).distance == high > fresh[1][2] + 1e-3
-    assert read_tip_distance(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(
+    assert predict_tip_distance(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(
         predicted.value[0] + 2e-3
     )
     plain = replace(model, tip=None).predict_distance(loads).value[0]
     outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-    assert read_tip_distance(model, loads, outside, tool, apart) == TipDistance(predicted.value[0], None)
-    assert read_tip_distance(replace(model, tip=None), loads, answer, tool, apart) == TipDistance(plain, None)
+    assert predict_tip_distance(model, loads, outside, tool, apart) == TipDistance(predicted.value[0], None)
+    assert predict_tip_distance(replace(model, tip=None), loads, answer, tool, apart) == TipDistance(plain, None)
     assert (
-        read_tip_distance(model, loads, answer, Blade(), apart) is None
-        and read_tip_distance(model, loads, answer, None, apart) is None
+        predict_tip_distance(model, loads, answer, Blade(), apart) is None
+        and predict_tip_distance(model, loads, answer, None, apart) is None
     )
     assert str(TipDistance(5.53e-3, 0.62e-3)) == "5.5 +- 0.7 mm" and str(TipDistance(5.53e-3, None)) == "5.5 mm"

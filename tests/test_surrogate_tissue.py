@@ -17,7 +17,7 @@ def test_sampled_tissues_follow_the_fitted_shares():
     assert ((poisson == FINE_POISSONS[9]) == (ratio == FINE_RATIOS[30])).all()
     draws = sample_from_fit(tissue, 3000.0, ("slide", "contact"), 30, 2)
     assert {draw.stiffness for draw in draws} == {0.5} and all(draw.skull == 0.25 for draw in draws)
-    stiff = sample_from_fit(tissue, 3000.0, ("slide", "contact"), 30, 2, ratio=2.0)
+    stiff = sample_from_fit(tissue, 3000.0, ("slide", "contact"), 30, 2, tumour_ratio=2.0)
     assert [draw.ratio for draw in stiff] == [draw.ratio / 2.0 for draw in draws]  # of a tumour that is stated as such
     with pytest.raises(InputError, match="cannot have"):
         sample_from_fit(tissue, 3000.0, ("contact",), 8)

@@ -9,8 +9,8 @@ from functools import partial
 import h5py
 import numpy as np
 
-from scenes.episodes.engine import find_still_missing, make_all
-from scenes.episodes.run_folder import BODIES, RunSettings, begin, get_versions, list_finished, to_episode_name
+from scenes.episodes.engine import list_missing_episodes, make_episodes
+from scenes.episodes.run_folder import BODIES, RunSettings, begin_run, get_versions, list_finished, to_episode_name
 from scenes.episodes.tasks import MadeEpisode, RunWork
 from sim.runtime.atomic_files import write_stream_atomically
 
@@ -91,9 +91,9 @@ def tiny_run(seed=1, device="cpu", **changed):
 def played(folder, workers, count, trouble=None, heard=lambda *words: None, again=False):
     """A run as the command makes one."""
     run = tiny_run(device=workers.device)
-    first = begin(folder, run, 'title = "tiny"\n')
-    there, missing = find_still_missing(folder, list_finished(folder), range(count), first, again)
-    return make_all(tiny_work(folder, trouble), folder, run, missing, workers, heard, there)
+    first = begin_run(folder, run, 'title = "tiny"\n')
+    there, missing = list_missing_episodes(folder, list_finished(folder), range(count), first, again)
+    return make_episodes(tiny_work(folder, trouble), folder, run, missing, workers, heard, there)
 
 
 def held(folder):

@@ -6,8 +6,8 @@ import sys
 from contextlib import redirect_stdout
 from dataclasses import asdict, replace
 
+from scenes.options.patient_options import add_patient, build_requested_scene, choose_deformer, open_patient
 from scenes.options.shared_options import add_json
-from scenes.options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
 from sim.arguments import check_integer
 
 
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from scenes.cli import add_plugin
 
     parser.add_argument("scene", nargs="?", default="press", help="a built-in scene")
-    add_theatre(parser)
+    add_patient(parser)
     add_plugin(parser)
     parser.add_argument("--size", default="640x480", metavar="WxH", help="size of the image [pixel]")
     parser.add_argument("--frames", type=int, default=120, help="number of timed frames")
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     if args.batch is not None:
         check_integer("--batch", args.batch, 1)
     width, height = measure_size(args.size)
-    theatre = build_requested_theatre(args, args.scene)
+    theatre = open_patient(args, args.scene)
     scene = build_requested_scene(args, args.scene, theatre)
     scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
     name = choose_deformer(args, theatre, scene)

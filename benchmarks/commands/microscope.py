@@ -4,8 +4,8 @@ import argparse
 import json
 from dataclasses import asdict, replace
 
+from scenes.options.patient_options import add_patient, build_requested_scene, open_patient
 from scenes.options.shared_options import add_json
-from scenes.options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre
 from sim.arguments import check_integer
 
 from .locate import bar
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=10, help="stride of the used frames")
     parser.add_argument("--cloud", action="store_true", help="observe a point cloud, without correspondences")
     parser.add_argument("--plain", action="store_true", help="render without vessels: the scan's grey values alone")
-    add_theatre(parser)
+    add_patient(parser)
     add_json(parser)
 
 
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     check_integer("--seeds", args.seeds, 1)
     check_integer("--every", args.every, 1)
-    theatre = build_requested_theatre(args, args.scene)
+    theatre = open_patient(args, args.scene)
     scene = build_requested_scene(args, args.scene, theatre)
     if isinstance(scene.observation_model, StereoObservation):
         model = replace(scene.observation_model, named=not args.cloud, vessels=not args.plain)

@@ -5,8 +5,8 @@ import json
 import sys
 from dataclasses import asdict
 
+from scenes.options.patient_options import add_patient, build_requested_scene, choose_deformer, open_patient
 from scenes.options.shared_options import add_json
-from scenes.options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
 from sim.arguments import check_integer
 from sim.errors import InputError
 
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from scenes.cli import add_plugin
 
     parser.add_argument("scene", nargs="?", default="press", help="a built-in scene")
-    add_theatre(parser)
+    add_patient(parser)
     add_plugin(parser)
     parser.add_argument("--solves", type=int, default=64, help="loads in the batch")
     parser.add_argument("--batch", type=int, default=64, help="loads solved together")
@@ -26,14 +26,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure the stages of a scene, and print them row by row."""
     from scenes.analysis.measurement import describe_machine
-    from scenes.play.deformers import explain_plan
+    from scenes.play.deformers import describe_solvers
     from scenes.script.scene import SCENES, find_scene
     from sim.effects import ToolForce
 
     from ..studies.stages import rows
 
     check_integer("--batch", args.batch, 1)
-    theatre = build_requested_theatre(args, args.scene)
+    theatre = open_patient(args, args.scene)
     scene = build_requested_scene(args, args.scene, theatre)
     if not any(isinstance(effect, ToolForce) for effect in scene.effects):
         pushing = ", ".join(
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         found.append(row)
         p95 = "" if row.p95 is None else f"{row.p95:.3g}"
         print(f"| {row.name} | {row.median:.3g} | {p95} | {row.unit} | {row.note} |", file=table, flush=True)
-    plan = tuple(line for fem in solvers for line in explain_plan(fem))
+    plan = tuple(line for fem in solvers for line in describe_solvers(fem))
     if plan:
         print("\nHow the finite elements go about a load:\n", *(f"- {line}" for line in plan), sep="\n", file=table)
     if args.json:

@@ -68,7 +68,7 @@ def frames_of(player: Player, count: int) -> Iterator[tuple[float, ...]]:
             encoded = clock.perf_counter()
             positions = player.compute_positions(last)
             stage = player.stage.select_stage(loads)
-            for layer in (stage.build_visible(positions), stage.build_tumour(positions)):
+            for layer in (stage.build_visible_cortex(positions), stage.build_tumour(positions)):
                 page.move(layer.name, layer.vertices, layer.triangles)
             page.put_sight(code, f"frame {number}")
             sent = clock.perf_counter()
@@ -114,7 +114,7 @@ def open_page(player: Player) -> Browser:
     bodies = [
         SceneSurface(layer.name, layer.vertices, layer.triangles, colour)
         for layer, colour in (
-            (player.stage.build_visible(positions), CORTEX_COLOUR),
+            (player.stage.build_visible_cortex(positions), CORTEX_COLOUR),
             (player.stage.build_tumour(positions), TUMOUR_COLOUR),
         )
     ]

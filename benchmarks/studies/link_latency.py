@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.link.frame import HEADER, BadMessageError, pack_message, read_header, to_stamp, to_time
-from scenes.link.messages import Code, SentMesh, encode_polydata, encode_status, transform
-from scenes.link.outgoing import SentPlaces
+from scenes.link.messages import EncodedMesh, Status, encode_polydata, encode_status, encode_transform
+from scenes.link.outgoing import SentPoints
 from scenes.link.pose_responder import NO_TARGETS, CameraView, PoseResult
 from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 from scenes.link.session import LinkSession
@@ -44,21 +44,21 @@ class Moved:
         """Build a strip of triangles between random points."""
         self._points = 0.05 * np.random.default_rng(0).normal(size=(points, 3))
         corners = np.arange(2 * points)[:, None] + np.arange(3)
-        self._mesh = SentMesh.from_triangles(corners % points)
+        self._mesh = EncodedMesh.from_triangles(corners % points)
 
     def compute_result(
-        self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
+        self, transforms: ReceivedTransforms, time: float, wall_time: float, previous: TrackingResult | None = None
     ) -> PoseResult:
         """Return the pose's shift, as the motion of a brain with a valid result."""
-        body = heard.find_relative(heard.names.tool, now)
+        body = transforms.find_relative_transform(transforms.names.tool, time)
         if isinstance(body, str):
             return PoseResult(
-                0, TrackingResult(moment, TumourState.NO_TOOL, body, NO_TARGETS, BrainMotion(self._points))
+                0, TrackingResult(wall_time, TumourState.NO_TOOL, body, NO_TARGETS, BrainMotion(self._points))
             )
         motion = BrainMotion(self._points + body.T[:3, 3], True)
-        return PoseResult(body.stamp, TrackingResult(moment, TumourState.GOOD, "", NO_TARGETS, motion))
+        return PoseResult(body.stamp, TrackingResult(wall_time, TumourState.GOOD, "", NO_TARGETS, motion))
 
-    def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
+    def find_camera(self, transforms: ReceivedTransforms, time: float, stamp: int) -> CameraView | str:
         """Return the reason: there is no camera."""
         return "no camera"
 
@@ -66,16 +66,16 @@ class Moved:
         """Return the undeformed points."""
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * self._points, self._mesh), stamp)
 
-    def build_messages(self, result: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
+    def build_messages(self, result: PoseResult, points: SentPoints | None = None) -> tuple[bytes, ...]:
         """Return the message with the surface."""
-        body = encode_polydata(1e3 * result.known.motion.positions, self._mesh)
+        body = encode_polydata(1e3 * result.tracking.motion.positions, self._mesh)
         return (pack_message("POLYDATA", "TumourNow", body, result.stamp),)
 
-    def build_status(self, result: PoseResult, refused: str) -> bytes:
+    def build_status(self, result: PoseResult, rejected: str) -> bytes:
         """Return the status of the result."""
-        return pack_message("STATUS", "Sulcus", encode_status(Code.OK, result.known.words), result.stamp)
+        return pack_message("STATUS", "Sulcus", encode_status(Status.OK, result.tracking.warning), result.stamp)
 
-    def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
+    def attach_points(self, names: list[str], positions: np.ndarray) -> SentPoints:
         """Raise BadMessageError: no points are tracked."""
         raise BadMessageError("no places are followed")
 
@@ -136,9 +136,9 @@ def _send(port: int, rate: float, count: int) -> None:
         for number in range(count):
             time.sleep(max(0.0, begun + number / rate - time.perf_counter()))
             T[0, 3] = 1.0 + number
-            out.sendall(pack_message("TRANSFORM", NAME, transform(T), to_stamp(time.time())))
+            out.sendall(pack_message("TRANSFORM", NAME, encode_transform(T), to_stamp(time.time())))
         time.sleep(0.5)
-        out.sendall(pack_message("TRANSFORM", NAME, transform(T), to_stamp(time.time() + 1e6)))
+        out.sendall(pack_message("TRANSFORM", NAME, encode_transform(T), to_stamp(time.time() + 1e6)))
         time.sleep(0.5)
 
 

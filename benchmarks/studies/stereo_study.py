@@ -74,7 +74,7 @@ def rows(
         last = player.compute_deformation(player.build_loads(number), last)
         positions = player.compute_positions(last)
         held = None if scene.tool is None else player.place_tool(scene.tool, touch, positions)
-        seen.append((number, positions, player.stage.compute_corners(None if held is None else held.pose)))
+        seen.append((number, positions, player.stage.compute_tool_corners(None if held is None else held.pose)))
         done += 1
         progress(done, total)
     found: list[TumourEstimate] = []
@@ -95,8 +95,8 @@ def rows(
 
 def row(seed: int, estimates: Sequence[TumourEstimate]) -> Row:
     """Summarise estimates."""
-    off = 1e3 * np.array([each.off for each in estimates])
-    true = 1e3 * np.array([np.linalg.norm(each.true) for each in estimates])
+    off = 1e3 * np.array([each.error for each in estimates])
+    true = 1e3 * np.array([np.linalg.norm(each.true_motion) for each in estimates])
     seen = [each for each in estimates if each.location is not None]
     radius = [1e3 * each.location.p95 for each in seen if each.location is not None]
     spent = 1e3 * np.array([each.seconds for each in estimates])
@@ -107,7 +107,7 @@ def row(seed: int, estimates: Sequence[TumourEstimate]) -> Row:
         moved_mm=float(true.max()), off_mm=float(np.median(off)), p95_mm=float(np.quantile(off, 0.95)),
         most_mm=float(off.max()),
         removed=float(1.0 - off.sum() / true.sum()) if true.any() else np.nan,
-        covered=float(np.mean([each.held for each in seen])) if seen else np.nan,
+        covered=float(np.mean([each.is_covered for each in seen])) if seen else np.nan,
         radius_mm=float(np.median(radius)) if seen else np.nan,
         milliseconds=float(np.median(spent)), slowest_ms=float(np.quantile(spent, 0.95)),
     )  # fmt: skip

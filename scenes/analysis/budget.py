@@ -21,29 +21,29 @@ MAX_LIVE_ERROR = 5e-5  # Largest distance of a node from the converged solution 
 
 
 def choose_within(
-    theatre: PatientSetup, scene: Scene, budget: tuple[float | None, float | None], report: Callable[[str], object]
+    patient: PatientSetup, scene: Scene, budget: tuple[float | None, float | None], notify: Callable[[str], object]
 ) -> ModelChoice:
     """Choose among the deformers of a scene, timed on its frames, and the families with recorded figures.
 
     Families are timed when they are chosen by their recorded time, and the choice is made again. `budget`: largest
-    error [mm] and time [ms]; `report` receives sentences for the user.
+    error [mm] and time [ms]; `notify` receives sentences for the user.
 
     Raises
     ------
     InputError
         See `choose` and `build_stage`.
     """
-    stage, recorded, offers = theatre.build_stage(scene), theatre.select_recorded(scene), []
+    stage, recorded, offers = patient.build_stage(scene), patient.select_recorded(scene), []
     if not recorded:
-        report(f"families of models are not offered: no figures for {scene.name} on this anatomy. {REMEDY}")
+        notify(f"families of models are not offered: no figures for {scene.name} on this anatomy. {REMEDY}")
 
     def offer(name: str, error_mm: float | None, of: str) -> None:
-        player = theatre.build_player_of(stage, theatre.build_deformer(name, scene), name)
+        player = patient.build_player_of(stage, patient.build_deformer(name, scene), name)
         error_mm = 1e3 * _get_reported_error(player.deformer) if error_mm is None else error_mm
         if not np.isnan(error_mm):
             offers.append(Offer(name, error_mm, _time_frames(player), of))
 
-    for name in theatre.list_deformers(scene):
+    for name in patient.list_deformers(scene):
         offer(name, None, f"; error relative to {'converged ' * (name == 'fem')}FEM")
     of = {name: f"; error relative to p2 in 95 % of {one.loads} recorded pushes" for name, one in recorded.items()}
     waiting = {
@@ -52,11 +52,11 @@ def choose_within(
     }
     while (choice := choose([*offers, *waiting.values()], *budget)).offer.name in waiting:
         name = choice.offer.name
-        report(f"timing {waiting.pop(name)}, where its preparation took {recorded[name].preparation_s:.2g} s")
+        notify(f"timing {waiting.pop(name)}, where its preparation took {recorded[name].preparation_s:.2g} s")
         try:
             offer(name, recorded[name].p95_mm, of[name])
         except InputError as error:
-            report(f"{name} cannot be chosen: {error}")
+            notify(f"{name} cannot be chosen: {error}")
     return choice
 
 

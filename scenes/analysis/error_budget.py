@@ -20,8 +20,8 @@ from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.priors import MESH, REGISTRATION, REGISTRATION_PRIOR, SEGMENTATION, SEGMENTATION_PRIOR
 from ..script.uncertainty import LEVEL, SURROGATE
 from ..script.viewpoint import Viewpoint
-from .tracking_errors import CORNER_NOISE, change_calibration, compute_row_delay, project_by_rows, project_corners
-from .uncertainty import SurfaceMotions, compute_error
+from .tracking_errors import CORNER_NOISE, change_calibration, compute_row_delay, project_corners, project_with_shutter
+from .uncertainty import SurfaceMotions, compute_motion_errors
 
 # Names of contributors to the overlay error.
 CALIBRATION, MARKERS, LATENCY, SHUTTER = "calibration", "markers", "latency x motion", "rolling shutter"
@@ -99,7 +99,7 @@ class FilmedScene:
         return self.viewpoint.calibration
 
     @cached_property
-    def believed(self) -> tuple[Calibration, ...]:
+    def sampled_calibrations(self) -> tuple[Calibration, ...]:
         """Sampled calibrations, cached because building one takes long."""
         scale = np.sqrt(np.diag(self.covariance))
         scale[scale == 0.0] = 1.0  # exact inputs
@@ -108,7 +108,7 @@ class FilmedScene:
         return tuple(change_calibration(self.calibration, step) for step in scale * (steps @ vectors.T))
 
     @cached_property
-    def off(self) -> np.ndarray:
+    def differences(self) -> np.ndarray:
         """Difference (b, n, 3) [m] between the scene's field and those of the bodies, without their mesh errors."""
         return self.bodies - self.field
 
@@ -136,7 +136,7 @@ class OverlayErrors:
         return np.hypot(self.across, self.along)
 
 
-def sample_errors(filmed: FilmedScene, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
+def sample_errors(scene: FilmedScene, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
     """Sample the overlay error caused by the contributors, all others being exact.
 
     The same seed gives the same random numbers for any set of contributors.
@@ -146,7 +146,7 @@ def sample_errors(filmed: FilmedScene, contributors: Sequence[str], count: int, 
     InputError
         A reference that the camera does not see.
     """
-    rows = [_compare_tumours(*sample) for sample in _generate_samples(filmed, frozenset(contributors), count, seed)]
+    rows = [_compare_tumours(*sample) for sample in _generate_samples(scene, frozenset(contributors), count, seed)]
     return OverlayErrors(*np.array(rows).T)
 
 
@@ -164,14 +164,14 @@ def _generate_samples(
         random, time, body = _sample_time_and_body(filmed, seed, number)
         late = float(of(LATENCY, np.array(filmed.latency + filmed.clock * random.standard_normal())))
         drawn = int(random.integers(CALIBRATION_COUNT))
-        taken = filmed.believed[drawn] if CALIBRATION in contributors else filmed.calibration
+        taken = filmed.sampled_calibrations[drawn] if CALIBRATION in contributors else filmed.calibration
         off = of(MARKERS, filmed.corner * random.standard_normal((corners, 2)))
         aside = of(SURROGATE, filmed.surrogate / np.sqrt(RADIUS_SQUARED) * random.standard_normal(3))
         shift = of(REGISTRATION, _sample_registration_error(filmed, random.standard_normal(6)))
         wide = of(SEGMENTATION, SEGMENTATION_PRIOR.range[1] * random.standard_normal(1))
         mesh = of(MESH, (filmed.meshes if PARAMETERS in contributors else filmed.own_mesh)[body])
         readout = filmed.calibration.readout if SHUTTER in contributors else 0.0
-        motion = filmed.field + (filmed.off[body] if PARAMETERS in contributors else 0.0)
+        motion = filmed.field + (filmed.differences[body] if PARAMETERS in contributors else 0.0)
         surface = filmed.rest + (1.0 + mesh) * motion
         true, then = _build_cameras(filmed, time, late, readout, surface.mean(axis=0))
         believed = taken.build_camera(then.T_camera_world)
@@ -179,7 +179,7 @@ def _generate_samples(
             found = project_corners(then, target, filmed.T_scan_patient, off)
             if readout:
                 at = partial(_build_delayed_camera, filmed, time - late)
-                found = project_by_rows(found, at, readout, filmed.T_scan_patient)
+                found = project_with_shutter(found, at, readout, filmed.T_scan_patient)
             initial = then.T_camera_world @ filmed.T_scan_patient
             _, pose = find_pose(believed, target, found, initial)
             if pose is None:
@@ -250,14 +250,14 @@ def _compare_tumours(
 class ErrorBudget:
     """Error budget of an overlay: each contributor alone, and all of `TECHNICAL` and `CLINICAL`.
 
-    `held`: coverage of the band on synthetic test cases, and its standard deviation (None for one case). Samples of one
+    `coverage`: of the band on synthetic test cases, and its standard deviation (None for one case). Samples of one
     body are correlated.
     """
 
     alone: dict[str, OverlayErrors]
     technical: OverlayErrors
     clinical: OverlayErrors
-    held: tuple[float, float | None] | None = None
+    coverage: tuple[float, float | None] | None = None
 
     @property
     def band(self) -> float:
@@ -270,21 +270,22 @@ class ErrorBudget:
 
 
 def compute_budget(
-    filmed: FilmedScene,
+    scene: FilmedScene,
     count: int,
     seed: int = 0,
-    twins: FilmedScene | None = None,
+    test_scene: FilmedScene | None = None,
     progress: Callable[[Sequence[str]], Iterable[str]] = iter,
 ) -> ErrorBudget:
-    """Compute the budget from `count` samples; `twins`, other bodies, test the band with other random numbers."""
-    alone = {name: sample_errors(filmed, [name], count, seed) for name in progress(CLINICAL)}
-    technical, clinical = (sample_errors(filmed, names, count, seed) for names in (TECHNICAL, CLINICAL))
+    """Compute the budget from `count` samples; `test_scene`, other bodies, test the band with other random numbers."""
+    alone = {name: sample_errors(scene, [name], count, seed) for name in progress(CLINICAL)}
+    technical, clinical = (sample_errors(scene, names, count, seed) for names in (TECHNICAL, CLINICAL))
     budget = ErrorBudget(alone, technical, clinical)
-    if twins is None:
+    if test_scene is None:
         return budget
-    within = sample_errors(twins, CLINICAL, count, seed + 1).worst <= budget.band
+    within = sample_errors(test_scene, CLINICAL, count, seed + 1).worst <= budget.band
     return replace(
-        budget, held=_share(within, [_sample_time_and_body(twins, seed + 1, number)[2] for number in range(count)])
+        budget,
+        coverage=_share(within, [_sample_time_and_body(test_scene, seed + 1, number)[2] for number in range(count)]),
     )
 
 
@@ -301,18 +302,20 @@ def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | No
     return share, float(np.sqrt(np.square(excess).sum() * clusters / (clusters - 1))) / len(within)
 
 
-def choose_moment(still: SurfaceMotions, answers: Sequence[tuple[np.ndarray, ...]], meshes: np.ndarray) -> int:
-    """Return the moment of a scene at which its bodies differ the most; `meshes` (b,): see `compute_error`."""
+def find_largest_spread(
+    nominal: SurfaceMotions, solutions: Sequence[tuple[np.ndarray, ...]], mesh_errors: np.ndarray
+) -> int:
+    """Return the time index at which a scene's bodies differ most; `mesh_errors` (b,): see `compute_motion_errors`."""
     sizes = []
-    for number, here in enumerate(still.fields):
-        off = compute_error(np.stack([result[number] for result in answers]), here, meshes)
+    for number, here in enumerate(nominal.fields):
+        off = compute_motion_errors(np.stack([result[number] for result in solutions]), here, mesh_errors)
         sizes.append(float(np.linalg.norm(off, axis=2).max(axis=1).mean()))
     return int(np.argmax(sizes))
 
 
-def compute_velocity(still: SurfaceMotions, number: int) -> np.ndarray:
+def compute_velocity(nominal: SurfaceMotions, time_index: int) -> np.ndarray:
     """Return the velocity (n, 3) [m/s] of the tumour's surface before a time; 0 if tissue was cut meanwhile."""
-    before, here = still.fields[max(number - 1, 0)], still.fields[number]
-    if number == 0 or before.shape != here.shape:
+    before, here = nominal.fields[max(time_index - 1, 0)], nominal.fields[time_index]
+    if time_index == 0 or before.shape != here.shape:
         return np.zeros_like(here)
-    return (here - before) / (still.times[number] - still.times[number - 1])
+    return (here - before) / (nominal.times[time_index] - nominal.times[time_index - 1])

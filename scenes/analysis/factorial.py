@@ -46,7 +46,7 @@ class FactorCombination:
     motion: float
 
 
-def solve_cells(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[FactorCombination]:
+def solve_levels(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[FactorCombination]:
     """Solve every combination on template meshes of about `nodes` nodes; the tool presses at three places."""
     for opening, depth in product(levels["opening [mm]"], levels["depth [mm]"]):
         subject = build_template_subject(Tumour(cover=1e-3 * float(depth)))
@@ -76,16 +76,16 @@ def _compute_mean_motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
     return 1e3 * float(np.linalg.norm(result.displacement, axis=2).mean())
 
 
-def compute_variance_shares(found: Sequence[FactorCombination], response: str = "force") -> dict[str, float]:
+def compute_variance_shares(cells: Sequence[FactorCombination], response: str = "force") -> dict[str, float]:
     """Return the share of variance of the logarithmic motion explained by each factor, and by each interaction of two.
 
     The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. The
     remainder to 1 is the interaction of three and more factors.
     """
-    values = np.log([getattr(cell, response) for cell in found])
+    values = np.log([getattr(cell, response) for cell in cells])
     good = np.isfinite(values)
     values = values[good] - values[good].mean()
-    kept = [cell.levels for cell, one in zip(found, good, strict=True) if one]
+    kept = [cell.levels for cell, one in zip(cells, good, strict=True) if one]
     names = [name for name in kept[0] if len({levels[name] for levels in kept}) > 1]
 
     def explained(*factors: str) -> float:
@@ -98,18 +98,19 @@ def compute_variance_shares(found: Sequence[FactorCombination], response: str = 
     return dict(sorted({**own, **pairs}.items(), key=lambda item: -item[1]))
 
 
-def build_panels(found: Sequence[FactorCombination]) -> list[ChartPanel]:
+def build_panels(combinations: Sequence[FactorCombination]) -> list[ChartPanel]:
     """Plot the motion over the tumour's depth, one panel per craniotomy: skulls, Poisson's ratios of the default."""
-    chosen = [{**DEFAULT, "nu": nu} for nu in _list_levels(found, "nu")]
-    chosen += [{**DEFAULT, "skull": skull} for skull in _list_levels(found, "skull") if skull != DEFAULT["skull"]]
-    motions = [cell.force for cell in found if np.isfinite(cell.force)]
+    chosen = [{**DEFAULT, "nu": nu} for nu in _list_levels(combinations, "nu")]
+    skulls = [skull for skull in _list_levels(combinations, "skull") if skull != DEFAULT["skull"]]
+    chosen += [{**DEFAULT, "skull": skull} for skull in skulls]
+    motions = [cell.force for cell in combinations if np.isfinite(cell.force)]
     span = 0.8 * min(motions), 1.5 * max(motions)  # the same for all openings
     out = []
-    for opening in _list_levels(found, "opening [mm]"):
+    for opening in _list_levels(combinations, "opening [mm]"):
         curves = []
         for body in chosen:
             here = {**body, "opening [mm]": opening}
-            mine = [cell for cell in found if here.items() <= cell.levels.items() and np.isfinite(cell.force)]
+            mine = [cell for cell in combinations if here.items() <= cell.levels.items() and np.isfinite(cell.force)]
             points = tuple((float(cell.levels["depth [mm]"]), cell.force) for cell in mine)
             curves.append(Curve(f"{body['skull']}, nu {body['nu']:g}", points))
         title = f"Opening of {opening:g} mm: how far {FORCE:g} N move the tumour"

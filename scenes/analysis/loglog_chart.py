@@ -49,7 +49,7 @@ class Dot:
     group: str
     x: float
     y: float
-    pale: bool = False
+    is_pale: bool = False
     y_range: tuple[float, float] | None = None
     hint: str = ""
 
@@ -141,8 +141,8 @@ def _build_canvas(panel: ChartPanel) -> FigureCanvasAgg:
         axes.plot([], [], "o", color=colour, markersize=DOT_DIAMETER, label=group)
     if panel.front:
         axes.step(*np.array(sorted(panel.front)).T, where="post", color=NAME_GREY, linewidth=1.0, zorder=1)
-    for number, dot in sorted(enumerate(panel.dots), key=lambda each: not each[1].pale):  # pale ones are covered
-        colour, opacity = groups[dot.group], PALE_OPACITY if dot.pale else 1.0
+    for number, dot in sorted(enumerate(panel.dots), key=lambda each: not each[1].is_pale):  # pale ones are covered
+        colour, opacity = groups[dot.group], PALE_OPACITY if dot.is_pale else 1.0
         if dot.y_range:
             axes.vlines(dot.x, *dot.y_range, color=colour, linewidth=1.0, alpha=0.6 * opacity)
         (drawn,) = axes.plot(dot.x, dot.y, "o", color=colour, markersize=DOT_DIAMETER, markeredgewidth=0, alpha=opacity)
@@ -162,7 +162,7 @@ def _write_names(axes: Axes, dots: Sequence[Dot]) -> None:
     taken = [Bbox([centre - reach, centre + reach]) for centre in centres]
     legend, frame = axes.get_legend(), axes.get_window_extent()
     taken += [legend.get_window_extent()] if legend else []
-    for dot in sorted((dot for dot in dots if dot.name), key=lambda dot: dot.pale):
+    for dot in sorted((dot for dot in dots if dot.name), key=lambda dot: dot.is_pale):
         names = [
             axes.annotate(
                 dot.name,
@@ -175,12 +175,12 @@ def _write_names(axes: Axes, dots: Sequence[Dot]) -> None:
         ]
         for name, (right, up) in zip(names, SIDES, strict=True):
             name.set(
-                ha=HORIZONTAL_ALIGNMENT[right], va=VERTICAL_ALIGNMENT[up], color=NAME_GREY if dot.pale else "black"
+                ha=HORIZONTAL_ALIGNMENT[right], va=VERTICAL_ALIGNMENT[up], color=NAME_GREY if dot.is_pale else "black"
             )
         boxes = [name.get_window_extent() for name in names]
         overlaps = [box.count_overlaps(taken) + (not _is_within(box, frame)) for box in boxes]
         best = int(np.argmin(overlaps))
-        is_kept = not (dot.pale and overlaps[best])
+        is_kept = not (dot.is_pale and overlaps[best])
         for number, name in enumerate(names):
             if number != best or not is_kept:
                 name.remove()

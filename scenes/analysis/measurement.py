@@ -58,10 +58,7 @@ def measure_peak_memory() -> float | None:
 
 @contextmanager
 def watch_gpu_memory(device: str) -> Iterator[list[int]]:
-    """Yield the additional GPU memory [bytes] that is used while the block runs.
-
-    Zero without a GPU.
-    """
+    """Yield the additional GPU memory [bytes] that is used while the block runs. Zero without a GPU."""
     where = wp.get_device(None if device == "auto" else device)
     taken = [0]
     if not where.is_cuda:

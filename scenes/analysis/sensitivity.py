@@ -50,23 +50,21 @@ class Variant:
 
     factor: str
     default: str
-    now: str
+    changed: str
     body: BodyVariant
-    aim: LoadPerturbation = LoadPerturbation()
+    perturbation: LoadPerturbation = LoadPerturbation()
 
 
 def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) -> list[Variant]:
     """List the variants of tool, tissue and skull, and of other `elements`."""
     tissue = body.tissue
-    young, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
+    text, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
     changed = [
         Variant("force or motion", "as drawn", "+-5 %", body, LoadPerturbation(share=0.05)),
         Variant("its direction", "as drawn", "+-2 deg", body, LoadPerturbation(turn=np.radians(2.0))),
         Variant("its position", "as drawn", "+-1 mm", body, LoadPerturbation(shift=1e-3)),
         *(
-            Variant(
-                "E", young, f"{step:+.0%}", replace(body, tissue=replace(tissue, young=(1.0 + step) * tissue.young))
-            )
+            Variant("E", text, f"{step:+.0%}", replace(body, tissue=replace(tissue, young=(1.0 + step) * tissue.young)))
             for step in (-0.2, 0.2)
         ),
         *(
@@ -81,11 +79,11 @@ def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] =
     if anatomy.slide_normal.any():
         changed += [Variant("skull", body.skull, skull, replace(body, skull=skull)) for skull in SKULLS]
     changed += [Variant("element", body.element, element, replace(body, element=element)) for element in elements]
-    return [variant for variant in changed if variant.body != body or variant.aim != LoadPerturbation()]
+    return [variant for variant in changed if variant.body != body or variant.perturbation != LoadPerturbation()]
 
 
-def apply_aim(loads: Loads, aim: LoadPerturbation, patch: Patch) -> Loads:
-    """Perturb the loads of one tool by `aim`: one block of loads for each direction.
+def perturb_loads(loads: Loads, perturbation: LoadPerturbation, patch: Patch) -> Loads:
+    """Perturb the loads of one tool by `perturbation`: one block of loads for each direction.
 
     Points are shifted along the open cortex.
     """
@@ -95,15 +93,15 @@ def apply_aim(loads: Loads, aim: LoadPerturbation, patch: Patch) -> Loads:
     name = MAGNITUDE[type(cause)]
     vector = getattr(cause, name)
     vectors, points = [vector], [cause.point]
-    if aim.share:
-        vectors = [(1.0 + share) * vector for share in (aim.share, -aim.share)]
-    if aim.turn:
+    if perturbation.share:
+        vectors = [(1.0 + share) * vector for share in (perturbation.share, -perturbation.share)]
+    if perturbation.turn:
         length = np.linalg.norm(vector, axis=1, keepdims=True)
-        turned = [np.sin(aim.turn) * length * way for way in find_perpendiculars(vector / length)]
-        vectors = [np.cos(aim.turn) * vector + aside for aside in turned]
-    if aim.shift:
+        turned = [np.sin(perturbation.turn) * length * way for way in find_perpendiculars(vector / length)]
+        vectors = [np.cos(perturbation.turn) * vector + aside for aside in turned]
+    if perturbation.shift:
         first, second = find_perpendiculars(patch.find_normals(cause.point))
-        points = [cause.point + aim.shift * way for way in (first, -first, second, -second)]
+        points = [cause.point + perturbation.shift * way for way in (first, -first, second, -second)]
     return stack(
         [Loads((replace(cause, **{name: one, "point": point}),), loads.time) for one in vectors for point in points]
     )
@@ -163,7 +161,7 @@ class SensitivityStudy:
         return Fem(self.anatomy, effects, self.accuracy, self.device, element=body.element)
 
 
-def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Iterator[SensitivityRow]:
+def measure_variants(study: SensitivityStudy, variants: Sequence[Variant]) -> Iterator[SensitivityRow]:
     """Yield the default, whose change is the whole motion, then the change of each variant from the default.
 
     Prescribed motions are those of the default under its forces: the mean motion of each footprint. Every solve starts
@@ -182,22 +180,24 @@ def measure_variants(study: SensitivityStudy, changed: Sequence[Variant]) -> Ite
     matched = match_motion(study.anatomy, study.loads, pushed)
     defaults = ((study.loads, pushed), (matched, fem.deform(matched, build_start(pushed.displacement))))
     rest = np.zeros((len(study.loads), len(nodes), 3))
-    whole = [change(default.restrict(nodes), default.restrict(nodes), rest) for _, default in defaults]
+    whole = [compute_change(default.restrict(nodes), default.restrict(nodes), rest) for _, default in defaults]
     yield SensitivityRow(Variant("motion itself", "", "", body), *whole)
-    for variant in changed:
+    for variant in variants:
         if variant.body != body:
             body, fem = variant.body, study.build_fem(variant.body)
         found = []
         for loads, default in defaults:
-            asked = apply_aim(loads, variant.aim, patch)
+            asked = perturb_loads(loads, variant.perturbation, patch)
             start = np.tile(default.displacement, (len(asked) // len(loads), 1, 1))
             of_default = default.restrict(nodes)
-            found.append(change(fem.deform(asked, build_start(start), nodes), of_default, of_default.displacement))
+            found.append(
+                compute_change(fem.deform(asked, build_start(start), nodes), of_default, of_default.displacement)
+            )
         yield SensitivityRow(variant, *found)
 
 
-def change(result: Deformation, default: Deformation, origin: np.ndarray) -> Change:
-    """Compare `result`, k blocks of the loads of `default`, with `origin` (B, n, 3) [m].
+def compute_change(result: Deformation, default: Deformation, reference: np.ndarray) -> Change:
+    """Compare `result`, k blocks of the loads of `default`, with `reference` (B, n, 3) [m].
 
     A load counts where it and its default converged.
     """
@@ -206,11 +206,11 @@ def change(result: Deformation, default: Deformation, origin: np.ndarray) -> Cha
     good = good & np.tile(sound, ways)
     if not good.any():
         return Change(0, len(good), *[np.nan] * 6)
-    now, then, origin = (
+    now, then, reference = (
         1e3 * field[good]
-        for field in (result.displacement, *(np.tile(one, (ways, 1, 1)) for one in (default.displacement, origin)))
+        for field in (result.displacement, *(np.tile(one, (ways, 1, 1)) for one in (default.displacement, reference)))
     )
-    distance = np.linalg.norm(now - origin, axis=2)
+    distance = np.linalg.norm(now - reference, axis=2)
     motion, before = (np.linalg.norm(field, axis=2).mean(axis=1) for field in (now, then))
     return Change(
         int(good.sum()),

@@ -28,10 +28,8 @@ def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarr
     points = board.corners - np.array([*(0.5 * board.size), 0.0])
     camera, views, poses = calibration.build_camera(np.eye(4)), [], []
     for number in range(VIEW_COUNT):
-        way = 2.0 * np.pi * number / VIEW_COUNT
-        turn = (
-            MAX_TILT * random.uniform(0.5, 1.0) * np.array([np.cos(way), np.sin(way), 0.3 * random.standard_normal()])
-        )
+        az = 2.0 * np.pi * number / VIEW_COUNT
+        turn = MAX_TILT * random.uniform(0.5, 1.0) * np.array([np.cos(az), np.sin(az), 0.3 * random.standard_normal()])
         depth = board.size[0] * calibration.focal[0] / (random.uniform(*BOARD_WIDTHS) * calibration.width)
         aside = 0.25 * random.uniform(-1.0, 1.0, 2) * np.array([calibration.width, calibration.height])
         shift = depth * np.array([*(aside / calibration.focal), 1.0])
@@ -44,16 +42,16 @@ def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarr
     return compute_intrinsics_covariance(calibration, views, poses)[0]
 
 
-def change_calibration(calibration: Calibration, step: np.ndarray) -> Calibration:
-    """Return a calibration whose nine parameters differ by `step` (9,); further lens coefficients are unchanged."""
-    fx, fy, cx, cy = (np.array([*calibration.focal, *calibration.principal]) + step[:4]).tolist()
+def change_calibration(calibration: Calibration, change: np.ndarray) -> Calibration:
+    """Return a calibration whose nine parameters differ by `change` (9,); further lens coefficients are unchanged."""
+    fx, fy, cx, cy = (np.array([*calibration.focal, *calibration.principal]) + change[:4]).tolist()
     coefficients = calibration.lens.coefficients.copy()
-    coefficients[:5] += step[4:]
+    coefficients[:5] += change[4:]
     return replace(calibration, focal=(fx, fy), principal=(cx, cy), lens=Lens(*coefficients.tolist()))
 
 
-def project_corners(camera: Camera, target: Target, T_world_target: np.ndarray, off: np.ndarray) -> DetectedCorners:
-    """Project the corners of a target's visible faces, each with an error from a row of `off` (n, 2) [pixel]."""
+def project_corners(camera: Camera, target: Target, T_world_target: np.ndarray, noise: np.ndarray) -> DetectedCorners:
+    """Project the corners of a target's visible faces, each with an error from a row of `noise` (n, 2) [pixel]."""
     points, faces, T = [], [], camera.T_camera_world @ T_world_target
     for number, face in enumerate(target.faces):
         if is_seen_from_front(T @ face.T_target_face):
@@ -62,24 +60,24 @@ def project_corners(camera: Camera, target: Target, T_world_target: np.ndarray, 
     at = np.concatenate([np.zeros((0, 3)), *points])
     pixels, _ = camera.project(at @ T_world_target[:3, :3].T + T_world_target[:3, 3])
     inside = (np.isfinite(pixels) & (pixels >= 0.0) & (pixels <= [camera.width - 1, camera.height - 1])).all(axis=1)
-    return DetectedCorners(at[inside], (pixels + off[: len(at)])[inside], np.array(faces, int)[inside])
+    return DetectedCorners(at[inside], (pixels + noise[: len(at)])[inside], np.array(faces, int)[inside])
 
 
-def project_by_rows(
-    seen: DetectedCorners, camera_at: Callable[[float], Camera], readout: float, T_world_target: np.ndarray
+def project_with_shutter(
+    corners: DetectedCorners, get_camera: Callable[[float], Camera], readout_time: float, T_world_target: np.ndarray
 ) -> DetectedCorners:
-    """Project corners with a rolling shutter that reads the image rows within `readout` [s].
+    """Project corners with a rolling shutter that reads the image rows within `readout_time` [s].
 
-    `camera_at` returns the camera at a delay [s] after the middle row is read. The noise of `seen` corners stays.
+    `get_camera` returns the camera at a delay [s] after the middle row is read. The noise of `corners` corners stays.
     """
-    at = seen.points @ T_world_target[:3, :3].T + T_world_target[:3, 3]
-    middle = camera_at(0.0)
+    at = corners.points @ T_world_target[:3, :3].T + T_world_target[:3, 3]
+    middle = get_camera(0.0)
     still, _ = middle.project(at)
     moved = [
-        camera_at(readout * compute_row_delay(middle, row)).project(place[None])[0][0]
+        get_camera(readout_time * compute_row_delay(middle, row)).project(place[None])[0][0]
         for place, row in zip(at, still[:, 1].tolist(), strict=True)
     ]
-    return replace(seen, pixels=seen.pixels + np.reshape(moved, still.shape) - still)
+    return replace(corners, pixels=corners.pixels + np.reshape(moved, still.shape) - still)
 
 
 def compute_row_delay(camera: Camera, row: float) -> float:

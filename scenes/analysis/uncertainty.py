@@ -88,7 +88,7 @@ class SurfaceMotions:
     normals: tuple[np.ndarray, ...]
 
 
-def apply_sample(scene: Scene, draw: PatientSample) -> Scene:
+def apply_sample(scene: Scene, sample: PatientSample) -> Scene:
     """Return the scene with another tissue, tumour, skull and place of the tool.
 
     Raises
@@ -99,16 +99,16 @@ def apply_sample(scene: Scene, draw: PatientSample) -> Scene:
     tissue = get_tissue(scene)
 
     def drawn(one: Material, times: float = 1.0) -> Material:
-        return replace(one, young=times * draw.stiffness * one.young, poisson=draw.poisson)
+        return replace(one, young=times * sample.stiffness * one.young, poisson=sample.poisson)
 
     regions = {label: drawn(one) for label, one in scene.elasticity.regions.items() if isinstance(one, Material)}
-    elasticity = Elasticity(drawn(tissue), {**regions, TUMOUR_LABEL: drawn(get_tumour_tissue(scene), draw.ratio)})
-    skull = SKULLS[choose_name(draw.skull, list_skulls(scene))]
+    elasticity = Elasticity(drawn(tissue), {**regions, TUMOUR_LABEL: drawn(get_tumour_tissue(scene), sample.ratio)})
+    skull = SKULLS[choose_name(sample.skull, list_skulls(scene))]
 
     def other(effect: Effect) -> Effect:
         return elasticity if isinstance(effect, Elasticity) else skull if isinstance(effect, SKULL_EFFECTS) else effect
 
-    return replace(scene, effects=tuple(map(other, scene.effects)), path=_shift_path(scene.path, draw.tip))
+    return replace(scene, effects=tuple(map(other, scene.effects)), path=_shift_path(scene.path, sample.tip))
 
 
 def list_skulls(scene: Scene) -> tuple[str, ...]:
@@ -130,17 +130,17 @@ def find_mesh_prior(scene: Scene, skull: str | None) -> ParameterPrior:
     return SINKING_MESH_PRIOR if any(isinstance(effect, Gravity) for effect in scene.effects) else SLIDING_MESH_PRIOR
 
 
-def sample_mesh_errors(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
+def sample_mesh_errors(scene: Scene, samples: Sequence[PatientSample]) -> np.ndarray:
     """Sample the mesh error (draws,) of each draw, relative to its motion."""
-    return estimate_mesh_deviations(scene, draws) * np.array([draw.mesh for draw in draws])
+    return estimate_mesh_deviations(scene, samples) * np.array([draw.mesh for draw in samples])
 
 
-def estimate_mesh_deviations(scene: Scene, draws: Sequence[PatientSample]) -> np.ndarray:
+def estimate_mesh_deviations(scene: Scene, samples: Sequence[PatientSample]) -> np.ndarray:
     """Return the standard deviation (draws,) of each draw's mesh error, relative to its motion."""
     if get_skull_model(scene) is None:
-        return np.full(len(draws), find_mesh_prior(scene, None).range[1])
+        return np.full(len(samples), find_mesh_prior(scene, None).range[1])
     skulls = list_skulls(scene)
-    return np.array([find_mesh_prior(scene, choose_name(draw.skull, skulls)).range[1] for draw in draws])
+    return np.array([find_mesh_prior(scene, choose_name(draw.skull, skulls)).range[1] for draw in samples])
 
 
 def get_tissue(scene: Scene) -> Material:
@@ -184,12 +184,12 @@ def _shift_path(path: Path, tip: Sequence[float]) -> Path:
     return aside
 
 
-def list_moments(scene: Scene) -> tuple[float, ...]:
+def list_solved_times(scene: Scene) -> tuple[float, ...]:
     """Return the times [s] of a scene that are solved."""
     return tuple(np.linspace(0.0, scene.duration, ENSEMBLE.solved_times).tolist())
 
 
-def solve_nominal(theatre: PatientSetup, scene: Scene) -> SurfaceMotions:
+def solve_nominal(patient: PatientSetup, scene: Scene) -> SurfaceMotions:
     """Solve the scene without changes.
 
     Raises
@@ -197,76 +197,77 @@ def solve_nominal(theatre: PatientSetup, scene: Scene) -> SurfaceMotions:
     InputError
         An anatomy without tumour; a time without equilibrium.
     """
-    if not len(theatre.anatomy.tumour_nodes):
+    if not len(patient.anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour to be uncertain of: make one with `sulcus anatomy`.")
-    result, normals = solve_scene(theatre, scene), []
+    result, normals = solve_scene(patient, scene), []
     if result is None:
         raise InputError(f"of the scene {scene.name} itself no equilibrium was found.")
-    for time in list_moments(scene):
-        loads = scene.build_loads(theatre.site, scene.path(time), time)
-        tumour = Stage(scene, theatre.site).select_stage(loads).build_tumour(theatre.anatomy.mesh.nodes)
+    for time in list_solved_times(scene):
+        loads = scene.build_loads(patient.site, scene.path(time), time)
+        tumour = Stage(scene, patient.site).select_stage(loads).build_tumour(patient.anatomy.mesh.nodes)
         normals.append(compute_vertex_normals(tumour.vertices, tumour.triangles))
-    return SurfaceMotions(list_moments(scene), result.motions, tuple(normals))
+    return SurfaceMotions(list_solved_times(scene), result.motions, tuple(normals))
 
 
-def solve_scene(theatre: PatientSetup, scene: Scene) -> Answer:
+def solve_scene(patient: PatientSetup, scene: Scene) -> Answer:
     """Compute the tumour's motions at each moment; None if one of them has no equilibrium.
 
     If the step from the previous moment does not converge, intermediate times are solved.
     """
-    fem, stage = theatre.build_fem(scene, ACCURACY, batch=1), Stage(scene, theatre.site)
+    fem, stage = patient.build_fem(scene, ACCURACY, batch=1), Stage(scene, patient.site)
     last, found, before, inverted = None, [], 0.0, 0
 
     def gone_to(times: Sequence[float], start: Deformation | None) -> Deformation | None:
         for time in times:
-            start = fem.deform(scene.build_loads(theatre.site, scene.path(time), time), start=start)
+            start = fem.deform(scene.build_loads(patient.site, scene.path(time), time), start=start)
             if not start.outcome[0].good:
                 return None
         return start
 
-    for time in list_moments(scene):
+    for time in list_solved_times(scene):
         result = gone_to([time], last)
         if result is None and time > before:
             result = gone_to(np.linspace(before, time, 1 + ENSEMBLE.load_steps)[1:].tolist(), last)
         if result is None:
             return None
         last, before, inverted = result, time, max(inverted, int(result.inverted[0]))
-        loads = scene.build_loads(theatre.site, scene.path(time), time)
+        loads = scene.build_loads(patient.site, scene.path(time), time)
         found.append(last.restrict(stage.select_stage(loads).tumour_vertices).displacement[0])
     return SolvedMotions(tuple(found), inverted)
 
 
-def solve_ensemble(theatre: PatientSetup, scene: Scene, draws: Sequence[PatientSample]) -> Iterator[Answer]:
+def solve_ensemble(patient: PatientSetup, scene: Scene, samples: Sequence[PatientSample]) -> Iterator[Answer]:
     """Yield the motions of every draw."""
-    for draw in draws:
-        yield solve_scene(theatre, apply_sample(scene, draw))
+    for draw in samples:
+        yield solve_scene(patient, apply_sample(scene, draw))
 
 
-def find_sound_draws(draws: Sequence[PatientSample], answers: Iterable[Answer]) -> SoundDraws:
+def select_solved_samples(samples: Sequence[PatientSample], solutions: Iterable[Answer]) -> SoundDraws:
     """Return the draws that have an equilibrium at each moment, with their motions."""
-    return [(draw, result.motions) for draw, result in zip(draws, answers, strict=True) if result is not None]
+    return [(draw, result.motions) for draw, result in zip(samples, solutions, strict=True) if result is not None]
 
 
-def filter_sound_draws(scene: Scene, draws: Sequence[PatientSample], answers: Iterable[Answer]) -> SoundDraws:
-    """Return the sound draws, see `find_sound_draws`, of a scene; check that there are enough.
+def filter_solved_samples(scene: Scene, samples: Sequence[PatientSample], solutions: Iterable[Answer]) -> SoundDraws:
+    """Return the sound draws, see `select_solved_samples`, of a scene; check that there are enough.
 
     Raises
     ------
     InputError
         Too few draws with an equilibrium.
     """
-    sound = find_sound_draws(draws, answers)
-    if len(sound) < ENSEMBLE.min_solved_share * len(draws):
-        raise InputError(f"of {len(draws)} draws of the scene {scene.name} {len(sound)} have an equilibrium: too few.")
+    sound = select_solved_samples(samples, solutions)
+    if len(sound) < ENSEMBLE.min_solved_share * len(samples):
+        found = f"of {len(samples)} draws of the scene {scene.name} {len(sound)}"
+        raise InputError(f"{found} have an equilibrium: too few.")
     return sound
 
 
 def estimate_uncertainty(
-    theatre: PatientSetup,
+    patient: PatientSetup,
     scene: Scene,
-    still: SurfaceMotions,
-    draws: Sequence[PatientSample],
-    answers: Iterable[Answer],
+    nominal: SurfaceMotions,
+    samples: Sequence[PatientSample],
+    solutions: Iterable[Answer],
     seed: int = 0,
 ) -> Uncertainty:
     """Estimate the error of the shown tumour position from the motions of an ensemble.
@@ -276,15 +277,15 @@ def estimate_uncertainty(
     InputError
         Too few draws with an equilibrium.
     """
-    answers = tuple(answers)
-    sound = filter_sound_draws(scene, draws, answers)
-    folded = sum(result is not None and result.inverted > 0 for result in answers)
+    solutions = tuple(solutions)
+    sound = filter_solved_samples(scene, samples, solutions)
+    folded = sum(result is not None and result.inverted > 0 for result in solutions)
     kept, shifts = [draw for draw, _ in sound], sample_rigid_errors(ENSEMBLE.shift_count, seed)
     meshes = sample_mesh_errors(scene, kept)
     rows = []
-    for moment, (field, normals) in enumerate(zip(still.fields, still.normals, strict=True)):
+    for moment, (field, normals) in enumerate(zip(nominal.fields, nominal.normals, strict=True)):
         motion = np.stack([result[moment] for _, result in sound])
-        off, (shift, wide) = compute_error(motion, field, meshes), shifts
+        off, (shift, wide) = compute_motion_errors(motion, field, meshes), shifts
         worst, middle = compute_worst_distances(off, normals, shift, wide)
         registered, _ = compute_worst_distances(off, normals, 0.0 * shift, wide)
         errors = worst, middle, registered, np.linalg.norm(off.mean(axis=1), axis=1)
@@ -294,10 +295,10 @@ def estimate_uncertainty(
     *lists, by_name = zip(*rows, strict=True)
     return Uncertainty(
         scene=scene.name,
-        mark=compute_scene_mark(scene, theatre.site, theatre.choose_element(scene)),
-        draws=len(draws),
-        failed=len(draws) - len(sound),
-        times=still.times,
+        mark=compute_scene_mark(scene, patient.site, patient.choose_element(scene)),
+        draws=len(samples),
+        failed=len(samples) - len(sound),
+        times=nominal.times,
         **dict(zip(("worst", "middle", "registered", "motion", "moved"), lists, strict=True)),
         parts={name: tuple(row[name] for row in by_name) for name in by_name[0]},
         folded=folded,
@@ -305,69 +306,69 @@ def estimate_uncertainty(
     )
 
 
-def compute_error(motion: np.ndarray, field: np.ndarray, meshes: np.ndarray) -> np.ndarray:
+def compute_motion_errors(motion: np.ndarray, field: np.ndarray, mesh_errors: np.ndarray) -> np.ndarray:
     """Return the error of a scene's field (n, 3) [m] relative to motions (draws, n, 3) with mesh errors (draws,)."""
-    return (1.0 + meshes)[:, None, None] * motion - field
+    return (1.0 + mesh_errors)[:, None, None] * motion - field
 
 
 def compute_worst_distances(
-    off: np.ndarray, normals: np.ndarray, shift: np.ndarray, wide: np.ndarray
+    errors: np.ndarray, normals: np.ndarray, shifts: np.ndarray, offsets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return errors of the worst point and of the centre (draws, shifts) [m], for every draw with every rigid error.
 
     off (draws, n, 3): errors of the model; normals (n, 3); shift (shifts, 3) and wide (shifts,): registration and
     segmentation [m].
     """
-    aside = shift[:, None] + wide[:, None, None] * normals
-    worst = np.stack([np.linalg.norm(one + aside, axis=2).max(axis=1) for one in off])
-    middle = np.stack([np.linalg.norm((one + aside).mean(axis=1), axis=1) for one in off])
+    aside = shifts[:, None] + offsets[:, None, None] * normals
+    worst = np.stack([np.linalg.norm(one + aside, axis=2).max(axis=1) for one in errors])
+    middle = np.stack([np.linalg.norm((one + aside).mean(axis=1), axis=1) for one in errors])
     return worst, middle
 
 
 def split_contributions(
-    motion: np.ndarray, field: np.ndarray, draws: Sequence[PatientSample], scene: Scene
+    motion: np.ndarray, field: np.ndarray, samples: Sequence[PatientSample], scene: Scene
 ) -> dict[str, float]:
     """Return each contributor's own error [m]: root mean square over the draws, at the worst surface point of each.
 
     A linear fit of the draws (draws, n, 3) separates the causes; its residual is their interaction.
     """
-    off, columns = motion - field, collect_contributor_values(draws, scene)
+    off, columns = motion - field, collect_contributor_values(samples, scene)
     design = np.concatenate(list(columns.values()), axis=1)
     slope = np.linalg.lstsq(design, off.reshape(len(off), -1), rcond=None)[0]
     found, first = {}, 0
     for name, column in columns.items():
         last = first + column.shape[1]
-        found[name] = compute_field_size((column @ slope[first:last]).reshape(off.shape))
+        found[name] = compute_rms_of_largest((column @ slope[first:last]).reshape(off.shape))
         first = last
-    found[COMBINED] = compute_field_size(off - (design @ slope).reshape(off.shape))
-    found[MESH] = compute_field_size(estimate_mesh_deviations(scene, draws)[:, None, None] * motion)
+    found[COMBINED] = compute_rms_of_largest(off - (design @ slope).reshape(off.shape))
+    found[MESH] = compute_rms_of_largest(estimate_mesh_deviations(scene, samples)[:, None, None] * motion)
     return found | {REGISTRATION: 3.0**0.5 * REGISTRATION_PRIOR.range[1], SEGMENTATION: SEGMENTATION_PRIOR.range[1]}
 
 
-def collect_contributor_values(draws: Sequence[PatientSample], scene: Scene) -> dict[str, np.ndarray]:
+def collect_contributor_values(samples: Sequence[PatientSample], scene: Scene) -> dict[str, np.ndarray]:
     """Return, by contributor, the difference of each draw from the scene (draws, columns); zero without difference."""
     poisson = get_tissue(scene).poisson
-    table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in draws])
+    table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in samples])
     found = {STIFFNESS.name: table[:, :1], POISSON.name: table[:, 1:2], RATIO.name: table[:, 2:3]}
     skull = get_skull_model(scene)
     others = [name for name in list_skulls(scene) if name != skull]
-    names = [choose_name(draw.skull, list_skulls(scene)) for draw in draws]
+    names = [choose_name(draw.skull, list_skulls(scene)) for draw in samples]
     if skull is not None:
         found[SKULL] = np.array([[name == other for other in others] for name in names], float)
     return found if scene.tool is None else found | {TOOL: table[:, 3:]}
 
 
-def compute_field_size(field: np.ndarray) -> float:
+def compute_rms_of_largest(field: np.ndarray) -> float:
     """Compute the root mean square over draws of the largest vector length in each draw; vectors (draws, n, 3)."""
     return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
 
 
 def measure_coverage(
     scene: Scene,
-    still: SurfaceMotions,
-    stated: Uncertainty,
-    draws: Sequence[PatientSample],
-    answers: Iterable[Answer],
+    nominal: SurfaceMotions,
+    uncertainty: Uncertainty,
+    samples: Sequence[PatientSample],
+    solutions: Iterable[Answer],
     seed: int,
 ) -> Uncertainty:
     """Return the uncertainty with the coverage on synthetic patients: new draws, with new registration errors.
@@ -377,21 +378,21 @@ def measure_coverage(
     InputError
         Fewer than two of them have an equilibrium.
     """
-    sound = find_sound_draws(draws, answers)
+    sound = select_solved_samples(samples, solutions)
     if len(sound) < 2:
         raise InputError(
-            f"{len(sound)} of {len(draws)} synthetic patients of the scene {scene.name} have an equilibrium: too few."
+            f"{len(sound)} of {len(samples)} synthetic patients of the scene {scene.name} have an equilibrium: too few."
         )
     meshes, inside = sample_mesh_errors(scene, [draw for draw, _ in sound]), []
     shape = len(sound), ENSEMBLE.shift_count  # different errors for each patient
     shift, wide = sample_rigid_errors(shape[0] * shape[1], seed)
     each = list(zip(shift.reshape(*shape, 3), wide.reshape(shape), strict=True))
-    for moment in range(1, len(still.times)):
+    for moment in range(1, len(nominal.times)):
         motion = np.stack([result[moment] for _, result in sound])
-        off = compute_error(motion, still.fields[moment], meshes)
-        pairs, normals = zip(off, each, strict=True), still.normals[moment]
+        off = compute_motion_errors(motion, nominal.fields[moment], meshes)
+        pairs, normals = zip(off, each, strict=True), nominal.normals[moment]
         worst = [compute_worst_distances(one[None], normals, *errors)[0][0] for one, errors in pairs]
-        inside.append(np.array(worst) <= stated.worst[moment])
+        inside.append(np.array(worst) <= uncertainty.worst[moment])
     shares = np.mean(inside, axis=(0, 2))  # errors of one patient depend on each other
     deviation = float(shares.std(ddof=1) / np.sqrt(len(shares)))
-    return replace(stated, patients=len(shares), covered=float(shares.mean()), deviation=deviation)
+    return replace(uncertainty, patients=len(shares), covered=float(shares.mean()), deviation=deviation)

@@ -16,5 +16,5 @@ SCENE = Scene(
     duration=6.0,
     effects=(Elasticity(DRAINED_TISSUE), Held(), SkullContact(), Gravity()),
     tool=None,
-    lying=build_drained_turn(drain=3.0, pause=0.5, turn=2.0, angle=np.radians(30.0), to=0.5),
+    lying=build_drained_turn(drain_time=3.0, pause_time=0.5, turn_time=2.0, angle=np.radians(30.0), level=0.5),
 )

@@ -30,7 +30,7 @@ SCENE = Scene(
     tool=Probe(radius=7e-3),
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity(), ToolForce()),
-    lying=build_drainage(2.0, to=0.2),
+    lying=build_drainage(2.0, level=0.2),
     observation_model=StereoObservation(),
     viewpoint=Viewpoint(width=800, height=600, eye="left", field=1.0),
     look=PLAIN_APPEARANCE,  # the stereo images of the FEM surface itself

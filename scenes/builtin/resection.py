@@ -15,6 +15,6 @@ SCENE = Scene(  # Without weight nothing would move: the model is free of stress
     duration=5.0,
     effects=(Elasticity(DRAINED_TISSUE), Held(), SkullContact(), Gravity()),
     tool=None,
-    lying=build_drainage(1.5, to=0.3),
+    lying=build_drainage(1.5, level=0.3),
     surgery=Debulking(times=(2.0, 2.7, 3.4, 4.1)),
 )

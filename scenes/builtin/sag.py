@@ -18,7 +18,7 @@ SCENE = Scene(
     duration=4.0,
     effects=(Elasticity(BRAIN, {TUMOUR_LABEL: TUMOUR}), Held(), Slide(), Gravity()),
     tool=None,
-    lying=build_drainage(3.0, to=0.2),
+    lying=build_drainage(3.0, level=0.2),
     observation_model=PointObservation(),
     viewpoint=Viewpoint(width=800, height=600),
     # The truth's dashed outline is drawn with an error of up to 0.4 pixels at a live solution: in one frame that

@@ -23,13 +23,13 @@ from sim.geometry.tetmesh import compute_dihedral_angles
 from sim.runtime.timing import time_stage
 
 from ..options.outputs import add_force, check_no_foreign_files, check_output_path
-from ..options.placement_options import add_opening_arguments, describe_opening, place_craniotomy, to_metres
+from ..options.placement_options import add_craniotomy_arguments, describe_craniotomy, place_craniotomy, to_metres
 from ..options.shared_options import add_json
 from ..options.subject_options import (
-    add_drawn_arguments,
-    add_label_arguments,
+    add_label_options,
+    add_synthetic_arguments,
     build_drawn_subject,
-    check_no_drawn_options,
+    check_no_synthetic_options,
     describe_source,
     list_label_options,
     parse_regions,
@@ -61,14 +61,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--preset", choices=tuple(PRESETS), default="default", help="values of the options that are not given"
     )
-    add_opening_arguments(parser)
+    add_craniotomy_arguments(parser)
     own = parser.add_argument_group("your own brain")
     own.add_argument("--labels", type=Path, metavar="FILE.nii.gz", help="label volume; without it, a tumour is drawn")
-    add_label_arguments(own, "--convention")
+    add_label_options(own, "--convention")
     own.add_argument(
         "--t1", type=Path, metavar="FILE.nii.gz", help="intensities in the same space, for the camera view"
     )
-    add_drawn_arguments(parser)
+    add_synthetic_arguments(parser)
     add_force(parser)
     add_json(parser, "print the summary as one line of JSON")
 
@@ -127,7 +127,7 @@ def _build_subject(args: argparse.Namespace, chosen: dict) -> Subject:
         for option in list_label_options(args):
             raise InputError(f"{option} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out.")
         return build_drawn_subject(args, chosen)
-    check_no_drawn_options(args)
+    check_no_synthetic_options(args)
     return build_masked_subject(read_head_masks(parse_sources(args)), args.t1, regions=parse_regions(args))
 
 
@@ -161,7 +161,7 @@ def _summarise_anatomy(
         "tumour_volume_error_percent": round(100.0 * float(volume / subject.tumour_volume - 1.0), 3),
         "surface_error_mean_mm": round(1e3 * float(np.average(error, weights=weight)), 3),
         "surface_error_p95_mm": round(1e3 * float(np.quantile(error, 0.95, weights=weight, method="inverted_cdf")), 3),
-        "opening": {"over": describe_opening(args), **_describe_position(subject, subject.site)},
+        "opening": {"over": describe_craniotomy(args), **_describe_position(subject, subject.site)},
         "tumour_pieces": [
             {"ml": round(1e6 * piece.volume, 3), "lost": gone, **_describe_position(subject, piece.centre)}
             for piece, gone in zip(subject.pieces, lost, strict=True)

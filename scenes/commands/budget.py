@@ -17,9 +17,9 @@ from sim.arguments import check_integer
 from sim.errors import InputError
 from sim.runtime.outside_files import wrap_errors
 
-from ..options.camera_options import add_camera, add_targets
+from ..options.camera_options import add_camera_options, use_tracked_camera
+from ..options.patient_options import add_model_options, build_requested_scene
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
-from ..options.theatre_options import add_bodies, build_requested_scene
 from ..options.tissue_options import add_model_tissue
 
 if TYPE_CHECKING:
@@ -50,9 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py; palpate and retract take over 4 minutes on two "
         "cores",
     )
-    add_bodies(parser)
+    add_model_options(parser)
     add_model_tissue(parser)
-    add_camera(parser, "hand-held")
+    add_camera_options(parser, "hand-held")
     parser.add_argument(
         "--intrinsics", type=Path, metavar="K.json",
         help="covariance of --camera, from `sulcus calibrate` (default: that of 24 good views of the board)",
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Unreadable files, numbers out of range, or a scene that cannot be solved.
     """
-    from ..analysis.error_budget import FilmedScene, choose_moment, compute_budget, compute_velocity
+    from ..analysis.error_budget import FilmedScene, compute_budget, compute_velocity, find_largest_spread
     from ..analysis.uncertainty import sample_mesh_errors, solve_nominal, split_contributions
     from ..play.deformers import open_theatre
     from ..play.stage import Stage
@@ -105,19 +105,19 @@ def run(args: argparse.Namespace) -> int:
     ):
         if not 0.0 <= value < 1e4:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
-    theatre = open_theatre(args.anatomy, args.model, args.device, [args.scene])
-    scene = _build_filmed_scene(args, theatre)
-    calibration, site = scene.viewpoint.calibration, theatre.site
+    patient = open_theatre(args.anatomy, args.model, args.device, [args.scene])
+    scene = _build_filmed_scene(args, patient)
+    calibration, site = scene.viewpoint.calibration, patient.site
     assert calibration is not None
     covariance = _read_intrinsic_covariance(args, calibration)
     registration = None
     if args.registration is not None:
         registration = read_registration(args.registration)
-        describe_other_mesh(registration, theatre.anatomy, args.registration)
-    still = solve_nominal(theatre, scene)
-    bodies = _sample_bodies(args, theatre, scene, args.draws, args.seed)
+        describe_other_mesh(registration, patient.anatomy, args.registration)
+    still = solve_nominal(patient, scene)
+    bodies = _sample_bodies(args, patient, scene, args.draws, args.seed)
     draws = [draw for draw, _ in bodies]
-    number = choose_moment(still, [answer for _, answer in bodies], sample_mesh_errors(scene, draws))
+    number = find_largest_spread(still, [answer for _, answer in bodies], sample_mesh_errors(scene, draws))
     time = still.times[number]
     own_bodies, meshes, own_mesh = _extract_motions_at(scene, bodies, number)
     filmed = FilmedScene(
@@ -125,13 +125,13 @@ def run(args: argparse.Namespace) -> int:
         T_scan_patient=place_reference(site, scene.viewpoint.build_camera(site)),
         rest=Stage(scene, site).select_stage(scene.build_loads(site, scene.path(time), time)).tumour_at_rest.vertices,
         field=still.fields[number], normals=still.normals[number], velocity=compute_velocity(still, number),
-        bodies=own_bodies, meshes=meshes, own_mesh=own_mesh, surrogate=_compute_model_bound(theatre, scene, time),
+        bodies=own_bodies, meshes=meshes, own_mesh=own_mesh, surrogate=_compute_model_bound(patient, scene, time),
         registration=registration, corner=args.corner_noise, latency=1e-3 * args.latency, clock=1e-3 * args.time_noise,
     )  # fmt: skip
     twins = None
     if args.twins:
         others, meshes, own_mesh = _extract_motions_at(
-            scene, _sample_bodies(args, theatre, scene, args.twins, args.seed + 1), number
+            scene, _sample_bodies(args, patient, scene, args.twins, args.seed + 1), number
         )
         twins = replace(filmed, bodies=others, meshes=meshes, own_mesh=own_mesh)
     bar = partial(tqdm, unit="part", desc="errors", leave=False, file=sys.stderr)
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _build_filmed_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
+def _build_filmed_scene(args: argparse.Namespace, patient: PatientSetup) -> Scene:
     """Build the scene with a calibrated camera.
 
     Raises
@@ -151,13 +151,13 @@ def _build_filmed_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scen
     """
     from ..analysis.uncertainty import get_tissue
 
-    scene = build_requested_scene(args, args.scene, theatre)
+    scene = build_requested_scene(args, args.scene, patient)
     if scene.observation_model is not None:
         raise InputError(
             f"the scene {scene.name} estimates the tumour position and reports its error: choose another scene."
         )
     get_tissue(scene)
-    filmed = add_targets(args, scene)
+    filmed = use_tracked_camera(args, scene)
     calibration = filmed.viewpoint.calibration
     if args.readout is None or calibration is None:
         return filmed
@@ -194,7 +194,7 @@ def _read_intrinsic_covariance(args: argparse.Namespace, calibration: Calibratio
     return covariance
 
 
-def _sample_bodies(args: argparse.Namespace, theatre: PatientSetup, scene: Scene, count: int, seed: int) -> Bodies:
+def _sample_bodies(args: argparse.Namespace, patient: PatientSetup, scene: Scene, count: int, seed: int) -> Bodies:
     """Sample bodies from the priors and solve the tumour's surface motion; drop those without equilibrium.
 
     Raises
@@ -202,14 +202,14 @@ def _sample_bodies(args: argparse.Namespace, theatre: PatientSetup, scene: Scene
     InputError
         Too few bodies with an equilibrium.
     """
-    from ..analysis.uncertainty import filter_sound_draws, solve_ensemble
+    from ..analysis.uncertainty import filter_solved_samples, solve_ensemble
     from ..script.priors import sample_priors
 
     draws = sample_priors(count, seed)
     bar = tqdm(
-        solve_ensemble(theatre, scene, draws), total=count, unit="body", desc=scene.name, leave=False, file=sys.stderr
+        solve_ensemble(patient, scene, draws), total=count, unit="body", desc=scene.name, leave=False, file=sys.stderr
     )
-    return filter_sound_draws(scene, draws, bar)
+    return filter_solved_samples(scene, draws, bar)
 
 
 def _extract_motions_at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -221,9 +221,9 @@ def _extract_motions_at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.n
     return np.stack([answer[number] for _, answer in bodies]), sample_mesh_errors(scene, draws), own
 
 
-def _compute_model_bound(theatre: PatientSetup, scene: Scene, time: float) -> float:
+def _compute_model_bound(patient: PatientSetup, scene: Scene, time: float) -> float:
     """Compute the error bound [m] of a scene's deformation model at a time [s]; 0 for FEM."""
-    player = theatre.build_player(theatre.select_default(scene), scene)
+    player = patient.build_player(patient.select_default(scene), scene)
     number = int(np.abs(scene.times - time).argmin())
     return player.draw(number, time, scene.path(time)).model_error or 0.0
 
@@ -249,8 +249,8 @@ def _collect_figures(
         "parts": {name: _compute_quantiles(errors) for name, errors in rows.items()},
         "inside": {PARAMETERS: inside},
         "largest": {"middle": found.find_largest("middle"), "worst": found.find_largest("worst")},
-        "band_mm": 1e3 * found.band, "held_twins": None if found.held is None else found.held[0],
-        "held_twins_off": None if found.held is None else found.held[1],
+        "band_mm": 1e3 * found.band, "held_twins": None if found.coverage is None else found.coverage[0],
+        "held_twins_off": None if found.coverage is None else found.coverage[1],
         "published_mm": list(PUBLISHED_ERRORS),
     }  # fmt: skip
 

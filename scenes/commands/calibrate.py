@@ -96,7 +96,7 @@ def _calibrate_camera(args: argparse.Namespace) -> int:
         **build_intrinsics_header(found.calibration, found.covariance),
         "rms_px": found.rms,
         "pictures": str(args.pictures),
-        "looked_at": seen.looked_at,
+        "looked_at": seen.image_count,
         "seen": len(seen.views),
         "used": found.used,
         "left_out": found.excluded,
@@ -107,7 +107,7 @@ def _calibrate_camera(args: argparse.Namespace) -> int:
     if args.json:
         print(to_json_line(report))
         return 0
-    print(f"{seen.looked_at} images, the board in {len(seen.views)}, {len(found.used)} views used")
+    print(f"{seen.image_count} images, the board in {len(seen.views)}, {len(found.used)} views used")
     if found.excluded:
         print(f"held out because of a large residual: {', '.join(found.excluded)}")
     print(f"rms {found.rms:.3f} px; corners covered {100.0 * found.covered:.0f} % of the image")

@@ -12,15 +12,9 @@ from typing import TYPE_CHECKING, TextIO
 
 from sim.arguments import check_integer
 
-from ..options.camera_options import add_camera, apply_camera_options
+from ..options.camera_options import add_camera_options, apply_camera_options
+from ..options.patient_options import add_patient, build_requested_scene, choose_deformer, list_playable, open_patient
 from ..options.shared_options import add_json, add_style
-from ..options.theatre_options import (
-    add_theatre,
-    build_requested_scene,
-    build_requested_theatre,
-    choose_deformer,
-    list_playable,
-)
 
 if TYPE_CHECKING:
     from ..play.checks import SceneFigures
@@ -40,9 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="built-in scenes, or MY_SCENE.py; tracking: a synthetic video with markers that disappear (default: all)",
     )  # fmt: skip
     parser.add_argument("--every", type=int, default=10, help="check every Nth frame")
-    add_theatre(parser)
-    add_camera(parser)
-    add_style(parser, without=("none",))  # the check needs an outline in the image
+    add_patient(parser)
+    add_camera_options(parser)
+    add_style(parser, excluded=("none",))  # the check needs an outline in the image
     add_json(parser)
 
 
@@ -50,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     """Check each scene; return 1 if a metric exceeds its limit."""
     from tqdm import tqdm
 
-    from ..play.checks import list_objections, measure
+    from ..play.checks import list_warnings, measure_frames
     from ..play.frame_text import format_errors
     from ..play.reference import solve_reference_frames
     from ..script.scene import SCENES
@@ -58,32 +52,32 @@ def run(args: argparse.Namespace) -> int:
     check_integer("--every", args.every, 1)
     asked = args.scenes or [*SCENES, TRACKING]
     names = [name for name in asked if name != TRACKING]
-    theatre = build_requested_theatre(args, *names)
-    scenes = [apply_camera_options(args, build_requested_scene(args, name, theatre)) for name in names]
-    scenes = list_playable(args, theatre, scenes)
+    patient = open_patient(args, *names)
+    scenes = [apply_camera_options(args, build_requested_scene(args, name, patient)) for name in names]
+    scenes = list_playable(args, patient, scenes)
     rows, table = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
-        name = choose_deformer(args, theatre, scene)
-        player = replace(theatre.build_player(name, scene), style=args.style)
-        print(f"{scene.name} by {theatre.describe_deformer(name, scene)}", file=table)
+        name = choose_deformer(args, patient, scene)
+        player = replace(patient.build_player(name, scene), style=args.style)
+        print(f"{scene.name} by {patient.describe_deformer(name, scene)}", file=table)
         total = len(scene.times[:: args.every])
         with tqdm(total=2 * total, unit="frame", desc=scene.name, leave=False, file=sys.stderr) as bar:
             frames = []
             for frame in player.play_frames(args.every):
                 frames.append(frame)
                 bar.update()
-            truth = solve_reference_frames(theatre, scene, [frame.loads for frame in frames], bar.update)
-        figures = measure(player, player.get_camera, frames, truth)
+            truth = solve_reference_frames(patient, scene, [frame.loads for frame in frames], bar.update)
+        figures = measure_frames(player, player.get_camera, frames, truth)
         broken = figures.find_violations(scene.bounds)
-        played = {"scene": scene.name, "deformer": name, "solver": theatre.describe_deformer(name, scene)}
+        played = {"scene": scene.name, "deformer": name, "solver": patient.describe_deformer(name, scene)}
         promised, error = _find_largest_errors(frames)
         rows.append({**played, "frames": len(frames), **figures.to_row(), "broken": broken})
-        against = list_objections(frames)
+        against = list_warnings(frames)
         rows[-1] |= {
             "model_error_mm": _to_millimetres(promised),
             "tumour_error_mm": _to_millimetres(error.bound),
-            "largest_part": error.largest,
-            "tumour_error_is_a_guess": error.guess,
+            "largest_part": error.main_source,
+            "tumour_error_is_a_guess": error.is_rough,
             "objections": against,
             "tumour_error_unobserved_mm": _to_millimetres(error.prior),
         }
@@ -95,23 +89,23 @@ def run(args: argparse.Namespace) -> int:
             f"skull{_describe_bond(figures.bond)}{_summarise_estimates(figures)}",
             file=table,
         )
-        for sentence in format_errors(promised, error, name != "fem", recorded=player.recorded):
+        for sentence in format_errors(promised, error, name != "fem", figures=player.recorded):
             print(f"{'':11s} {sentence}", file=table)
         for sentence in (*broken, *against):
             print(f"{'':11s} {sentence}", file=table)
-    tracking = _check_tracking(args, theatre, table) if TRACKING in asked else None
+    tracking = _check_tracking(args, patient, table) if TRACKING in asked else None
     passed = not any(row["broken"] for row in (*rows, *([] if tracking is None else [tracking])))
     if args.json:
         print(json.dumps({"passed": passed, "scenes": rows, "tracking": tracking}))
     return 0 if passed else 1
 
 
-def _check_tracking(args: argparse.Namespace, theatre: PatientSetup, table: TextIO) -> dict[str, object]:
+def _check_tracking(args: argparse.Namespace, patient: PatientSetup, table: TextIO) -> dict[str, object]:
     """Check the overlay on a synthetic video whose markers disappear and return."""
-    from ..tracked.rendered_video import build_synthetic_video
+    from ..tracked.rendered_video import render_synthetic_video
     from ..tracked.tracking_checks import build_default_pipeline, measure_tracking
 
-    film = build_synthetic_video(theatre)
+    film = render_synthetic_video(patient)
     figures = measure_tracking(film, *build_default_pipeline(film, args.style))
     broken = figures.find_violations()
     print(
@@ -127,10 +121,10 @@ def _check_tracking(args: argparse.Namespace, theatre: PatientSetup, table: Text
 
 def _find_largest_errors(frames: Sequence[Frame]) -> tuple[float | None, TumourError]:
     """Return the maxima over a scene's frames: error bound of the model [m], and tumour position error."""
-    from ..play.frame_text import find_worst
+    from ..play.frame_text import find_largest
 
     promised = [frame.model_error for frame in frames if frame.model_error is not None]
-    return max(promised, default=None), find_worst([frame.tumour_error for frame in frames])
+    return max(promised, default=None), find_largest([frame.tumour_error for frame in frames])
 
 
 def _to_millimetres(metres: float | None) -> float | None:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from sim.errors import InputError
 
-from ..options.camera_options import add_camera, apply_camera_options
+from ..options.camera_options import add_camera_options, apply_camera_options
+from ..options.patient_options import add_patient, build_requested_scene, choose_deformer, open_patient
 from ..options.shared_options import add_address, add_style, list_addresses, print_addresses
-from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
 
 if TYPE_CHECKING:
     from ..script.scene import Scene
@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a built-in scene or MY_SCENE.py (default: the first scene that a trained model supports, spatula on the "
         "template, or else press)",
     )  # fmt: skip
-    add_theatre(parser)
-    add_camera(parser)
+    add_patient(parser)
+    add_camera_options(parser)
     add_style(parser)
     parser.add_argument(
         "--host", default="127.0.0.1", help="network address of the server; users of other machines need a token"
@@ -62,43 +62,43 @@ def run(args: argparse.Namespace) -> int:
     kernels.submit(load_kernels)
     from ar.page.access_guard import check_address
 
-    from .interrupt import run_until_ended
+    from .interrupt import run_until_signal
 
     try:
         check_address(args.host, args.port)
     except (OSError, ValueError) as error:
         raise InputError(f"no page on host {args.host}, port {args.port} ({error}): choose others.") from error
-    return run_until_ended(partial(play, args, kernels))
+    return run_until_signal(partial(play_demo, args, kernels))
 
 
-def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitStack) -> int:
-    """Open the page, and play once `kernels` has loaded the first image's kernels; `closing` closes the page."""
+def play_demo(args: argparse.Namespace, kernel_loader: ThreadPoolExecutor, exit_stack: ExitStack) -> int:
+    """Open the page, and play once `kernel_loader` has loaded the first kernels; `exit_stack` closes the page."""
     from ar.page.access_guard import UnguardedError
 
     from ..page.demo import Demo
 
-    theatre = build_requested_theatre(args, *([] if args.scene is None else [args.scene]))
+    patient = open_patient(args, *([] if args.scene is None else [args.scene]))
 
     def asked(scene: str) -> Scene:
-        return apply_camera_options(args, build_requested_scene(args, scene, theatre))
+        return apply_camera_options(args, build_requested_scene(args, scene, patient))
 
-    scene = asked(args.scene or theatre.select_default_scene())
-    name = choose_deformer(args, theatre, scene)
+    scene = asked(args.scene or patient.select_default_scene())
+    name = choose_deformer(args, patient, scene)
     anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:
         demo = Demo(
-            theatre, scene, name, args.host, args.port,
-            anatomy=anatomy, find=asked, style=args.style, origins=list_addresses(args),
+            patient, scene, name, args.host, args.port,
+            anatomy=anatomy, get_scene=asked, style=args.style, origins=list_addresses(args),
         )  # fmt: skip
     except UnguardedError as error:
         raise InputError(str(error)) from error
-    closing.callback(demo.close)
+    exit_stack.callback(demo.close)
     print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)
     print_addresses(demo.browser)
-    print(f"{scene.name} by {theatre.describe_deformer(name, scene)}")
+    print(f"{scene.name} by {patient.describe_deformer(name, scene)}")
     demo.busy.begin_work("compiling; the next start finds it done")
     if name != "fem":
-        kernels.submit(demo.cast.predict, name, (0, None))
-    kernels.shutdown()
+        kernel_loader.submit(demo.cast.predict, name, (0, None))
+    kernel_loader.shutdown()
     demo.run(args.seconds)
     return 0

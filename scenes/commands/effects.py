@@ -10,8 +10,8 @@ from sim.errors import InputError
 from sim.runtime.threads import choose_threads
 
 from ..options.outputs import check_output_path
+from ..options.patient_options import add_trajectory, build_requested_scene
 from ..options.shared_options import add_anatomy, add_device, add_json, to_json_line
-from ..options.theatre_options import add_trajectory, build_requested_scene
 from ..options.tissue_options import add_model_tissue
 
 # Column titles of the table.
@@ -45,8 +45,8 @@ def run(args: argparse.Namespace) -> int:
 
     check_integer("--every", args.every, 1)
     names = args.scenes or SCENES
-    theatre = open_theatre(args.anatomy, device=args.device, scenes=names)
-    scenes = [build_requested_scene(args, name, theatre) for name in names]
+    patient = open_theatre(args.anatomy, device=args.device, scenes=names)
+    scenes = [build_requested_scene(args, name, patient) for name in names]
     if args.out is not None:
         check_output_path(args.out, ".json", resumed=True)
         read_effect_records(args.out)
@@ -54,13 +54,13 @@ def run(args: argparse.Namespace) -> int:
     for scene in scenes:
         found = []
         try:
-            who, acting = theatre.describe_deformer("fem", scene), scene.get_effects_on(theatre.anatomy)
-            some = None if args.out is None else list_switchable_effects(scene, theatre.anatomy)
+            who, acting = patient.describe_deformer("fem", scene), scene.get_effects_on(patient.anatomy)
+            some = None if args.out is None else list_switchable_effects(scene, patient.anatomy)
             print(f"{scene.name} by {who}: all effects together, then what each adds to the others\n", file=table)
             print(f"| {' | '.join(COLUMN_TITLES)} |\n|{'---|' * len(COLUMN_TITLES)}", file=table)
             total = 1 + len(acting if some is None else some)
             with tqdm(total=total, unit="effect", leave=False, file=sys.stderr) as bar:
-                for row in measure_effects(theatre, scene, args.every, some):
+                for row in measure_effects(patient, scene, args.every, some):
                     found.append(row)
                     figures = (row.milliseconds, row.held_mb, row.tumour_mm, row.cortex_mm)
                     cells = ["" if figure is None else f"{figure:.2f}" for figure in figures]
@@ -73,8 +73,8 @@ def run(args: argparse.Namespace) -> int:
             continue
         reports.append({"scene": scene.name, "solver": who, "effects": [asdict(row) for row in found]})
         if args.out is not None:
-            hardware = _describe_hardware(args.device, len(theatre.anatomy.mesh.tets))
-            write_effect_record(args.out, build_record(theatre, scene, found, args.every, hardware))
+            hardware = _describe_hardware(args.device, len(patient.anatomy.mesh.tets))
+            write_effect_record(args.out, build_record(patient, scene, found, args.every, hardware))
     if args.json:
         print(to_json_line(reports[0] if len(args.scenes) == 1 else {"scenes": reports}))
     return int(any("error" in report for report in reports))

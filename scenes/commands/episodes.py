@@ -106,18 +106,18 @@ def run(args: argparse.Namespace) -> int:
 
 def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_if_asked: Callable[[], None]) -> int:
     with require_extra("data", "sulcus episodes needs"):
-        from ..episodes.engine import find_still_missing, make_all
+        from ..episodes.engine import list_missing_episodes, make_episodes
     from ..episodes.make import choose_body, make_body, make_episode
-    from ..episodes.run_folder import RunSettings, begin, get_versions, list_finished, read_run
+    from ..episodes.run_folder import RunSettings, begin_run, get_versions, list_finished, read_run
     from ..episodes.tasks import RunWork
 
     before = read_run(out)
     device = before.device if before and args.device == "auto" else args.device
     with _start_workers(args, device) as workers:
         run = RunSettings(plan.name, plan.digest, args.seed, workers.device, get_versions())
-        first_client = begin(out, run, plan.text, args.force)
+        first_client = begin_run(out, run, plan.text, args.force)
         found = list_finished(out)
-        there, missing = find_still_missing(
+        there, missing = list_missing_episodes(
             out, found, range(args.first, args.first + args.count), first_client, args.again
         )
         given = out, plan, args.seed
@@ -128,11 +128,11 @@ def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_
         )
         begun = time.perf_counter()
         with _show_progress(out, there, args.count, stop_if_asked) as heard:
-            tally = make_all(work, out, run, missing, workers, heard, there)
+            tally = make_episodes(work, out, run, missing, workers, heard, there)
         seconds = time.perf_counter() - begun
         changed = tally != there
         lacking = _update_card(out, list_finished(out) if changed else found, changed)
-        _report(args, out, tally, seconds, workers.where, lacking is None and tally.made + tally.skipped > 0)
+        _report(args, out, tally, seconds, workers.description, lacking is None and tally.made + tally.skipped > 0)
     if lacking is not None:
         print(lacking, file=sys.stderr)
     return int(tally.failed + tally.lost > 0)
@@ -142,16 +142,16 @@ def _update_card(out: Path, numbers: Set[int], changed: bool) -> str | None:
     """Update the card of the data set; return the reason if this fails."""
     from tqdm import tqdm
 
-    from ..episodes.exports.card import keep_card
+    from ..episodes.exports.card import update_card
 
     bar = partial(tqdm, unit="episode", desc="data sheet", file=sys.stderr, leave=False, mininterval=1.0, disable=None)
-    return keep_card(out, numbers, changed, bar)
+    return update_card(out, numbers, changed, bar)
 
 
 def _start_workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
     from dask.system import CPU_COUNT
 
-    from ..episodes.workers import connect_workers, start_own_workers
+    from ..episodes.workers import connect_workers, start_local_workers
 
     if args.scheduler:
         return connect_workers(args.scheduler, device)
@@ -160,8 +160,8 @@ def _start_workers(args: argparse.Namespace, device: str) -> AbstractContextMana
     if find_device(device, "float32").on_cuda:
         cards = parse_device_names("all")
         count = args.workers or len(cards)
-        return start_own_workers([cards[number % len(cards)] for number in range(count)])
-    return start_own_workers(["cpu"] * (args.workers or CPU_COUNT))
+        return start_local_workers([cards[number % len(cards)] for number in range(count)])
+    return start_local_workers(["cpu"] * (args.workers or CPU_COUNT))
 
 
 @contextmanager

@@ -16,16 +16,16 @@ from sim.arguments import check_integer
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, explain_error
 
-from ..options.camera_options import add_camera, add_targets
+from ..options.camera_options import add_camera_options, use_tracked_camera
 from ..options.outputs import add_force, check_output_folder, check_output_frames, check_output_path
+from ..options.patient_options import add_patient, build_requested_scene, choose_deformer, open_patient
 from ..options.shared_options import add_json, add_seed, to_json_line
-from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
 
 if TYPE_CHECKING:
     from ..play.deformers import PatientSetup
     from ..play.player import Player
     from ..script.scene import Scene
-    from ..tracked.filming import Trouble, VideoFrame
+    from ..tracked.filming import Disturbance, VideoFrame
 
 # Kinds of disturbances. Repeated here, so that `--help` does not import the renderer.
 DISTURBANCES = ("reference", "tool", "bright", "smear", "gap")
@@ -53,20 +53,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_seed(parser, "noise and of --registered")
     parser.add_argument(
-        "--trouble", type=parse_trouble, action="append", default=[], metavar="KIND:FROM-TO",
+        "--trouble", type=parse_disturbance, action="append", default=[], metavar="KIND:FROM-TO",
         help=f"disturbance between two times [s]: {', '.join(DISTURBANCES)}; repeatable",
     )  # fmt: skip
     parser.add_argument(
         "--registered", type=float, nargs=2, default=(0.0, 0.0), metavar=("MM", "DEGREES"),
         help="standard deviations of the registration error at the craniotomy, per axis (default: 0 0)",
     )  # fmt: skip
-    add_theatre(parser)
-    add_camera(parser)
+    add_patient(parser)
+    add_camera_options(parser)
     add_force(parser)
     add_json(parser)
 
 
-def parse_trouble(text: str) -> tuple[str, float, float]:
+def parse_disturbance(text: str) -> tuple[str, float, float]:
     """Parse KIND:FROM-TO into a name and two times [s], for argparse."""
     found = re.fullmatch(r"(\w+):([\d.]+)-([\d.]+)", text)
     if found is None:
@@ -85,11 +85,11 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Input that cannot be read, output that cannot be written, numbers out of range.
     """
-    from ..tracked.calibration_file import write_calibration, write_exactly_known
-    from ..tracked.filming import Taking, Trouble, mount_targets, register_with_error, render_shots
+    from ..tracked.calibration_file import write_calibration, write_exact_intrinsics
+    from ..tracked.filming import Artefacts, Disturbance, mount_targets, register_with_error, render_frames
     from ..tracked.registration_file import write_registration
     from ..tracked.tracked_tool import write_tool
-    from ..tracked.truth import VideoGroundTruth, write_table, write_truth
+    from ..tracked.truth import VideoGroundTruth, write_truth, write_truth_table
 
     check_integer("--every", args.every, 1)
     for name, value in (
@@ -100,22 +100,22 @@ def run(args: argparse.Namespace) -> int:
         if not 0.0 <= value < np.inf:
             raise InputError(f"{name} {value:g}: give a number that is not below 0.")
     shift, turn = args.registered
-    taking = Taking(args.blur, args.noise, tuple(Trouble(*each) for each in args.trouble), args.seed)
-    theatre = build_requested_theatre(args, args.scene)
-    scene = _build_scene(args, theatre)
+    taking = Artefacts(args.blur, args.noise, tuple(Disturbance(*each) for each in args.trouble), args.seed)
+    patient = open_patient(args, args.scene)
+    scene = _build_scene(args, patient)
     if all("gap" in taking.list_disturbances(time) for time in scene.times[:: args.every].tolist()):
         raise InputError("no image would be recorded: choose --seconds and --trouble that leave some.")
-    _check_disturbances(taking.troubles, scene.times[:: args.every])
+    _check_disturbances(taking.disturbances, scene.times[:: args.every])
     calibration = scene.viewpoint.calibration
     assert calibration is not None
     folder = check_output_folder(args.out, "video and its ground truth")
     paths = {name: check_output_path(folder / name, Path(name).suffix, args.force) for name in WRITTEN_FILES}
-    player = theatre.build_player(choose_deformer(args, theatre, scene, "fem"), scene)
+    player = patient.build_player(choose_deformer(args, patient, scene, "fem"), scene)
     mounts = mount_targets(player)
     shots: list[VideoFrame] = []
-    film = _write_film(args, render_shots(player, mounts, taking, args.every), shots, player)
+    film = _write_film(args, render_frames(player, mounts, taking, args.every), shots, player)
     write_calibration(paths["camera.yaml"], replace(calibration, name=f"sulcus film: {scene.name}"))
-    write_exactly_known(paths["camera.json"], calibration)
+    write_exact_intrinsics(paths["camera.json"], calibration)
     write_registration(paths["registration.json"], register_with_error(player.site, mounts, shift, turn, args.seed))
     write_tool(paths["tool.json"], mounts.tool)
     truth = VideoGroundTruth(
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
         np.stack([shot.displacement for shot in shots]),
     )
     write_truth(paths["truth.npz"], truth)
-    write_table(paths["truth.csv"], truth, player.stage.tumour_at_rest.vertices)
+    write_truth_table(paths["truth.csv"], truth, player.stage.tumour_at_rest.vertices)
     moved = 1e3 * float(np.linalg.norm(truth.displacement, axis=2).mean(axis=1).max())
     report = {"scene": scene.name, "frames": len(shots), "film": str(film), "tumour_moves_mm": moved}
     summary = f"{len(shots)} images of {scene.name}; maximum tumour displacement {moved:.2f} mm: {film}"
@@ -134,19 +134,19 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_disturbances(troubles: Sequence[Trouble], times: np.ndarray) -> None:
+def _check_disturbances(troubles: Sequence[Disturbance], times: np.ndarray) -> None:
     """Reject a disturbance that contains none of the frame `times` (F,) [s]: it would have no effect."""
     for each in troubles:
-        if not ((each.since <= times) & (times < each.until)).any():
+        if not ((each.start <= times) & (times < each.end)).any():
             raise InputError(
-                f"--trouble {each.kind}:{each.since:g}-{each.until:g} contains no image of this video, which ends at "
+                f"--trouble {each.kind}:{each.start:g}-{each.end:g} contains no image of this video, which ends at "
                 f"{times[-1]:.2f} s: choose times within it, or a smaller --every."
             )
 
 
-def _build_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
+def _build_scene(args: argparse.Namespace, patient: PatientSetup) -> Scene:
     """Return the scene with its tracked camera, limited to the requested duration."""
-    scene = add_targets(args, build_requested_scene(args, args.scene, theatre))
+    scene = use_tracked_camera(args, build_requested_scene(args, args.scene, patient))
     if args.readout is not None:
         view = scene.viewpoint
         assert view.calibration is not None
@@ -167,8 +167,8 @@ def _write_film(args: argparse.Namespace, taken: Iterator[VideoFrame], shots: li
     def noted() -> Iterator[np.ndarray]:
         total = len(range(0, len(player.scene.times), args.every))
         for shot in tqdm(taken, total=total, unit="picture", file=sys.stderr):
-            shots.append(replace(shot, colour=shot.colour[:0]))
-            yield shot.colour
+            shots.append(replace(shot, image=shot.image[:0]))
+            yield shot.image
 
     try:
         if not args.png:

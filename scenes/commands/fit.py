@@ -16,7 +16,7 @@ from sim.material import BRAIN
 from ..options.outputs import add_force, check_output_path
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
 from ..options.tissue_options import add_region_argument, parse_region_tissues
-from .locate import describe_left_out
+from .locate import describe_excluded_rows
 from .locator import REGIONS, find_locator
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     check_frames(anatomy, frames)  # reject invalid frames before a locator is built
     if TUMOUR_LABEL in parse_region_tissues(args.region, BRAIN, anatomy.mesh):
         raise InputError("--region tumour: its stiffness is what `sulcus fit` finds. Give other regions alone.")
-    locator = find_locator(args, anatomy, small=True)
+    locator = find_locator(args, anatomy, allow_small=True)
     excluded = find_unsupported(locator, frames)
     with tqdm(file=sys.stderr) as bar:
 
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(to_json_line({**_summarise_tissue(tissue, out), "outliers": [each.tolist() for each in excluded]}))
     else:
-        notes = [f"Frame {n}: {describe_left_out(each)}" for n, each in enumerate(excluded, start=1) if len(each)]
+        notes = [f"Frame {n}: {describe_excluded_rows(each)}" for n, each in enumerate(excluded, start=1) if len(each)]
         print("\n".join([*notes, *format_fit(tissue, out)]))
     return 0
 
@@ -118,7 +118,7 @@ def _summarise_tissue(tissue: FittedTissue, out: Path) -> dict[str, object]:
     }
 
 
-def format_fit(tissue: FittedTissue, out: Path) -> list[str]:
+def format_fit(tissue: FittedTissue, out_path: Path) -> list[str]:
     """Describe the fitted parameters, and those that are not determined."""
     low, middle, high = tissue.ratio
     lines = [
@@ -131,11 +131,11 @@ def format_fit(tissue: FittedTissue, out: Path) -> list[str]:
         low, middle, high = (1e-3 * each for each in tissue.stiffness)
         lines.append(f"Young's modulus of the brain is {middle:.2g} kPa (95 %: {low:.2g} to {high:.2g}).")
     lines += [f"Of {name} the frames say little: it is about as unknown as before." for name in tissue.not_known]
-    return [*lines, f"written: {out}"]
+    return [*lines, f"written: {out_path}"]
 
 
-def find_fitted_tissue(path: Path | None, anatomy: Path, digest: str) -> FittedTissue | None:
-    """Read the tissue from `path`, or from the file next to an anatomy; None if there is none.
+def find_fitted_tissue(tissue_path: Path | None, anatomy_path: Path, digest: str) -> FittedTissue | None:
+    """Read the tissue from `tissue_path`, or from the file next to an anatomy; None if there is none.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def find_fitted_tissue(path: Path | None, anatomy: Path, digest: str) -> FittedT
     """
     from surrogate.fitting.tissue import load_tissue, to_tissue_path
 
-    if path is not None and not path.is_file():
-        raise InputError(f"{path}: no such file: make it by `sulcus fit`, or leave --tissue out.")
-    where = path or to_tissue_path(anatomy)
+    if tissue_path is not None and not tissue_path.is_file():
+        raise InputError(f"{tissue_path}: no such file: make it by `sulcus fit`, or leave --tissue out.")
+    where = tissue_path or to_tissue_path(anatomy_path)
     return load_tissue(where, digest) if where.is_file() else None

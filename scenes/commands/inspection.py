@@ -88,9 +88,7 @@ class Inspection:
     def format_lines(self) -> list[str]:
         """Format the result as a few lines of text."""
         error = max(self.voxel)
-        pieces = [
-            f"  piece {number}: {volume:.2f} ml, {place}" for number, (volume, place) in enumerate(self.pieces, 1)
-        ]
+        pieces = [f"  piece {number}: {size:.2f} ml, {place}" for number, (size, place) in enumerate(self.pieces, 1)]
         shown, hidden = pieces[:MAX_LISTED_PIECES], len(pieces) - MAX_LISTED_PIECES
         at = ", ".join(f"{value:.0f}" for value in self.opening)
         plural = "" if len(pieces) == 1 else "s"
@@ -99,7 +97,7 @@ class Inspection:
             f"{self.regions['tumour']}",
             *shown,
             *([f"  and {hidden} smaller"] if hidden > 0 else []),
-            *(f"{name} {volume:.2f} ml: {self._describe_part(name)}" for name, volume in self.parts.items()),
+            *(f"{name} {size:.2f} ml: {self._describe_part(name)}" for name, size in self.parts.items()),
             f"tumour {self.depth:.0f} mm under the nearest cortex, within one voxel ({error:.1f} mm)",
             f"opening: {self.place}, at {at} mm (RAS), {self.distance:.0f} mm from the tumour",
             f"voxels {' x '.join(f'{edge:.3g}' for edge in self.voxel)} mm, stored {self.axes} "

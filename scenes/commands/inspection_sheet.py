@@ -77,7 +77,7 @@ class InspectionView:
         steps = self.reach * ((2.0 * np.arange(SIDE) + 1.0) / SIDE - 1.0)
         return self.middle + steps[:, None, None] * self.down + steps[None, :, None] * self.right
 
-    def find_letters(self) -> dict[str, str]:
+    def find_orientation_letters(self) -> dict[str, str]:
         """Return the letters of the patient's sides at the left, right, upper and lower edge of the image."""
         found = {}
         for edge, direction in (
@@ -91,10 +91,10 @@ class InspectionView:
         return found
 
 
-def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
+def draw_sheet(inspection: Inspection, masks: HeadMasks, subject: Subject, open_mask: np.ndarray) -> np.ndarray:
     """Draw the sheet as an image (H, W, 3) uint8.
 
-    `opened` (n,) bool says which points of the subject's cortex are in the opening.
+    `open_mask` (n,) bool says which points of the subject's cortex are in the opening.
     """
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     centre = subject.pieces[0].centre
@@ -105,14 +105,14 @@ def draw_inspection_sheet(found: Inspection, masks: HeadMasks, subject: Subject,
         reach = 0.5 * float(((high - low) * across).max()) + VIEW_MARGIN
         middle = 0.5 * (low + high) * across + centre * (1.0 - across)
         view = InspectionView(f"{plane.name}, through the tumour", right, down, middle, reach)
-        colour, names = _slice(view, masks, subject, opened)
+        colour, names = _slice(view, masks, subject, open_mask)
         panels.append(_draw_frame(colour, view))
         drawn |= names
-    panels.append(_draw_cortex(masks, subject, opened))
+    panels.append(_draw_cortex(masks, subject, open_mask))
     picture = Image.new("RGB", (2 * SIDE + COLUMN_WIDTH, 2 * SIDE), GROUND_COLOUR)
     for number, panel in enumerate(panels):
         picture.paste(Image.fromarray(panel), (SIDE * (number % 2), SIDE * (number // 2)))
-    _write_text(ImageDraw.Draw(picture), found, [name for name in COLOURS if name in drawn])
+    _write_text(ImageDraw.Draw(picture), inspection, [name for name in COLOURS if name in drawn])
     return np.asarray(picture)
 
 
@@ -213,7 +213,7 @@ def _draw_frame(colour: np.ndarray, view: InspectionView) -> np.ndarray:
     ink = ImageDraw.Draw(picture)
     ink.rectangle([0, 0, SIDE - 1, SIDE - 1], outline=(60, 60, 64))
     font = ImageFont.load_default(FONT_SIZE)
-    letters = view.find_letters()
+    letters = view.find_orientation_letters()
     half = SIDE // 2
     for edge, at, anchor in (
         ("left", (8, half), "lm"), ("right", (SIDE - 8, half), "rm"),

@@ -20,15 +20,15 @@ MAX_CLEANUP_TIME = 0.3  # Maximum time for cleaning up after a signal [s].
 POLL_INTERVAL = 0.1
 
 
-class Ended(BaseException):
+class EndedBySignal(BaseException):
     """Exception that a signal raises in the main thread, with the exit code."""
 
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.code = EXIT_CODES[signal.Signals(number)]
+    def __init__(self, signal_number: int) -> None:
+        super().__init__(signal_number)
+        self.code = EXIT_CODES[signal.Signals(signal_number)]
 
 
-def run_until_ended(work: Callable[[ExitStack], int]) -> int:
+def run_until_signal(work: Callable[[ExitStack], int]) -> int:
     """Run `work`, clean up and return its result; at a signal, clean up and exit the process immediately.
 
     The work runs in its own thread, so that the main thread, which receives signals, is free during long calls.
@@ -47,13 +47,13 @@ def run_until_ended(work: Callable[[ExitStack], int]) -> int:
     before = {number: signal.getsignal(number) for number in EXIT_CODES}
     try:
         for number in EXIT_CODES:
-            signal.signal(number, leave)
+            signal.signal(number, raise_on_signal)
         worker = threading.Thread(target=fulfil_work, args=(result, work, closing), name="work", daemon=True)
         worker.start()
         while worker.is_alive():
             worker.join(POLL_INTERVAL)
         return result.result()
-    except Ended as ended:
+    except EndedBySignal as ended:
         for number in EXIT_CODES:
             signal.signal(number, signal.SIG_IGN)
         cleaner = threading.Thread(target=closing.close, name="closing", daemon=True)
@@ -110,17 +110,17 @@ def _is_finalising(frame: FrameType | None) -> bool:
     return False
 
 
-def leave(number: int, frame: FrameType | None) -> None:
-    """Handle a signal: raise `Ended` in the main thread."""
-    raise Ended(number)
+def raise_on_signal(signal_number: int, frame: FrameType | None) -> None:
+    """Handle a signal: raise `EndedBySignal` in the main thread."""
+    raise EndedBySignal(signal_number)
 
 
-def fulfil_work(result: Future[int], work: Callable[[ExitStack], int], closing: ExitStack) -> None:
-    """Run `work`, clean up, and store the return value or the exception in `result`."""
+def fulfil_work(future: Future[int], work: Callable[[ExitStack], int], exit_stack: ExitStack) -> None:
+    """Run `work`, clean up, and store the return value or the exception in `future`."""
     try:
-        with closing:
-            code = work(closing)
+        with exit_stack:
+            code = work(exit_stack)
     except BaseException as error:
-        result.set_exception(error)
+        future.set_exception(error)
     else:
-        result.set_result(code)
+        future.set_result(code)

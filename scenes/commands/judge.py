@@ -55,9 +55,7 @@ def run(args: argparse.Namespace) -> int:
                 f"{args.data}: holds loads at places where {name} was trained: simulate others, with another --seed."
             )
     scores = [score(name, model, loads, truth, nodes) for name, model in models.items()]
-    promised = {
-        name: compute_coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None
-    }
+    bounds = {name: compute_coverage(model, loads, truth) for name, model in models.items() if model.bounds is not None}
     gauge = build_tip_gauge(data.anatomy)
     distance = gauge.compute_distances(loads, data.read_displacement(gauge.nodes)[data.good], gauge.nodes, data.tool)
     ranged = {
@@ -74,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     motion = 1e3 * float(np.linalg.norm(truth, axis=2).mean())
     preset = "" if data.tool is not None else data.provenance.get("preset", "")
     if args.json:
-        covered, of_tip = ({name: asdict(found) for name, found in each.items()} for each in (promised, ranged))
+        covered, of_tip = ({name: asdict(found) for name, found in each.items()} for each in (bounds, ranged))
         figures = {"scores": [asdict(row) for row in scores], "coverage": covered, "distance_coverage": of_tip}
         figures["force"] = {name: asdict(found) for name, found in forces.items()}
         print(json.dumps({**figures, "motion_mm": motion, "nominal_refused": compute_rejected_share(preset)}))
@@ -83,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
         if describe_rejected(preset):
             print(describe_rejected(preset))
         for name in models:
-            for bound, coverage in (("bounds", promised), ("bounds of the distance from tip to tumour", ranged)):
+            for bound, coverage in (("bounds", bounds), ("bounds of the distance from tip to tumour", ranged)):
                 print(f"{name}: {bound} cover {coverage[name]}" if name in coverage else f"{name}: has no {bound}")
             if name in forces:
                 print(f"{name}: the tool's force: {forces[name]}")

@@ -19,8 +19,8 @@ from sim.errors import InputError
 
 from ..options.shared_options import add_device
 from ..options.tissue_options import add_model_tissue, apply_tissue_options
-from ..tracked.tracked_scene import build_mover, build_tracked_scene
-from .interrupt import run_until_ended
+from ..tracked.tracked_scene import build_requested_deformer, build_tracked_scene
+from .interrupt import run_until_signal
 
 if TYPE_CHECKING:
     from ..link.received_transforms import TransformNames
@@ -120,12 +120,12 @@ def run(args: argparse.Namespace) -> int:
         warning = "OpenIGTLink has no password: every program that can reach this address can move the displayed tumour"
         print(f"sulcus link: {warning}", file=sys.stderr)
     source = None if args.client is None else parse_address(args.client)
-    if source is not None and source[1] == args.port and is_here(source[0], args.host):
+    if source is not None and source[1] == args.port and is_local_host(source[0], args.host):
         raise InputError(
             f"--client {args.client}: port {args.port} of this machine is the one that is served here. Give --port "
             f"another one, as --port {args.port % 65535 + 1}, or give --client the port of the other server."
         )
-    return run_until_ended(partial(_run_link, args, source))
+    return run_until_signal(partial(_run_link, args, source))
 
 
 def parse_names(args: argparse.Namespace) -> TransformNames:
@@ -163,9 +163,9 @@ def is_ipv6(text: str) -> bool:
     return True
 
 
-def is_here(host: str, served: str) -> bool:
+def is_local_host(host: str, server_address: str) -> bool:
     """Return True if a host is this machine, or the server's own address."""
-    if host == served:
+    if host == server_address:
         return True
     try:
         found = socket.getaddrinfo(host, 0, type=socket.SOCK_DGRAM)
@@ -221,7 +221,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
     from sim.runtime.device import find_device
 
     from ..link.console import limit_rate, print_safely
-    from ..link.outgoing import Outgoing
+    from ..link.outgoing import ResultEncoder
     from ..link.pose_responder import PoseResponder
     from ..link.received_transforms import ReceivedTransforms
     from ..link.session import LinkSession, OverlayCamera
@@ -235,20 +235,20 @@ def open_link(args: argparse.Namespace) -> LinkSession:
     calibration = None if args.camera is None else read_calibration(args.camera)
     registration = None if args.registration is None else read_registration(args.registration)
     tool = None if args.tool is None else read_tool(args.tool)
-    theatre = open_theatre(args.anatomy, args.model, args.device)
+    patient = open_theatre(args.anatomy, args.model, args.device)
     warning = (
         f"a {args.registration_name} that is sent does not say whose registration it is"
         if registration is None
-        else describe_other_mesh(registration, theatre.anatomy, str(args.registration))
+        else describe_other_mesh(registration, patient.anatomy, str(args.registration))
     )
     if registration is None or registration.scanned is None:
         warning += ". All results are unreliable: give --registration with a file of `sulcus register --anatomy`"
     if warning:
         print(f"sulcus link: {warning}", file=sys.stderr)
-    tool = tool or _choose_tool(theatre, args.anatomy)
-    scene = apply_tissue_options(args, build_tracked_scene(args, tool.shape), theatre)
-    deformer, who = build_mover(args, theatre, scene, True)
-    stage, tracking = theatre.build_stage(scene), 1e-3 * args.tracking_noise
+    tool = tool or _choose_tool(patient, args.anatomy)
+    scene = apply_tissue_options(args, build_tracked_scene(args, tool.shape), patient)
+    deformer, who = build_requested_deformer(args, patient, scene, True)
+    stage, tracking = patient.build_stage(scene), 1e-3 * args.tracking_noise
     eye = None
     if calibration is not None:
         device = find_device(args.device, LIVE.precision).name
@@ -256,7 +256,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
         eye = OverlayCamera(calibration, Painter(stage, tool, device=device), tracking)
     print(f"{args.anatomy.name}; {tool.shape}; motion by {who}", flush=True)
     answering = PoseResponder(ToolMotion(stage, deformer), tool, tracking, registration)
-    seconds = 0.0 if deformer is None else answering.measure()
+    seconds = 0.0 if deformer is None else answering.measure_solve_time()
     if deformer is not None:
         print(f"one solution takes {seconds:.2g} s on this machine", flush=True)
     if 2.0 * seconds > args.stale:
@@ -267,15 +267,15 @@ def open_link(args: argparse.Namespace) -> LinkSession:
         )
     heard = ReceivedTransforms(parse_names(args), args.stale)
     return LinkSession(
-        answering, Outgoing(stage, registration is not None), heard, eye, args.clients, limit_rate(print_safely)
+        answering, ResultEncoder(stage, registration is not None), heard, eye, args.clients, limit_rate(print_safely)
     )
 
 
-def _choose_tool(theatre: PatientSetup, path: Path) -> TrackedTool:
+def _choose_tool(patient: PatientSetup, path: Path) -> TrackedTool:
     """Return the tool of the best pose model, with its origin at the tip as in PLUS: z points away from the shaft."""
     from ..tracked.tracked_tool import TrackedTool
 
-    posed = [(model.bound, model.tool) for model in theatre.models.values() if model.tool is not None]
+    posed = [(model.bound, model.tool) for model in patient.models.values() if model.tool is not None]
     if not posed:
         raise InputError(
             f"no model next to {path} supports tool poses. Give --tool TOOL.json with --deformer fem, or train one: "

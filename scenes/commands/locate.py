@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         read_observation(args.observed, args.tips), rigid=1e-3 * args.rigid, checked=args.registration_checked
     )
     to_evidence(anatomy, observation)  # reject points that cannot be placed before the locator is loaded
-    locator = find_locator(args, anatomy, small=out is None)
+    locator = find_locator(args, anatomy, allow_small=out is None)
     found = locator.locate(observation)
     if out is not None:
         every = np.arange(len(anatomy.mesh.nodes))
@@ -136,11 +136,11 @@ def _list_warnings(found: Location) -> list[str]:
     if found.slipped:
         warnings.append("If it was checked, say so by --registration-checked.")
     if len(found.outliers):
-        warnings.append(describe_left_out(found.outliers))
+        warnings.append(describe_excluded_rows(found.outliers))
     return warnings + [f"Left out, as the points do not support it: tip {number + 1}." for number in found.outlier_tips]
 
 
-def describe_left_out(numbers: np.ndarray) -> str:
+def describe_excluded_rows(indices: np.ndarray) -> str:
     """Describe which rows of a file were excluded, by the numbers (k,) of their points from 0."""
-    rows = ", ".join(str(number + 2) for number in numbers[:20]) + (" ..." if len(numbers) > 20 else "")
+    rows = ", ".join(str(number + 2) for number in indices[:20]) + (" ..." if len(indices) > 20 else "")
     return f"Left out, off the open cortex or without support by other points: rows {rows} of the file."

@@ -57,9 +57,9 @@ def run(args: argparse.Namespace) -> int:
     check_integer("--seed", args.seed, 0)
     find_device(args.device, "float32")
     anatomy = read_anatomy(args.anatomy)
-    locator = make_with_progress(path, anatomy, args.seed, args.device, list_regions_known(args, anatomy))
+    locator = build_with_progress(path, anatomy, args.seed, args.device, list_regions_known(args, anatomy))
     save_locator(path, locator.restrict() if args.small else locator)
-    forget_parts(path)
+    remove_temporary_files(path)
     size = path.stat().st_size
     written = {"out": str(path), "shapes": len(locator.prior.shape), "bytes": size, "whole": not args.small}
     written["regions"] = [asdict(one) for one in locator.regions]
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def make_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Region, ...]) -> Locator:
+def build_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Region, ...]) -> Locator:
     """Build a locator with a progress bar; parts that an interrupted run left next to `path` are reused."""
     from tqdm import tqdm
 
@@ -87,8 +87,8 @@ def make_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, reg
         )
 
 
-def find_locator(args: argparse.Namespace, anatomy: Anatomy, small: bool = False) -> Locator:
-    """Load the locator next to the anatomy, or build one; a locator covers every vertex, unless it may be `small`.
+def find_locator(args: argparse.Namespace, anatomy: Anatomy, allow_small: bool = False) -> Locator:
+    """Load the locator next to the anatomy, or build one; a locator covers every vertex, unless `allow_small`.
 
     Raises
     ------
@@ -106,16 +106,16 @@ def find_locator(args: argparse.Namespace, anatomy: Anatomy, small: bool = False
                 f"{path}: knows other regions than --region says ({describe_regions(locator.regions) or 'none'}). "
                 "Leave --region out, or name another file by --locator: one that knows them is made there."
             )
-        if locator.prior.nodes is not None and not small:
+        if locator.prior.nodes is not None and not allow_small:
             raise InputError(
                 f"{path}: is small, and knows nothing of most vertices that a result has. Leave out --out for the "
                 "tumour alone, or name another file by --locator: a whole one is made there."
             )
         return locator
     path = check_output_path(path, ".npz", args.force)
-    locator = make_with_progress(path, anatomy, args.seed, args.device, list_regions_known(args, anatomy))
+    locator = build_with_progress(path, anatomy, args.seed, args.device, list_regions_known(args, anatomy))
     save_locator(path, locator)
-    forget_parts(path)
+    remove_temporary_files(path)
     return locator
 
 
@@ -140,7 +140,7 @@ def list_regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Regi
     return list_known_regions(learned) if learned is not None else ()
 
 
-def forget_parts(path: Path) -> None:
+def remove_temporary_files(path: Path) -> None:
     """Remove temporary files next to a locator's path."""
     shutil.rmtree(_to_parts_path(path), ignore_errors=True)
 

@@ -18,7 +18,8 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, explain_error
 
 from ..options.outputs import add_force, check_output_path
-from ..options.poses_options import add_poses, check_pose_options, open_external_tracker
+from ..options.patient_options import add_model_options
+from ..options.poses_options import add_pose_options, check_pose_options, open_external_tracker
 from ..options.shared_options import (
     add_address,
     add_device,
@@ -28,10 +29,9 @@ from ..options.shared_options import (
     print_addresses,
     to_json_line,
 )
-from ..options.theatre_options import add_bodies
 from ..options.tissue_options import add_model_tissue, apply_tissue_options
-from ..tracked.tracked_scene import REST, build_mover, build_tracked_scene
-from .interrupt import run_until_ended
+from ..tracked.tracked_scene import REST, build_requested_deformer, build_tracked_scene
+from .interrupt import run_until_signal
 
 if TYPE_CHECKING:
     from ar.optics.calibration import Calibration
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from ..tracked.follower import Follower
     from ..tracked.overlay_painter import Painter
     from ..tracked.page import OverlayPage
-    from ..tracked.run import Shown
+    from ..tracked.run import Overlay
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".webp")  # Endings of video file names.
 HOST = "127.0.0.1"  # Address of the page: reachable from this machine only.
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", required=True, metavar="K.yaml", help="the camera, from `sulcus calibrate`")
     parser.add_argument("--registration", required=True, metavar="R.json", help="registration from `sulcus register`")
     parser.add_argument("--tool", metavar="TOOL.json", help="tool with its marker cube (default: no tool)")
-    add_bodies(parser)
+    add_model_options(parser)
     parser.add_argument(
         "--deformer", metavar="NAME",
         help="deformation model under the tool: a model of tool poses, guarded, fem or rest. rest: as in the "
@@ -88,7 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds", type=float, default=np.inf, help="close the page after this many seconds (default: never)"
     )
-    add_poses(parser)
+    add_pose_options(parser)
     add_model_tissue(parser, skull=True)
     add_device(parser, "FEM and images")
     add_json(parser)
@@ -96,7 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Parts:
+class Pipeline:
     """Inputs of a run."""
 
     calibration: Calibration
@@ -113,14 +113,14 @@ def run(args: argparse.Namespace) -> int:
     InputError
         Files that cannot be read, written, or do not belong together; images of another size than the camera's.
     """
-    from ..tracked.run import write_rows
+    from ..tracked.run import write_tracking_table
     from ..tracked.truth import compute_overlay_error, read_truth, summarise_errors
 
     camera = args.pictures.isdecimal() and not Path(args.pictures).exists()
     if not 0.0 < args.rate < np.inf:
         raise InputError(f"--rate {args.rate:g}: frame rate [1/s] must be > 0.")
     if camera or args.page:
-        return run_until_ended(partial(_serve_page, args, camera))
+        return run_until_signal(partial(_serve_page, args, camera))
     inputs = [args.pictures, args.camera, args.registration, args.tool, args.anatomy, args.truth, args.covered]
     inputs += [*(args.poses or ()), args.hand_eye, args.camera_poses]
     check_pose_options(args)
@@ -133,13 +133,13 @@ def run(args: argparse.Namespace) -> int:
         truth = read_truth(args.truth, stage.anatomy.digest, len(stage.tumour_vertices))
     shown = _draw_video(args, parts, out)
     errors = [
-        None if truth is None else compute_overlay_error(each.known, truth, parts.calibration, stage) for each in shown
+        None if truth is None else compute_overlay_error(each.result, truth, parts.calibration, stage) for each in shown
     ]
     if table is not None:
-        write_rows(table, shown, errors)
+        write_tracking_table(table, shown, errors)
     report = _report(shown, parts.model)
     if truth is not None:
-        report["off"] = summarise_errors([each.known for each in shown], errors)
+        report["off"] = summarise_errors([each.result for each in shown], errors)
     return _print_summary(args, report, shown, out, table)
 
 
@@ -147,7 +147,7 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
     """Show a video or a live camera on a page, until the time is over or a signal arrives."""
     from ar.page.access_guard import UnguardedError, check_address
 
-    from ..tracked.run import write_rows
+    from ..tracked.run import write_tracking_table
 
     films = {"--out": args.out, "--truth": args.truth, "--covered": args.covered, "--poses": args.poses}
     given = [name for name, value in (films | {"--live": args.live or None}).items() if value is not None]
@@ -164,13 +164,13 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
     except (ValueError, OSError, UnguardedError) as error:
         raise InputError(str(error)) from error
     if table is not None:
-        write_rows(table, shown, [None] * len(shown))
+        write_tracking_table(table, shown, [None] * len(shown))
     if not shown:
         return 1
     return _print_summary(args, _report(shown, parts.model), shown, None, table)
 
 
-def _show_camera(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
+def _show_camera(args: argparse.Namespace, parts: Pipeline, closing: ExitStack) -> list[Overlay]:
     from ar.tracking.live_camera import open_camera, read_camera_images, read_newest
 
     from ..tracked.follower import FollowerSettings
@@ -183,30 +183,30 @@ def _show_camera(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> 
     return _build_page(args, parts, closing, name).watch(images, args.seconds)
 
 
-def _show_video(args: argparse.Namespace, parts: Parts, closing: ExitStack) -> list[Shown]:
-    from ..tracked.seekable_video import SeekableFilm
+def _show_video(args: argparse.Namespace, parts: Pipeline, closing: ExitStack) -> list[Overlay]:
+    from ..tracked.seekable_video import SeekableVideo
 
-    film = SeekableFilm(Path(args.pictures), args.rate)
+    film = SeekableVideo(Path(args.pictures), args.rate)
     return _build_page(args, parts, closing, film.path.name, film.count).play(film, args.seconds)
 
 
-def _build_page(args: argparse.Namespace, parts: Parts, closing: ExitStack, name: str, frames: int = 0) -> OverlayPage:
+def _build_page(args: argparse.Namespace, parts: Pipeline, stack: ExitStack, name: str, frames: int = 0) -> OverlayPage:
     from ..tracked.page import OverlayPage
 
     page = OverlayPage(parts.follower, parts.painter, name, parts.model, HOST, args.port, frames, list_addresses(args))
-    closing.callback(page.close)
+    stack.callback(page.close)
     print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {parts.model}", flush=True)
     print_addresses(page.browser)
     return page
 
 
 def _print_summary(
-    args: argparse.Namespace, report: dict[str, object], shown: list[Shown], out: Path | None, table: Path | None
+    args: argparse.Namespace, report: dict[str, object], shown: list[Overlay], out: Path | None, table: Path | None
 ) -> int:
     """Print the summary of a run; return 1 if no frame has a reliable tumour position."""
     report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
     print(to_json_line(report) if args.json else _format_report(report))
-    return 0 if any(each.known.relied for each in shown) else 1
+    return 0 if any(each.result.is_reliable for each in shown) else 1
 
 
 def _check_video_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path:
@@ -215,7 +215,7 @@ def _check_video_path(path: Path, force: bool, inputs: list[str | Path | None]) 
     return check_output_path(path, path.suffix, force, inputs)
 
 
-def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
+def _read_parts(args: argparse.Namespace, film: bool) -> Pipeline:
     """Read the inputs of a run, starting with those that take little time."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
@@ -245,35 +245,35 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Parts:
         check_video(Path(args.pictures), args.rate, calibration, args.camera)
     tool = None if args.tool is None else read_tool(args.tool)
     elsewhere = open_external_tracker(args, calibration)
-    theatre = open_theatre(args.anatomy, args.model, args.device)
-    warning = describe_other_mesh(registration, theatre.anatomy, args.registration)
+    patient = open_theatre(args.anatomy, args.model, args.device)
+    warning = describe_other_mesh(registration, patient.anatomy, args.registration)
     if warning:
         print(f"sulcus overlay: {warning}", file=sys.stderr)
-    scene = apply_tissue_options(args, build_tracked_scene(args, None if tool is None else tool.shape), theatre)
-    stage = theatre.build_stage(scene)
-    deformer, who = build_mover(args, theatre, scene, tool is not None)
+    scene = apply_tissue_options(args, build_tracked_scene(args, None if tool is None else tool.shape), patient)
+    stage = patient.build_stage(scene)
+    deformer, who = build_requested_deformer(args, patient, scene, tool is not None)
     motion = ToolMotion(stage, deformer)
     device = find_device(args.device, LIVE.precision).name
     load_kernels(device)
     follower = Follower(calibration, registration, tool, motion, elsewhere, intrinsic)
-    return Parts(calibration, follower, Painter(stage, tool, args.style, device), who)
+    return Pipeline(calibration, follower, Painter(stage, tool, args.style, device), who)
 
 
-def _draw_video(args: argparse.Namespace, parts: Parts, out: Path | None) -> list[Shown]:
+def _draw_video(args: argparse.Namespace, parts: Pipeline, out: Path | None) -> list[Overlay]:
     """Draw the overlay on all frames, and write a video if requested; return the results without images."""
     from ar.screen import write_film
     from ar.tracking.image_sequences import read_frame_rate, read_video
 
-    from ..tracked.run import draw_overlays, read_timed
+    from ..tracked.run import draw_overlays, read_timed_images
 
-    shown: list[Shown] = []
+    shown: list[Overlay] = []
 
     def pictures() -> Iterator[np.ndarray]:
         masks = None if args.covered is None else read_video(args.covered, args.rate)
-        film = read_timed(read_video(Path(args.pictures), args.rate, colour=True), masks)
+        film = read_timed_images(read_video(Path(args.pictures), args.rate, colour=True), masks)
         for each in draw_overlays(film, parts.follower, parts.painter, args.live):
             shown.append(each.drop_image())
-            yield each.colour
+            yield each.image
 
     try:
         if out is None:
@@ -288,17 +288,17 @@ def _draw_video(args: argparse.Namespace, parts: Parts, out: Path | None) -> lis
     return shown
 
 
-def _report(shown: list[Shown], who: str) -> dict[str, object]:
+def _report(shown: list[Overlay], who: str) -> dict[str, object]:
     """Summarise a run for JSON."""
     from ..tracked.run import summarise_latencies
 
     count = len(shown)
-    states = Counter(each.known.state.value for each in shown)
+    states = Counter(each.result.state.value for each in shown)
     return {
         "pictures": count,
         "motion_by": who,
-        "reference_seen_percent": 100.0 * sum(each.known.reference_time == each.known.time for each in shown) / count,
-        "tool_seen_percent": 100.0 * sum(each.known.T_scan_tool is not None for each in shown) / count,
+        "reference_seen_percent": 100.0 * sum(each.result.reference_time == each.result.time for each in shown) / count,
+        "tool_seen_percent": 100.0 * sum(each.result.T_scan_tool is not None for each in shown) / count,
         "states": dict(states.most_common()),
         "latency": summarise_latencies(shown),
     }

@@ -29,14 +29,14 @@ from surrogate.data.tool_loads import PRESETS
 
 from ..options.outputs import add_force, check_output_path
 from ..options.placement_options import (
-    add_opening_arguments,
-    get_trajectory_option,
+    add_craniotomy_arguments,
+    get_trajectory_path,
     place_craniotomy,
+    to_craniotomy_args,
     to_metres,
-    to_opening_options,
 )
 from ..options.shared_options import add_devices, add_json
-from ..options.subject_options import add_label_arguments, label_words, list_label_options, parse_regions, parse_sources
+from ..options.subject_options import add_label_options, list_label_options, parse_regions, parse_sources, to_label_args
 from ..options.tissue_options import NON_BRAIN_REGIONS, add_element_argument, add_region_argument, parse_region_tissues
 from ..script.shipped_files import get_template_path
 
@@ -49,13 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="without LABELS: write sample_labels.nii.gz and sample_t1.nii.gz of a synthetic patient next to --out, "
         "and continue with them",
     )  # fmt: skip
-    add_label_arguments(parser, "--convention", "--labels")
+    add_label_options(parser, "--convention", "--labels")
     parser.add_argument("--t1", type=Path, help="intensities in the same space, for the camera view")
     parser.add_argument(
         "--out", type=Path, default="patient.vtu", metavar="PATIENT.vtu",
         help="anatomy to write; data (.h5) and models (.model.npz) are written next to it",
     )  # fmt: skip
-    add_opening_arguments(parser)
+    add_craniotomy_arguments(parser)
     parser.add_argument(
         "--inspect", action="store_true",
         help="preview in seconds, without making anything: numbers, warnings, and the image PATIENT.inspect.png",
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
     force = ["--force"] if args.force else []
     t1 = [] if args.t1 is None else ["--t1", str(args.t1)]
     steps = [
-        ["anatomy", *label_words(args), *t1, *to_opening_options(args), "--out", str(args.out)],
+        ["anatomy", *to_label_args(args), *t1, *to_craniotomy_args(args), "--out", str(args.out)],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--tool-preset", args.tool_preset,
          "--device", args.device, "--material", args.material,
          *([] if args.element is None else ["--element", args.element]),
@@ -189,7 +189,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
     from ar.screen import write_png
 
     from .inspection import inspect_subject
-    from .inspection_sheet import draw_inspection_sheet
+    from .inspection_sheet import draw_sheet
 
     began = time.perf_counter()
     picture = args.out.with_suffix(".inspect.png")
@@ -201,7 +201,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
     found = inspect_subject(masks, subject, regions)
     opened = find_exposed_cortex(subject, choose_diameter(subject, plan))
     with write_atomically(picture, ".png") as partial:
-        write_png(partial, draw_inspection_sheet(found, masks, subject, opened))
+        write_png(partial, draw_sheet(found, masks, subject, opened))
     took = round(time.perf_counter() - began, 2)
     if args.json:
         print(json.dumps({**found.to_json(), "picture": str(picture), "seconds": took}))
@@ -216,7 +216,7 @@ def _format_scene_options(args: argparse.Namespace) -> str:
     """Return the options that a scene needs to match these data: tissue, element and planned trajectory."""
     tissue = "" if args.material == BRAIN.law else f" --material {args.material}"
     element = "" if args.element in (None, RECOMMENDED) else f" --element {args.element}"
-    trajectory = get_trajectory_option(args)
+    trajectory = get_trajectory_path(args)
     return tissue + element + ("" if trajectory is None else f" --trajectory {trajectory}")
 
 

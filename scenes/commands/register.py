@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from sim import read_anatomy
     from surrogate.locating.observed_files import read_columns
 
-    from ..tracked.registration_file import as_stored, describe_scan, write_registration
+    from ..tracked.registration_file import describe_scan, to_json, write_registration
 
     if args.surface is not None and args.anatomy is None:
         raise InputError("--surface is traced on an anatomy: give it by --anatomy.")
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     target = None if anatomy is None else _compute_tumour_error(found, anatomy)
     if args.json:
         figures = {} if target is None else {"tumour_p95_mm": 1e3 * target[1], "along_mm": target[0].tolist()}
-        print(to_json_line({"out": str(out), **as_stored(found), **figures, **_summarise_residuals(fits)}))
+        print(to_json_line({"out": str(out), **to_json(found), **figures, **_summarise_residuals(fits)}))
         return 0
     print("\n".join(_format_table(fits)))
     print(f"{found.pairs} pairs fit to {1e3 * found.rms:.2f} mm (rms); that is not the error at the tumour")

@@ -11,10 +11,10 @@ from sim.arguments import check_integer
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, explain_error
 
-from ..options.camera_options import add_camera, apply_camera_options
+from ..options.camera_options import add_camera_options, apply_camera_options
 from ..options.outputs import add_force, check_output_folder, check_output_frames, check_output_path
+from ..options.patient_options import add_patient, build_requested_scene, choose_deformer, open_patient
 from ..options.shared_options import add_json, add_style
-from ..options.theatre_options import add_theatre, build_requested_scene, build_requested_theatre, choose_deformer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=1, help="render every Nth frame")
     parser.add_argument("--film", type=Path, help="also write a video: .mp4, .gif or .webp")
     parser.add_argument("--plain", action="store_true", help="leave out the panel of figures")
-    add_theatre(parser)
-    add_camera(parser)
+    add_patient(parser)
+    add_camera_options(parser)
     add_style(parser)
     add_force(parser)
     add_json(parser)
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     """Render all frames; return 1 if a frame is unreliable."""
     from tqdm import tqdm
 
-    from ..play.scene_costs import add_cost_label
+    from ..play.scene_costs import draw_cost_panel
 
     check_integer("--every", args.every, 1)
     check_output_folder(args.out, "frames")
@@ -43,10 +43,10 @@ def run(args: argparse.Namespace) -> int:
         if args.film.suffix not in (".mp4", ".gif", ".webp"):
             raise InputError(f"{args.film}: unsupported video type: expected .mp4, .gif or .webp.")
         check_output_path(args.film, args.film.suffix, args.force, [args.camera])
-    theatre = build_requested_theatre(args, args.scene)
-    scene = apply_camera_options(args, build_requested_scene(args, args.scene, theatre))
-    name = choose_deformer(args, theatre, scene)
-    player = replace(theatre.build_player(name, scene), style=args.style)
+    patient = open_patient(args, args.scene)
+    scene = apply_camera_options(args, build_requested_scene(args, args.scene, patient))
+    name = choose_deformer(args, patient, scene)
+    player = replace(patient.build_player(name, scene), style=args.style)
     others = check_output_frames(args.out, args.force)
     written, bad = [], 0
     try:
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             path.unlink()
         film = Film(args.out)
         for frame in tqdm(player.play_frames(every=args.every), total=len(scene.times[:: args.every]), file=sys.stderr):
-            film.show(frame.number, frame.shown if args.plain else add_cost_label(frame, name))
+            film.show(frame.number, frame.shown if args.plain else draw_cost_panel(frame, name))
             written.append(args.out / f"frame_{frame.number:04d}.png")
             bad += not frame.deformation.outcome[0].good
         if args.film is not None:
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
             write_film(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
     except OSError as error:
         raise InputError(f"{args.out}: the frames cannot be written ({explain_error(error)}). {REMEDY}") from error
-    film, who = None if args.film is None else str(args.film), theatre.describe_deformer(name, scene)
+    film, who = None if args.film is None else str(args.film), patient.describe_deformer(name, scene)
     report = {"scene": scene.name, "deformer": name, "solver": who, "frames": len(written), "not_good": bad}
     report |= {"out": str(args.out), "film": film}
     beside = "" if film is None else f", video {film}"

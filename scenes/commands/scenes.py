@@ -9,8 +9,8 @@ from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, explain_error
 
 from ..options.outputs import add_force, check_output_folder, check_output_path
+from ..options.patient_options import list_playable
 from ..options.shared_options import add_anatomy, add_device, add_json
-from ..options.theatre_options import list_playable
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,31 +40,31 @@ def run(args: argparse.Namespace) -> int:
         check_output_folder(args.out, "pictures")
         for name in (*scenes, "sheet"):
             check_output_path(args.out / f"{name}.png", ".png", args.force)
-    theatre = open_theatre(args.anatomy, device=args.device)
+    patient = open_theatre(args.anatomy, device=args.device)
     lines = sys.stderr if args.json else sys.stdout
-    drawn = [] if args.out is None else [scene.name for scene in list_playable(args, theatre, list(scenes.values()))]
+    drawn = [] if args.out is None else [scene.name for scene in list_playable(args, patient, list(scenes.values()))]
     rows, pictures = [], {}
     drawing = tqdm(total=len(scenes), unit="scene", leave=False, disable=args.out is None, file=sys.stderr)
     with drawing as bar:
         for name, scene in scenes.items():
-            names = [type(effect).__name__ for effect in scene.get_effects_on(theatre.anatomy)]
+            names = [type(effect).__name__ for effect in scene.get_effects_on(patient.anatomy)]
             row = {
                 "scene": name,
                 "title": scene.title,
                 "effects": names,
-                "deformers": list(theatre.list_deformers(scene)),
+                "deformers": list(patient.list_deformers(scene)),
             }
-            players = ", ".join(theatre.list_deformers(scene))
-            row["solver"] = solver = theatre.describe_deformer("fem", scene)
+            players = ", ".join(patient.list_deformers(scene))
+            row["solver"] = solver = patient.describe_deformer("fem", scene)
             bar.write(f"{name}: {scene.title}\n  acting: {', '.join(names)}", file=lines)
             bar.write(f"  can be played by: {players}\n  fem: {solver}", file=lines)
             if name in drawn:
-                usual = theatre.select_default(scene)
-                found = render_thumbnail(theatre.build_player(usual, scene), usual)
-                pictures[name] = found.colour
-                row |= {"milliseconds": found.milliseconds, "moved_mm": found.moved_mm, "played_by": usual}
-                cost = f"{found.total:.0f} ms a frame by {usual}"
-                bar.write(f"  {cost}; the tumour moves by up to {found.moved_mm:.2f} mm", file=lines)
+                usual = patient.select_default(scene)
+                found = render_thumbnail(patient.build_player(usual, scene), usual)
+                pictures[name] = found.image
+                row |= {"milliseconds": found.milliseconds, "moved_mm": found.motion_mm, "played_by": usual}
+                cost = f"{found.total_milliseconds:.0f} ms a frame by {usual}"
+                bar.write(f"  {cost}; the tumour moves by up to {found.motion_mm:.2f} mm", file=lines)
             rows.append(row)
             bar.update()
     if args.out is not None:

@@ -17,8 +17,8 @@ from sim.errors import InputError
 from surrogate.data.tool_loads import PRESETS, draw
 
 from ..options.outputs import add_force, check_output_path
+from ..options.patient_options import add_model_options
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
-from ..options.theatre_options import add_bodies
 
 if TYPE_CHECKING:
     from surrogate.model.learned import Learned
@@ -48,7 +48,7 @@ LOCKING_NOTES = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    add_bodies(parser)
+    add_model_options(parser)
     parser.add_argument(
         "--element", choices=ELEMENTS,
         help="element of the mesh (default: smoothed, because linear tetrahedra lock as nu nears 0.5; p2 for meshes "
@@ -83,9 +83,9 @@ def run(args: argparse.Namespace) -> int:
         check_output_path(args.out, ".csv", args.force)
     if args.factorial:
         return _run_factorial(args)
-    theatre = open_theatre(args.anatomy, args.model, args.device)
-    anatomy = theatre.anatomy
-    pushed = (model for model in theatre.models.values() if model.tool is None)
+    patient = open_theatre(args.anatomy, args.model, args.device)
+    anatomy = patient.anatomy
+    pushed = (model for model in patient.models.values() if model.tool is None)
     model = min(pushed, key=lambda model: model.bound, default=None)
     loads = draw(args.tool_preset, anatomy, args.count, args.seed)
     body = BodyVariant(element=args.element or ("smoothed" if anatomy.mesh.middles is None else "p2"))
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     with tqdm(total=1 + len(changed), unit="row", file=sys.stderr) as bar:
         for row in measure_variants(study, changed):
             found.append(row)
-            names = (row.variant.factor, row.variant.default, row.variant.now)
+            names = (row.variant.factor, row.variant.default, row.variant.changed)
             bar.write(_format_row((*names, *_format_cells(row.force), *_format_cells(row.motion))), file=lines)
             bar.update()
     table = [_flatten_row(row) for row in found]
@@ -126,7 +126,7 @@ def _run_factorial(args: argparse.Namespace) -> int:
 
     from ar.screen import write_png
 
-    from ..analysis.factorial import LEVELS, build_panels, compute_variance_shares, solve_cells
+    from ..analysis.factorial import LEVELS, build_panels, compute_variance_shares, solve_levels
     from ..analysis.loglog_chart import draw_panels
     from ..analysis.measurement import write_table
 
@@ -134,7 +134,7 @@ def _run_factorial(args: argparse.Namespace) -> int:
         raise InputError("--factorial makes its bodies of the template: leave --anatomy out.")
     picture = args.out and check_output_path(args.out.with_suffix(".png"), ".png", args.force)
     total = prod(map(len, LEVELS.values()))
-    found = list(tqdm(solve_cells(nodes=args.nodes, device=args.device), total=total, unit="cell", file=sys.stderr))
+    found = list(tqdm(solve_levels(nodes=args.nodes, device=args.device), total=total, unit="cell", file=sys.stderr))
     table = [{**cell.levels, "force_mm": cell.force, "motion_mm": cell.motion} for cell in found]
     failed = sum(not np.isfinite(value) for cell in found for value in (cell.force, cell.motion))
     parts = {response: compute_variance_shares(found, response) for response in ("force", "motion")}
@@ -215,4 +215,4 @@ def _flatten_row(row: SensitivityRow) -> dict[str, Any]:
     variant = row.variant
     sides = {"force": row.force, "motion": row.motion}
     figures = {f"{side} {name}": value for side, change in sides.items() for name, value in asdict(change).items()}
-    return {"what": variant.factor, "default": variant.default, "now": variant.now, **figures}
+    return {"what": variant.factor, "default": variant.default, "now": variant.changed, **figures}

@@ -33,7 +33,7 @@ from surrogate.data.solver_pool import LazyFem, open_solvers
 from surrogate.data.tool_loads import OVERLOAD_PRESETS, PRESETS, compute_rejected_share, describe_rejected, draw
 from surrogate.data.tool_poses import choose_ball, draw_poses
 
-from ..options.outputs import add_force, check_output_path, find_begun_batch, read_statements, remove_data
+from ..options.outputs import add_force, check_output_path, read_attributes, read_batch_size, remove_outdated_data
 from ..options.shared_options import add_devices, add_json, add_seed
 from ..options.tissue_options import (
     add_element_argument,
@@ -103,7 +103,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate the loads; return 0 even if a load did not converge: the data set records which did."""
-    out = check_output_path(args.out, ".h5", args.force, resumed="anatomy" in read_statements(Path(args.out)))
+    out = check_output_path(args.out, ".h5", args.force, resumed="anatomy" in read_attributes(Path(args.out)))
     with time_stage("draw"):
         anatomy = read_anatomy(get_template_path() if args.anatomy is None else args.anatomy)
         if not len(anatomy.tumour_nodes):
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         passive = (effect for effect in effects if not isinstance(effect, ToolForce | NodalForce))
         effects = (*passive, ToolContact((tool,)))
     devices = parse_device_names(args.device)
-    batch = find_begun_batch(out) if args.batch is None else args.batch
+    batch = read_batch_size(out) if args.batch is None else args.batch
     with ExitStack() as closing:
         stop_if_asked = closing.enter_context(interrupt_on_termination())
         with time_stage("set-up"):
@@ -137,7 +137,7 @@ def run(args: argparse.Namespace) -> int:
             **{f"{name} version": get_version(name) for name in ("sulcus", "warp-lang", "numpy")},
         }
         if args.force:
-            remove_data(out, {**provenance, "anatomy": anatomy.digest})
+            remove_outdated_data(out, {**provenance, "anatomy": anatomy.digest})
         bar = closing.enter_context(tqdm(unit="load", disable=args.json, file=sys.stderr))
 
         def progress(done: int, total: int) -> None:
@@ -154,10 +154,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def show_progress(bar: tqdm, done: int, total: int) -> None:
+def show_progress(progress_bar: tqdm, done: int, total: int) -> None:
     """Show that `done` of `total` rows are finished."""
-    bar.total = total
-    bar.update(done - bar.n)
+    progress_bar.total = total
+    progress_bar.update(done - progress_bar.n)
 
 
 def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
@@ -175,9 +175,9 @@ def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) ->
     else:  # imports that are not needed for training alone
         from ..script.craniotomy_frame import build_craniotomy_frame
         from ..script.scene import find_scene
-        from ..script.scene_poses import draw_scene_poses
+        from ..script.scene_poses import sample_scene_poses
 
-        tool, loads = draw_scene_poses(find_scene(args.scene), build_craniotomy_frame(anatomy), args.count, args.seed)
+        tool, loads = sample_scene_poses(find_scene(args.scene), build_craniotomy_frame(anatomy), args.count, args.seed)
     return tool, Loads(loads.causes, sample_times(len(loads), args.seed)) if tissue.prony else loads
 
 

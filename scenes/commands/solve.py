@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "`start` (V, 3), an initial guess in the file's unit, and cell data `region`. Mid-edge nodes in the file "
         "are fixed only where `fixed` marks them",
     )
-    add_tissue_arguments(parser, whole=True)
+    add_tissue_arguments(parser, full_help=True)
     add_element_argument(parser, "p1, the file's linear tetrahedra as every other program takes them")
     parser.add_argument("--tolerance", type=float, default=1e-6, help="tolerance of the relative residual")
     parser.add_argument(
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     plan = fem.plan.explain() if args.explain else ()
     for line in plan:
         print(line, file=sys.stderr)
-    deformation = fem.deform(loads, read_start(file, args.mesh, UNITS[args.unit]))
+    deformation = fem.deform(loads, read_initial_guess(file, args.mesh, UNITS[args.unit]))
     seconds = time.perf_counter() - clock
     write_mesh(out, anatomy.mesh, {"displacement": deformation.displacement[0]})
     outcome, reached, inverted = deformation.outcome[0], float(deformation.reached[0]), int(deformation.inverted[0])
@@ -123,8 +123,8 @@ def run(args: argparse.Namespace) -> int:
     return 0 if outcome.good else 1
 
 
-def read_start(file: MeshFile, name: str, metre: float) -> Deformation | None:
-    """Return the initial guess in a file's point data `start`, if there is one. `metre`: the file's unit of length [m].
+def read_initial_guess(file: MeshFile, name: str, length_unit: float) -> Deformation | None:
+    """Return the initial guess in a file's point data `start`, if there is one. `length_unit` of the file [m].
 
     Raises
     ------
@@ -133,11 +133,13 @@ def read_start(file: MeshFile, name: str, metre: float) -> Deformation | None:
     """
     if "start" not in file.point_data:
         return None
-    return build_start(metre * _check_field(name, "start", file.point_data["start"], {(len(file.mesh.nodes), 3)})[None])
+    return build_start(
+        length_unit * _check_field(name, "start", file.point_data["start"], {(len(file.mesh.nodes), 3)})[None]
+    )
 
 
-def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Loads, list[str]]:
-    """Read constraints and loads of a file's point data, with notes on changes. `metre`: the file's unit of length [m].
+def read_problem(file: MeshFile, name: str, length_unit: float) -> tuple[Anatomy, Loads, list[str]]:
+    """Read constraints and loads of a file's point data, with notes on changes. `length_unit` of the file [m].
 
     Raises
     ------
@@ -171,7 +173,7 @@ def read_problem(file: MeshFile, name: str, metre: float) -> tuple[Anatomy, Load
             if free.any():
                 notes.append(f"`prescribed` is ignored on {free.sum()} components that are not `fixed`")
             stored = np.where(held & ~orphan[:, None], stored, 0.0)
-        prescribed = metre * _check_field(name, "prescribed", stored, {(count, 3)})
+        prescribed = length_unit * _check_field(name, "prescribed", stored, {(count, 3)})
         most, size = np.linalg.norm(prescribed, axis=1).max(), np.ptp(mesh.nodes[~orphan], axis=0).max()
         if most > size:
             notes.append(

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from ar.tracking.targets import TIP_DISTANCE
 
     from ..tracked.calibration_file import read_calibration
-    from ..tracked.external_tracker import follow_body
+    from ..tracked.external_tracker import track_video
     from ..tracked.pose_file import write_poses
     from ..tracked.video_camera import check_video
 
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     calibration = read_calibration(args.camera)
     check_video(args.pictures, args.rate, calibration, args.camera)
     begun = time.perf_counter()
-    rows = list(follow_body(args.pictures, calibration, args.body, args.reference_frame, args.rate))
+    rows = list(track_video(args.pictures, calibration, args.body, args.reference_frame, args.rate))
     seconds = time.perf_counter() - begun
     write_poses(out, rows, tip)
     good = sum(row.pose is not None for row in rows)
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         print(to_json_line(report))
     else:
         print(f"{len(rows)} images of the {args.body}, {middle:.1f} ms each (median):")
-        for (lacks, verdict), count in Counter((row.lacks, row.verdict) for row in rows).most_common():
+        for (lacks, verdict), count in Counter((row.missing_target, row.verdict) for row in rows).most_common():
             print(f"  {100.0 * count / len(rows):5.1f} %  {f'{lacks} ' if lacks else ''}{verdict.value}")
         print(f"written: {out}, in the {args.reference_frame}'s frame")
     return 0 if good else 1

@@ -74,11 +74,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def parse_learners(words: str) -> list[str]:
+def parse_learners(text: str) -> list[str]:
     """Parse the names in `--learners`; an empty name is an error."""
-    names = [name.strip() for name in words.split(",")]
+    names = [name.strip() for name in text.split(",")]
     if not all(names):
-        raise InputError(f"--learners {words!r}: name each learner, with one comma between two, or leave it out.")
+        raise InputError(f"--learners {text!r}: name each learner, with one comma between two, or leave it out.")
     return names
 
 

@@ -16,8 +16,8 @@ from tqdm import tqdm
 from sim.arguments import check_integer
 
 from ..options.outputs import check_output_path
+from ..options.patient_options import add_model_options, build_requested_scene
 from ..options.shared_options import add_device, add_json, add_seed, to_json_line
-from ..options.theatre_options import add_bodies, build_requested_scene
 from ..options.tissue_options import add_model_tissue
 from .fit import find_fitted_tissue
 
@@ -39,7 +39,7 @@ registration, segmentation. Force, fluid level and resection are assumed to be a
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
-    add_bodies(parser)
+    add_model_options(parser)
     add_model_tissue(parser)
     parser.add_argument("--draws", type=int, default=40, help=f"number of sampled bodies to solve, >= {MIN_BODIES}")
     parser.add_argument(
@@ -82,15 +82,15 @@ def run(args: argparse.Namespace) -> int:
     check_integer("--draws", args.draws, MIN_BODIES)
     check_integer("--twins", args.twins, 2 if args.twins else 0)
     names = args.scenes or SCENES
-    theatre = open_theatre(args.anatomy, args.model, args.device, names)
-    scenes = [build_requested_scene(args, name, theatre) for name in names]
+    patient = open_theatre(args.anatomy, args.model, args.device, names)
+    scenes = [build_requested_scene(args, name, patient) for name in names]
     out = args.out or to_uncertainty_path(args.anatomy or get_template_path())
     # Check before hours of work: the tissue must have priors. An existing file is read, and scenes are added to it.
     for scene in scenes:
         get_tissue(scene)
     check_output_path(out, ".json", resumed=True)
     read_uncertainties(out)
-    fitted = find_fitted_tissue(args.tissue, args.anatomy or get_template_path(), theatre.anatomy.digest)
+    fitted = find_fitted_tissue(args.tissue, args.anatomy or get_template_path(), patient.anatomy.digest)
 
     def draws_of(scene: Scene, count: int, seed: int) -> list[PatientSample]:
         if fitted is None:
@@ -102,17 +102,17 @@ def run(args: argparse.Namespace) -> int:
     for scene in scenes:
         bar = partial(tqdm, unit="body", desc=scene.name, leave=False, file=sys.stderr)
         draws, twins = (draws_of(scene, *each) for each in ((args.draws, args.seed), (args.twins, args.seed + 1)))
-        still = solve_nominal(theatre, scene)
+        still = solve_nominal(patient, scene)
         found = estimate_uncertainty(
-            theatre, scene, still, draws, bar(solve_ensemble(theatre, scene, draws), total=len(draws)), args.seed
+            patient, scene, still, draws, bar(solve_ensemble(patient, scene, draws), total=len(draws)), args.seed
         )
         found = replace(found, frames=0 if fitted is None else fitted.frames)
         if twins:
             write_uncertainties(out, [found])
-            tried = bar(solve_ensemble(theatre, scene, twins), total=len(twins))
+            tried = bar(solve_ensemble(patient, scene, twins), total=len(twins))
             found = measure_coverage(scene, still, found, twins, tried, args.seed + 1)
         write_uncertainties(out, [found])
-        rows.append(_summarise_scene(theatre, scene, found))
+        rows.append(_summarise_scene(patient, scene, found))
         print("\n".join(_format_lines(rows[-1])), file=lines, flush=True)
     if args.json:
         print(to_json_line({"seed": args.seed, "out": str(out), "scenes": rows}))
@@ -121,11 +121,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _summarise_scene(theatre: PatientSetup, scene: Scene, found: Uncertainty) -> dict[str, Any]:
+def _summarise_scene(patient: PatientSetup, scene: Scene, found: Uncertainty) -> dict[str, Any]:
     """Summarise a scene at the time of the largest bound on the tumour's error [mm]."""
     from ..play.frame_text import format_errors
 
-    model = theatre.models.get(theatre.select_best(scene))
+    model = patient.models.get(patient.select_best(scene))
     promised = None if model is None or not np.isfinite(model.bound) else float(model.bound)
     moment = int(np.argmax(found.worst))
     error = found.evaluate(found.times[moment], promised or 0.0)
@@ -135,9 +135,9 @@ def _summarise_scene(theatre: PatientSetup, scene: Scene, found: Uncertainty) ->
         "scene": scene.name, "said": format_errors(promised, error, model is not None), "time_s": found.times[moment],
         "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
         "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment],
-        "largest_part": None if found.few else error.largest,
+        "largest_part": None if found.has_few_draws else error.main_source,
         "draws": found.draws, "failed": found.failed, "frames": found.frames, "folded": found.folded,
-        "fitted_numbers": found.numbers, "few": found.few, "guess": found.guess,
+        "fitted_numbers": found.numbers, "few": found.has_few_draws, "guess": found.is_rough,
         "patients": found.patients, "covered": found.covered, "covered_deviation": found.deviation,
         "parts_mm": ranked,
     }  # fmt: skip

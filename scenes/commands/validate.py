@@ -55,12 +55,12 @@ def run(args: argparse.Namespace) -> int:
             found[report.path] = report
             bar.update()
     reports = [found[path] for path in dict.fromkeys(paths)]
-    reports += [one for place in args.episodes if place.is_dir() for one in list_lost_episodes(place)]
+    reports += [one for place in args.episodes if place.is_dir() for one in list_missing_episodes(place)]
     if args.solve:
-        from ..episodes.reading.repeated_frames import solve_again
+        from ..episodes.reading.repeated_frames import solve_frames_again
 
         bar = tqdm(reports, unit="episode", desc="solved again", file=sys.stderr)
-        reports = [one if one.problems else solve_again(one, args.solve, args.device) for one in bar]
+        reports = [one if one.problems else solve_frames_again(one, args.solve, args.device) for one in bar]
     broken = [report for report in reports if report.problems]
     trained = {place: list_model_errors(place) for place in args.episodes if place.is_dir()}
     if args.json:
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     return 1 if broken else 0
 
 
-def list_lost_episodes(folder: Path) -> list[Report]:
+def list_missing_episodes(folder: Path) -> list[Report]:
     """List the missing episodes that a folder's card names."""
     from ..episodes.exports.card import TABLE, list_card_files
     from ..episodes.reading.validation import Report
@@ -84,9 +84,9 @@ def list_lost_episodes(folder: Path) -> list[Report]:
     return [Report(folder / name, [words]) for name in list_card_files(folder) if not (folder / name).is_file()]
 
 
-def format_reports(reports: list[Report], broken: list[Report]) -> list[str]:
+def format_reports(reports: list[Report], unreadable: list[Report]) -> list[str]:
     """Format the faults of each file, the files that could not be checked, and statistics of all complete ones."""
-    lines = [f"{report.path}: {problem}" for report in broken for problem in report.problems]
+    lines = [f"{report.path}: {problem}" for report in unreadable for problem in report.problems]
     lines = [
         *lines[:MAX_LISTED_FILES],
         *([f"and {len(lines) - MAX_LISTED_FILES} more: --json has all"] if len(lines) > MAX_LISTED_FILES else []),

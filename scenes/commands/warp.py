@@ -12,9 +12,9 @@ import numpy as np
 
 from sim.errors import InputError
 
+from ..options.patient_options import add_trajectory, build_requested_scene
 from ..options.shared_options import add_device, add_json, to_json_line
 from ..options.subject_options import add_axes
-from ..options.theatre_options import add_trajectory, build_requested_scene
 from ..options.tissue_options import add_model_tissue, apply_tissue_options
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     cause = parser.add_mutually_exclusive_group(required=True)
     cause.add_argument("--scene", metavar="NAME", help="built-in scene or MY_SCENE.py, solved by FEM at one frame")
     cause.add_argument(
-        "--load", type=load, metavar="X,Y,Z,N",
+        "--load", type=parse_load, metavar="X,Y,Z,N",
         help="force [N] of a round tool that presses inwards on the open cortex nearest to a point [mm, RAS]",
     )  # fmt: skip
     cause.add_argument(
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
-def load(text: str) -> tuple[float, float, float, float]:
+def parse_load(text: str) -> tuple[float, float, float, float]:
     """Parse X,Y,Z,N into four numbers, for argparse."""
     try:
         x, y, z, newton = (float(part) for part in text.split(","))
@@ -88,23 +88,23 @@ def run(args: argparse.Namespace) -> int:
     from ..script.scene import check_scene_exists
     from ..script.shipped_files import get_template_path
     from ..warp.export import WarpSettings, write_warp
-    from ..warp.images import read_picture
+    from ..warp.images import read_patient_image
     from ..warp.places import count_steps
 
     check_warp_options(args)
     if args.scene is not None:
         check_scene_exists(args.scene)
     with write_folder_atomically(args.out) as place:
-        theatre = open_theatre(args.anatomy, None, args.device)
-        scene = None if args.located else build_scene(args, theatre)
+        patient = open_theatre(args.anatomy, None, args.device)
+        scene = None if args.located else build_scene(args, patient)
         pictures = [
-            read_picture(path, theatre.anatomy, path in args.label_maps, args.axes)
+            read_patient_image(path, patient.anatomy, path in args.label_maps, args.axes)
             for path in (*args.image, *args.label_maps)
         ]
         for picture in pictures:
             for warning in picture.warnings:
                 print(f"{picture.path}: {warning}", file=sys.stderr)
-        moment, sequence = select_moments(args, theatre, scene)
+        moment, sequence = select_deformed_anatomies(args, patient, scene)
         source = (args.anatomy or get_template_path()).name
         spacing = None if args.spacing is None else 1e-3 * args.spacing
         total = count_steps(spacing) + 2 + len(pictures) + bool(sequence)
@@ -147,7 +147,7 @@ def check_warp_options(args: argparse.Namespace) -> None:
             raise InputError(f"two images would both become {name}. Rename one, or warp them one after the other.")
 
 
-def build_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
+def build_scene(args: argparse.Namespace, patient: PatientSetup) -> Scene:
     """Return the requested scene; a load is a scene with a constantly pushing tool.
 
     Raises
@@ -156,8 +156,8 @@ def build_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
         An unknown scene or frame; a force that does not push, or is too large; a point away from the cortex.
     """
     if args.load is not None:
-        return apply_tissue_options(args, replace(build_pushing_scene(theatre, args.load), name="load"), theatre)
-    scene = build_requested_scene(args, args.scene, theatre)
+        return apply_tissue_options(args, replace(build_pushing_scene(patient, args.load), name="load"), patient)
+    scene = build_requested_scene(args, args.scene, patient)
     last = len(scene.times) - 1
     if not 0 <= args.frame_number <= last:
         raise InputError(f"--frame-number {args.frame_number}: {scene.name} has the frames 0 to {last}.")
@@ -166,7 +166,7 @@ def build_scene(args: argparse.Namespace, theatre: PatientSetup) -> Scene:
     return scene
 
 
-def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float, float]) -> Scene:
+def build_pushing_scene(patient: PatientSetup, load: tuple[float, float, float, float]) -> Scene:
     """Return the scene of a round tool that pushes the open cortex at X, Y, Z [mm, RAS] with a force [N].
 
     Raises
@@ -177,10 +177,10 @@ def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float,
     from ..script.scene import find_scene
     from ..script.tool_paths import Touch
 
-    *place, newton = asked
+    *place, newton = load
     if not 0.0 < newton <= MAX_FORCE:
         raise InputError(f"--load: a force of {newton:g} N is no push on a brain; give 0 to {MAX_FORCE:g} N.")
-    point, site = 1e-3 * np.array(place), theatre.site
+    point, site = 1e-3 * np.array(place), patient.site
     nearest = site.find_nearest(point).point if np.isfinite(point).all() else np.full(3, np.inf)
     apart = 1e3 * float(np.linalg.norm(nearest - point))
     if not apart <= MAX_DISTANCE:
@@ -194,33 +194,32 @@ def build_pushing_scene(theatre: PatientSetup, asked: tuple[float, float, float,
     return replace(find_scene("press"), path=lambda time: touch, duration=1.0, frames_per_second=1.0)
 
 
-def select_moments(
-    args: argparse.Namespace, theatre: PatientSetup, scene: Scene | None
+def select_deformed_anatomies(
+    args: argparse.Namespace, patient: PatientSetup, scene: Scene | None
 ) -> tuple[DeformedAnatomy, list[tuple[float, DeformedAnatomy]]]:
     """Return the requested moment, and those of a sequence with times [s]; without a scene, read it from a file.
 
     Raises
     ------
     InputError
-        See `read_moment`.
+        See `read_deformed_anatomy`.
     """
     from tqdm import tqdm
 
-    from ..warp.deformed_anatomy import Played, read_moment
+    from ..warp.deformed_anatomy import PlayedScene, read_deformed_anatomy
 
     if scene is None:
-        return read_moment(args.located, theatre.anatomy), []
+        return read_deformed_anatomy(args.located, patient.anatomy), []
     wanted = args.frame_number or 0
     many = [] if args.sequence is None else list(range(0, len(scene.times), args.sequence))
     frames = sorted({wanted, *many})
     with tqdm(total=frames[-1] + 1, unit="frame", desc="finite elements", file=sys.stderr) as bar:
-        found = dict(
-            zip(frames, Played(theatre, scene, args.load is not None).list_moments(frames, bar.update), strict=True)
-        )
+        played = PlayedScene(patient, scene, args.load is not None)
+        found = dict(zip(frames, played.solve_frames(frames, bar.update), strict=True))
     return found[wanted], [(float(scene.times[number]), found[number]) for number in many]
 
 
-def format_warp(report: dict, out: Path) -> str:
+def format_warp(report: dict, out_path: Path) -> str:
     """Format the summary of a warp."""
     error, bound = report["grid_error_mm"], report["bound_mm"]
     lines = [
@@ -234,4 +233,4 @@ def format_warp(report: dict, out: Path) -> str:
     for image in report["images"]:
         lost = image["outside"] + image["resected"]
         lines.append(f"{image['name']}: {image['moved']:,} voxels moved, {lost:,} without source data are set to 0.")
-    return "\n".join([*lines, f"Written to {out}; README.txt there says how to open it."])
+    return "\n".join([*lines, f"Written to {out_path}; README.txt there says how to open it."])

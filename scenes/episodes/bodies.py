@@ -32,8 +32,8 @@ from surrogate.training.train import train
 from ..play.deformers import PatientSetup, open_theatre, to_model_path
 from ..script.shipped_files import get_template_path
 from .draws import build_generator, sample_value
-from .incomplete_bodies import DATA, TABLE, check_resumed, forget
-from .plan import NO_LEARNER, Bodies, EpisodePlan, compute_anatomy_digest, list_fields, to_ratio_key
+from .incomplete_bodies import DATA, TABLE, remove_data_set, resume_data_set
+from .plan import NO_LEARNER, Bodies, EpisodePlan, compute_anatomy_digest, list_sampled_fields, to_ratio_key
 from .run_folder import BODIES, get_versions
 
 MAX_ATTEMPTS = 6  # Maximum number of sampled tumours: one may leave the brain, or its craniotomy have too few nodes.
@@ -48,7 +48,7 @@ class EpisodeBody:
     """Body of a data set: folder of its files, and its sampled parameters by name."""
 
     folder: Path
-    drawn: Mapping[str, Any]
+    parameters: Mapping[str, Any]
 
     @property
     def anatomy(self) -> Path:
@@ -58,16 +58,17 @@ class EpisodeBody:
     @property
     def tissue(self) -> Elasticity:
         """Tissue of the body."""
-        return get_tissue(self.drawn)
+        return get_tissue(self.parameters)
 
-    def build_effects(self, *more: Effect, lets_go: bool = False) -> tuple[Effect, ...]:
+    def build_effects(self, *more: Effect, can_separate: bool = False) -> tuple[Effect, ...]:
         """Return the effects: constraints, skull and others.
 
-        With `lets_go`, the brain may separate from the skull, regardless of the sampled skull model.
+        With `can_separate`, the brain may separate from the skull, regardless of the sampled skull model.
         """
-        return (self.tissue, Held(), SKULLS["contact" if lets_go else self.drawn["bodies.tissue.skull"]], *more)
+        skull = "contact" if can_separate else self.parameters["bodies.tissue.skull"]
+        return self.tissue, Held(), SKULLS[skull], *more
 
-    def open_theatre(self, device: str) -> PatientSetup:
+    def open_patient(self, device: str) -> PatientSetup:
         """Open the body and the models in its files.
 
         Raises
@@ -75,7 +76,7 @@ class EpisodeBody:
         InputError
             See `open_theatre`.
         """
-        shipped = self.drawn["bodies.anatomies"] == "template" and not to_model_path(self.anatomy).is_file()
+        shipped = self.parameters["bodies.anatomies"] == "template" and not to_model_path(self.anatomy).is_file()
         return open_theatre(self.anatomy, to_model_path(get_template_path()) if shipped else None, device)
 
 
@@ -97,9 +98,7 @@ def _to_ratio_name(region: str) -> str:
 
 def _drop_absent_regions(values: Mapping[str, Any], anatomy: Anatomy) -> dict[str, Any]:
     """Return the sampled values without the stiffness of regions that an anatomy does not have."""
-    absent = {
-        _to_ratio_name(name) for name, label in PART_LABELS.items() if not anatomy.mesh.mark_elements(label).any()
-    }
+    absent = {_to_ratio_name(name) for name, part in PART_LABELS.items() if not anatomy.mesh.mark_elements(part).any()}
     return {name: value for name, value in values.items() if name not in absent}
 
 
@@ -109,23 +108,23 @@ def sample_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dic
     for table, values, again in (
         ("bodies", bodies, 0), ("bodies.tissue", bodies.tissue, 0), ("bodies.tumour", bodies.tumour, attempt),
     ):  # fmt: skip
-        for name, value, *_ in list_fields(values):
+        for name, value, *_ in list_sampled_fields(values):
             found[f"{table}.{name}"] = sample_value(value, build_generator(seed, number, f"{table}.{name}/{again}"))
     found["bodies.tumour.seed"] = int(build_generator(seed, number, f"bodies.tumour.seed/{attempt}").integers(2**31))
     return found
 
 
 def write_body(
-    folder: Path, plan: EpisodePlan, seed: int, number: int, device: str, others: Sequence[Path] = ()
+    folder: Path, plan: EpisodePlan, seed: int, number: int, device: str, other_folders: Sequence[Path] = ()
 ) -> bool:
     """Make a body in its own folder: anatomy, scan, trained model, and `body.json` last.
 
-    Loads that were solved before, there or in `others`, are not solved again; returns True if there were any. The
+    Loads solved before, there or in `other_folders`, are not solved again; returns True if there were any. The
     files have the same bytes in both cases.
 
     Parameters
     ----------
-    others
+    other_folders
         Folders in which the same body was partly made, or is being made.
 
     Raises
@@ -142,7 +141,7 @@ def write_body(
         write_intensity(to_intensity_path(body.anatomy), scan)
     before = False
     if bodies.learner.name != NO_LEARNER and not _can_use_shipped_model(body, anatomy):
-        before = _train(body, anatomy, plan, seed, number, device, others)
+        before = _train(body, anatomy, plan, seed, number, device, other_folders)
     (folder / BODY_FILE).write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
     return before
 
@@ -193,10 +192,10 @@ def _sample_anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy,
 
 def _can_use_shipped_model(body: EpisodeBody, anatomy: Anatomy) -> bool:
     """Return True if the shipped model applies to this body."""
-    if body.drawn["bodies.anatomies"] != "template":
+    if body.parameters["bodies.anatomies"] != "template":
         return False
     models = load(to_model_path(get_template_path()), anatomy)
-    effects = build_push_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"])
+    effects = build_push_effects(anatomy, body.tissue, body.parameters["bodies.tissue.skull"])
     return any(find_rejection(model, effects, recommend_element(anatomy.mesh)) is None for model in models.values())
 
 
@@ -205,7 +204,7 @@ def _train(
 ) -> bool:
     """Train a model on simulated loads of a body, which are then removed; return True if earlier loads were reused."""
     learner = plan.contents.bodies.learner
-    effects = (*build_push_effects(anatomy, body.tissue, body.drawn["bodies.tissue.skull"]), NodalForce())
+    effects = (*build_push_effects(anatomy, body.tissue, body.parameters["bodies.tissue.skull"]), NodalForce())
     fem = Fem(anatomy, effects, TRAIN, device, 64)
     first = int(build_generator(seed, number, "bodies.learner").integers(2**31))
     stated = {
@@ -215,14 +214,14 @@ def _train(
     }  # fmt: skip
     data = body.folder / DATA
     all_stated = {**stated, **get_versions(), "anatomy": anatomy.digest, "loads": str(learner.loads)}
-    before = check_resumed(data, all_stated, others)
+    before = resume_data_set(data, all_stated, others)
     simulate(data, fem, draw_loads(PRESET, anatomy, learner.loads, first), stated)
     known = read_dataset(data)
     batch = BATCH_SIZE if fem.problem.device.on_cuda else None
     expansion = Expansion(known, device, kept=data.with_suffix(TABLE), batch=batch)
     trained = train(known, [learner.name], expansion=expansion)
     save(to_model_path(body.anatomy), {name: _remove_training_dates(model) for name, model in trained.models.items()})
-    forget(data)
+    remove_data_set(data)
     return before
 
 
@@ -246,14 +245,14 @@ def list_model_errors(folder: Path) -> dict[int, ReportedErrors]:
     return found
 
 
-def find_weak(models: Mapping[int, ReportedErrors]) -> dict[int, ReportedErrors]:
+def select_weak(models: Mapping[int, ReportedErrors]) -> dict[int, ReportedErrors]:
     """Select the weak models, the largest error bound first."""
     return dict(sorted(((number, one) for number, one in models.items() if one.weak), key=lambda each: -each[1].bound))
 
 
 def describe_weak(models: Mapping[int, ReportedErrors]) -> list[str]:
     """Describe the weak models and their errors, in sentences; empty if there is none."""
-    weak = find_weak(models)
+    weak = select_weak(models)
     if not weak:
         return []
     return [
@@ -272,5 +271,5 @@ def to_weak_json(models: Mapping[int, ReportedErrors]) -> list[dict[str, float |
             "bound_mm": 1e3 * one.bound,
             "mean_share_of_motion": None if one.held_out is None else one.held_out.mean,
         }
-        for number, one in find_weak(models).items()
+        for number, one in select_weak(models).items()
     ]

@@ -52,7 +52,7 @@ def write_checksums(file: h5py.File) -> None:
     file.attrs[CHECKSUM_ATTRIBUTE] = compute_file_digest(file)
 
 
-def find_broken(file: h5py.File) -> list[str]:
+def find_errors(file: h5py.File) -> list[str]:
     """List the differences from the recorded checksums; empty for a file without checksums."""
     if CHECKSUM_ATTRIBUTE not in file.attrs:
         return []

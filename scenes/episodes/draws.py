@@ -53,7 +53,7 @@ def build_generator(seed: int, number: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, number, crc32(name.encode())])
 
 
-def get_distribution(value: object) -> Distribution:
+def to_distribution(value: object) -> Distribution:
     """Return a plan's value as a `Distribution`."""
     if isinstance(value, Distribution):
         return value
@@ -62,9 +62,9 @@ def get_distribution(value: object) -> Distribution:
     return Distribution(choice=list(value) if isinstance(value, list) else [value])  # type: ignore[list-item]
 
 
-def sample_value(value: object, random: np.random.Generator) -> float | str | bool:
+def sample_value(distribution: object, random: np.random.Generator) -> float | str | bool:
     """Sample a value of a plan's `Number` or `Word`."""
-    spread = get_distribution(value)
+    spread = to_distribution(distribution)
     if spread.uniform is not None:
         return float(random.uniform(*spread.uniform))
     if spread.log is not None:
@@ -77,23 +77,23 @@ def sample_value(value: object, random: np.random.Generator) -> float | str | bo
     return spread.choice[int(random.choice(len(spread.choice), p=weights))]
 
 
-def check_spread(value: object, name: str, limits: ValueLimits | None, words: tuple[str, ...] = ()) -> None:
+def check_distribution(value: object, name: str, limits: ValueLimits | None, choices: tuple[str, ...] = ()) -> None:
     """Check that every value that can be sampled is valid.
 
     Parameters
     ----------
     limits
         Allowed range of numbers; None for words.
-    words
+    choices
         Allowed words; empty: any word.
 
     Raises
     ------
     InputError
         A reversed or infinite range, invalid weights, a value outside the limits, or a word that is not in
-        `words`.
+        `choices`.
     """
-    spread = get_distribution(value)
+    spread = to_distribution(value)
     given = [kind for kind in ("uniform", "log", "normal", "choice") if getattr(spread, kind) is not None]
     if len(given) != 1:
         said = " and ".join(given) or "none"
@@ -113,7 +113,7 @@ def check_spread(value: object, name: str, limits: ValueLimits | None, words: tu
         if spread.log is not None and not low > 0.0:
             raise InputError(f"{name}: a logarithmic range starts above 0, not at {low:g}.")
     for each in values:
-        _check_value(each, name, limits, words)
+        _check_value(each, name, limits, choices)
 
 
 def _check_choice(spread: Distribution, name: str) -> None:

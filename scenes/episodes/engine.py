@@ -19,7 +19,7 @@ from distributed.scheduler import KilledWorker
 
 from sim.errors import InputError
 
-from .run_folder import Failure, RunSettings, list_failed, list_failures, mark_failed, to_episode_name, unmark
+from .run_folder import Failure, RunSettings, list_failed, list_failures, mark_failed, remove_failure, to_episode_name
 from .tasks import MadeEpisode, RunWork, TaskOutcome, try_task
 from .workers import MAX_WORKER_DEATHS, Workers, describe_scheduler_end
 
@@ -67,8 +67,8 @@ class RunStatistics:
         return replace(self, made=self.made + 1, frames=frames, bytes=size)
 
 
-def find_still_missing(
-    folder: Path, found: Set[int], numbers: range, first_client: bool, again: bool = False
+def list_missing_episodes(
+    folder: Path, existing: Set[int], numbers: range, first_client: bool, retry: bool = False
 ) -> tuple[RunStatistics, list[int]]:
     """Count episodes that exist or have failed permanently, and list the missing ones in their order of execution.
 
@@ -77,13 +77,13 @@ def find_still_missing(
 
     Parameters
     ----------
-    found
+    existing
         Numbers of all existing episodes.
-    again
+    retry
         True to retry permanently failed episodes.
     """
-    there = found & set(numbers)
-    gone = set() if again else {number for number, one in list_failures(folder).items() if not one.lost}
+    there = existing & set(numbers)
+    gone = set() if retry else {number for number, one in list_failures(folder).items() if not one.lost}
     gone = gone.intersection(numbers) - there
     missing = [number for number in numbers if number not in there and number not in gone]
     if not first_client:
@@ -91,20 +91,20 @@ def find_still_missing(
     return RunStatistics(skipped=len(there), failed=len(gone)), missing
 
 
-def make_all(
+def make_episodes(
     work: RunWork,
     folder: Path,
     run: RunSettings,
     numbers: Sequence[int],
     workers: Workers,
-    heard: ProgressListener,
-    before: RunStatistics,
+    listener: ProgressListener,
+    statistics: RunStatistics,
 ) -> RunStatistics:
     """Make the missing episodes, each after its body; failures are recorded in the folder. Returns the totals.
 
     Parameters
     ----------
-    before
+    statistics
         Totals of earlier work.
 
     Raises
@@ -116,7 +116,7 @@ def make_all(
     busy: dict[str, tuple[str, int, Future]] = {}
     bodies: dict[int, Future] = {}
     failed_before, token = list_failed(folder), uuid4().hex
-    tally, count, counted = before, workers.count(), monotonic()
+    tally, count, counted = statistics, workers.count(), monotonic()
 
     def hand_out(kind: str, number: int, make: Callable[[int], MadeEpisode], *needed: Future) -> Future:
         future = workers.client.submit(
@@ -131,14 +131,14 @@ def make_all(
         nonlocal tally
         if outcome.halt:
             raise InputError(outcome.halt)
-        heard(kind, outcome, count)
+        listener(kind, outcome, count)
         if kind == BODY:
             return
         tally = tally.add(outcome)
         if outcome.failed:
             mark_failed(folder, Failure(outcome.number, outcome.failed, outcome.lost))
         elif outcome.number in failed_before:
-            unmark(folder, outcome.number)
+            remove_failure(folder, outcome.number)
 
     def missing() -> Iterator[int]:
         for number in numbers:
@@ -163,7 +163,7 @@ def make_all(
                 note(kind, replace(outcome, number=number))
             if monotonic() - counted > POLL_INTERVAL:
                 count, counted = workers.count(), monotonic()
-                heard(EPISODE, None, count)
+                listener(EPISODE, None, count)
     finally:
         if workers.client.status == "running":
             workers.client.cancel([future for _, _, future in busy.values()])
@@ -193,7 +193,7 @@ def _collect_outcomes(
         except TimeoutError:
             future.add_done_callback(ended.put)
         except CancelledError as error:  # state of all futures when the scheduler is gone
-            raise describe_scheduler_end(workers.where) from error
+            raise describe_scheduler_end(workers.description) from error
         else:
             yield future, outcome
 

@@ -113,13 +113,13 @@ class EpisodeRecording:
         FEM solves every Nth frame; None: FEM plays the scene, and its solutions are stored directly.
     overlay
         True to also store the image with the overlay.
-    dated
+    with_times
         True to store date and wall times; without them the same scene gives the same bytes.
-    grain
+    add_noise
         Function from the number of a frame and its colour image (H, W, 3) uint8 to the image with camera noise.
-    sensed
+    read_sensors
         Sensor readings (with noise) of the other columns, by name.
-    stated
+    attributes
         Further attributes.
     fem
         FEM solver to use, if it already exists.
@@ -127,10 +127,10 @@ class EpisodeRecording:
 
     solved_every: int | None = 1
     overlay: bool = True
-    dated: bool = True
-    grain: Callable[[int, np.ndarray], np.ndarray] = lambda number, colour: colour
-    sensed: Callable[[Mapping[str, Any]], Mapping[str, np.ndarray]] = lambda columns: {}
-    stated: Mapping[str, str | int] = field(default_factory=dict)
+    with_times: bool = True
+    add_noise: Callable[[int, np.ndarray], np.ndarray] = lambda number, colour: colour
+    read_sensors: Callable[[Mapping[str, Any]], Mapping[str, np.ndarray]] = lambda columns: {}
+    attributes: Mapping[str, str | int] = field(default_factory=dict)
     fem: Fem | ResectedFem | None = None
 
 
@@ -163,21 +163,21 @@ def collect(
         pictures = file.create_group("pictures")
         stores: dict[str, h5py.Dataset] = {}
         rows, loads = [], []  # a frame itself holds seven megabytes
-        for frame in progress(player.play_frames(together=1 if recording.dated else BATCH_FRAMES)):
+        for frame in progress(player.play_frames(together=1 if recording.with_times else BATCH_FRAMES)):
             for name, code in encode_frame(frame, player, recording, right).items():
                 if name not in stores:
                     stores[name] = pictures.create_dataset(name, (total,), h5py.vlen_dtype(np.uint8))
                 stores[name][frame.number] = code
             if stream.failure is not None:  # no frame after the failure would be kept
                 raise stream.failure
-            rows.append(collect_numbers_of_frame(frame, player, recording.dated))
+            rows.append(collect_frame_values(frame, player, recording.with_times))
             loads.append(frame.loads)
         every = recording.solved_every
         numbers = np.arange(0, total, every or 1)
         asked = [loads[k] for k in numbers]
         truth = None if every is None else solve_reference_frames(theatre, player.scene, asked, solved, recording.fem)
-        outcomes = write_motion(file, player, rows, numbers, truth, recording)
-        describe(file, theatre, player, deformer, recording)
+        outcomes = write_motions(file, player, rows, numbers, truth, recording)
+        write_attributes(file, theatre, player, deformer, recording)
         write_checksums(file)
     return {"out": str(path), "scene": player.scene.name, "deformer": deformer, "frames": total, "fem": outcomes}
 
@@ -190,14 +190,14 @@ def encode_frame(
     tumour = player.stage.select_stage(frame.loads).build_tumour(player.estimate_positions(frame))
     mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles, player.stage.device)
     depth = np.minimum(np.rint(picture.depth / DEPTH_SCALE), np.iinfo(np.uint16).max).astype(np.uint16)
-    found = {"colour": _encode_jpeg(recording.grain(2 * frame.number, picture.colour))}
+    found = {"colour": _encode_jpeg(recording.add_noise(2 * frame.number, picture.colour))}
     if recording.overlay:
         found["overlay"] = _encode_jpeg(frame.shown)
     if right is not None:
         seen = right.select_stage(frame.loads).render(
             _build_right_camera(player, frame), player.compute_positions(frame.deformation), frame.pose
         )
-        found["colour_right"] = _encode_jpeg(recording.grain(2 * frame.number + 1, seen.colour))
+        found["colour_right"] = _encode_jpeg(recording.add_noise(2 * frame.number + 1, seen.colour))
     return found | {
         "depth": encode_png(depth),
         "segmentation": encode_png(picture.segmentation),
@@ -215,8 +215,8 @@ def _build_right_camera(player: Player, frame: Frame) -> Camera:
     return replace(player.scene.viewpoint, eye="right").build_camera(player.site, frame.time)
 
 
-def collect_numbers_of_frame(frame: Frame, player: Player, dated: bool = True) -> dict[str, np.ndarray | float | str]:
-    """Return all values except images, by name; with computing times if `dated`."""
+def collect_frame_values(frame: Frame, player: Player, with_times: bool = True) -> dict[str, np.ndarray | float | str]:
+    """Return all values except images, by name; with computing times if `with_times`."""
     nodes, cortex = player.site.anatomy.tumour_nodes, find_cortex_vertices(player)
     right = player.scene.viewpoint.eye == "left"
     return {
@@ -232,10 +232,10 @@ def collect_numbers_of_frame(frame: Frame, player: Player, dated: bool = True) -
         "tumour_left": ~player.stage.select_stage(frame.loads).anatomy.orphaned[nodes],
         "outcome_predicted": frame.deformation.outcome[0].name,
         "bound": frame.deformation.bound[:, 0],
-        "model_error": to_number(frame.model_error),
-        "tumour_error": to_number(frame.tumour_error.bound),
-        "tumour_error_unobserved": to_number(frame.tumour_error.prior),
-        **({"seconds": np.array([frame.seconds[stage] for stage in STAGES])} if dated else {}),
+        "model_error": to_nan(frame.model_error),
+        "tumour_error": to_nan(frame.tumour_error.bound),
+        "tumour_error_unobserved": to_nan(frame.tumour_error.prior),
+        **({"seconds": np.array([frame.seconds[stage] for stage in STAGES])} if with_times else {}),
     }
 
 
@@ -249,8 +249,8 @@ def collect_tool(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, n
     return {
         "T_world_tool": pose,
         "tip": tip,
-        "distance": to_number(frame.distance),
-        "distance_error": to_number(frame.distance_error),
+        "distance": to_nan(frame.distance),
+        "distance_error": to_nan(frame.distance_error),
     }
 
 
@@ -261,7 +261,7 @@ def collect_reactions(result: Deformation) -> dict[str, np.ndarray]:
     return {"reaction_predicted": result.reaction[0], "reaction_bound": result.reaction_bound[:, 0]}
 
 
-def to_number(value: float | None) -> float:
+def to_nan(value: float | None) -> float:
     """Convert None to NaN."""
     return np.nan if value is None else value
 
@@ -284,33 +284,33 @@ def collect_causes(loads: Loads) -> dict[str, np.ndarray]:
     return found
 
 
-def write_motion(
+def write_motions(
     file: h5py.File,
     player: Player,
     rows: list[dict],
-    numbers: np.ndarray,
-    truth: Deformation | None,
-    how: EpisodeRecording,
+    frame_numbers: np.ndarray,
+    fem: Deformation | None,
+    recording: EpisodeRecording,
 ) -> dict[str, int]:
     """Write all values except images, one row per frame, and the FEM solutions; return their outcomes.
 
-    `truth` has one row for each frame in `numbers` (F,); None: FEM computed the rows themselves.
+    `fem` has one row for each frame in `frame_numbers` (F,); None: FEM computed the rows themselves.
     """
     nodes, cortex = player.site.anatomy.tumour_nodes, find_cortex_vertices(player)
     rest = player.site.anatomy.mesh.nodes
     columns: dict[str, Sequence | np.ndarray] = {
         name: [row[name] for row in rows] for name in rows[0] if all(name in row for row in rows)
     }
-    if truth is None:
+    if fem is None:
         outcomes = list(columns["outcome_predicted"])
         columns |= {f"{of}_fem": columns[f"{of}_predicted"] for of in ("tumour", "cortex")}
     else:
-        outcomes = [outcome.name for outcome in truth.outcome]
+        outcomes = [outcome.name for outcome in fem.outcome]
         for of, which in (("tumour", nodes), ("cortex", cortex)):
-            columns[f"{of}_fem"] = rest[which] + truth.restrict(which).displacement
-        if truth.reaction.shape[1]:
-            columns["reaction_fem"] = truth.reaction
-    columns |= {"outcome_fem": outcomes, "fem_frames": numbers, **how.sensed(columns)}
+            columns[f"{of}_fem"] = rest[which] + fem.restrict(which).displacement
+        if fem.reaction.shape[1]:
+            columns["reaction_fem"] = fem.reaction
+    columns |= {"outcome_fem": outcomes, "fem_frames": frame_numbers, **recording.read_sensors(columns)}
     for name, values in columns.items():
         text = h5py.string_dtype() if isinstance(values[0], str) else None
         made = file.create_dataset(name, data=np.asarray(values, text), compression="gzip")
@@ -323,8 +323,8 @@ def write_motion(
     return {name.lower(): outcomes.count(name) for name in sorted(set(outcomes))}
 
 
-def describe(
-    file: h5py.File, theatre: PatientSetup, player: Player, deformer: str, recording: EpisodeRecording
+def write_attributes(
+    file: h5py.File, patient: PatientSetup, player: Player, deformer: str, recording: EpisodeRecording
 ) -> None:
     """Write units, coordinate systems and provenance as attributes."""
     scene, camera, model = player.scene, player.camera, find_model(player.deformer)
@@ -344,15 +344,15 @@ def describe(
             "scene": scene.name,
             "deformer": deformer,
             "effects": repr(scene.get_effects_on(player.site.anatomy)),
-            "finite_elements": theatre.describe_deformer("fem", scene),
-            "answered_by": theatre.describe_deformer(deformer, scene),
-            "element": theatre.choose_element(scene),
+            "finite_elements": patient.describe_deformer("fem", scene),
+            "answered_by": patient.describe_deformer(deformer, scene),
+            "element": patient.choose_element(scene),
             "tissue": "none",
             **describe_tissue_source(scene.elasticity),
             "tool": repr(scene.tool),
             "footprint_m": np.nan if scene.tool is None else scene.tool.radius,
             "model_digest": "none" if model is None else compute_model_digest(model),
-            **({"date": datetime.now(UTC).isoformat(timespec="seconds")} if recording.dated else {}),
+            **({"date": datetime.now(UTC).isoformat(timespec="seconds")} if recording.with_times else {}),
             "anatomy": player.site.anatomy.digest,
             "world_frame": "RAS [m]",
             "camera_frame": "OpenCV: x right, y down, z forward; pixel centres at whole numbers",
@@ -362,7 +362,7 @@ def describe(
             "segmentation": ", ".join(f"{label} {name}" for label, name in NAMES.items()) + ", 0 nothing",
             "sulcus_version": get_version("sulcus"),
             "solved_every": recording.solved_every or 1,
-            **recording.stated,
+            **recording.attributes,
         }
     )
 

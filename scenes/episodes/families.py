@@ -10,11 +10,11 @@ import numpy as np
 from sim.effects import Effect, Gravity, Retraction, ToolContact, ToolForce
 
 from ..builtin.retract import RELAXING_BRAIN
-from ..script.camera_paths import sample_wandering
+from ..script.camera_paths import sample_hand_motion
 from ..script.debulking import Debulking
 from ..script.head_pose import Lie, build_drained_turn, get_supine_pose
 from ..script.tool import Blade, Instrument, Probe
-from ..script.tool_paths import Path, Touch, draw, keep_idle, lay, palpate, press, slide, smooth
+from ..script.tool_paths import Path, Touch, draw, keep_idle, lay, palpate, press, slide, smooth_step
 from .draws import Number, ValueLimits
 
 PRONY = RELAXING_BRAIN.prony
@@ -104,7 +104,7 @@ class FamilyMotions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     slide: SlideMotion | None = None
     draw: DrawMotion | None = None
     reach: Reach | None = None
-    walk: Walk | None = None
+    sample_walk_scenario: Walk | None = None
     palpate: Palpate | None = None
     retract: Retract | None = None
     drain: Drain | None = None
@@ -127,9 +127,9 @@ class Scenario:
         See `Scene`.
     effects
         Effects beyond tissue, constraints and skull.
-    relaxes
+    is_viscoelastic
         True if the tissue is viscoelastic.
-    lets_go
+    skull_separates
         True if the brain may separate from the skull, regardless of the body's skull model.
     """
 
@@ -138,8 +138,8 @@ class Scenario:
     effects: tuple[Effect, ...] = (ToolForce(),)
     lying: Lie = get_supine_pose
     surgery: Debulking | None = None
-    relaxes: bool = False
-    lets_go: bool = False
+    is_viscoelastic: bool = False
+    skull_separates: bool = False
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class ScenarioInputs:
     seconds: float
     reach: Callable[[float], float]
 
-    def place(self, radius: float) -> tuple[float, float]:
+    def sample_position(self, radius: float) -> tuple[float, float]:
         """Sample a position [m] of a tool of this radius [m] in the tangent plane of the open cortex."""
         far = self.values["spread"] * self.reach(radius)
         angle = self.random.uniform(0.0, 2.0 * np.pi)
@@ -166,13 +166,13 @@ class ScenarioInputs:
         return Probe(radius=1e-3 * self.values["radius_mm"])
 
 
-def sample_press_scenario(chance: ScenarioInputs) -> Scenario:
+def sample_press_scenario(inputs: ScenarioInputs) -> Scenario:
     """Scenario of `Press`."""
-    probe = chance.probe
-    at = chance.place(probe.radius)
-    tilt, angle = np.radians(chance.values["tilt_deg"]), chance.random.uniform(0.0, 2.0 * np.pi)
+    probe = inputs.probe
+    at = inputs.sample_position(probe.radius)
+    tilt, angle = np.radians(inputs.values["tilt_deg"]), inputs.random.uniform(0.0, 2.0 * np.pi)
     aslant = float(tilt * np.cos(angle)), float(tilt * np.sin(angle))
-    way = press(chance.values["force_n"], 0.35 * chance.seconds, 0.2 * chance.seconds, at)
+    way = press(inputs.values["force_n"], 0.35 * inputs.seconds, 0.2 * inputs.seconds, at)
 
     def path(time: float) -> Touch:
         return replace(way(time), tilt=aslant)
@@ -180,20 +180,20 @@ def sample_press_scenario(chance: ScenarioInputs) -> Scenario:
     return Scenario(path, probe)
 
 
-def sample_slide_scenario(chance: ScenarioInputs) -> Scenario:
+def sample_slide_scenario(inputs: ScenarioInputs) -> Scenario:
     """Scenario of `SlideMotion`."""
-    probe = chance.probe
-    start, end = chance.place(probe.radius), chance.place(probe.radius)
-    rise = 0.12 * chance.seconds
-    return Scenario(slide(chance.values["force_n"], start, end, chance.seconds - 2.0 * rise, rise), probe)
+    probe = inputs.probe
+    start, end = inputs.sample_position(probe.radius), inputs.sample_position(probe.radius)
+    rise = 0.12 * inputs.seconds
+    return Scenario(slide(inputs.values["force_n"], start, end, inputs.seconds - 2.0 * rise, rise), probe)
 
 
-def sample_draw_scenario(chance: ScenarioInputs) -> Scenario:
+def sample_draw_scenario(inputs: ScenarioInputs) -> Scenario:
     """Scenario of `DrawMotion`."""
-    probe, rise = chance.probe, 0.25 * chance.seconds
-    tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(probe.radius)
-    way = draw(chance.values["force_n"], tilt, rise, 0.2 * chance.seconds, at)
-    angle = float(chance.random.uniform(0.0, 2.0 * np.pi))
+    probe, rise = inputs.probe, 0.25 * inputs.seconds
+    tilt, at = float(np.radians(inputs.values["tilt_deg"])), inputs.sample_position(probe.radius)
+    way = draw(inputs.values["force_n"], tilt, rise, 0.2 * inputs.seconds, at)
+    angle = float(inputs.random.uniform(0.0, 2.0 * np.pi))
 
     def path(time: float) -> Touch:
         touch = way(time)
@@ -202,83 +202,85 @@ def sample_draw_scenario(chance: ScenarioInputs) -> Scenario:
     return Scenario(path, probe)
 
 
-def sample_reach_scenario(chance: ScenarioInputs) -> Scenario:
+def sample_reach_scenario(inputs: ScenarioInputs) -> Scenario:
     """Scenario of `Reach`."""
-    probe, count = chance.probe, round(chance.values["places"])
-    places = np.array([chance.place(probe.radius) for _ in range(count)])
-    forces = chance.values["force_n"] * chance.random.uniform(0.5, 1.0, count)
-    takes = chance.seconds / count
+    probe, count = inputs.probe, round(inputs.values["places"])
+    places = np.array([inputs.sample_position(probe.radius) for _ in range(count)])
+    forces = inputs.values["force_n"] * inputs.random.uniform(0.5, 1.0, count)
+    takes = inputs.seconds / count
 
     def path(time: float) -> Touch:
         number = min(int(time / takes), count - 1)
         share = time / takes - number
         # In the last part the tool moves to the next place, lifted; before, it presses and releases.
-        on = smooth((share - (1.0 - REST_SHARE)) / REST_SHARE)
+        on = smooth_step((share - (1.0 - REST_SHARE)) / REST_SHARE)
         x, y = (1.0 - on) * places[number] + on * places[min(number + 1, count - 1)]
         half = 0.5 * (1.0 - REST_SHARE)
-        return Touch(float(x), float(y), float(forces[number] * (smooth(share / half) - smooth(share / half - 1.0))))
+        pressed = smooth_step(share / half) - smooth_step(share / half - 1.0)
+        return Touch(float(x), float(y), float(forces[number] * pressed))
 
     return Scenario(path, probe)
 
 
-def walk(chance: ScenarioInputs) -> Scenario:
+def sample_walk_scenario(inputs: ScenarioInputs) -> Scenario:
     """Scenario of `Walk`."""
-    probe, seed = chance.probe, int(chance.random.integers(2**31))
-    far, force = 0.5 * chance.values["spread"] * chance.reach(probe.radius), chance.values["force_n"]
+    probe, seed = inputs.probe, int(inputs.random.integers(2**31))
+    far, force = 0.5 * inputs.values["spread"] * inputs.reach(probe.radius), inputs.values["force_n"]
 
     def path(time: float) -> Touch:
-        way = sample_wandering(seed, time)
-        begun = smooth(time / (0.15 * chance.seconds))
+        way = sample_hand_motion(seed, time)
+        begun = smooth_step(time / (0.15 * inputs.seconds))
         return Touch(float(far * way[0]), float(far * way[1]), force * begun * float(np.clip(0.6 + 0.2 * way[2], 0, 1)))
 
     return Scenario(path, probe)
 
 
-def sample_palpate_scenario(chance: ScenarioInputs) -> Scenario:
+def sample_palpate_scenario(inputs: ScenarioInputs) -> Scenario:
     """Scenario of `Palpate`."""
-    probe, rise = chance.probe, 0.2 * chance.seconds
-    start, end = chance.place(probe.radius), chance.place(probe.radius)
-    way = palpate(1e-3 * chance.values["depth_mm"], start, end, chance.seconds - 2.0 * rise, rise)
+    probe, rise = inputs.probe, 0.2 * inputs.seconds
+    start, end = inputs.sample_position(probe.radius), inputs.sample_position(probe.radius)
+    way = palpate(1e-3 * inputs.values["depth_mm"], start, end, inputs.seconds - 2.0 * rise, rise)
     return Scenario(way, probe, (ToolContact((probe.shape,)),))
 
 
-def sample_retract_scenario(chance: ScenarioInputs) -> Scenario:
+def sample_retract_scenario(inputs: ScenarioInputs) -> Scenario:
     """Scenario of `Retract`."""
     blade = Blade()
-    tilt, at = float(np.radians(chance.values["tilt_deg"])), chance.place(blade.radius)
-    way = lay(1e-3 * chance.values["depth_mm"], tilt, 0.4 * chance.seconds, at)
-    return Scenario(way, blade, (Retraction(blade.shape),), relaxes=True)
+    tilt, at = float(np.radians(inputs.values["tilt_deg"])), inputs.sample_position(blade.radius)
+    way = lay(1e-3 * inputs.values["depth_mm"], tilt, 0.4 * inputs.seconds, at)
+    return Scenario(way, blade, (Retraction(blade.shape),), is_viscoelastic=True)
 
 
-def sample_drain_scenario(chance: ScenarioInputs) -> Scenario:
+def sample_drain_scenario(inputs: ScenarioInputs) -> Scenario:
     """Scenario of `Drain`."""
-    turn, fluid = float(np.radians(chance.values["turn_deg"])), chance.values["fluid"]
-    lie = build_drained_turn(0.5 * chance.seconds, 0.1 * chance.seconds, 0.3 * chance.seconds, turn, fluid)
-    return Scenario(effects=(Gravity(),), lying=lie, lets_go=True)
+    turn, fluid = float(np.radians(inputs.values["turn_deg"])), inputs.values["fluid"]
+    lie = build_drained_turn(0.5 * inputs.seconds, 0.1 * inputs.seconds, 0.3 * inputs.seconds, turn, fluid)
+    return Scenario(effects=(Gravity(),), lying=lie, skull_separates=True)
 
 
-def sample_debulk_scenario(chance: ScenarioInputs) -> Scenario:
+def sample_debulk_scenario(inputs: ScenarioInputs) -> Scenario:
     """Scenario of `Debulk`."""
-    count, fluid = round(chance.values["steps"]), chance.values["fluid"]
-    lie = build_drained_turn(0.3 * chance.seconds, 0.0, 1.0, 0.0, fluid)
-    times = tuple((chance.seconds * np.linspace(0.4, 0.9, count)).tolist())
-    return Scenario(effects=(Gravity(),), lying=lie, surgery=Debulking(times), lets_go=True)
+    count, fluid = round(inputs.values["steps"]), inputs.values["fluid"]
+    lie = build_drained_turn(0.3 * inputs.seconds, 0.0, 1.0, 0.0, fluid)
+    times = tuple((inputs.seconds * np.linspace(0.4, 0.9, count)).tolist())
+    return Scenario(effects=(Gravity(),), lying=lie, surgery=Debulking(times), skull_separates=True)
 
 
 FAMILIES: dict[str, Callable[[ScenarioInputs], Scenario]] = {
     "press": sample_press_scenario, "slide": sample_slide_scenario, "draw": sample_draw_scenario,
-    "reach": sample_reach_scenario, "walk": walk, "palpate": sample_palpate_scenario,
+    "reach": sample_reach_scenario, "walk": sample_walk_scenario, "palpate": sample_palpate_scenario,
     "retract": sample_retract_scenario, "drain": sample_drain_scenario, "debulk": sample_debulk_scenario,
 }  # fmt: skip
 """Scenario of each family of `FamilyMotions`."""
 
 
-def add_tremor(path: Path, seed: int, place: float, force: float) -> Path:
+def add_tremor(path: Path, seed: int, position_sigma: float, force_sigma: float) -> Path:
     """Return a path with a hand's tremor and drift: standard deviations of place [m] and force [N]; none in the air."""
 
     def trembles(time: float) -> Touch:
-        touch, way = path(time), sample_wandering(seed, time)
-        pushed = max(0.0, touch.force + force * float(way[2])) if touch.force > 0.0 else touch.force
-        return replace(touch, x=touch.x + place * float(way[0]), y=touch.y + place * float(way[1]), force=pushed)
+        touch, way = path(time), sample_hand_motion(seed, time)
+        pushed = max(0.0, touch.force + force_sigma * float(way[2])) if touch.force > 0.0 else touch.force
+        right, up = (position_sigma * way[:2]).tolist()
+        return replace(touch, x=touch.x + right, y=touch.y + up, force=pushed)
 
     return trembles

@@ -19,14 +19,14 @@ NOTE, TABLE = ".json", ".series.npz"
 """Endings of companion files: description of the loads; table of the series, if the learner has one."""
 
 
-def check_resumed(data: Path, stated: Mapping[str, str], others: Sequence[Path]) -> bool:
+def resume_data_set(path: Path, inputs: Mapping[str, str], other_folders: Sequence[Path]) -> bool:
     """Resume a data set and its table from the most complete copy; return True if there is one.
 
-    Copies are searched in its own folder and in `others`.
+    Copies are searched in its own folder and in `other_folders`.
 
     Parameters
     ----------
-    stated
+    inputs
         All inputs that determine its bytes; files with other inputs are ignored.
 
     Raises
@@ -34,19 +34,19 @@ def check_resumed(data: Path, stated: Mapping[str, str], others: Sequence[Path])
     InputError
         A file that cannot be written.
     """
-    said = json.dumps(dict(stated), sort_keys=True)
-    if not _is_of(data, said):
-        forget(data)
-        with write_atomically(data.with_suffix(NOTE), NOTE, clean=False) as partial:
+    said = json.dumps(dict(inputs), sort_keys=True)
+    if not _is_of(path, said):
+        remove_data_set(path)
+        with write_atomically(path.with_suffix(NOTE), NOTE, clean=False) as partial:
             partial.write_text(said, encoding="utf-8")
-    alike = [data, *(each for other in others if _is_of(each := other / data.name, said))]
+    alike = [path, *(each for other in other_folders if _is_of(each := other / path.name, said))]
     *_, (whole, size, best) = sorted(max(_find_kept_files(each), default=(False, 0, each)) for each in alike)
     if size:
-        _copy(best, data if whole else to_unfinished_path(data))
+        _copy(best, path if whole else to_unfinished_path(path))
     for table in (each.with_suffix(TABLE) for each in alike):
-        if table.exists() and not data.with_suffix(TABLE).exists():
-            _copy(table, data.with_suffix(TABLE))
-    return is_begun(data.parent)
+        if table.exists() and not path.with_suffix(TABLE).exists():
+            _copy(table, path.with_suffix(TABLE))
+    return has_solved_loads(path.parent)
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -61,7 +61,7 @@ def _copy(source: Path, target: Path) -> None:
         shutil.copyfileobj(file, copy)
 
 
-def is_begun(folder: Path) -> bool:
+def has_solved_loads(folder: Path) -> bool:
     """Return True if a folder contains solved loads of a body."""
     return any(path.exists() for path in _list_files(folder / DATA)[1:])
 
@@ -73,7 +73,7 @@ def clear_folder(folder: Path) -> None:
         path.unlink()
 
 
-def forget(data: Path) -> None:
+def remove_data_set(data: Path) -> None:
     """Remove a data set, complete or unfinished, and its table."""
     for path in _list_files(data):
         path.unlink(missing_ok=True)

@@ -24,7 +24,7 @@ from ..script.scene import Scene
 from .bodies import BODY_FILE, EpisodeBody, read_body, write_body
 from .draws import build_generator
 from .episode import EpisodeRecording, collect
-from .incomplete_bodies import clear_folder, is_begun
+from .incomplete_bodies import clear_folder, has_solved_loads
 from .plan import NO_LEARNER, EpisodePlan
 from .run_folder import BODIES, to_episode_name
 from .scripted import build_scene, sample_body_number, sample_episode
@@ -34,29 +34,29 @@ from .tasks import MadeEpisode
 QUANTILES = ndtri((np.arange(256) + 0.5) / 256)
 
 
-def add_noise(colour: np.ndarray, deviation: float, random: np.random.Generator) -> np.ndarray:
+def add_noise(image: np.ndarray, sigma: float, random: np.random.Generator) -> np.ndarray:
     """Return an image (H, W, 3) uint8 with Gaussian noise [grey levels], independent of pixel and colour.
 
     The noise has 256 values, equally probable: quantiles of the normal distribution. They are fast to sample, and fit
     into a byte up to a standard deviation of 40.
     """
-    if deviation == 0.0:
-        return colour
-    steps = np.rint(deviation * QUANTILES).astype(np.int8).tobytes()
-    added = np.frombuffer(random.bytes(colour.size).translate(steps), np.int8).reshape(colour.shape)
-    total = np.add(colour, added, dtype=np.int16)
+    if sigma == 0.0:
+        return image
+    steps = np.rint(sigma * QUANTILES).astype(np.int8).tobytes()
+    added = np.frombuffer(random.bytes(image.size).translate(steps), np.int8).reshape(image.shape)
+    total = np.add(image, added, dtype=np.int16)
     return np.clip(total, 0, 255, out=total).astype(np.uint8)
 
 
-def add_jitter(poses: np.ndarray, metres: float, radians: float, random: np.random.Generator) -> np.ndarray:
+def add_jitter(poses: np.ndarray, position_sigma: float, angle_sigma: float, random: np.random.Generator) -> np.ndarray:
     """Add tracking errors to poses (n, 4, 4): Gaussian, along and about the axes of each pose's own frame."""
     off = np.tile(np.eye(4), (len(poses), 1, 1))
-    off[:, :3, 3] = metres * random.standard_normal((len(poses), 3))
-    off[:, :3, :3] = Rotation.from_rotvec(radians * random.standard_normal((len(poses), 3))).as_matrix()
+    off[:, :3, 3] = position_sigma * random.standard_normal((len(poses), 3))
+    off[:, :3, :3] = Rotation.from_rotvec(angle_sigma * random.standard_normal((len(poses), 3))).as_matrix()
     return poses @ off
 
 
-def sense_columns(
+def add_sensor_noise(
     columns: Mapping[str, Any], noise: Mapping[str, float], seed: int, number: int
 ) -> dict[str, np.ndarray]:
     """Return the measured columns of an episode: `force_read`, and both tracked poses."""
@@ -107,7 +107,7 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
         return MadeEpisode(path, failed=f"{path}: is no whole body. Remove it, and give the same command with --again.")
     resumed = False
     try:
-        with write_folder_atomically(path, is_kept=is_begun) as partial:
+        with write_folder_atomically(path, is_kept=has_solved_loads) as partial:
             clear_folder(partial)
             resumed = write_body(partial, plan, seed, number, device, list_partials(path))
     except InputError as error:
@@ -141,28 +141,28 @@ def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device
 
 
 @dataclass(frozen=True, eq=False)
-class OpenedEpisode:
+class OpenedBody:
     """Body whose files were read, and its FEM solvers by the effects that they solve."""
 
     body: EpisodeBody
-    theatre: PatientSetup
-    made: dict[str, Fem | ResectedFem] = field(default_factory=dict)
+    patient: PatientSetup
+    solvers: dict[str, Fem | ResectedFem] = field(default_factory=dict)
 
     def get_fem(self, scene: Scene) -> Fem | ResectedFem:
         """Return the FEM solver of a scene; a few are cached, because building one takes as long as some frames."""
-        asked = repr(scene.get_effects_on(self.theatre.anatomy))
-        if asked not in self.made:
-            if len(self.made) >= MAX_CACHE_SIZE:
-                self.made.clear()
-            self.made[asked] = build_reference_fem(self.theatre, scene)
-        return self.made[asked]
+        asked = repr(scene.get_effects_on(self.patient.anatomy))
+        if asked not in self.solvers:
+            if len(self.solvers) >= MAX_CACHE_SIZE:
+                self.solvers.clear()
+            self.solvers[asked] = build_reference_fem(self.patient, scene)
+        return self.solvers[asked]
 
 
 @lru_cache(maxsize=MAX_CACHE_SIZE)
-def open_body(place: Path, device: str) -> OpenedEpisode:
+def open_body(folder: Path, device: str) -> OpenedBody:
     """Return an existing body, read once for many episodes; InputError as `read_body`."""
-    body = read_body(place)
-    return OpenedEpisode(body, body.open_theatre(device))
+    body = read_body(folder)
+    return OpenedBody(body, body.open_patient(device))
 
 
 def _collect_episode(
@@ -171,10 +171,10 @@ def _collect_episode(
     """Play an episode and write its file."""
     contents = plan.contents
     opened, asked = open_body(place, device), sample_episode(contents, seed, number)
-    body, theatre = opened.body, opened.theatre
-    scene = build_scene(plan, body, theatre.site, asked, seed, number)
-    name = "fem" if contents.bodies.learner.name == NO_LEARNER else theatre.select_best(scene)
-    player = replace(theatre.build_player(name, scene), composed=contents.overlay)
+    body, patient = opened.body, opened.patient
+    scene = build_scene(plan, body, patient.site, asked, seed, number)
+    name = "fem" if contents.bodies.learner.name == NO_LEARNER else patient.select_best(scene)
+    player = replace(patient.build_player(name, scene), composed=contents.overlay)
     noise = asked.group("noise")
 
     def grain(picture: int, colour: np.ndarray) -> np.ndarray:
@@ -182,12 +182,12 @@ def _collect_episode(
 
     recording = EpisodeRecording(
         None if name == "fem" else contents.solved_every, contents.overlay, False, grain,
-        lambda columns: sense_columns(columns, noise, seed, number),
+        lambda columns: add_sensor_noise(columns, noise, seed, number),
         {
             "plan": plan.text, "plan_name": plan.name, "plan_digest": plan.digest, "seed": seed, "episode": number,
             "family": asked.family, "body": asked.body,
-            "parameters": json.dumps({**asked.values, **body.drawn}, sort_keys=True),
+            "parameters": json.dumps({**asked.values, **body.parameters}, sort_keys=True),
         },
         None if name == "fem" else opened.get_fem(scene),
     )  # fmt: skip
-    return collect(path, theatre, player, name, lambda frames: frames, recording=recording)
+    return collect(path, patient, player, name, lambda frames: frames, recording=recording)

@@ -20,7 +20,7 @@ from sim.runtime.outside_files import wrap_errors
 from surrogate.training.train import LEARNERS, check_learners
 
 from ..script.camera_paths import PATHS
-from .draws import Distribution, Number, ValueLimits, Word, check_spread
+from .draws import Distribution, Number, ValueLimits, Word, check_distribution
 from .families import FamilyMotions
 
 TYPE_NAMES = {
@@ -197,7 +197,7 @@ class EpisodePlan:
         return sha256("".join((self.text, *self.own.values())).encode()).hexdigest()[:16]
 
 
-def list_shipped() -> list[str]:
+def list_shipped_plans() -> list[str]:
     """List the names of the shipped plans."""
     return sorted(path.stem for path in SHIPPED_PLANS.glob("*.toml"))
 
@@ -214,13 +214,13 @@ def load_plan(name: str) -> EpisodePlan:
     path = Path(name) if name.endswith(".toml") else SHIPPED_PLANS / f"{name}.toml"
     if not os.path.isfile(path):  # accepts any name
         raise InputError(
-            f"there is no plan {name!r}: choose {', '.join(list_shipped())}, or give the path of a .toml file."
+            f"there is no plan {name!r}: choose {', '.join(list_shipped_plans())}, or give the path of a .toml file."
         )
     with wrap_errors(path, "a plan", "A plan is text in UTF-8."):
         if path.stat().st_size > MAX_PLAN_BYTES:
             raise InputError(f"is longer than a plan may be, {MAX_PLAN_BYTES:,} bytes. Leave out what is no plan.")
         text = path.read_text(encoding="utf-8-sig")
-    plan = plan_from(text, path.stem, path.parent)
+    plan = parse_plan(text, path.stem, path.parent)
     return replace(plan, own={each: compute_anatomy_digest(plan, each) for each in _list_own_anatomies(plan.contents)})
 
 
@@ -239,7 +239,7 @@ def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
     return found.hexdigest()[:16]
 
 
-def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
+def parse_plan(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
     """Parse the plan in a TOML text.
 
     Raises
@@ -260,7 +260,7 @@ def plan_from(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
     return plan
 
 
-def list_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | None, tuple[str, ...]]]:
+def list_sampled_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | None, tuple[str, ...]]]:
     """List every field that may be sampled: name, value, limits of a number, and allowed words."""
     found = []
     for name, (kind, about) in _list_field_types(type(table)).items():
@@ -270,7 +270,7 @@ def list_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | 
     return found
 
 
-def list_fixed(table: msgspec.Struct) -> list[tuple[str, float, ValueLimits]]:
+def list_fixed_numbers(table: msgspec.Struct) -> list[tuple[str, float, ValueLimits]]:
     """List every fixed number: name, value and limits; one entry for each number of a pair."""
     found = []
     for name, (kind, about) in _list_field_types(type(table)).items():
@@ -296,9 +296,9 @@ def list_tables(contents: PlanContents) -> dict[str, msgspec.Struct]:
 
 def _check(contents: PlanContents) -> None:
     for table, values in list_tables(contents).items():
-        for name, value, limits, words in list_fields(values):
-            check_spread(value, f"{table}.{name}".lstrip("."), limits, words)
-        for name, value, limits in list_fixed(values):
+        for name, value, limits, words in list_sampled_fields(values):
+            check_distribution(value, f"{table}.{name}".lstrip("."), limits, words)
+        for name, value, limits in list_fixed_numbers(values):
             if not limits.low <= value <= limits.high:
                 raise InputError(f"{f'{table}.{name}'.lstrip('.')}: {value} is outside {limits}.")
     if contents.bodies.learner.name != NO_LEARNER:

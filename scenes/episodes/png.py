@@ -15,15 +15,15 @@ GREY, SUB = 0, 1
 LEVEL = 1  # Compression level.
 
 
-def encode_png(picture: np.ndarray) -> np.ndarray:
+def encode_png(image: np.ndarray) -> np.ndarray:
     """Encode a grey image (H, W) uint8 or uint16 as the bytes (n,) uint8 of a PNG file.
 
     ISO/IEC 15948: one IDAT chunk, and the filter Sub in all rows. The same image gives the same bytes.
     """
-    height, width = picture.shape
-    bits = 8 * picture.itemsize
+    height, width = image.shape
+    bits = 8 * image.itemsize
     header = struct.pack(">IIBBBBB", width, height, bits, GREY, 0, 0, 0)
-    packed = isal_zlib.compress(_filter_rows(picture), LEVEL)
+    packed = isal_zlib.compress(_filter_rows(image), LEVEL)
     code = SIGNATURE + _encode_chunk(b"IHDR", header) + _encode_chunk(b"IDAT", packed) + _encode_chunk(b"IEND", b"")
     return np.frombuffer(code, np.uint8)
 

@@ -67,14 +67,14 @@ def to_episode_name(number: int) -> str:
     return f"episode_{number:06d}.h5"
 
 
-def begin(folder: Path, run: RunSettings, text: str, force: bool = False) -> bool:
+def begin_run(folder: Path, run: RunSettings, plan_text: str, force: bool = False) -> bool:
     """Initialise the folder of a run, or open it; return True if it is new.
 
     Unfinished files of dead processes are removed; those of an unfinished body stay, to be resumed.
 
     Parameters
     ----------
-    text
+    plan_text
         Text of the plan, as stored next to the episodes.
     force
         True to accept a folder with other files, or of other versions.
@@ -96,7 +96,7 @@ def begin(folder: Path, run: RunSettings, text: str, force: bool = False) -> boo
         _write_json(folder / RUN, {"format": FORMAT, **asdict(run)})
     if not (folder / PLAN).exists():
         with write_atomically(folder / PLAN, ".toml") as partial:
-            partial.write_text(text)
+            partial.write_text(plan_text)
     try:  # the first of simultaneous clients wins
         (folder / RATES).mkdir()
     except FileExistsError:
@@ -155,7 +155,7 @@ def mark_failed(folder: Path, failure: Failure) -> None:
     _write_json(_to_failed_path(folder, failure.number), asdict(failure))
 
 
-def unmark(folder: Path, number: int) -> None:
+def remove_failure(folder: Path, number: int) -> None:
     """Remove the failure of an episode that was completed later."""
     _to_failed_path(folder, number).unlink(missing_ok=True)
 
@@ -203,14 +203,14 @@ def _check_same_run(folder: Path, found: RunSettings, run: RunSettings, force: b
             f"{folder}: holds episodes that were made on {found.device}, whose last digits differ. Give --device "
             f"{found.device}, or choose another folder."
         )
-    other = describe_versions(found.versions, run.versions)
+    other = describe_other_versions(found.versions, run.versions)
     if other and not force:
         raise InputError(
             f"{folder}: was begun with {other}: episodes may differ. Choose another folder, or give --force to go on."
         )
 
 
-def describe_versions(others: Mapping[str, str], ours: Mapping[str, str]) -> str:
+def describe_other_versions(others: Mapping[str, str], own: Mapping[str, str]) -> str:
     """Describe the packages of other versions; empty if there are none."""
-    names = [name for name in sorted({*others, *ours}) if others.get(name) != ours.get(name)]
-    return ", ".join(f"{name} {others.get(name, 'none')} and not {ours.get(name, 'none')}" for name in names)
+    names = [name for name in sorted({*others, *own}) if others.get(name) != own.get(name)]
+    return ", ".join(f"{name} {others.get(name, 'none')} and not {own.get(name, 'none')}" for name in names)

@@ -18,7 +18,7 @@ from ..script.viewpoint import Appearance, Cottonoid, Viewpoint
 from .bodies import EpisodeBody
 from .draws import build_generator, sample_value
 from .families import FAMILIES, PRONY, ScenarioInputs, add_tremor
-from .plan import FIXED, EpisodePlan, PlanContents, list_fields, list_tables
+from .plan import FIXED, EpisodePlan, PlanContents, list_sampled_fields, list_tables
 
 # Largest deviation of the cortex's red, green and blue from the default, in units of the tint.
 MAX_TINTS = np.array([0.3, 1.0, 1.0])
@@ -63,14 +63,14 @@ def sample_episode(contents: PlanContents, seed: int, number: int) -> EpisodeSam
     for table, struct in list_tables(contents).items():
         if table.startswith("bodies") or (table.startswith("motion") and table != f"motion.{family}"):
             continue
-        for name, value, *_ in list_fields(struct):
+        for name, value, *_ in list_sampled_fields(struct):
             full = f"{table}.{name}".lstrip(".")
             values[full] = sample_value(value, build_generator(seed, number, full))
     return EpisodeSample(sample_body_number(contents, seed, number), family, values)
 
 
 def build_scene(
-    plan: EpisodePlan, body: EpisodeBody, site: CraniotomyFrame, asked: EpisodeSample, seed: int, number: int
+    plan: EpisodePlan, body: EpisodeBody, site: CraniotomyFrame, sample: EpisodeSample, seed: int, number: int
 ) -> Scene:
     """Build the scene of an episode on a body.
 
@@ -79,24 +79,24 @@ def build_scene(
     InputError
         An impossible scene: a tumour of too few tetrahedra for its shares, a lens that folds the image.
     """
-    contents, seconds = plan.contents, asked.values["seconds"]
+    contents, seconds = plan.contents, sample.values["seconds"]
     chance = ScenarioInputs(
-        asked.group(f"motion.{asked.family}"), build_generator(seed, number, "motion"), seconds, site.compute_reach
+        sample.group(f"motion.{sample.family}"), build_generator(seed, number, "motion"), seconds, site.compute_reach
     )
-    act = FAMILIES[asked.family](chance)
-    hand = asked.group("hand")
+    act = FAMILIES[sample.family](chance)
+    hand = sample.group("hand")
     path = act.path
     if act.tool is not None and (hand["tremor_mm"] > 0.0 or hand["tremor_n"] > 0.0):
         first = int(build_generator(seed, number, "hand").integers(2**31))
         path = add_tremor(path, first, 1e-3 * hand["tremor_mm"], hand["tremor_n"])
-    effects = body.build_effects(*act.effects, lets_go=act.lets_go)
-    if act.relaxes:
+    effects = body.build_effects(*act.effects, can_separate=act.skull_separates)
+    if act.is_viscoelastic:
         effects = tuple(make_relaxing(each) if isinstance(each, Elasticity) else each for each in effects)
-    title = f"{FAMILIES[asked.family].__doc__ or ''} Episode {number} of the plan {plan.name}, seed {seed}."
+    title = f"{FAMILIES[sample.family].__doc__ or ''} Episode {number} of the plan {plan.name}, seed {seed}."
     return Scene(
-        asked.family, title, path, seconds, effects, act.tool, act.lying, act.surgery,
-        viewpoint=_build_viewpoint(contents, asked.group("look"), seed, number),
-        look=_build_appearance(asked.group("look"), site, seed, number), frames_per_second=contents.frames_per_second,
+        sample.family, title, path, seconds, effects, act.tool, act.lying, act.surgery,
+        viewpoint=_build_viewpoint(contents, sample.group("look"), seed, number),
+        look=_build_appearance(sample.group("look"), site, seed, number), frames_per_second=contents.frames_per_second,
     )  # fmt: skip
 
 

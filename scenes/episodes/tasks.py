@@ -12,7 +12,7 @@ from typing import ClassVar
 from sim.errors import InputError
 from sim.runtime.threads import limit_to_one_thread
 
-from .run_folder import RunSettings, describe_versions, get_versions, read_run
+from .run_folder import RunSettings, describe_other_versions, get_versions, read_run
 
 DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
 """Errors that would occur in every other episode, too."""
@@ -144,7 +144,7 @@ def try_task(
 def _explain_unfit_worker(folder: Path, run: RunSettings) -> str:
     """Return the reason why this worker cannot take part in the run; empty if it can."""
     here = platform.node()
-    other = describe_versions(get_versions(), run.versions)
+    other = describe_other_versions(get_versions(), run.versions)
     if other:
         return f"the worker on {here} has {other}. Install the same there."
     found = read_run(folder)

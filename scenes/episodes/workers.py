@@ -46,7 +46,7 @@ class _Started:
 
 @contextmanager
 def start_processes(
-    address: str, security: Security, devices: Sequence[str], starts: int
+    address: str, security: Security, devices: Sequence[str], max_starts: int
 ) -> Iterator[Callable[[], None]]:
     """Start workers of the scheduler at an address, one for each device, killed at the end; yield a restart function.
 
@@ -55,7 +55,7 @@ def start_processes(
     Raises
     ------
     InputError
-        In the restart function: a process ended `starts` times in a row without a connection.
+        In the restart function: a process ended `max_starts` times in a row without a connection.
     """
     crew = [_start(address, security, device, 1) for device in devices]
 
@@ -64,9 +64,9 @@ def start_processes(
             if one.process.is_alive():
                 continue
             times = 1 if _has_served(one) else one.times + 1
-            if times > starts:
+            if times > max_starts:
                 raise InputError(
-                    f"a process on {devices[place]} crashed {starts} times at start-up "
+                    f"a process on {devices[place]} crashed {max_starts} times at start-up "
                     f"(exit code {one.process.exitcode}). Use fewer --workers, or check the free memory."
                 )
             _close(one)
@@ -136,16 +136,16 @@ class Workers:
         Connection to the scheduler.
     device
         "cpu" or "cuda".
-    where
+    description
         Description of the machines.
-    tend
+    restart
         Function that restarts ended processes.
     """
 
     client: Client
     device: str
-    where: str
-    tend: Callable[[], None] = lambda: None
+    description: str
+    restart: Callable[[], None] = lambda: None
 
     @property
     def needs(self) -> dict[str, int] | None:
@@ -160,19 +160,19 @@ class Workers:
         InputError
             A scheduler that ended; processes that end as soon as they are started.
         """
-        self.tend()
+        self.restart()
         if self.client.status != "running":
-            raise describe_scheduler_end(self.where)
+            raise describe_scheduler_end(self.description)
         try:
             known = self.client.scheduler_info(n_workers=-1)["workers"].values()
         except (OSError, TimeoutError) as error:
-            raise describe_scheduler_end(self.where) from error
+            raise describe_scheduler_end(self.description) from error
         return sum(self.needs is None or GPU_RESOURCE in one["resources"] for one in known)
 
 
 @contextmanager
-def start_own_workers(
-    devices: Sequence[str], settings: Mapping[str, object] | None = None, starts: int = 10
+def start_local_workers(
+    devices: Sequence[str], settings: Mapping[str, object] | None = None, max_starts: int = 10
 ) -> Iterator[Workers]:
     """Yield processes of this machine, one for each name in `devices`, each with the GPU in its name.
 
@@ -186,7 +186,7 @@ def start_own_workers(
         Devices, such as "cpu" or "cuda:1"; all of one kind.
     settings
         Settings of Dask, in addition to `SETTINGS`.
-    starts
+    max_starts
         Maximum number of consecutive crashes of a process before its first task is done.
     """
     device = devices[0].split(":")[0]
@@ -199,20 +199,20 @@ def start_own_workers(
         with (
             closing(SpecCluster({}, scheduler, security=security, name=f"sulcus-{os.getpid()}")) as cluster,
             Client(cluster, set_as_default=False) as client,
-            start_processes(cluster.scheduler_address, security, devices, starts) as tend,
+            start_processes(cluster.scheduler_address, security, devices, max_starts) as tend,
         ):
             yield Workers(client, device, f"{len(devices)} process{'es' * (len(devices) > 1)} on {device}", tend)
 
 
 @contextmanager
-def connect_workers(address: str, device: str, patience: float = SCHEDULER_TIMEOUT) -> Iterator[Workers]:
+def connect_workers(address: str, device: str, timeout: float = SCHEDULER_TIMEOUT) -> Iterator[Workers]:
     """Yield the workers of a running scheduler; their number may change.
 
     Parameters
     ----------
     device
         "cpu", "cuda", or "auto": cuda if one of the workers has a GPU.
-    patience
+    timeout
         Time-out of the scheduler [s].
 
     Raises
@@ -222,7 +222,7 @@ def connect_workers(address: str, device: str, patience: float = SCHEDULER_TIMEO
     """
     silence_dask()
     try:
-        client = Client(address, set_as_default=False, timeout=patience)
+        client = Client(address, set_as_default=False, timeout=timeout)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
             f"--scheduler {address}: no Dask scheduler at this address. Start one by `dask scheduler`, and use the "
@@ -246,6 +246,6 @@ def _restore_environment() -> Iterator[None]:
         os.environ.update(before)
 
 
-def describe_scheduler_end(where: str) -> InputError:
+def describe_scheduler_end(workers: str) -> InputError:
     """Return the error of a lost scheduler."""
-    return InputError(f"{where}: their scheduler ended. Results are kept; run the same command again to resume.")
+    return InputError(f"{workers}: their scheduler ended. Results are kept; run the same command again to resume.")

@@ -15,7 +15,7 @@ from sim.arguments import check_integer
 from sim.errors import InputError
 
 from .episode import Episode, EpisodeStep
-from .observation import KINDS, build_action_space, build_space
+from .observation import KINDS, build_action_space, build_observation_space
 from .observation_camera import ObservationCamera
 from .registration import MAX_STEPS, NAMESPACE
 from .setting import TaskSetting, check_arguments, open_setting
@@ -28,9 +28,9 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": ro
 
 
 def open_environment_setting(
-    task: str, observation: str, render_mode: str | None, given: Mapping[str, Any], together: bool | None = None
+    task: str, observation: str, render_mode: str | None, settings: Mapping[str, Any], together: bool | None = None
 ) -> TaskSetting:
-    """Open the setting of environments; anatomy, physics, device, size and model are `given`, see `open_setting`.
+    """Open the setting of environments; anatomy, physics, device, size and model are `settings`, see `open_setting`.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def open_environment_setting(
         raise InputError(f"observation is {observation!r:.80}: choose one of {', '.join(KINDS)}.")
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise InputError(f"render_mode is {render_mode!r:.80}: choose {', '.join(RENDER_MODES)}, or None.")
-    return open_setting(find_task(task), *check_arguments(given), together)
+    return open_setting(find_task(task), *check_arguments(settings), together)
 
 
 class Operation(gymnasium.Env):
@@ -80,7 +80,7 @@ class Operation(gymnasium.Env):
         given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
         self.setting = open_environment_setting(task, observation, render_mode, given)
         self.observation, self.render_mode = observation, render_mode
-        self.observation_space = build_space(observation, size)
+        self.observation_space = build_observation_space(observation, size)
         self.action_space = build_action_space()
         self.episode, self.pictures = Episode(self.setting), ObservationCamera(self.setting)
 
@@ -95,8 +95,8 @@ class Operation(gymnasium.Env):
         super().reset(seed=seed)
         if options:
             raise InputError(f"options are {options!r:.80}: there are none; give them to gymnasium.make.")
-        (touched,) = self.setting.answers.compute_responses([self.episode.begin(self.np_random)])
-        step = self.episode.take(touched)
+        (touched,) = self.setting.tissue_model.compute_responses([self.episode.begin(self.np_random)])
+        step = self.episode.end_step(touched)
         return self._build_observation(step), step.info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -107,8 +107,8 @@ class Operation(gymnasium.Env):
         InputError
             See `Episode.ask`.
         """
-        (touched,) = self.setting.answers.compute_responses([self.episode.ask(action)])
-        step = self.episode.take(touched)
+        (touched,) = self.setting.tissue_model.compute_responses([self.episode.request_step(action)])
+        step = self.episode.end_step(touched)
         return self._build_observation(step), step.reward, step.terminated, False, step.info
 
     def render(self) -> np.ndarray | None:
@@ -119,12 +119,12 @@ class Operation(gymnasium.Env):
         InputError
             No episode has begun.
         """
-        return None if self.render_mode is None else self.pictures.render([self.episode.seen])[0][0]
+        return None if self.render_mode is None else self.pictures.render([self.episode.view])[0][0]
 
     def _build_observation(self, step: EpisodeStep) -> Any:
         if self.observation == "states":
             return step.states
-        colour, depth = self.pictures.render([self.episode.seen])
+        colour, depth = self.pictures.render([self.episode.view])
         return {"rgb": colour[0], "depth": depth[0], "states": step.states}
 
 
@@ -171,7 +171,7 @@ class Operations(VectorEnv):
         given = {"anatomy": anatomy, "physics": physics, "device": device, "size": size, "model": model}
         self.setting = open_environment_setting(task, observation, render_mode, given, together)
         self.observation, self.render_mode = observation, render_mode
-        self.single_observation_space = build_space(observation, size)
+        self.single_observation_space = build_observation_space(observation, size)
         self.single_action_space = build_action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -215,7 +215,7 @@ class Operations(VectorEnv):
         begins = [episode.over and episode.drawn is not None for episode in self.episodes]
         steps = self._take_steps(
             [
-                episode.begin(self.randoms[row]) if begins[row] else episode.ask(twists[row])
+                episode.begin(self.randoms[row]) if begins[row] else episode.request_step(twists[row])
                 for row, episode in enumerate(self.episodes)
             ]
         )
@@ -230,17 +230,17 @@ class Operations(VectorEnv):
         """Return the image (H, W, 3) uint8 of each camera; None without a render mode."""
         if self.render_mode is None:
             return None
-        return tuple(self.pictures.render([episode.seen for episode in self.episodes])[0])
+        return tuple(self.pictures.render([episode.view for episode in self.episodes])[0])
 
     def _take_steps(self, asked: list[TissueRequest]) -> list[EpisodeStep]:
-        answers = self.setting.answers.compute_responses(asked)
-        return [episode.take(touched) for episode, touched in zip(self.episodes, answers, strict=True)]
+        answers = self.setting.tissue_model.compute_responses(asked)
+        return [episode.end_step(touched) for episode, touched in zip(self.episodes, answers, strict=True)]
 
     def _build_observation(self, steps: Sequence[EpisodeStep]) -> Any:
         states = np.stack([step.states for step in steps])
         if self.observation == "states":
             return states
-        colour, depth = self.pictures.render([episode.seen for episode in self.episodes])
+        colour, depth = self.pictures.render([episode.view for episode in self.episodes])
         return {"rgb": colour, "depth": depth, "states": states}
 
     def _stack_infos(self, steps: Sequence[EpisodeStep]) -> dict[str, Any]:

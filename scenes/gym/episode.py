@@ -7,14 +7,14 @@ import numpy as np
 
 from sim.errors import InputError
 
-from ..script.camera_paths import sample_wandering
-from ..script.tool_paths import smooth
+from ..script.camera_paths import sample_hand_motion
+from ..script.tool_paths import smooth_step
 from .observation import FORCE_NOISE, MOTION_NOISE, POSITION_NOISE, compute_states
 from .observation_camera import Seen
 from .setting import TaskSetting
 from .tasks import MAX_LOAD_RATIO, STEP_SECONDS, Goal
-from .tissue_requests import TissueRequest, Touched
-from .tool_motion import RobotTool, build_tool_frame, compute_lever, lay_tool, move_tool, shift_pose
+from .tissue_requests import Response, TissueRequest
+from .tool_motion import RobotTool, build_tool_frame, compute_pivot_distance, move_tool, place_tool, shift_pose
 
 
 @dataclass(frozen=True)
@@ -43,34 +43,34 @@ class EpisodeScore:
 
     Parameters
     ----------
-    away
+    distance
         Distance of the tool from its place [m].
-    off
+    amount_error
         Difference between the reached and the requested amount, relative to the latter.
-    cut
+    cut_shares
         Shares of the tumour that are cut.
-    load
+    load_ratio
         The force, or the pressure, as a share of its limit: the greater of both.
     """
 
-    away: float
-    off: float
-    cut: int
-    load: float
+    distance: float
+    amount_error: float
+    cut_shares: int
+    load_ratio: float
 
     @property
     def potential(self) -> float:
         """Potential whose differences are rewarded."""
-        away = min(self.away, REWARD.max_potential_distance) / REWARD.potential_length
-        return REWARD.share_reward * self.cut - away - min(self.off, 1.0)
+        away = min(self.distance, REWARD.max_potential_distance) / REWARD.potential_length
+        return REWARD.share_reward * self.cut_shares - away - min(self.amount_error, 1.0)
 
 
-def compute_reward(before: EpisodeScore, now: EpisodeScore, success: bool, ended: bool) -> float:
-    """Return the reward of a step from one state to the next; `ended`: True if the episode ends at a limit."""
-    reward = now.potential - before.potential - REWARD.step_penalty
-    if now.load > 1.0:
+def compute_reward(previous: EpisodeScore, current: EpisodeScore, success: bool, is_aborted: bool) -> float:
+    """Return the reward of a step from one state to the next; `is_aborted`: True if the episode ends at a limit."""
+    reward = current.potential - previous.potential - REWARD.step_penalty
+    if current.load_ratio > 1.0:
         reward -= REWARD.limit_penalty
-    return float(reward + (REWARD.success_reward if success else REWARD.abort_reward if ended else 0.0))
+    return float(reward + (REWARD.success_reward if success else REWARD.abort_reward if is_aborted else 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,16 +93,16 @@ class ResetSample:
     tremor: float
 
 
-def draw(setting: TaskSetting, random: np.random.Generator) -> ResetSample:
+def sample_reset(setting: TaskSetting, random: np.random.Generator) -> ResetSample:
     """Sample the random values of an episode."""
     goal, site, tool = setting.sample_goal(random), setting.site, setting.task.tool
     high, far, angle, size = random.random(4)
     aside = START_OFFSETS[0] + far * (START_OFFSETS[1] - START_OFFSETS[0])
-    x, y = ((goal.place - site.origin) @ axis for axis in (site.right, site.up))
+    x, y = ((goal.position - site.origin) @ axis for axis in (site.right, site.up))
     x, y = x + aside * np.cos(2.0 * np.pi * angle), y + aside * np.sin(2.0 * np.pi * angle)
     under = site.find_contact(float(x), float(y), tool.radius).point
     tip = under - (START_HEIGHTS[0] + high * (START_HEIGHTS[1] - START_HEIGHTS[0])) * site.axis
-    return ResetSample(goal, lay_tool(site, tool, tip), int(random.integers(2**31)), MAX_TREMOR * float(size))
+    return ResetSample(goal, place_tool(site, tool, tip), int(random.integers(2**31)), MAX_TREMOR * float(size))
 
 
 class Episode:
@@ -122,13 +122,13 @@ class Episode:
 
     def begin(self, random: np.random.Generator) -> TissueRequest:
         """Sample an episode and return its first request to the tissue model."""
-        self.random, self.drawn = random, draw(self.setting, random)
+        self.random, self.drawn = random, sample_reset(self.setting, random)
         self.hand, self.touched, self.judged = self.drawn.hand, None, None
         self.step, self.held, self.violations, self.cut, self.over = 0, 0, 0, 0, False
-        self.patch = self.setting.find_near(self.drawn.goal.place)
+        self.patch = self.setting.find_vertices_near(self.drawn.goal.position)
         return self._build_request(self.drawn)
 
-    def ask(self, action: np.ndarray) -> TissueRequest:
+    def request_step(self, action: np.ndarray) -> TissueRequest:
         """Move the tool; return the next request to the tissue model.
 
         Raises
@@ -143,24 +143,24 @@ class Episode:
             raise InputError(f"the action {np.array2string(twist, threshold=12)} is none: give six finite numbers.")
         task = self.setting.task
         twist = np.clip(twist, -1.0, 1.0) * np.repeat([task.step, task.turn], 3)
-        self.hand = move_tool(self.hand, self.setting.site, task.tool, twist, task.tilt, task.deepest)
+        self.hand = move_tool(self.hand, self.setting.site, task.tool, twist, task.max_tilt, task.max_depth)
         self.step += 1
         return self._build_request(self.drawn)
 
     def _build_request(self, drawn: ResetSample) -> TissueRequest:
         task = self.setting.task
-        offset = drawn.tremor * self.frame @ sample_wandering(drawn.seed, STEP_SECONDS * self.step)[:3]
+        offset = drawn.tremor * self.frame @ sample_hand_motion(drawn.seed, STEP_SECONDS * self.step)[:3]
         self.actual = shift_pose(self.hand, offset)
-        fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth(self.step / DRAIN_STEPS)
-        return TissueRequest(self.actual.compute_pose(task.tool), self.touched, fluid, self.done)
+        fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth_step(self.step / DRAIN_STEPS)
+        return TissueRequest(self.actual.compute_pose(task.tool), self.touched, fluid, self.completed_steps)
 
     @property
-    def done(self) -> int:
+    def completed_steps(self) -> int:
         """Number of completed resection steps: the corridor is cut before an episode begins."""
-        return self.cut + 1 if self.setting.task.cuts else 0
+        return self.cut + 1 if self.setting.task.resects else 0
 
     @property
-    def seen(self) -> Seen:
+    def view(self) -> Seen:
         """View of the episode for images.
 
         Raises
@@ -172,80 +172,81 @@ class Episode:
             raise InputError("no episode has begun: call reset() before render().")
         return self.touched, self.actual.compute_pose(self.setting.task.tool), self.shown
 
-    def take(self, touched: Touched) -> EpisodeStep:
+    def end_step(self, response: Response) -> EpisodeStep:
         """Return the result of a step from the tissue's response."""
         assert self.drawn is not None
-        task, goal, self.shown = self.setting.task, self.drawn.goal, self.done
-        target = self._compute_target(touched)
-        judged = self._compute_score(touched, target)
-        kept = touched.good and judged.away <= task.aside and judged.off <= task.tolerance and judged.load <= 1.0
+        task, goal, self.shown = self.setting.task, self.drawn.goal, self.completed_steps
+        target = self._compute_target(response)
+        judged = self._compute_score(response, target)
+        kept = response.reliable and judged.distance <= task.max_distance and judged.load_ratio <= 1.0
+        kept = kept and judged.amount_error <= task.tolerance
         self.held = self.held + 1 if kept else 0
-        success = self.held >= task.held
-        if success and task.cuts:
+        success = self.held >= task.hold_steps
+        if success and task.resects:
             self.cut, self.held = self.cut + 1, 0
             success = self.cut >= goal.amount
-            judged = self._compute_score(touched, target)
-        ended = judged.load > MAX_LOAD_RATIO or not touched.good
+            judged = self._compute_score(response, target)
+        ended = judged.load_ratio > MAX_LOAD_RATIO or not response.reliable
         reward = 0.0 if self.judged is None else compute_reward(self.judged, judged, success, ended)
-        self.violations += int(judged.load > 1.0)
-        self.touched, self.judged, self.over = touched, judged, success or ended
+        self.violations += int(judged.load_ratio > 1.0)
+        self.touched, self.judged, self.over = response, judged, success or ended
         return EpisodeStep(
-            self._build_states(touched), reward, success or ended, self._collect_truth(touched, target, success)
+            self._build_states(response), reward, success or ended, self._collect_truth(response, target, success)
         )
 
-    def _compute_target(self, touched: Touched) -> np.ndarray:
+    def _compute_target(self, touched: Response) -> np.ndarray:
         """Compute the target position of the tool (3,) [m]: the goal, or the deformed position of the next share."""
         planned = self._compute_planned_target()
-        return planned if self.share is None else planned + touched.motion[self.share].mean(axis=0)
+        return planned if self.next_share is None else planned + touched.motion[self.next_share].mean(axis=0)
 
     @property
-    def share(self) -> np.ndarray | None:
+    def next_share(self) -> np.ndarray | None:
         """Vertices of the next share of the tumour to be cut, or of the last share; None if the task cuts nothing."""
-        shares = self.setting.shares
+        shares = self.setting.resection_shares
         return shares[min(self.cut, len(shares) - 1)] if shares else None
 
     def _compute_planned_target(self) -> np.ndarray:
         """Compute the target position of the tool in the scan (3,) [m]."""
         assert self.drawn is not None
         nodes = self.setting.site.anatomy.mesh.nodes
-        return self.drawn.goal.place if self.share is None else nodes[self.share].mean(axis=0)
+        return self.drawn.goal.position if self.next_share is None else nodes[self.next_share].mean(axis=0)
 
-    def _compute_score(self, touched: Touched, target: np.ndarray) -> EpisodeScore:
+    def _compute_score(self, touched: Response, target: np.ndarray) -> EpisodeScore:
         assert self.drawn is not None
         task, goal, axis = self.setting.task, self.drawn.goal, self.setting.site.axis
         size = float(np.linalg.norm(touched.force))
-        load = max(size / task.force, touched.pressure / task.pressure)
-        if task.cuts:
-            return EpisodeScore(float(np.linalg.norm(self.actual.place - target)), 0.0, self.cut, load)
-        tip = self.actual.place + compute_lever(task.tool) * axis
+        load = max(size / task.max_force, touched.pressure / task.max_pressure)
+        if task.resects:
+            return EpisodeScore(float(np.linalg.norm(self.actual.position - target)), 0.0, self.cut, load)
+        tip = self.actual.position + compute_pivot_distance(task.tool) * axis
         along = float((target - tip) @ axis)
         aside = float(np.linalg.norm(target - tip - along * axis))
         away = float(np.hypot(aside, max(along, 0.0) if size == 0.0 else 0.0))
         return EpisodeScore(away, abs(self._compute_reached(touched) - goal.amount) / goal.amount, 0, load)
 
-    def _compute_reached(self, touched: Touched) -> float:
+    def _compute_reached(self, touched: Response) -> float:
         """Return the force [N], the shift [m], or the shares cut, which are compared with the goal's amount."""
         assert self.drawn is not None
-        if self.setting.task.cuts:
+        if self.setting.task.resects:
             return float(self.cut)
-        if self.setting.task.forward == 0.0:
+        if self.setting.task.max_push_angle == 0.0:
             return float(np.linalg.norm(touched.force))
         row = np.searchsorted(touched.nodes, self.patch)
         return float(touched.motion[row].mean(axis=0) @ self.drawn.goal.direction)
 
-    def _build_states(self, touched: Touched) -> np.ndarray:
+    def _build_states(self, touched: Response) -> np.ndarray:
         assert self.drawn is not None
         task, goal = self.setting.task, self.drawn.goal
         cortex = touched.motion[np.searchsorted(touched.nodes, self.setting.cortex)].mean(axis=0)
         noise = self.random.standard_normal((3, 3))
         tracked = shift_pose(self.actual, POSITION_NOISE * noise[0])
         sensed = np.stack([touched.force, cortex]) + np.array([[FORCE_NOISE], [MOTION_NOISE]]) * noise[1:]
-        done = self.cut / goal.amount if task.cuts else self.held / task.held
+        done = self.cut / goal.amount if task.resects else self.held / task.hold_steps
         time = STEP_SECONDS * self.step
-        planned = replace(goal, place=self._compute_planned_target())
+        planned = replace(goal, position=self._compute_planned_target())
         return compute_states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
 
-    def _collect_truth(self, touched: Touched, target: np.ndarray, success: bool) -> dict[str, Any]:
+    def _collect_truth(self, touched: Response, target: np.ndarray, success: bool) -> dict[str, Any]:
         """Return ground truth that is not observed (see the docs). Arrays are new in each step."""
         assert self.judged is not None and self.drawn is not None
         setting = self.setting
@@ -256,7 +257,7 @@ class Episode:
             "pose": self.actual.compute_pose(setting.task.tool),
             "force": touched.force.copy(), "pressure": touched.pressure,
             "tumour_nodes": now, "tumour_middle": now[left].mean(axis=0), "model_error": touched.error,
-            "target": target.copy(), "away": self.judged.away, "asked": float(self.drawn.goal.amount),
-            "reached": self._compute_reached(touched), "load": self.judged.load, "violations": self.violations,
-            "success": success, "reliable": touched.good, "steps_done": self.shown,
+            "target": target.copy(), "away": self.judged.distance, "asked": float(self.drawn.goal.amount),
+            "reached": self._compute_reached(touched), "load": self.judged.load_ratio, "violations": self.violations,
+            "success": success, "reliable": touched.reliable, "steps_done": self.shown,
         }  # fmt: skip

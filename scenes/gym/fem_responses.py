@@ -18,11 +18,11 @@ from sim.resected_fem import ResectedFem
 from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.head_pose import HeadPose
 from .model_responses import Hertz
-from .tissue_requests import TissueRequest, Touched
+from .tissue_requests import Response, TissueRequest
 
 
 @dataclass(frozen=True, eq=False)
-class PosedElements:
+class PosedFem:
     """FEM in contact with a rigid tool.
 
     The pressure under a ball is Hertz's at its force; under a blade it is the maximum of `sim.compute_pressure`.
@@ -33,27 +33,27 @@ class PosedElements:
         FEM with `ToolContact` of the tool.
     ball
         Hertz model of the tool, if the tool is a ball.
-    together
+    batched
         True if all environments are solved in one batch.
     """
 
     fem: Fem
     ball: Hertz | None
-    together: bool = False
+    batched: bool = False
 
-    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
         """Solve as `TissueModel.compute_responses`; environments at the start of an episode form a separate batch."""
-        found: dict[int, Touched] = {}
-        begin = [row for row, each in enumerate(asked) if each.last is None]
-        going = [row for row, each in enumerate(asked) if each.last is not None]
+        found: dict[int, Response] = {}
+        begin = [row for row, each in enumerate(requests) if each.previous is None]
+        going = [row for row, each in enumerate(requests) if each.previous is not None]
         for rows in (begin, going):
-            for some in [rows] if self.together and rows else [[row] for row in rows]:
-                found |= dict(zip(some, self._solve_poses([asked[row] for row in some]), strict=True))
-        return [found[row] for row in range(len(asked))]
+            for some in [rows] if self.batched and rows else [[row] for row in rows]:
+                found |= dict(zip(some, self._solve_poses([requests[row] for row in some]), strict=True))
+        return [found[row] for row in range(len(requests))]
 
-    def _solve_poses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def _solve_poses(self, asked: Sequence[TissueRequest]) -> list[Response]:
         loads = Loads((Touching(np.stack([each.pose for each in asked])[:, None]),))
-        starts = [each.last.memory for each in asked if each.last is not None and each.last.memory is not None]
+        starts = [each.previous.memory for each in asked if each.previous and each.previous.memory is not None]
         result = self.fem.deform(loads, join_deformations(starts) if len(starts) > 1 else next(iter(starts), None))
         force = result.reaction[:, 0, :3]
         size = np.linalg.norm(force, axis=1)
@@ -65,7 +65,7 @@ class PosedElements:
         if len(asked) > 1:
             rows = [replace(result.select(np.array([row])), warm={}) for row in range(len(asked))]
         return [
-            Touched(row.displacement[0], row.nodes, force[number], highest[number], row.outcome[0].good, memory=row)
+            Response(row.displacement[0], row.nodes, force[number], highest[number], row.outcome[0].good, memory=row)
             for number, row in enumerate(rows)
         ]
 
@@ -76,7 +76,7 @@ LEVEL_SPACING = (
 MAX_SURFACE_DISTANCE = 0.03  # Distance from the corridor and the tumour within which healthy tissue is considered [m].
 
 
-class HealthySurface(NamedTuple):
+class RemainingSurface(NamedTuple):
     """Surface (S, 3) of the remaining healthy tissue near the tumour; undeformed outward normals (V, 3)."""
 
     triangles: np.ndarray
@@ -84,7 +84,7 @@ class HealthySurface(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class CutElements:
+class ResectionFem:
     """FEM under gravity, by fluid level and resection step; each state is solved once.
 
     Contact of the tool, a ball, with healthy tissue follows `Hertz`. The ball enters the tumour and moves no tissue.
@@ -103,23 +103,24 @@ class CutElements:
     fem: ResectedFem
     ball: Hertz
     _solved: dict[tuple[int, int], Deformation] = field(default_factory=dict)
-    _surfaces: dict[int, HealthySurface] = field(default_factory=dict)
+    _surfaces: dict[int, RemainingSurface] = field(default_factory=dict)
 
-    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
         """Solve as `TissueModel.compute_responses`; independent of earlier requests: levels have a fixed order."""
-        return [self._solve_touch(each) for each in asked]
+        return [self._solve_touch(each) for each in requests]
 
-    def _solve_touch(self, asked: TissueRequest) -> Touched:
+    def _solve_touch(self, asked: TissueRequest) -> Response:
         level = (1.0 - asked.fluid) / LEVEL_SPACING
         low = int(level)
         share = level - low
-        motion = self._solve_level(low, asked.done).displacement[0]
+        motion = self._solve_level(low, asked.completed_steps).displacement[0]
         if share > 0.0:
-            motion = (1.0 - share) * motion + share * self._solve_level(low + 1, asked.done).displacement[0]
-        force = self._compute_force(asked.pose, asked.done, motion)
+            motion = (1.0 - share) * motion + share * self._solve_level(low + 1, asked.completed_steps).displacement[0]
+        force = self._compute_force(asked.pose, asked.completed_steps, motion)
         size = float(np.linalg.norm(force))
-        good = all(self._solve_level(low + more, asked.done).outcome[0].good for more in range(2 if share > 0.0 else 1))
-        return Touched(motion, np.arange(len(motion)), force, self.ball.compute_pressure(size), good)
+        levels = range(low, low + (2 if share > 0.0 else 1))
+        good = all(self._solve_level(level, asked.completed_steps).outcome[0].good for level in levels)
+        return Response(motion, np.arange(len(motion)), force, self.ball.compute_pressure(size), good)
 
     def _solve_level(self, level: int, done: int) -> Deformation:
         """Return the solution at a fluid level, started from the level above.
@@ -150,13 +151,13 @@ class CutElements:
         distance = float(np.copysign(np.linalg.norm(away), away @ outward))
         return -float(self.ball.compute_force(np.array(radius - distance))) * outward
 
-    def _get_healthy(self, done: int) -> HealthySurface:
+    def _get_healthy(self, done: int) -> RemainingSurface:
         """Return the remaining body after a number of steps."""
         if done not in self._surfaces:
             self._surfaces[done] = self._build_healthy(done)
         return self._surfaces[done]
 
-    def _build_healthy(self, done: int) -> HealthySurface:
+    def _build_healthy(self, done: int) -> RemainingSurface:
         body = self.fem.get_remaining_body(done).anatomy
         left, brain = body.mesh, ~body.in_tumour
         surface = TetMesh(left.nodes, left.tets[brain], left.region[brain]).surface
@@ -165,4 +166,4 @@ class CutElements:
         middle = left.nodes[surface].mean(axis=1)
         around = np.concatenate([way, left.nodes[tumour]])
         near = np.linalg.norm(middle[:, None] - around, axis=2).min(axis=1) < MAX_SURFACE_DISTANCE
-        return HealthySurface(surface[near], compute_vertex_normals(left.nodes, surface))
+        return RemainingSurface(surface[near], compute_vertex_normals(left.nodes, surface))

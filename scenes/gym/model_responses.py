@@ -17,7 +17,7 @@ from surrogate.model.guarded import compute_tool_pressure
 from surrogate.model.learned import Learned
 
 from ..script.craniotomy_frame import CraniotomyFrame
-from .tissue_requests import TissueRequest, Touched
+from .tissue_requests import Response, TissueRequest
 
 DEPTH_TOLERANCE = 1e-5  # Tolerance of the ball's depth [m].
 MAX_ITERATIONS = 12  # Maximum number of iterations for the ball's depth.
@@ -82,31 +82,31 @@ class PressedModel:
         Model trained on pushes.
     ball
         Hertz model of the tool on the model's tissue.
-    together
+    batched
         True if all environments are predicted in one batch.
     """
 
     site: CraniotomyFrame
     model: Learned
     ball: Hertz
-    together: bool = False
+    batched: bool = False
 
     @cached_property
     def _patch(self) -> Patch:
         return open_patch(self.site.anatomy)
 
-    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
         """Predict as `TissueModel.compute_responses`."""
-        poses = np.stack([each.pose for each in asked])
-        parts = [poses] if self.together else np.split(poses, len(poses))
+        poses = np.stack([each.pose for each in requests])
+        parts = [poses] if self.batched else np.split(poses, len(poses))
         return [touched for part in parts for touched in self._predict_poses(part)]
 
-    def _predict_poses(self, poses: np.ndarray) -> list[Touched]:
+    def _predict_poses(self, poses: np.ndarray) -> list[Response]:
         """Predict tools at poses (B, 4, 4) together."""
         near = to_indentation(Loads((Touching(poses[:, None]),)), Ball(self.ball.radius), self._patch)
         depth = np.linalg.norm(near.force, axis=1)
         inward = np.divide(near.force, depth[:, None], out=np.zeros_like(near.force), where=depth[:, None] > 0.0)
-        answers = [Touched(np.zeros((len(self.model.nodes), 3)), self.model.nodes, np.zeros(3), 0.0) for _ in poses]
+        answers = [Response(np.zeros((len(self.model.nodes), 3)), self.model.nodes, np.zeros(3), 0.0) for _ in poses]
         rows = np.flatnonzero(depth > 0.0)
         if not len(rows):
             return answers
@@ -115,7 +115,7 @@ class PressedModel:
         result = self.model.deform(self._build_loads(point, inward, size))
         stated = np.where(np.isfinite(result.bound[0]), result.bound[0], self.model.bound)
         for number, row in enumerate(rows.tolist()):
-            answers[row] = Touched(
+            answers[row] = Response(
                 result.displacement[number], result.nodes, size[number] * inward[number],
                 self.ball.compute_pressure(float(size[number])), bool(found[number]), float(stated[number]),
             )  # fmt: skip
@@ -171,21 +171,21 @@ class PosedModel:
     model: Learned
     ball: Hertz | None
 
-    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
         """Predict as `TissueModel.compute_responses`, one by one.
 
         If the model rejects a pose, the tissue stays and is marked unreliable.
         """
-        return [self._predict_pose(each.pose, each.last) for each in asked]
+        return [self._predict_pose(each.pose, each.previous) for each in requests]
 
-    def _predict_pose(self, pose: np.ndarray, last: Touched | None) -> Touched:
+    def _predict_pose(self, pose: np.ndarray, last: Response | None) -> Response:
         loads = Loads((Touching(pose[None, None]),))
         try:
             result = self.model.deform(loads, None if last is None else last.memory)
         except InputError:
             nodes = self.model.nodes
-            rest = Touched(np.zeros((len(nodes), 3)), nodes, np.zeros(3), 0.0) if last is None else last
-            return replace(rest, good=False, error=float("inf"))
+            rest = Response(np.zeros((len(nodes), 3)), nodes, np.zeros(3), 0.0) if last is None else last
+            return replace(rest, reliable=False, error=float("inf"))
         force = result.reaction[0, 0, :3]
         if self.ball is None:
             highest = float(compute_tool_pressure(self.model, loads, result).max())
@@ -194,4 +194,4 @@ class PosedModel:
         error = float(result.bound[0, 0])
         if not np.isfinite(error):
             error = self.model.bound
-        return Touched(result.displacement[0], result.nodes, force, highest, error=error, memory=result)
+        return Response(result.displacement[0], result.nodes, force, highest, error=error, memory=result)

@@ -28,10 +28,10 @@ def build_action_space() -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (6,), np.float32)
 
 
-def build_space(kind: str, size: tuple[int, int]) -> spaces.Space:
+def build_observation_space(observation_kind: str, size: tuple[int, int]) -> spaces.Space:
     """Return the observation space of one of `KINDS`, with images of a width and height [pixel]."""
     states = spaces.Box(-STATE_BOUND, STATE_BOUND, (STATE_SIZE,), np.float32)
-    if kind == "states":
+    if observation_kind == "states":
         return states
     width, height = size
     return spaces.Dict(
@@ -44,31 +44,31 @@ def build_space(kind: str, size: tuple[int, int]) -> spaces.Space:
 
 
 def compute_states(
-    task: GymTask, goal: Goal, hand: RobotTool, sensed: np.ndarray, time: float, done: float, frame: np.ndarray,
-    origin: np.ndarray,
+    task: GymTask, goal: Goal, robot_tool: RobotTool, readings: np.ndarray, time: float, progress: float,
+    axes: np.ndarray, origin: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
     """Compute the state (24,) float32, in the axes (3, 3) of twists, relative to the open cortex's centre (3,) [m].
 
     Parameters
     ----------
-    hand
+    robot_tool
         Tracked pose of the tool.
-    sensed
+    readings
         Measured force on the tissue [N] and motion of the open cortex [m], as rows (2, 3).
     time
         Time since the start of the episode [s].
-    done
+    progress
         Completed share of the steps to hold, or of the tissue to cut.
     """
     parts = (
-        (hand.place - origin) @ frame / LENGTH_UNIT,
-        (frame.T @ hand.turned)[:, :2].T.ravel(),
-        sensed[0] @ frame / task.force,
+        (robot_tool.position - origin) @ axes / LENGTH_UNIT,
+        (axes.T @ robot_tool.rotation)[:, :2].T.ravel(),
+        readings[0] @ axes / task.max_force,
         [time / TIME_UNIT],
-        (goal.place - origin) @ frame / LENGTH_UNIT,
-        goal.direction @ frame,
+        (goal.position - origin) @ axes / LENGTH_UNIT,
+        goal.direction @ axes,
         [goal.amount / task.unit],
-        [done],
-        sensed[1] @ frame / LENGTH_UNIT,
+        [progress],
+        readings[1] @ axes / LENGTH_UNIT,
     )
     return np.clip(np.concatenate(parts), -STATE_BOUND, STATE_BOUND).astype(np.float32)

@@ -9,9 +9,9 @@ from ar.optics.camera import Camera
 from ar.rendering.renderer import Renderer
 
 from .setting import TaskSetting
-from .tissue_requests import Touched
+from .tissue_requests import Response
 
-Seen = tuple[Touched, np.ndarray, int]
+Seen = tuple[Response, np.ndarray, int]
 """Rendered state: the tissue's response, T_world_tool (4, 4), and the number of resection steps done."""
 
 
@@ -27,16 +27,16 @@ class ObservationCamera:
         """Static camera of the setting."""
         return self.setting.scene.viewpoint.build_camera(self.setting.site)
 
-    def render(self, seen: Sequence[Seen]) -> tuple[np.ndarray, np.ndarray]:
+    def render(self, views: Sequence[Seen]) -> tuple[np.ndarray, np.ndarray]:
         """Render colours (B, H, W, 3) uint8 and depths (B, H, W) float32 [m], 0 in the background."""
-        shape = len(seen), self.camera.height, self.camera.width
+        shape = len(views), self.camera.height, self.camera.width
         colour, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
-        for done in sorted({each[2] for each in seen}):
-            rows = [row for row, each in enumerate(seen) if each[2] == done]
+        for done in sorted({each[2] for each in views}):
+            rows = [row for row, each in enumerate(views) if each[2] == done]
             stage = self.setting.get_stage(done)
             scenes = [
                 stage.build_layers(self._compute_positions(touched), pose)
-                for touched, pose, _ in (seen[row] for row in rows)
+                for touched, pose, _ in (views[row] for row in rows)
             ]
             if done not in self._renderers:
                 self._renderers[done] = Renderer(scenes[0], stage.lamp, stage.device)
@@ -45,7 +45,7 @@ class ObservationCamera:
             colour[rows], depth[rows] = pictures.colour.numpy(), pictures.depth.numpy()
         return colour, depth
 
-    def _compute_positions(self, touched: Touched) -> np.ndarray:
+    def _compute_positions(self, touched: Response) -> np.ndarray:
         positions = self.setting.site.anatomy.mesh.nodes.copy()
         positions[touched.nodes] += touched.motion
         return positions

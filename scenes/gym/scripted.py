@@ -33,7 +33,7 @@ def compute_scripted_actions(task: str, states: np.ndarray, settings: PolicySett
     states = np.asarray(states, np.float64)
     place, goal, cortex = (LENGTH_UNIT * states[..., first : first + 3] for first in (0, 13, 21))
     off = goal - place
-    force = np.linalg.norm(known.force * states[..., 9:12], axis=-1)
+    force = np.linalg.norm(known.max_force * states[..., 9:12], axis=-1)
     asked, touches = known.unit * states[..., 19], force > settings.min_contact_force
     if known == DEBULK:
         off = off + cortex

@@ -21,13 +21,13 @@ from sim.skulls import Bonded
 from surrogate.model.guarded import has_tool_pressure
 
 from ..play.deformers import PatientSetup, open_theatre
-from ..play.learned_regions import find_learned_regions
+from ..play.learned_regions import find_trained_regions
 from ..play.stage import Stage
 from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
 from ..script.shipped_files import get_gym_model_path
 from ..script.tool import Blade, Probe
-from .fem_responses import CutElements, PosedElements
+from .fem_responses import PosedFem, ResectionFem
 from .model_responses import Hertz, PosedModel, PressedModel
 from .tasks import Goal, GymTask
 from .tissue_requests import TissueModel
@@ -48,30 +48,31 @@ class TaskSetting:
 
     Parameters
     ----------
-    task, scene, theatre
+    task, scene, patient
         Task, scene and body. Regions have the tissue that the body's models were trained with.
-    answers
+    tissue_model
         Model of the tissue's response to the tool.
     """
 
     task: GymTask
     scene: Scene
-    theatre: PatientSetup
-    answers: TissueModel
+    patient: PatientSetup
+    tissue_model: TissueModel
 
     @property
     def site(self) -> CraniotomyFrame:
         """The open cortex."""
-        return self.theatre.site
+        return self.patient.site
 
     @cached_property
     def stage(self) -> Stage:
         """Renderer of the body."""
-        return self.theatre.build_stage(self.scene)
+        return self.patient.build_stage(self.scene)
 
-    def get_stage(self, done: int) -> Stage:
+    def get_stage(self, step: int) -> Stage:
         """Return the rendered body after a number of resection steps."""
-        return self.stage.select_stage(Loads((Resected(np.array([float(done)])),))) if self.task.cuts else self.stage
+        cut = Loads((Resected(np.array([float(step)])),))
+        return self.stage.select_stage(cut) if self.task.resects else self.stage
 
     @cached_property
     def cortex(self) -> np.ndarray:
@@ -79,12 +80,12 @@ class TaskSetting:
         return np.unique(self.site.anatomy.open_surface)
 
     @cached_property
-    def middle(self) -> np.ndarray:
+    def tumour_centre(self) -> np.ndarray:
         """Mean position of the tumour's vertices in the scan (3,) [m]."""
         return self.site.anatomy.mesh.nodes[self.site.anatomy.tumour_nodes].mean(axis=0)
 
     @cached_property
-    def shares(self) -> tuple[np.ndarray, ...]:
+    def resection_shares(self) -> tuple[np.ndarray, ...]:
         """Mesh vertices of the tetrahedra of each share that is cut, in order."""
         surgery = self.task.surgery
         if surgery is None:
@@ -92,26 +93,25 @@ class TaskSetting:
         mesh = self.site.anatomy.mesh
         return tuple(mesh.tets[list(step)].ravel() for step in surgery.build_resection(self.site.anatomy).steps[1:])
 
-    def find_near(self, place: np.ndarray) -> np.ndarray:
+    def find_vertices_near(self, position: np.ndarray) -> np.ndarray:
         """Find the vertices (n,) of the open cortex within `PATCH_RADIUS` of a place (3,) [m], or the nearest one."""
-        away = np.linalg.norm(self.site.anatomy.mesh.nodes[self.cortex] - place, axis=1)
+        away = np.linalg.norm(self.site.anatomy.mesh.nodes[self.cortex] - position, axis=1)
         return self.cortex[away <= max(PATCH_RADIUS, away.min())]
 
     def sample_goal(self, random: np.random.Generator) -> Goal:
         """Sample a goal; every task takes the same number of random values."""
         far, angle, turn, amount, more = random.random(5)
         task, site = self.task, self.site
-        arm = self.middle - site.origin
+        arm = self.tumour_centre - site.origin
         offset = MAX_GOAL_DISTANCE * np.sqrt(far) * np.array([np.cos(2.0 * np.pi * angle), np.sin(2.0 * np.pi * angle)])
-        place = site.find_contact(
-            float(arm @ site.right + offset[0]), float(arm @ site.up + offset[1]), task.tool.radius
-        )
+        at = site.find_contact(float(arm @ site.right + offset[0]), float(arm @ site.up + offset[1]), task.tool.radius)
         size = task.amount[0] + amount * (task.amount[1] - task.amount[0])
-        if task.cuts:
-            return Goal(self.middle, site.axis, size, MIN_FLUID_LEVEL + more * (MAX_FLUID_LEVEL - MIN_FLUID_LEVEL))
-        lean, turn = task.forward * more, 2.0 * np.pi * turn
+        if task.resects:
+            level = MIN_FLUID_LEVEL + more * (MAX_FLUID_LEVEL - MIN_FLUID_LEVEL)
+            return Goal(self.tumour_centre, site.axis, size, level)
+        lean, turn = task.max_push_angle * more, 2.0 * np.pi * turn
         sideways = np.cos(turn) * site.right + np.sin(turn) * site.up
-        return Goal(place.point, np.cos(lean) * site.axis + np.sin(lean) * sideways, size)
+        return Goal(at.point, np.cos(lean) * site.axis + np.sin(lean) * sideways, size)
 
 
 @lru_cache(maxsize=8)
@@ -122,7 +122,7 @@ def open_setting(
     device: str,
     size: tuple[int, int],
     model: str | None = None,
-    together: bool | None = None,
+    batched: bool | None = None,
 ) -> TaskSetting:
     """Return a task on an anatomy, which is read once for all environments of a process.
 
@@ -141,7 +141,7 @@ def open_setting(
     model
         File of trained models. None: the file next to the anatomy, or the shipped one for template and spatula.
         Regions have the tissue that the models were trained with.
-    together
+    batched
         True to solve all environments in one batch; None: on a GPU only. On the CPU one batch is several times as
         fast, but the last digits depend on the other environments.
 
@@ -151,29 +151,29 @@ def open_setting(
         Unreadable files; an anatomy without tumour or open cortex; an unavailable device; a missing model, or a given
         model that is not applicable.
     """
-    theatre = _open_setup(anatomy, _get_shipped_model(task) if model is None and anatomy == TEMPLATE else model, device)
-    if not theatre.anatomy.in_tumour.any():
+    patient = _open_setup(anatomy, _get_shipped_model(task) if model is None and anatomy == TEMPLATE else model, device)
+    if not patient.anatomy.in_tumour.any():
         raise InputError(f"{anatomy}: has no tumour, which these tasks aim at: mesh one with region {TUMOUR_LABEL}.")
     scene, tool = task.build_scene(size), task.tool
-    scene = scene.replace_regions(find_learned_regions(scene.elasticity, theatre.learned_tissue))
+    scene = scene.replace_regions(find_trained_regions(scene.elasticity, patient.learned_tissue))
     card = find_device(device, LIVE.precision).name != "cpu"
-    at_once = card if together is None else together
-    ball = Hertz(tool.radius, _find_touched_tissue(task, scene, theatre.site)) if isinstance(tool, Probe) else None
+    at_once = card if batched is None else batched
+    ball = Hertz(tool.radius, _find_touched_tissue(task, scene, patient.site)) if isinstance(tool, Probe) else None
     if physics != "fem":
-        refused = _list_rejections(task, scene, theatre)
-        known = [each for name, each in theatre.models.items() if refused[name] is None]
+        refused = _list_rejections(task, scene, patient)
+        known = [each for name, each in patient.models.items() if refused[name] is None]
         if posed := [each for each in known if each.tool is not None]:
-            return TaskSetting(task, scene, theatre, PosedModel(min(posed, key=BOUND_KEY), ball))
+            return TaskSetting(task, scene, patient, PosedModel(min(posed, key=BOUND_KEY), ball))
         if ball is not None and known:
             return TaskSetting(
-                task, scene, theatre, PressedModel(theatre.site, min(known, key=BOUND_KEY), ball, at_once)
+                task, scene, patient, PressedModel(patient.site, min(known, key=BOUND_KEY), ball, at_once)
             )
         _report_no_model(task, anatomy, physics, model, next(iter(refused.values()), None))
-    fem = theatre.build_fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
+    fem = patient.build_fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
     if isinstance(fem, Fem):
-        return TaskSetting(task, scene, theatre, PosedElements(fem, ball, at_once))
+        return TaskSetting(task, scene, patient, PosedFem(fem, ball, at_once))
     assert ball is not None
-    return TaskSetting(task, scene, theatre, CutElements(theatre.site, fem, ball))
+    return TaskSetting(task, scene, patient, ResectionFem(patient.site, fem, ball))
 
 
 def _find_touched_tissue(task: GymTask, scene: Scene, site: CraniotomyFrame) -> Tissue:
@@ -185,22 +185,22 @@ def _find_touched_tissue(task: GymTask, scene: Scene, site: CraniotomyFrame) -> 
     arm = mesh.nodes[site.anatomy.tumour_nodes].mean(axis=0) - site.origin
     place = site.find_contact(float(arm @ site.right), float(arm @ site.up), task.tool.radius).point
     near = np.linalg.norm(mesh.nodes[mesh.tets].mean(axis=1) - place, axis=1) < task.tool.radius
-    labels = [] if task.cuts else np.unique(mesh.region[near]).tolist()
+    labels = [] if task.resects else np.unique(mesh.region[near]).tolist()
     most = max(labels, key=lambda label: mesh.volumes[near & (mesh.region == label)].sum(), default=None)
     tissue = elasticity.default if most is None else elasticity.get_law(most)
     assert tissue is not None
     return tissue
 
 
-def _list_rejections(task: GymTask, scene: Scene, theatre: PatientSetup) -> dict[str, str | None]:
+def _list_rejections(task: GymTask, scene: Scene, patient: PatientSetup) -> dict[str, str | None]:
     """Return, by name, why a trained model is not applicable; None if it is. For a ball, models of pushes apply too."""
-    if task.cuts:
-        return dict.fromkeys(theatre.models, "tissue is resected, which no model supports")
+    if task.resects:
+        return dict.fromkeys(patient.models, "tissue is resected, which no model supports")
     ball = isinstance(task.tool, Probe)
     pushes = replace(scene, effects=(scene.elasticity, Held(), Bonded(), ToolForce()))
-    moved, pushed = theatre.list_rejections(scene), theatre.list_rejections(pushes) if ball else {}
+    moved, pushed = patient.list_rejections(scene), patient.list_rejections(pushes) if ball else {}
     found = {}
-    for name, each in theatre.models.items():
+    for name, each in patient.models.items():
         found[name] = pushed.get(name, moved[name]) if each.tool is None else moved[name]
         if (
             found[name] is None
@@ -227,7 +227,7 @@ def _report_no_model(task: GymTask, anatomy: str, physics: str, model: str | Non
         raise InputError(
             f"physics='model': no trained model of {anatomy} is applicable to the task {task.name}{because}. {remedy}"
         )
-    if why is not None and not task.cuts:
+    if why is not None and not task.resects:
         said = f"FEM is used for the task {task.name} on {anatomy}: no trained model is applicable{because}. {remedy}"
         warnings.warn(said, stacklevel=2)
 
@@ -242,7 +242,7 @@ def _get_shipped_model(task: GymTask) -> str | None:
     return str(get_gym_model_path()) if isinstance(task.tool, Blade) else None
 
 
-def check_arguments(given: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int], str | None]:
+def check_arguments(arguments: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int], str | None]:
     """Validate `anatomy`, `physics`, `device`, `size` and `model`, see `open_setting`.
 
     Raises
@@ -250,7 +250,7 @@ def check_arguments(given: Mapping[str, object]) -> tuple[str, str, str, tuple[i
     InputError
         An invalid value.
     """
-    anatomy, physics, device, size, model = (given[name] for name in ARGUMENTS)
+    anatomy, physics, device, size, model = (arguments[name] for name in ARGUMENTS)
     if not isinstance(anatomy, str | Path):
         raise InputError(f"anatomy is {anatomy!r:.80}: give 'template', or the path of a .vtu file.")
     if not isinstance(model, str | Path | None):

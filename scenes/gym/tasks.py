@@ -25,7 +25,7 @@ class Goal:
 
     Parameters
     ----------
-    place
+    position
         Goal position (3,) [m] in the scan.
     direction
         (3,) unit vector in which tissue is pressed or drawn.
@@ -35,7 +35,7 @@ class Goal:
         Final fluid level as a share of its height.
     """
 
-    place: np.ndarray
+    position: np.ndarray
     direction: np.ndarray
     amount: float
     fluid: float = 1.0
@@ -51,54 +51,54 @@ class GymTask:
         Name in lower case; description.
     tool
         Tool of the robot.
-    force, pressure
+    max_force, max_pressure
         Limits of the force on the tissue [N], and of the pressure under the tool [Pa].
     amount
         Range of the goal's amount, in its own unit; `unit` is the amount with the observation 1.
     tolerance
         Tolerance relative to the requested amount.
-    aside
+    max_distance
         Maximum distance of the tool from its goal position [m].
-    held
+    hold_steps
         Number of consecutive steps for which the goal must be held.
-    forward
+    max_push_angle
         Maximum angle of a push to the inward axis [rad].
     step, turn
         Translation [m] and rotation [rad] of an action of 1.
-    tilt
+    max_tilt
         Maximum tilt of the tool from its first orientation [rad].
-    deepest
+    max_depth
         Maximum depth below the centre of the open cortex [m].
-    cuts
+    resects
         True if tissue is resected.
     """
 
     name: str
     title: str
     tool: Instrument
-    force: float
-    pressure: float
+    max_force: float
+    max_pressure: float
     amount: tuple[float, float]
     unit: float
     tolerance: float
-    aside: float
-    held: int
-    forward: float = 0.0
+    max_distance: float
+    hold_steps: int
+    max_push_angle: float = 0.0
     step: float = 1e-3
     turn: float = float(np.radians(2.0))
-    tilt: float = float(np.radians(40.0))
-    deepest: float = 0.02
-    cuts: bool = False
+    max_tilt: float = float(np.radians(40.0))
+    max_depth: float = 0.02
+    resects: bool = False
 
     @property
     def surgery(self) -> Debulking | None:
         """Return the resection: the corridor, then share after share; the last share remains."""
-        return Debulking(tuple(float(each) for each in range(int(self.amount[1]) + 1))) if self.cuts else None
+        return Debulking(tuple(float(each) for each in range(int(self.amount[1]) + 1))) if self.resects else None
 
     def build_scene(self, size: tuple[int, int]) -> Scene:
         """Return the scene of the task, with images of a width and height [pixel]."""
         view = replace(OBLIQUE_VIEWPOINT, width=size[0], height=size[1])
-        if self.cuts:
+        if self.resects:
             effects = Elasticity(MATERIALS["drained"].tissue), Held(), SkullContact(), Gravity()
             return Scene(
                 self.name, self.title, effects=effects, tool=self.tool, surgery=self.surgery, viewpoint=view,
@@ -120,17 +120,18 @@ class Aspirator(Probe):
 
 PALPATE = GymTask(
     "palpate", "Press on the cortex over the tumour with the force that is asked for, and hold it.",
-    Probe(radius=6e-3), force=0.25, pressure=2.7e3, amount=(0.06, 0.15), unit=0.25, tolerance=0.15, aside=3e-3, held=5,
+    Probe(radius=6e-3), max_force=0.25, max_pressure=2.7e3, amount=(0.06, 0.15), unit=0.25, tolerance=0.15,
+    max_distance=3e-3, hold_steps=5,
 )  # fmt: skip
 RETRACT = GymTask(
     "retract", "Lay a spatula on the cortex, draw it aside as far as is asked for, and hold it.",
-    Blade(), force=0.5, pressure=4e3, amount=(1.5e-3, 3.5e-3), unit=5e-3, tolerance=0.15, aside=6e-3, held=5,
-    forward=float(np.radians(30.0)),
+    Blade(), max_force=0.5, max_pressure=4e3, amount=(1.5e-3, 3.5e-3), unit=5e-3, tolerance=0.15,
+    max_distance=6e-3, hold_steps=5, max_push_angle=float(np.radians(30.0)),
 )  # fmt: skip
 DEBULK = GymTask(
     "debulk", "Follow the tumour as it sinks, and suck it out share by share, without pressing on healthy tissue.",
-    Aspirator(), force=0.02, pressure=2e3, amount=(3.0, 3.0), unit=3.0, tolerance=0.0, aside=4e-3, held=5,
-    deepest=0.06, cuts=True,
+    Aspirator(), max_force=0.02, max_pressure=2e3, amount=(3.0, 3.0), unit=3.0, tolerance=0.0, max_distance=4e-3,
+    hold_steps=5, max_depth=0.06, resects=True,
 )  # fmt: skip
 TASKS = {task.name: task for task in (PALPATE, RETRACT, DEBULK)}
 """Tasks by name."""

@@ -10,7 +10,7 @@ from sim.deformation import Deformation
 
 
 @dataclass(frozen=True, eq=False)
-class Touched:
+class Response:
     """Response of the tissue to a tool.
 
     Parameters
@@ -21,7 +21,7 @@ class Touched:
         Force of the tool on the tissue (3,) [N].
     pressure
         Maximum pressure under the tool [Pa].
-    good
+    reliable
         True if the solution is reliable.
     error
         95 % bound of the tumour vertex error relative to the model's FEM [m]; 0 for FEM itself.
@@ -33,7 +33,7 @@ class Touched:
     nodes: np.ndarray
     force: np.ndarray
     pressure: float
-    good: bool = True
+    reliable: bool = True
     error: float = 0.0
     memory: Deformation | None = None
 
@@ -46,18 +46,18 @@ class TissueRequest:
     ----------
     pose
         T_world_tool (4, 4).
-    last
+    previous
         Previous response; None at the start of an episode.
     fluid
         Fluid level relative to its full height.
-    done
+    completed_steps
         Number of completed resection steps.
     """
 
     pose: np.ndarray
-    last: Touched | None = None
+    previous: Response | None = None
     fluid: float = 1.0
-    done: int = 0
+    completed_steps: int = 0
 
 
 class TissueModel(Protocol):
@@ -67,6 +67,6 @@ class TissueModel(Protocol):
     for byte for any number of requests.
     """
 
-    def compute_responses(self, asked: Sequence[TissueRequest]) -> list[Touched]:
+    def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
         """Compute the responses to requests, in their order."""
         ...

@@ -22,7 +22,7 @@ from surrogate.onnx_export.export import build_graph
 from surrogate.onnx_export.graph import Sheet
 
 from ..episodes.reading.bodies import is_template
-from ..page.text import RESEARCH_ONLY, format_legend, to_stroke
+from ..page.text import RESEARCH_ONLY, format_legend, to_svg_stroke
 from ..play.deformers import PatientSetup
 from ..play.frame_text import OUTCOME_WARNINGS
 from ..play.player import BONE_WARNING
@@ -32,7 +32,7 @@ from ..script.scene import Scene
 from ..script.shipped_files import get_template_path
 from ..script.tool import Probe
 from .packing import pack_arrays
-from .scene_arrays import build_arrays, describe_stage
+from .scene_arrays import build_arrays, describe_camera_and_tool
 
 MAX_BYTES = 2_000_000  # Largest size of the file [bytes].
 MAX_MODEL_BYTES = 32_000_000  # Size of a model's arrays above which they do not fit, compressed [bytes].
@@ -51,7 +51,7 @@ class ExportedModel:
     cortex: bool
 
 
-def write_html(path: str | Path, theatre: PatientSetup, scene: Scene, learner: str | None = None) -> ExportedModel:
+def write_html(path: str | Path, patient: PatientSetup, scene: Scene, learner: str | None = None) -> ExportedModel:
     """Write the page of a scene atomically, without the motion of the cortex if that is too large; return its model.
 
     Parameters
@@ -68,11 +68,11 @@ def write_html(path: str | Path, theatre: PatientSetup, scene: Scene, learner: s
     """
     if not isinstance(scene.tool, Probe):
         raise InputError(f"{scene.name}: the page pushes with a palpation ball, which this scene has not.")
-    found = choose_model(theatre, learner)
-    page = build_html(theatre, scene, found).encode()
+    found = choose_model(patient, learner)
+    page = build_html(patient, scene, found).encode()
     if found.cortex and len(page) > MAX_BYTES:
-        found = build_exported_model(found.name, found.model, cortex=False)
-        page = build_html(theatre, scene, found).encode()
+        found = build_exported_model(found.name, found.model, with_cortex=False)
+        page = build_html(patient, scene, found).encode()
     if len(page) > MAX_BYTES:
         raise InputError(
             f"{found.name}: the page would have {len(page) / 1e6:.1f} MB, but at most {MAX_BYTES / 1e6:g} MB are "
@@ -83,7 +83,7 @@ def write_html(path: str | Path, theatre: PatientSetup, scene: Scene, learner: s
     return found
 
 
-def choose_model(theatre: PatientSetup, learner: str | None = None) -> ExportedModel:
+def choose_model(patient: PatientSetup, learner: str | None = None) -> ExportedModel:
     """Trace the named model, or the model with the fewest parameters.
 
     Raises
@@ -91,12 +91,12 @@ def choose_model(theatre: PatientSetup, learner: str | None = None) -> ExportedM
     InputError
         See `write_html`.
     """
-    if learner is not None and learner not in theatre.models:
-        raise InputError(f"no learner is called {learner}: choose from {', '.join(theatre.models)}.")
+    if learner is not None and learner not in patient.models:
+        raise InputError(f"no learner is called {learner}: choose from {', '.join(patient.models)}.")
     found, reasons = [], []
-    for name in theatre.models if learner is None else [learner]:
+    for name in patient.models if learner is None else [learner]:
         try:
-            found.append(build_exported_model(name, theatre.models[name], cortex=True))
+            found.append(build_exported_model(name, patient.models[name], with_cortex=True))
         except InputError as error:
             reasons.append(str(error))
     if not found:
@@ -104,7 +104,7 @@ def choose_model(theatre: PatientSetup, learner: str | None = None) -> ExportedM
     return min(found, key=lambda one: _count_bytes(one.sheet))
 
 
-def build_exported_model(name: str, model: Learned, cortex: bool) -> ExportedModel:
+def build_exported_model(name: str, model: Learned, with_cortex: bool) -> ExportedModel:
     """Trace a model of the tumour, or of the cortex too.
 
     Raises
@@ -114,40 +114,40 @@ def build_exported_model(name: str, model: Learned, cortex: bool) -> ExportedMod
     """
     if model.tool is not None:
         raise InputError(f"{name} is a model of poses, but the page pushes by a force: export another learner.")
-    sheet = build_graph(name, model, cortex)
+    sheet = build_graph(name, model, with_cortex)
     if _count_bytes(sheet) > MAX_MODEL_BYTES:
         raise InputError(
             f"{name} has {_count_bytes(sheet) / 1e6:.0f} MB of numbers, too many for a page: export another learner."
         )
-    return ExportedModel(name, model, sheet, cortex)
+    return ExportedModel(name, model, sheet, with_cortex)
 
 
 def _count_bytes(sheet: Sheet) -> int:
     return sum(array.nbytes for array in sheet.constants.values())
 
 
-def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> str:
+def build_html(patient: PatientSetup, scene: Scene, exported: ExportedModel) -> str:
     """Build the text of the page with model, surfaces, scripts and style."""
-    stage, model = theatre.build_stage(scene).plain, exported.model
+    stage, model = patient.build_stage(scene).without_fine_cortex, exported.model
     nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
     table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})
-    described = describe_stage(stage, scene.viewpoint.build_camera(stage.site))
+    described = describe_camera_and_tool(stage, scene.viewpoint.build_camera(stage.site))
     most = described["force"]["most"] = round(FORCE_RANGE * model.envelope.force[1], 2)
     described |= {
         "arrays": table,
         "graph": exported.sheet.to_json(),
         "bound": model.bound if np.isfinite(model.bound) else None,
-        **_describe_errors(theatre, scene),
+        **_describe_errors(patient, scene),
     }
     script = "\n".join(_read(name) for name in SCRIPTS)
     style = _read("page.css")
     fields = {
         "title": escape(f"sulcus: {scene.name}"),
-        "heading": escape(f"Simulation: {describe_location(theatre.anatomy)} tumour, scene {scene.name}"),
+        "heading": escape(f"Simulation: {describe_location(patient.anatomy)} tumour, scene {scene.name}"),
         "caption": escape(" ".join(scene.title.split())),
         "restriction": escape(RESEARCH_ONLY),
-        "facts": "".join(f'<p class="dim">{escape(fact)}</p>' for fact in _list_facts(theatre, exported)),
-        "notice": _format_notice() if is_template(theatre.anatomy.digest) else "",
+        "facts": "".join(f'<p class="dim">{escape(fact)}</p>' for fact in _list_facts(patient, exported)),
+        "notice": _format_notice() if is_template(patient.anatomy.digest) else "",
         "legend": _format_legend(),
         "most": f"{most:g}",
     }
@@ -157,9 +157,9 @@ def build_html(theatre: PatientSetup, scene: Scene, exported: ExportedModel) -> 
     )  # fmt: skip
 
 
-def _describe_errors(theatre: PatientSetup, scene: Scene) -> dict[str, Any]:
+def _describe_errors(patient: PatientSetup, scene: Scene) -> dict[str, Any]:
     """Return the error of the tumour position in proportion to its motion, and its description for the page."""
-    error, registration = theatre.estimate_motion_error(scene), scene.registration
+    error, registration = patient.estimate_motion_error(scene), scene.registration
     known = None if error is None else {"rest": error.rest[registration], "surface": error.surface}
     words = {
         "still": "the tool does not push: the tumour is where the scan has it",
@@ -172,7 +172,7 @@ def _describe_errors(theatre: PatientSetup, scene: Scene) -> dict[str, Any]:
     return {"positionError": known, "words": words}
 
 
-def _list_facts(theatre: PatientSetup, exported: ExportedModel) -> list[str]:
+def _list_facts(patient: PatientSetup, exported: ExportedModel) -> list[str]:
     """Return sentences about model, error bound, anatomy and program."""
     model = exported.model
     bound = f"at most {1e3 * model.bound:.2f} mm" if np.isfinite(model.bound) else "not known"
@@ -180,7 +180,7 @@ def _list_facts(theatre: PatientSetup, exported: ExportedModel) -> list[str]:
         f"Fast model: {model.source}.",
         f"Model error (95 % of loads like those of the training, relative to FEM): {bound} at any point of the tumour; "
         "the page shows that of each load.",
-        f"Brain: {len(theatre.anatomy.mesh.nodes)} mesh points.",
+        f"Brain: {len(patient.anatomy.mesh.nodes)} mesh points.",
         f"Written by sulcus {get_version('sulcus')}; this file loads nothing from elsewhere.",
     ]
 
@@ -193,7 +193,7 @@ def _format_notice() -> str:
 
 
 def _format_legend() -> str:
-    now = to_stroke(TUMOUR_COLOUR)
+    now = to_svg_stroke(TUMOUR_COLOUR)
     return format_legend(
         [
             (f'{now} stroke-width="3"', "predicted tumour"),

@@ -44,18 +44,18 @@ def build_arrays(stage: Stage, nodes: np.ndarray) -> dict[str, np.ndarray]:
     used, drape_triangles = np.unique(drape.triangles, return_inverse=True)
     arrays = {
         **_build_surface("patch", patch.points, patch.triangles, np.float64),
-        "patchRows": find_rows(patch.nodes, nodes),
+        "patchRows": find_row_indices(patch.nodes, nodes),
         **_build_surface("cortex", cortex.vertices, cortex.triangles),
-        "cortexRows": find_rows(stage.visible_vertices, nodes),
+        "cortexRows": find_row_indices(stage.visible_vertices, nodes),
         **_build_surface("drape", drape.vertices[used], drape_triangles),
         **_build_surface("tool", tool.mesh.vertices @ pose[:3, :3].T + pose[:3, 3], tool.mesh.faces),
         **_build_surface("tumour", rest[stage.tumour_vertices], stage.tumour_at_rest.triangles),
-        "tumourRows": find_rows(stage.tumour_vertices, nodes),
+        "tumourRows": find_row_indices(stage.tumour_vertices, nodes),
     }
     return arrays | _build_texture(stage, cortex)
 
 
-def find_rows(vertices: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+def find_row_indices(vertices: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return the position (n,) uint16 of each of the `vertices` (n,) in sorted `nodes`, or `NO_ROW`."""
     row = np.searchsorted(nodes, vertices).clip(max=len(nodes) - 1)
     return np.where(nodes[row] == vertices, row, NO_ROW).astype(np.uint16)
@@ -86,7 +86,7 @@ def _build_texture(stage: Stage, cortex: Layer) -> dict[str, np.ndarray]:
     }
 
 
-def describe_stage(stage: Stage, camera: Camera) -> dict[str, Any]:
+def describe_camera_and_tool(stage: Stage, camera: Camera) -> dict[str, Any]:
     """Return coordinate system, camera, light, colours and tool, for JSON; lengths [m], colours scene-linear."""
     site, tool, lamp, scene = stage.site, stage.scene.tool, stage.lamp, stage.scene
     assert isinstance(tool, Probe)

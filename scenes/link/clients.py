@@ -17,7 +17,7 @@ from .frame import (
     read_header,
     read_metadata,
 )
-from .messages import Code, encode_status
+from .messages import Status, encode_status
 
 REJECTED_DEVICE = "SulcusRefused"
 """Device name of each STATUS that is sent to one client."""
@@ -53,15 +53,15 @@ class Client:
 
     number: int
     writer: asyncio.StreamWriter
-    waiting: dict[str, tuple[bytes, ...]] = field(default_factory=dict)
+    pending: dict[str, tuple[bytes, ...]] = field(default_factory=dict)
     news: asyncio.Event = field(default_factory=asyncio.Event)
     spoke: asyncio.Event = field(default_factory=asyncio.Event)
-    asks: bool = False
+    polls: bool = False
     leaving: bool = False
 
     def offer(self, key: str, messages: tuple[bytes, ...]) -> None:
         """Queue messages for sending; older ones of the same key are dropped."""
-        self.waiting[key] = messages
+        self.pending[key] = messages
         self.news.set()
 
     def leave(self) -> None:
@@ -79,20 +79,20 @@ class LinkClients:
     ----------
     receive
         Callback for each wanted message with a valid checksum.
-    longest
+    max_size
         Maximum size of a message by type; 0: not wanted.
-    most
+    max_clients
         Maximum number of clients; further ones are rejected.
-    note
+    log
         Callback for a line when a client connects or leaves, and when a message is rejected for a new reason.
     """
 
     def __init__(
-        self, receive: Receive, longest: Longest, most: int = 16, note: Callable[[str], None] = lambda line: None
+        self, receive: Receive, max_size: Longest, max_clients: int = 16, log: Callable[[str], None] = lambda line: None
     ) -> None:
         self.refused: Counter[str] = Counter()
         """Number of rejected messages, by reason."""
-        self._receive, self._longest, self._most, self._note = receive, longest, most, note
+        self._receive, self._longest, self._most, self._note = receive, max_size, max_clients, log
         self._numbers = count()
         self._clients: dict[int, Client] = {}
         self._newest: dict[str, tuple[bytes, ...]] = {}
@@ -106,17 +106,17 @@ class LinkClients:
         """Send messages to all clients, together; they replace queued messages of the same key."""
         self._newest[key] = tuple(messages)
         for client in self._clients.values():
-            if not client.asks:
+            if not client.polls:
                 client.offer(key, self._newest[key])
 
-    def reject(self, number: int, code: Code, why: str, text: str) -> None:
+    def reject(self, client_number: int, code: Status, reason: str, text: str) -> None:
         """Count a rejected message, and send a STATUS to one client; a newer STATUS replaces a queued one."""
-        self._count_rejection(why, text)
-        client = self._clients.get(number)
-        if client is not None and not client.asks:
+        self._count_rejection(reason, text)
+        client = self._clients.get(client_number)
+        if client is not None and not client.polls:
             client.offer(REJECTED_DEVICE, (pack_message("STATUS", REJECTED_DEVICE, encode_status(code, text), 0),))
 
-    async def converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one connection until it ends."""
         task = asyncio.current_task()
         assert task is not None
@@ -128,7 +128,7 @@ class LinkClients:
             return
         self._count_rejection("too many clients")
         text = f"{self._most} clients are connected, and no more are taken: end one of them"
-        writer.write(pack_message("STATUS", REJECTED_DEVICE, encode_status(Code.BUSY, text), 0))
+        writer.write(pack_message("STATUS", REJECTED_DEVICE, encode_status(Status.BUSY, text), 0))
         await _close(writer)
 
     async def close(self) -> None:
@@ -143,7 +143,7 @@ class LinkClients:
 
     async def listen(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Receive the messages of a server until the connection ends, and send nothing."""
-        await self._attend(Client(next(self._numbers), writer, asks=True), reader)
+        await self._attend(Client(next(self._numbers), writer, polls=True), reader)
 
     async def _serve_client(self, client: Client, reader: asyncio.StreamReader) -> None:
         peer = client.writer.get_extra_info("peername")
@@ -177,15 +177,15 @@ class LinkClients:
                 await client.spoke.wait()
         except TimeoutError:
             pass
-        if not client.asks:
-            client.waiting = self._newest | client.waiting
+        if not client.polls:
+            client.pending = self._newest | client.pending
             client.news.set()
         try:
-            while not client.leaving or client.waiting:
+            while not client.leaving or client.pending:
                 await client.news.wait()
                 client.news.clear()
-                while client.waiting:
-                    messages = client.waiting.pop(next(iter(client.waiting)))
+                while client.pending:
+                    messages = client.pending.pop(next(iter(client.pending)))
                     client.writer.writelines(messages)
                     async with asyncio.timeout(CLIENT_LIMITS.timeout):
                         await client.writer.drain()
@@ -209,9 +209,9 @@ class LinkClients:
                     await self._receive_body(client, reader, header)
                 await asyncio.sleep(0)  # lets other tasks run if a client sends without pause
         except TimeoutError:
-            self.reject(client.number, Code.TIMEOUT, "message that does not end", "a message did not end: reconnect")
+            self.reject(client.number, Status.TIMEOUT, "message that does not end", "a message did not end: reconnect")
         except BadMessageError as error:
-            self.reject(client.number, Code.OVERFLOW, "no message", f"{error}: reconnect")
+            self.reject(client.number, Status.OVERFLOW, "no message", f"{error}: reconnect")
         except asyncio.IncompleteReadError as error:
             if error.partial:
                 self._count_rejection("message that breaks off")
@@ -228,7 +228,7 @@ class LinkClients:
         longest = self._longest(header.kind)
         if header.size > longest:
             await _skip_bytes(reader, header.size)
-            why, code = ("too long", Code.OVERFLOW) if longest else ("type not used", Code.UNKNOWN_INSTRUCTION)
+            why, code = ("too long", Status.OVERFLOW) if longest else ("type not used", Status.UNKNOWN_INSTRUCTION)
             self.reject(client.number, code, why, f"{_format_name(header)} is passed over: {why}")
             return
         body = await reader.readexactly(header.size)
@@ -236,24 +236,24 @@ class LinkClients:
             content = read_content(header, body)
             self._receive(client.number, replace(header, metadata=read_metadata(header, body)), content)
         except BadMessageError as error:
-            code = Code.CHECKSUM if str(error) == WRONG_CHECKSUM else Code.CONFIGURATION
+            code = Status.CHECKSUM if str(error) == WRONG_CHECKSUM else Status.CONFIGURATION
             why = str(error).partition(":")[0]  # The text after a colon differs from message to message.
             self.reject(client.number, code, why, f"{_format_name(header)} is rejected: {error}")
 
     def _handle_request(self, client: Client, header: Header) -> None:
         """Handle a request: send one message (GET), or stop (STP) or start the stream of messages."""
-        client.asks = header.kind.startswith(QUERIES)
+        client.polls = header.kind.startswith(QUERIES)
         client.spoke.set()
         if header.kind.startswith("STP_"):
-            client.waiting.clear()
-        elif client.asks:
+            client.pending.clear()
+        elif client.polls:
             found = _find_message(self._newest, header.kind.removeprefix("GET_"), header.name)
             text = f"there is no {header.kind.removeprefix('GET_')} yet"
-            none = pack_message("STATUS", REJECTED_DEVICE, encode_status(Code.NOT_FOUND, text), 0)
-            client.waiting.clear()
+            none = pack_message("STATUS", REJECTED_DEVICE, encode_status(Status.NOT_FOUND, text), 0)
+            client.pending.clear()
             client.offer("asked", (found or none,))
         else:
-            client.waiting = dict(self._newest)
+            client.pending = dict(self._newest)
             client.news.set()
 
     def _count_rejection(self, why: str, text: str = "") -> None:

@@ -54,7 +54,7 @@ class Header:
     metadata: Mapping[str, str] = field(default_factory=dict)
 
 
-def read_header(raw: bytes) -> Header:
+def read_header(raw_bytes: bytes) -> Header:
     """Decode the header in 58 bytes.
 
     Raises
@@ -62,7 +62,7 @@ def read_header(raw: bytes) -> Header:
     BadMessageError
         An unknown version, or a type or name with characters other than printable ASCII: not OpenIGTLink.
     """
-    version, kind, name, stamp, size, checksum = HEADER.unpack(raw)
+    version, kind, name, stamp, size, checksum = HEADER.unpack(raw_bytes)
     words = [text.split(b"\0", 1)[0] for text in (kind, name)]
     if version not in VERSIONS or not words[0] or not all(32 <= byte < 127 for text in words for byte in text):
         raise BadMessageError("these bytes are no OpenIGTLink message of version 1 or 2")
@@ -115,10 +115,10 @@ def read_metadata(header: Header, body: bytes) -> dict[str, str]:
     return found
 
 
-def pack_message(kind: str, name: str, body: bytes, stamp: int) -> bytes:
+def pack_message(message_type: str, device_name: str, content: bytes, stamp: int) -> bytes:
     """Return a whole message of version 1, which every client reads; a name longer than 20 bytes is cut."""
-    text = name.encode("ascii", "replace")[:NAME_BYTES]
-    return HEADER.pack(1, kind.encode(), text, stamp, len(body), crc64.ecma_182(body)) + body
+    text = device_name.encode("ascii", "replace")[:NAME_BYTES]
+    return HEADER.pack(1, message_type.encode(), text, stamp, len(content), crc64.ecma_182(content)) + content
 
 
 def to_stamp(time: float) -> int:

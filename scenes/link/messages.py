@@ -26,7 +26,7 @@ ASCII = 3  # Number of the encoding US-ASCII.
 MAX_TEXT_BYTES = (1 << 16) - 1  # Maximum length of a text [bytes].
 
 
-class Code(IntEnum):
+class Status(IntEnum):
     """Codes of a STATUS."""
 
     OK = 1
@@ -42,34 +42,31 @@ class Code(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class SentMesh:
-    """Encoded triangles (m, 3) of a moving surface.
-
-    The triangles are encoded once.
-    """
+class EncodedMesh:
+    """Encoded triangles (m, 3) of a moving surface. The triangles are encoded once."""
 
     count: int
     cells: bytes
 
     @staticmethod
-    def from_triangles(triangles: np.ndarray) -> SentMesh:
+    def from_triangles(triangles: np.ndarray) -> EncodedMesh:
         """Encode triangles, given as vertex numbers (m, 3)."""
         rows = np.full((len(triangles), 4), 3, INTEGER_TYPE)
         rows[:, 1:] = triangles
-        return SentMesh(len(triangles), rows.tobytes())
+        return EncodedMesh(len(triangles), rows.tobytes())
 
 
-EMPTY_MESH = SentMesh(0, b"")
+EMPTY_MESH = EncodedMesh(0, b"")
 """Surface that is not available."""
 
 
-def encode_polydata(points: np.ndarray, mesh: SentMesh) -> bytes:
+def encode_polydata(points: np.ndarray, mesh: EncodedMesh) -> bytes:
     """Encode points (n, 3) [mm] and the triangles between them as POLYDATA."""
     head = struct.pack(">10I", len(points), 0, 0, 0, 0, mesh.count, len(mesh.cells), 0, 0, 0)
     return head + np.ascontiguousarray(points, FLOAT_TYPE).tobytes() + mesh.cells
 
 
-def transform(T: np.ndarray) -> bytes:
+def encode_transform(T: np.ndarray) -> bytes:
     """Encode a rigid motion (4, 4) [mm] as TRANSFORM, column by column."""
     return np.ascontiguousarray(T[:3].T, FLOAT_TYPE).tobytes()
 
@@ -109,9 +106,9 @@ def _read_floats(content: bytes, count: int) -> np.ndarray:
     return np.frombuffer(content, FLOAT_TYPE).astype(float)
 
 
-def encode_points(names: list[str], places: np.ndarray) -> bytes:
+def encode_points(names: list[str], positions: np.ndarray) -> bytes:
     """Encode named points (n, 3) [mm] as POINT."""
-    rows = zip(names, places.tolist(), strict=True)
+    rows = zip(names, positions.tolist(), strict=True)
     return b"".join(
         POINT.pack(name.encode("ascii", "replace")[:64], b"", 255, 255, 0, 255, *place, 0.0, b"")
         for name, place in rows
@@ -135,12 +132,12 @@ def read_points(content: bytes) -> tuple[list[str], np.ndarray]:
     return [row[0].split(b"\0", 1)[0].decode("ascii", "replace") for row in rows], places
 
 
-def encode_image(colour: np.ndarray) -> bytes:
+def encode_image(image: np.ndarray) -> bytes:
     """Encode an image (H, W, 3) uint8 as IMAGE, with pixels of 1 mm around the origin."""
-    height, width, channels = colour.shape
+    height, width, channels = image.shape
     size = width, height, 1
     axes = 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
-    return IMAGE.pack(1, channels, BYTES, BIG, RAS, *size, *axes, 0, 0, 0, *size) + colour.tobytes()
+    return IMAGE.pack(1, channels, BYTES, BIG, RAS, *size, *axes, 0, 0, 0, *size) + image.tobytes()
 
 
 def read_image(content: bytes) -> np.ndarray:
@@ -170,7 +167,7 @@ def encode_string(text: str) -> bytes:
     return struct.pack(">HH", ASCII, len(raw)) + raw
 
 
-def encode_status(code: Code, text: str) -> bytes:
+def encode_status(code: Status, text: str) -> bytes:
     """Encode a code, its name, and a sentence as STATUS."""
-    name = "" if code is Code.OK else code.name
+    name = "" if code is Status.OK else code.name
     return STATUS.pack(code, 0, name.encode()) + text.encode("ascii", "replace") + b"\0"

@@ -15,13 +15,13 @@ from ..tracked.follower import TrackingResult, TumourState
 from .frame import BadMessageError, pack_message
 from .messages import (
     EMPTY_MESH,
-    Code,
-    SentMesh,
+    EncodedMesh,
+    Status,
     encode_points,
     encode_polydata,
     encode_status,
     encode_string,
-    transform,
+    encode_transform,
 )
 from .pose_responder import PoseResult
 
@@ -37,7 +37,7 @@ INSIDE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class SentPlaces:
+class SentPoints:
     """Points in or on the tumour, or on the open cortex.
 
     Parameters
@@ -48,7 +48,7 @@ class SentPlaces:
         Positions in the scan (n, 3) [m].
     vertices, weights
         (n, 4): mesh vertices that determine their motion, and interpolation weights.
-    unfollowed
+    unattached
         Description of points that cannot be followed, with their distances; empty: none.
     """
 
@@ -56,11 +56,11 @@ class SentPlaces:
     rest: np.ndarray
     vertices: np.ndarray
     weights: np.ndarray
-    unfollowed: str = ""
+    unattached: str = ""
 
 
 @dataclass(frozen=True, eq=False)
-class Outgoing:
+class ResultEncoder:
     """Encoder of results on a stage. All positions are in the scan's RAS, in millimetres.
 
     `registered` is true if the registration's error is known.
@@ -70,14 +70,14 @@ class Outgoing:
     registered: bool = True
 
     @cached_property
-    def _surfaces(self) -> tuple[tuple[str, np.ndarray, SentMesh], ...]:
+    def _surfaces(self) -> tuple[tuple[str, np.ndarray, EncodedMesh], ...]:
         """Name, vertices and triangles of the tumour, and of the open cortex."""
         cortex, faces = np.unique(self.stage.anatomy.open_surface, return_inverse=True)
-        tumour = SentMesh.from_triangles(self.stage.tumour_at_rest.triangles)
+        tumour = EncodedMesh.from_triangles(self.stage.tumour_at_rest.triangles)
         return ("Tumour", self.stage.tumour_vertices, tumour), (
             "Cortex",
             cortex,
-            SentMesh.from_triangles(faces.reshape(-1, 3)),
+            EncodedMesh.from_triangles(faces.reshape(-1, 3)),
         )
 
     def build_scan(self, stamp: int) -> bytes:
@@ -86,35 +86,36 @@ class Outgoing:
         at = self.stage.anatomy.mesh.nodes[vertices]
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * at, mesh), stamp)
 
-    def build_messages(self, result: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
+    def build_messages(self, result: PoseResult, points: SentPoints | None = None) -> tuple[bytes, ...]:
         """Build all messages of a result, with the result's stamp; unknown surfaces are sent without points."""
-        known, stamp = result.known, result.stamp
+        known, stamp = result.tracking, result.stamp
         none = encode_polydata(np.empty((0, 3)), EMPTY_MESH)
         out = []
         for name, vertices, mesh in self._surfaces:
             here = _is_motion_known(known, vertices)
             body = encode_polydata(1e3 * known.motion.positions[vertices], mesh) if here else none
-            for word, shown in (("Now", known.relied), ("Doubtful", known.state is TumourState.UNSURE)):
+            for word, shown in (("Now", known.is_reliable), ("Doubtful", known.state is TumourState.UNSURE)):
                 out.append(pack_message("POLYDATA", f"{name}{word}", body if shown else none, stamp))
-        if known.relied:
+        if known.is_reliable:
             rest, now = (each[self.stage.tumour_vertices] for each in (self._rest, known.motion.positions))
-            out.append(pack_message("TRANSFORM", "TumourToRas", transform(fit_rigid(1e3 * rest, 1e3 * now)), stamp))
+            motion = encode_transform(fit_rigid(1e3 * rest, 1e3 * now))
+            out.append(pack_message("TRANSFORM", "TumourToRas", motion, stamp))
         out.append(pack_message("STRING", "TipToTumour", encode_string(self._format_distance(result)), stamp))
         out.append(pack_message("STRING", "TumourMotion", encode_string(self._format_motion(known)), stamp))
-        if places is not None:
-            body = self._build_point_message(known, places)
-            for word, shown in (("Now", known.relied), ("Doubtful", known.state is TumourState.UNSURE)):
+        if points is not None:
+            body = self._build_point_message(known, points)
+            for word, shown in (("Now", known.is_reliable), ("Doubtful", known.state is TumourState.UNSURE)):
                 out.append(pack_message("POINT", f"Points{word}", body if shown else b"", stamp))
         return tuple(out)
 
-    def build_status(self, result: PoseResult, refused: str) -> bytes:
+    def build_status(self, result: PoseResult, rejected: str) -> bytes:
         """Build the STATUS of a result, with the number of rejected messages by reason."""
-        known = result.known
-        code = Code.OK if known.relied else Code.NOT_READY
-        words = known.words or f"the tumour is known, {known.state.value}"
-        return pack_message("STATUS", "Sulcus", encode_status(code, f"{words}{refused}"), result.stamp)
+        known = result.tracking
+        code = Status.OK if known.is_reliable else Status.NOT_READY
+        words = known.warning or f"the tumour is known, {known.state.value}"
+        return pack_message("STATUS", "Sulcus", encode_status(code, f"{words}{rejected}"), result.stamp)
 
-    def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
+    def attach_points(self, names: list[str], positions: np.ndarray) -> SentPoints:
         """Attach points of the scan (n, 3) [m]: to the tumour's volume if inside, else to the nearest surface.
 
         Raises
@@ -122,17 +123,17 @@ class Outgoing:
         BadMessageError
             No point or too many; none in or on the tumour or on open cortex, so that their motion is unknown.
         """
-        if not 0 < len(at) <= MAX_PLACES:
+        if not 0 < len(positions) <= MAX_PLACES:
             raise BadMessageError(f"no place, or more than are followed: 1 to {MAX_PLACES}")
         anatomy = self.stage.anatomy
         triangles = np.concatenate([anatomy.tumour_surface, anatomy.open_surface])
-        found = find_closest_points(at, self._rest[triangles])
-        away = np.linalg.norm(found.point - at, axis=1)
+        found = find_closest_points(positions, self._rest[triangles])
+        away = np.linalg.norm(found.point - positions, axis=1)
         corners = triangles[found.triangle]
         vertices = np.concatenate([corners, corners[:, :1]], axis=1)
-        weights = np.concatenate([found.weights, np.zeros((len(at), 1))], axis=1)
-        held = locate(anatomy.mesh, at)
-        inside = self._is_in_tumour(held, at)
+        weights = np.concatenate([found.weights, np.zeros((len(positions), 1))], axis=1)
+        held = locate(anatomy.mesh, positions)
+        inside = self._is_in_tumour(held, positions)
         vertices[inside], weights[inside], away[inside] = held.vertices[inside], held.weights[inside], 0.0
         labels = [name or f"number {row}" for row, name in enumerate(names, 1)]
         strange = _format_names(
@@ -141,7 +142,7 @@ class Outgoing:
         good = np.flatnonzero(away <= MAX_POINT_DISTANCE)
         if not len(good):
             raise BadMessageError(f"{UNTRACKED_POINTS}: {strange}")
-        return SentPlaces(tuple(names[row] for row in good), at[good], vertices[good], weights[good], strange)
+        return SentPoints(tuple(names[row] for row in good), positions[good], vertices[good], weights[good], strange)
 
     def _is_in_tumour(self, held: LocatedPoints, at: np.ndarray) -> np.ndarray:
         """Return True for each point (n, 3) [m] in tetrahedra of the tumour."""
@@ -153,7 +154,7 @@ class Outgoing:
     def _rest(self) -> np.ndarray:
         return self.stage.anatomy.mesh.nodes
 
-    def _build_point_message(self, known: TrackingResult, places: SentPlaces) -> bytes:
+    def _build_point_message(self, known: TrackingResult, places: SentPoints) -> bytes:
         """Build the POINT message of the positions of those points that the result covers."""
         moved = (known.motion.positions - self._rest)[places.vertices]
         at = 1e3 * (places.rest + np.einsum("nk,nkd->nd", places.weights, moved))
@@ -163,18 +164,19 @@ class Outgoing:
 
     def _format_distance(self, result: PoseResult) -> str:
         """Describe the distance from tip to tumour with its error and source, or the reason why it is not available."""
-        known, gauge = result.known, result.gauge
+        known, gauge = result.tracking, result.gauge
         if gauge is None:
-            return f"not known: {known.words}"
+            return f"not known: {known.warning}"
         inside = "inside the tumour, its edge " if gauge.inside else ""
         return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._source}){_format_doubt(known)}"
 
     def _format_motion(self, known: TrackingResult) -> str:
         """Describe the tumour's displacement, with its error and sources; or why it is unknown."""
-        if known.band is None:
-            return f"not known: {known.words}"
-        moved = format_millimetres(known.motion.moved, known.motion.error)
-        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._source}){_format_doubt(known)}"
+        if known.bound is None:
+            return f"not known: {known.warning}"
+        moved = format_millimetres(known.motion.distance, known.motion.error)
+        within = bound_words(known.bound, 1)
+        return f"moved {moved}, placed within {within} (95 %; {self._source}){_format_doubt(known)}"
 
     @property
     def _source(self) -> str:
@@ -186,7 +188,7 @@ class Outgoing:
 
 def _format_doubt(known: TrackingResult) -> str:
     """Describe why numbers are unreliable; empty if they are reliable."""
-    return "" if known.relied else f"; doubtful: {known.words}"
+    return "" if known.is_reliable else f"; doubtful: {known.warning}"
 
 
 def _format_names(names: list[str]) -> str:
@@ -201,10 +203,10 @@ def _is_motion_known(known: TrackingResult, vertices: np.ndarray) -> bool:
     return result is not None and bool(np.isin(vertices, result.nodes).all())
 
 
-def fit_rigid(rest: np.ndarray, now: np.ndarray) -> np.ndarray:
+def fit_rigid(rest: np.ndarray, current: np.ndarray) -> np.ndarray:
     """Fit the rigid motion (4, 4) that maps points (n, 3) to their current positions (n, 3), in their unit."""
-    middle, there = rest.mean(axis=0), now.mean(axis=0)
+    middle, there = rest.mean(axis=0), current.mean(axis=0)
     T = np.eye(4)
-    T[:3, :3] = Rotation.align_vectors(now - there, rest - middle)[0].as_matrix()
+    T[:3, :3] = Rotation.align_vectors(current - there, rest - middle)[0].as_matrix()
     T[:3, 3] = there - T[:3, :3] @ middle
     return T

@@ -20,14 +20,14 @@ from ..tracked.follower import (
     TrackingResult,
     TumourState,
     compute_tip_covariance,
-    describe_wide_band,
+    describe_large_error,
 )
 from ..tracked.overlay_painter import Painter
 from ..tracked.plausible import describe_misplaced_tool
 from ..tracked.tool_motion import ToolMotion
 from ..tracked.tracked_tool import TrackedTool
 from .frame import to_stamp, to_time
-from .received_transforms import ReceivedTransforms, Sent
+from .received_transforms import ReceivedTransform, ReceivedTransforms
 
 MIN_POSES = 3  # Minimum number of poses to estimate the camera's acceleration between them.
 OWNER_QUESTION = "are these its poses and registration?"  # Question in the warning about a misplaced tool.
@@ -36,16 +36,16 @@ TIMED_DEPTH = 2e-3  # Depth of the tool whose solution is timed at the start [m]
 
 
 @dataclass(frozen=True, eq=False)
-class CameraPlacement:
+class CameraPose:
     """Camera pose T (4, 4) [m] in the reference's frame, and error of a position by the camera's motion [m]."""
 
     T: np.ndarray
-    moved: float
+    motion_error: float
 
 
-def place_camera(
-    course: Sequence[Sent], now: float, stamp: int, place: np.ndarray, stale: float
-) -> CameraPlacement | str:
+def interpolate_camera_pose(
+    received: Sequence[ReceivedTransform], now: float, stamp: int, position: np.ndarray, max_age: float
+) -> CameraPose | str:
     """Interpolate a camera's pose at an image's time stamp, from its poses, the newest last; or return a reason.
 
     Between two poses, and just after the newest, see `PoseStream.interpolate`. The error is the camera's
@@ -53,26 +53,26 @@ def place_camera(
     three poses, it is the newest pose, and the position's motion in the image since. Without stamps, arrival times of
     messages are used. A reason has {name} instead of the transform's name.
     """
-    body = course[-1]
-    stamped = bool(stamp and all(sent.stamp for sent in course))
-    times = np.array([to_time(sent.stamp) if stamped else sent.arrived for sent in course])
+    body = received[-1]
+    stamped = bool(stamp and all(sent.stamp for sent in received))
+    times = np.array([to_time(sent.stamp) if stamped else sent.arrived for sent in received])
     time = to_time(stamp) if stamped else now
-    poses = np.stack([sent.T for sent in course])
-    if stamped and len(course) >= MIN_POSES and np.ptp(times[-MIN_POSES:]) <= MAX_GAP * MIN_POSES:
-        between = PoseStream(times, poses, np.zeros((len(course), 6, 6))).interpolate(time)
+    poses = np.stack([sent.T for sent in received])
+    if stamped and len(received) >= MIN_POSES and np.ptp(times[-MIN_POSES:]) <= MAX_GAP * MIN_POSES:
+        between = PoseStream(times, poses, np.zeros((len(received), 6, 6))).interpolate(time)
         if between is not None:
-            arm = float(np.linalg.norm(place - between.T_camera_target[:3, 3]))
+            arm = float(np.linalg.norm(position - between.T_camera_target[:3, 3]))
             shift, turn = np.sqrt(np.diag(between.covariance)[[0, 3]])
-            return CameraPlacement(between.T_camera_target, float(shift + turn * arm))
+            return CameraPose(between.T_camera_target, float(shift + turn * arm))
     apart = abs(time - times[-1])
-    if apart > stale:
-        return f"no {{name}} within {stale:g} s of the image's time"
-    if len(course) < 2:
+    if apart > max_age:
+        return f"no {{name}} within {max_age:g} s of the image's time"
+    if len(received) < 2:
         return "one {name} alone, which does not say how fast the camera moves"
     step = times[-1] - times[-2]
-    here, there = (np.linalg.inv(T) @ np.append(place, 1.0) for T in poses[-1:-3:-1])
+    here, there = (np.linalg.inv(T) @ np.append(position, 1.0) for T in poses[-1:-3:-1])
     way = float(np.linalg.norm((here - there)[:3]))
-    return CameraPlacement(body.T, way * apart / step if step > 0.0 else np.inf)
+    return CameraPose(body.T, way * apart / step if step > 0.0 else np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +83,14 @@ class PoseResult:
     ----------
     stamp
         The pose's own time stamp; without one, or without a result, that of the computation.
-    known
+    tracking
         Positions of tumour and cortex, with state and text of an overlay.
     gauge
         Distance from tip to tumour; None if unknown.
     """
 
     stamp: int
-    known: TrackingResult
+    tracking: TrackingResult
     gauge: Gauge | None = None
 
 
@@ -98,11 +98,11 @@ class PoseResult:
 class CameraView:
     """Pose of the scan in a camera's frame: T_camera_scan (4, 4) [m].
 
-    `moved` is the tumour's error [m] from the time between pose and image.
+    `motion_error` is the tumour's error [m] from the time between pose and image.
     """
 
     T_camera_scan: np.ndarray
-    moved: float
+    motion_error: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,35 +127,35 @@ class PoseResponder:
     registration: Registration | None = None
 
     def compute_result(
-        self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
+        self, transforms: ReceivedTransforms, time: float, wall_time: float, previous: TrackingResult | None = None
     ) -> PoseResult:
-        """Compute the result at a time `now` [s], from the result `before`; `moment` is now, in seconds since 1970."""
-        registration = self._find_registration(heard)
+        """Compute the result at a time `time` [s], from the result `previous`; `wall_time`: now, in s since 1970."""
+        registration = self._find_registration(transforms)
         if isinstance(registration, str):
-            return self._build_unknown(registration, moment, before)
-        body = heard.find_relative(heard.names.tool, now)
+            return self._build_unknown(registration, wall_time, previous)
+        body = transforms.find_relative_transform(transforms.names.tool, time)
         if isinstance(body, str):
-            return self._build_unknown(body, moment, before)
-        stamp = body.stamp or to_stamp(moment)
+            return self._build_unknown(body, wall_time, previous)
+        stamp = body.stamp or to_stamp(wall_time)
         beside = Pose(body.T, np.diag(np.repeat([self.tracking**2, 0.0], 3)), 0.0, 0)
         pose = np.linalg.inv(registration.T_patient_scan) @ body.T @ self.tool.T_cube_tool
         spread = compute_tip_covariance(registration, self.tool, beside)
-        motion = self.motion.compute_motion(pose, spread, None if before is None else before.motion)
+        motion = self.motion.compute_motion(pose, spread, None if previous is None else previous.motion)
         known = TrackingResult(
-            to_time(stamp), TumourState.GOOD if motion.moved > 0.0 else TumourState.REST, "",
+            to_time(stamp), TumourState.GOOD if motion.distance > 0.0 else TumourState.REST, "",
             NO_TARGETS, motion, None, pose, spread,
         )  # fmt: skip
-        known = replace(known, reference_time=known.time, tool_time=moment, **self._describe_doubts(known, before))
+        known = replace(known, reference_time=known.time, tool_time=wall_time, **self._describe_doubts(known, previous))
         if known.state is TumourState.UNKNOWN:
             return PoseResult(stamp, known)
         known = self._add_band(known, registration)
-        if known.relied and registration.scanned is None:
-            known = replace(known, state=TumourState.UNSURE, words=UNCHECKED_WARNING)
+        if known.is_reliable and registration.scanned is None:
+            known = replace(known, state=TumourState.UNSURE, warning=UNCHECKED_WARNING)
         stage = self.motion.stage
-        gauge = Painter(stage, self.tool).measure_tip(known, stage.build_tumour(motion.positions))
+        gauge = Painter(stage, self.tool).measure_tip_distance(known, stage.build_tumour(motion.positions))
         return PoseResult(stamp, known, gauge)
 
-    def measure(self) -> float:
+    def measure_solve_time(self) -> float:
         """Measure the time of one solution [s]: the tool 2 mm deep at the craniotomy, with kernels loaded before."""
         site, pose = self.motion.stage.site, np.eye(4)
         pose[:3] = np.column_stack([site.right, site.up, -site.axis, site.origin + TIMED_DEPTH * site.axis])
@@ -164,71 +164,72 @@ class PoseResponder:
         self.motion.compute_motion(pose, self.tracking**2 * np.eye(3))
         return clock.perf_counter() - begun
 
-    def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
-        """Return the scan's pose in the camera's frame for an image's time stamp, or why it is unknown at `now` [s]."""
-        name = heard.names.camera
-        registration, body = self._find_registration(heard), heard.find_relative(name, now)
+    def find_camera(self, transforms: ReceivedTransforms, time: float, stamp: int) -> CameraView | str:
+        """Return the scan's pose in the camera's frame at an image's time stamp, or why it is unknown at `time` [s]."""
+        name = transforms.names.camera
+        registration, body = self._find_registration(transforms), transforms.find_relative_transform(name, time)
         if isinstance(registration, str) or isinstance(body, str):
             return registration if isinstance(registration, str) else str(body)
         middle = registration.T_patient_scan @ np.append(self.motion.stage.tumour_at_rest.vertices.mean(axis=0), 1.0)
-        placed = place_camera(heard.list_transforms(name), now, stamp, middle[:3], heard.stale)
+        placed = interpolate_camera_pose(transforms.list_transforms(name), time, stamp, middle[:3], transforms.max_age)
         if isinstance(placed, str):
             return placed.format(name=name)
-        return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.moved)
+        return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.motion_error)
 
     def _find_registration(self, heard: ReceivedTransforms) -> Registration | str:
         """Return the registration from the file or the last message, or the reason why there is none."""
         if self.registration is not None:
             return self.registration
-        sent = heard.sent.get(heard.names.registration)
+        sent = heard.newest.get(heard.names.registration)
         if sent is None:
             return f"no {heard.names.registration} yet"
         return Registration(np.linalg.inv(sent.T), np.zeros((6, 6)), np.zeros(3), 0.0, 0)
 
     def _describe_doubts(self, known: TrackingResult, before: TrackingResult | None) -> dict[str, object]:
         """Return state, text and `near` of an unreliable result; only `near` of a reliable result."""
-        near = before is not None and before.near
+        near = before is not None and before.was_near
         assert known.T_scan_tool is not None
         doubt, near = describe_misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, OWNER_QUESTION)
-        doubt = doubt or known.motion.doubt
+        doubt = doubt or known.motion.warning
         if doubt:
-            return {"state": TumourState.UNSURE, "words": doubt, "near": near}
-        if not known.motion.known:
-            return {"state": TumourState.UNKNOWN, "words": UNKNOWN_WARNING, "near": near}
-        return {"near": near}
+            return {"state": TumourState.UNSURE, "warning": doubt, "was_near": near}
+        if not known.motion.supported:
+            return {"state": TumourState.UNKNOWN, "warning": UNKNOWN_WARNING, "was_near": near}
+        return {"was_near": near}
 
     def _add_band(self, known: TrackingResult, registration: Registration) -> TrackingResult:
         """Add the bound on the tumour's error [m], and its parts by source, to a reliable result."""
-        if not known.relied:
+        if not known.is_reliable:
             return known
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
         _, covariance = registration.point(middle)
         registered = float(np.sqrt(chi2.ppf(LEVEL, 3) * max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
-        parts = {"registration": registered, "tool": known.motion.tool, "model": known.motion.model}
+        parts = {"registration": registered, "tool": known.motion.tool_error, "model": known.motion.model_error}
         band = float(np.hypot(registered, known.motion.error))
-        return add_bound(known, band, parts)
+        return add_error_bound(known, band, parts)
 
     def _build_unknown(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
         """Build the result without a known position, with the reason."""
         tool_time = None if before is None else before.tool_time
-        near = before is not None and before.near
+        near = before is not None and before.was_near
         state = TumourState.NO_TOOL if tool_time is None else TumourState.STALE
-        motion = self.motion.rest if before is None else before.motion
+        motion = self.motion.rest_motion if before is None else before.motion
         return PoseResult(
-            to_stamp(moment), TrackingResult(moment, state, why, NO_TARGETS, motion, tool_time=tool_time, near=near)
+            to_stamp(moment), TrackingResult(moment, state, why, NO_TARGETS, motion, tool_time=tool_time, was_near=near)
         )  # fmt: skip
 
 
-def add_bound(known: TrackingResult, band: float, parts: dict[str, float]) -> TrackingResult:
+def add_error_bound(tracking: TrackingResult, bound: float, contributions: dict[str, float]) -> TrackingResult:
     """Add a bound [m] on the position, and its parts, to a result; beyond 5 mm it is unreliable."""
-    if band <= FollowerSettings().max_overlay_error:
-        return replace(known, band=band, parts=parts)
-    return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band), band=None, parts={})
+    if bound <= FollowerSettings().max_overlay_error:
+        return replace(tracking, bound=bound, sources=contributions)
+    return replace(tracking, state=TumourState.UNSURE, warning=describe_large_error(bound), bound=None, sources={})
 
 
-def add_lateness(result: PoseResult, age: float, stale: float) -> PoseResult:
-    """Return the result for a pose of the given age [s]: stale if older than `stale`."""
-    if age <= stale or not (result.known.relied or result.known.state is TumourState.UNSURE):
+def mark_late(result: PoseResult, age: float, max_age: float) -> PoseResult:
+    """Return the result for a pose of the given age [s]: stale if older than `max_age`."""
+    if age <= max_age or not (result.tracking.is_reliable or result.tracking.state is TumourState.UNSURE):
         return result
     words = f"stale, the result is {age:.1f} s old: do not rely on it"
-    return replace(result, known=replace(result.known, state=TumourState.STALE, words=words, band=None), gauge=None)
+    late = replace(result.tracking, state=TumourState.STALE, warning=words, bound=None)
+    return replace(result, tracking=late, gauge=None)

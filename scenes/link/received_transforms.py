@@ -44,7 +44,7 @@ class TransformNames:
 
 
 @dataclass(frozen=True, eq=False)
-class Sent:
+class ReceivedTransform:
     """Received transform: T (4, 4) [m], its time stamp, time of arrival [s], and number of the client."""
 
     T: np.ndarray
@@ -61,18 +61,18 @@ class ReceivedTransforms:
     ----------
     names
         Names of the accepted transforms.
-    stale
+    max_age
         Maximum age of a moving body's transform [s].
-    sent, earlier
+    newest, earlier
         Newest transforms, and earlier ones (oldest first), by name.
     """
 
     names: TransformNames
-    stale: float
-    sent: Mapping[str, Sent] = field(default_factory=dict)
-    earlier: Mapping[str, tuple[Sent, ...]] = field(default_factory=dict)
+    max_age: float
+    newest: Mapping[str, ReceivedTransform] = field(default_factory=dict)
+    earlier: Mapping[str, tuple[ReceivedTransform, ...]] = field(default_factory=dict)
 
-    def add_transform(self, name: str, matrix: np.ndarray, stamp: int, now: float, sender: int) -> ReceivedTransforms:
+    def add_transform(self, name: str, matrix: np.ndarray, stamp: int, time: float, sender: int) -> ReceivedTransforms:
         """Return the state with a transform (4, 4) [mm] of one client added.
 
         Raises
@@ -86,8 +86,8 @@ class ReceivedTransforms:
         T = to_rigid(matrix)
         if name != self.names.registration and np.array_equal(matrix, np.eye(4)):
             raise BadMessageError("the identity, which trackers send for invisible bodies")
-        last = self.sent.get(name)
-        if last is not None and last.sender != sender and now - last.arrived < self.stale:
+        last = self.newest.get(name)
+        if last is not None and last.sender != sender and time - last.arrived < self.max_age:
             raise BadMessageError("another client sends it, too")
         if last is not None and last.sender == sender and stamp and name != self.names.registration:
             if stamp == last.stamp:
@@ -99,35 +99,35 @@ class ReceivedTransforms:
             if last is None or (stamp and stamp < last.stamp)
             else (*self.earlier[name][1 - MAX_KEPT_TRANSFORMS :], last)
         )
-        newest = {**self.sent, name: Sent(T, stamp, now, sender)}
-        return replace(self, sent=newest, earlier={**self.earlier, name: kept})
+        newest = {**self.newest, name: ReceivedTransform(T, stamp, time, sender)}
+        return replace(self, newest=newest, earlier={**self.earlier, name: kept})
 
-    def find_relative(self, name: str, now: float) -> Sent | str:
+    def find_relative_transform(self, name: str, time: float) -> ReceivedTransform | str:
         """Return a body relative to the patient's reference, with its own time stamp; or why it is unknown."""
         needed = (name, self.names.reference) if self.names.is_tracker_transform(name) else (name,)
         for each in needed:
-            sent = self.sent.get(each)
+            sent = self.newest.get(each)
             if sent is None:
                 return f"no {each} yet"
-            if (age := now - sent.arrived) > self.stale:
+            if (age := time - sent.arrived) > self.max_age:
                 return f"no new {each} for {age:.1f} s"
-        return self._transform_to_reference(name, self.sent[name])
+        return self._transform_to_reference(name, self.newest[name])
 
-    def list_transforms(self, name: str) -> tuple[Sent, ...]:
+    def list_transforms(self, name: str) -> tuple[ReceivedTransform, ...]:
         """Return a body's transforms by one sender, oldest first, relative to the current reference."""
-        newest = self.sent[name]
+        newest = self.newest[name]
         every = (*self.earlier.get(name, ()), newest)
         return tuple(self._transform_to_reference(name, sent) for sent in every if sent.sender == newest.sender)
 
-    def _transform_to_reference(self, name: str, body: Sent) -> Sent:
+    def _transform_to_reference(self, name: str, body: ReceivedTransform) -> ReceivedTransform:
         if not self.names.is_tracker_transform(name):
             return body
-        reference = self.sent[self.names.reference]
+        reference = self.newest[self.names.reference]
         arrived = min(body.arrived, reference.arrived)
         return replace(body, T=np.linalg.inv(reference.T) @ body.T, arrived=arrived)
 
 
-def check_status(metadata: Mapping[str, str]) -> None:
+def check_tracker_status(metadata: Mapping[str, str]) -> None:
     """Reject a transform of a body that its tracker does not see: any status other than OK.
 
     Raises

@@ -13,7 +13,7 @@ import numpy as np
 
 from ar.optics.calibration import Calibration
 
-from ..tracked.follower import TrackingResult, TumourState, compute_radius_across
+from ..tracked.follower import TrackingResult, TumourState, compute_error_radius
 from ..tracked.overlay_painter import Painter
 from .clients import LinkClients
 from .console import format_address
@@ -21,7 +21,7 @@ from .frame import BadMessageError, Header, pack_message, to_stamp
 from .messages import (
     IMAGE,
     POINT,
-    Code,
+    Status,
     encode_image,
     encode_status,
     read_image,
@@ -29,9 +29,9 @@ from .messages import (
     read_position,
     read_transform,
 )
-from .outgoing import MAX_PLACES, UNTRACKED_POINTS, SentPlaces
-from .pose_responder import CameraView, PoseResult, add_bound, add_lateness
-from .received_transforms import ReceivedTransforms, check_status
+from .outgoing import MAX_PLACES, UNTRACKED_POINTS, SentPoints
+from .pose_responder import CameraView, PoseResult, add_error_bound, mark_late
+from .received_transforms import ReceivedTransforms, check_tracker_status
 
 CHECK_INTERVAL = 0.1  # Interval of checks for missing input [s].
 STATUS_INTERVAL = 1.0  # Interval of unchanged STATUS messages [s].
@@ -50,12 +50,12 @@ class PoseResponderLike(Protocol):
     """Interface of a solver for poses."""
 
     def compute_result(
-        self, heard: ReceivedTransforms, now: float, moment: float, before: TrackingResult | None = None
+        self, transforms: ReceivedTransforms, time: float, wall_time: float, previous: TrackingResult | None = None
     ) -> PoseResult:
         """Compute the result, as `PoseResponder.compute_result`."""
         ...
 
-    def find_camera(self, heard: ReceivedTransforms, now: float, stamp: int) -> CameraView | str:
+    def find_camera(self, transforms: ReceivedTransforms, time: float, stamp: int) -> CameraView | str:
         """Return the scan's pose, as `PoseResponder.find_camera`."""
         ...
 
@@ -64,19 +64,19 @@ class MessageWriter(Protocol):
     """Interface of an encoder of results."""
 
     def build_scan(self, stamp: int) -> bytes:
-        """Build the scan's message, as `Outgoing.build_scan`."""
+        """Build the scan's message, as `ResultEncoder.build_scan`."""
         ...
 
-    def build_messages(self, result: PoseResult, places: SentPlaces | None = None) -> tuple[bytes, ...]:
-        """Build the messages, as `Outgoing.build_messages`."""
+    def build_messages(self, result: PoseResult, points: SentPoints | None = None) -> tuple[bytes, ...]:
+        """Build the messages, as `ResultEncoder.build_messages`."""
         ...
 
-    def build_status(self, result: PoseResult, refused: str) -> bytes:
-        """Build the STATUS, as `Outgoing.build_status`."""
+    def build_status(self, result: PoseResult, rejected: str) -> bytes:
+        """Build the STATUS, as `ResultEncoder.build_status`."""
         ...
 
-    def attach_points(self, names: list[str], at: np.ndarray) -> SentPlaces:
-        """Attach points, as `Outgoing.attach_points`."""
+    def attach_points(self, names: list[str], positions: np.ndarray) -> SentPoints:
+        """Attach points, as `ResultEncoder.attach_points`."""
         ...
 
 
@@ -88,21 +88,22 @@ class OverlayCamera:
     painter: Painter
     tracking: float
 
-    def draw(self, colour: np.ndarray, known: TrackingResult, seen: CameraView | str) -> np.ndarray:
+    def draw(self, image: np.ndarray, tracking: TrackingResult, view: CameraView | str) -> np.ndarray:
         """Draw a result on an image (H, W, 3) uint8.
 
         If the scan's pose in the camera's frame is unknown, only the reason is drawn.
         """
-        if isinstance(seen, str):
-            known = replace(known, state=TumourState.NO_REFERENCE, words=f"{seen}: nothing is drawn")
-            return self.painter.paint(colour, known).colour
-        T = seen.T_camera_scan
-        if known.band is not None:
-            middle = known.motion.positions[self.painter.stage.tumour_vertices].mean(axis=0)
-            placed = compute_radius_across(self.tracking**2 * np.eye(3), T[:3, :3] @ middle + T[:3, 3])
-            parts = {**known.parts, "camera": placed, "time": seen.moved}
-            known = add_bound(known, float(np.linalg.norm([known.band, placed, seen.moved])), parts)
-        return self.painter.paint(colour, replace(known, camera=self.calibration.build_camera(T))).colour
+        if isinstance(view, str):
+            tracking = replace(tracking, state=TumourState.NO_REFERENCE, warning=f"{view}: nothing is drawn")
+            return self.painter.paint(image, tracking).colour
+        T = view.T_camera_scan
+        if tracking.bound is not None:
+            middle = tracking.motion.positions[self.painter.stage.tumour_vertices].mean(axis=0)
+            placed = compute_error_radius(self.tracking**2 * np.eye(3), T[:3, :3] @ middle + T[:3, 3])
+            parts = {**tracking.sources, "camera": placed, "time": view.motion_error}
+            bound = float(np.linalg.norm([tracking.bound, placed, view.motion_error]))
+            tracking = add_error_bound(tracking, bound, parts)
+        return self.painter.paint(image, replace(tracking, camera=self.calibration.build_camera(T))).colour
 
 
 class LinkSession:
@@ -112,35 +113,35 @@ class LinkSession:
 
     Parameters
     ----------
-    answers, speaks
+    responder, encoder
         Solver, and encoder of its results.
-    heard
+    transforms
         Received transforms, with the names in use.
-    eye
+    camera
         Overlay of received images; None: images are not wanted.
-    most
+    max_clients
         Maximum number of clients.
-    note
+    log
         Callback for a line when something changes: clients, the source, the state, and rejections.
     """
 
     def __init__(
         self,
-        answers: PoseResponderLike,
-        speaks: MessageWriter,
-        heard: ReceivedTransforms,
-        eye: OverlayCamera | None = None,
-        most: int = 16,
-        note: Callable[[str], None] = lambda line: None,
+        responder: PoseResponderLike,
+        encoder: MessageWriter,
+        transforms: ReceivedTransforms,
+        camera: OverlayCamera | None = None,
+        max_clients: int = 16,
+        log: Callable[[str], None] = lambda line: None,
     ) -> None:
-        self.clients = LinkClients(self._receive, self._get_max_size, most, note)
-        self._note = note
-        self._answers, self._speaks, self._heard, self._eye = answers, speaks, heard, eye
+        self.clients = LinkClients(self._receive, self._get_max_size, max_clients, log)
+        self._note = log
+        self._answers, self._speaks, self._heard, self._eye = responder, encoder, transforms, camera
         self._others: dict[str, None] = {}
-        self._places: SentPlaces | None = None
+        self._places: SentPoints | None = None
         self._states: set[TumourState] = set()
         self._loop = asyncio.get_running_loop()
-        self._solved = self._shown = answers.compute_result(heard, self._loop.time(), clock.time())
+        self._solved = self._shown = responder.compute_result(transforms, self._loop.time(), clock.time())
         # Arrival of the pose that was solved last, and start of the solution that is being computed [s].
         self._arrived = self._begun = np.inf
         self._posed, self._pictured = asyncio.Event(), asyncio.Event()
@@ -164,7 +165,7 @@ class LinkSession:
         OSError
             An address on which no server can be opened.
         """
-        server = await asyncio.start_server(self.clients.converse, host, port, limit=READ_AHEAD_BYTES)
+        server = await asyncio.start_server(self.clients.serve_connection, host, port, limit=READ_AHEAD_BYTES)
         ready.set_result(server.sockets[0].getsockname()[1])
         work = [] if source is None else [asyncio.create_task(self._connected(*source))]
         try:
@@ -204,7 +205,7 @@ class LinkSession:
             for task in (*tasks, ended):
                 task.cancel()
             over = pack_message(
-                "STATUS", "Sulcus", encode_status(Code.SHUTDOWN, "the server ends"), to_stamp(clock.time())
+                "STATUS", "Sulcus", encode_status(Status.SHUTDOWN, "the server ends"), to_stamp(clock.time())
             )
             self.clients.publish("status", (over,))
             await self.clients.close()
@@ -217,7 +218,7 @@ class LinkSession:
             await self._posed.wait()
             self._posed.clear()
             heard, places, self._begun = self._heard, self._places, self._loop.time()
-            body = heard.find_relative(heard.names.tool, self._begun)
+            body = heard.find_relative_transform(heard.names.tool, self._begun)
             result, messages = await self._loop.run_in_executor(
                 thread, self._compute_messages, heard, places, self._begun
             )
@@ -235,9 +236,9 @@ class LinkSession:
             now, kinds = self._loop.time(), frozenset(self.clients.refused)
             if (result := self._get_current_result(now)) is not self._shown:
                 self._show(result, self._speaks.build_messages(result, self._places))
-            known = result.known
+            known = result.tracking
             # A growing number alone is not reported again.
-            saying = known.state, re.sub(r"[\d.]+", "", known.words), kinds, tuple(self._others)
+            saying = known.state, re.sub(r"[\d.]+", "", known.warning), kinds, tuple(self._others)
             if saying != said or now - beat >= STATUS_INTERVAL:
                 said, beat = saying, now
                 self.clients.publish("status", (self._speaks.build_status(result, self._format_rejected(known)),))
@@ -245,29 +246,30 @@ class LinkSession:
 
     def _get_current_result(self, now: float) -> PoseResult:
         """Return the last solution, or the reason why it is not valid at a time [s]; the solver is not called."""
-        if isinstance(self._heard.find_relative(self._heard.names.tool, now), str):
-            return self._answers.compute_result(self._heard, now, clock.time(), self._shown.known)
-        result, waited = add_lateness(self._solved, now - self._arrived, self._heard.stale), now - self._begun
+        if isinstance(self._heard.find_relative_transform(self._heard.names.tool, now), str):
+            return self._answers.compute_result(self._heard, now, clock.time(), self._shown.tracking)
+        result, waited = mark_late(self._solved, now - self._arrived, self._heard.max_age), now - self._begun
         if (
             result is self._solved
-            and result.known.state in (TumourState.NO_TOOL, TumourState.STALE)
+            and result.tracking.state in (TumourState.NO_TOOL, TumourState.STALE)
             and waited > STATUS_INTERVAL
         ):
-            return replace(result, known=replace(result.known, words=f"no solution yet, computing for {waited:.0f} s"))
+            late = replace(result.tracking, warning=f"no solution yet, computing for {waited:.0f} s")
+            return replace(result, tracking=late)
         return result
 
     def _compute_messages(
-        self, heard: ReceivedTransforms, places: SentPlaces | None, now: float
+        self, heard: ReceivedTransforms, places: SentPoints | None, now: float
     ) -> tuple[PoseResult, tuple[bytes, ...]]:
         """Compute a result and its messages, in the solver's thread."""
-        result = self._answers.compute_result(heard, now, clock.time(), self._shown.known)
+        result = self._answers.compute_result(heard, now, clock.time(), self._shown.tracking)
         return result, self._speaks.build_messages(result, places)
 
     def _show(self, result: PoseResult, messages: tuple[bytes, ...]) -> None:
         self._shown = result
-        if result.known.state not in self._states:
-            self._states.add(result.known.state)
-            self._note(f"the tumour is {_describe_state(result.known)}")
+        if result.tracking.state not in self._states:
+            self._states.add(result.tracking.state)
+            self._note(f"the tumour is {_describe_state(result.tracking)}")
         self.clients.publish("answer", messages)
 
     def _format_rejected(self, known: TrackingResult) -> str:
@@ -287,7 +289,7 @@ class LinkSession:
                 continue
             (colour, stamp), heard = self._picture, self._heard
             camera = self._answers.find_camera(heard, self._loop.time(), stamp)
-            drawn = await self._loop.run_in_executor(thread, eye.draw, colour, self._shown.known, camera)
+            drawn = await self._loop.run_in_executor(thread, eye.draw, colour, self._shown.tracking, camera)
             self.clients.publish("picture", (pack_message("IMAGE", "Overlay", encode_image(drawn), stamp),))
 
     def _get_max_size(self, kind: str) -> int:
@@ -316,9 +318,9 @@ class LinkSession:
                 names, places = read_points(content)
                 self._places = self._speaks.attach_points(names, 1e-3 * places)
                 self._posed.set()
-                if self._places.unfollowed:
-                    words = f"{UNTRACKED_POINTS}: {self._places.unfollowed}; the others are followed"
-                    self.clients.reject(number, Code.CONFIGURATION, UNTRACKED_POINTS, words)
+                if self._places.unattached:
+                    words = f"{UNTRACKED_POINTS}: {self._places.unattached}; the others are followed"
+                    self.clients.reject(number, Status.CONFIGURATION, UNTRACKED_POINTS, words)
 
     def _receive_transform(self, number: int, header: Header, content: bytes) -> None:
         names = self._heard.names
@@ -327,7 +329,7 @@ class LinkSession:
             if header.name and len(self._others) < MAX_OTHERS:
                 self._others[header.name] = None
             return
-        check_status(header.metadata)
+        check_tracker_status(header.metadata)
         matrix = (read_transform if header.kind == "TRANSFORM" else read_position)(content)
         self._heard = self._heard.add_transform(name, matrix, header.stamp, self._loop.time(), number)
         if name in (names.tool, names.registration):
@@ -336,6 +338,6 @@ class LinkSession:
 
 def _describe_state(known: TrackingResult) -> str:
     """Describe the state of the tumour, for a console."""
-    if known.relied:
+    if known.is_reliable:
         return f"known, {known.state.value}"
-    return f"{'doubtful' if known.state is TumourState.UNSURE else 'not known'}: {known.words}"
+    return f"{'doubtful' if known.state is TumourState.UNSURE else 'not known'}: {known.warning}"

@@ -19,8 +19,8 @@ PATHS = ("hand-held", "microscope", "orbit")
 MAX_TILT = 75.0  # Largest tilt of the line of sight [deg].
 
 
-def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None:
-    """Declare the camera's options: shared by every command that draws a scene; `path` is the usual one."""
+def add_camera_options(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """Declare the camera's options: shared by every command that draws a scene; `default` is the usual one."""
     group = parser.add_argument_group("camera options; see docs/camera.md")
     group.add_argument(
         "--camera", type=Path, metavar="FILE.yaml",
@@ -39,7 +39,7 @@ def add_camera(parser: argparse.ArgumentParser, path: str | None = None) -> None
         "--distance", type=float, metavar="MM",
         help="distance of the camera (default: 300; tracked: all targets in sight)",
     )  # fmt: skip
-    group.add_argument("--path", choices=PATHS, default=path, help=f"camera motion (default: {path or 'none'})")
+    group.add_argument("--path", choices=PATHS, default=default, help=f"camera motion (default: {default or 'none'})")
     group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held")
     group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
 
@@ -53,7 +53,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
-    """Return the scene with the requested camera; unchanged if the options of `add_camera` are not given.
+    """Return the scene with the requested camera; unchanged if the options of `add_camera_options` are not given.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
     return scene if view is scene.viewpoint else replace(scene, viewpoint=view)
 
 
-def add_targets(args: argparse.Namespace, scene: Scene) -> Scene:
+def use_tracked_camera(args: argparse.Namespace, scene: Scene) -> Scene:
     """Return the scene with a tracked camera that sees the craniotomy, the reference and the tool's cube.
 
     Raises

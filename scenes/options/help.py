@@ -65,7 +65,7 @@ class CommandParser(argparse.ArgumentParser):
         return (super() if section is None else section).add_argument(*names, **settings)
 
 
-def replace_former(arguments: Sequence[str]) -> list[str]:
+def replace_former_options(arguments: Sequence[str]) -> list[str]:
     """Replace former names of options, with a notice for each."""
     command = arguments[0] if arguments else ""
     pairs = [pair.partition(":") for key in {"", command} for pair in FORMER.get(key, "").split()]

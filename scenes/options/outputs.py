@@ -84,7 +84,7 @@ def check_output_frames(folder: Path, force: bool) -> list[Path]:
 UNCHANGED_ATTRIBUTES = ("anatomy", "effects", "tissue", "element", "accuracy", "preset", "seed", "shape")
 
 
-def read_statements(path: Path) -> dict[str, str]:
+def read_attributes(path: Path) -> dict[str, str]:
     """Read the attributes of a data set, an unfinished one, or a model file as texts; empty if unreadable."""
     import h5py
 
@@ -102,16 +102,16 @@ def read_statements(path: Path) -> dict[str, str]:
         return {}
 
 
-def find_foreign_files(mesh: Path, digest: str) -> list[Path]:
+def find_foreign_files(mesh_path: Path, digest: str) -> list[Path]:
     """List data and models next to a mesh file that were made with an anatomy of another `digest`."""
     from ..play.deformers import to_model_path  # takes seconds, and is not needed for simulation alone
 
-    data = mesh.with_suffix(".h5")
-    beside = (data, to_unfinished_path(data), to_model_path(mesh))
-    return [path for path in beside if path.is_file() and read_statements(path).get("anatomy", digest) != digest]
+    data = mesh_path.with_suffix(".h5")
+    beside = (data, to_unfinished_path(data), to_model_path(mesh_path))
+    return [path for path in beside if path.is_file() and read_attributes(path).get("anatomy", digest) != digest]
 
 
-def check_no_foreign_files(mesh: Path, digest: str, force: bool) -> list[Path]:
+def check_no_foreign_files(mesh_path: Path, digest: str, force: bool) -> list[Path]:
     """Return the files of `find_foreign_files`, which only `force` accepts.
 
     Raises
@@ -119,27 +119,27 @@ def check_no_foreign_files(mesh: Path, digest: str, force: bool) -> list[Path]:
     InputError
         An existing file, without `force`.
     """
-    found = find_foreign_files(mesh, digest)
+    found = find_foreign_files(mesh_path, digest)
     if found and not force:
         raise InputError(
-            f"{mesh}: would replace the anatomy to which {' and '.join(path.name for path in found)} next to it "
+            f"{mesh_path}: would replace the anatomy to which {' and '.join(path.name for path in found)} next to it "
             "belong. Repeat the first command, choose another --out, or give --force to replace them."
         )
     return found
 
 
-def remove_data(path: Path, wanted: Mapping[str, str]) -> None:
-    """Remove a data set, complete or unfinished, whose attributes differ from `wanted`; keep others."""
+def remove_outdated_data(path: Path, expected: Mapping[str, str]) -> None:
+    """Remove a data set, complete or unfinished, whose attributes differ from `expected`; keep others."""
     for each in (path, to_unfinished_path(path)):
-        found = read_statements(each)
-        if any(found.get(name) != wanted.get(name) for name in UNCHANGED_ATTRIBUTES):
+        found = read_attributes(each)
+        if any(found.get(name) != expected.get(name) for name in UNCHANGED_ATTRIBUTES):
             each.unlink(missing_ok=True)
 
 
-def find_begun_batch(path: Path) -> int | None:
+def read_batch_size(path: Path) -> int | None:
     """Return the batch size of an existing or unfinished data set, which it keeps; None if unreadable."""
     for each in (path, to_unfinished_path(path)):
-        found = read_statements(each).get("batch", "")
+        found = read_attributes(each).get("batch", "")
         if found.isdigit():
             return int(found)
     return None

@@ -15,7 +15,7 @@ Point = tuple[float, float, float]
 LINE_POINTS = 2000  # Number of points of a trajectory that are compared with the brain.
 
 
-def add_opening_arguments(parser: argparse.ArgumentParser) -> None:
+def add_craniotomy_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --nodes, --craniotomy, --fine-opening, and --opening-at and --opening-over, of which one may be given."""
     parser.add_argument("--nodes", type=int, default=5300, metavar="N", help="number of mesh nodes, 2000 to 250000")
     parser.add_argument(
@@ -58,7 +58,7 @@ def parse_opening(text: str) -> int | Point | Path:
     return int(text) if text.isdecimal() else point_or_file(text)
 
 
-def to_opening_options(args: argparse.Namespace) -> list[str]:
+def to_craniotomy_args(args: argparse.Namespace) -> list[str]:
     """Return the options as arguments of another command."""
     given = {name: getattr(args, name) for name in ("nodes", "craniotomy", "opening_at", "opening_over")}
     texts = {
@@ -69,7 +69,7 @@ def to_opening_options(args: argparse.Namespace) -> list[str]:
     return [f"--{name}={text}" for name, text in texts.items()] + ["--fine-opening"] * args.fine_opening
 
 
-def get_trajectory_option(args: argparse.Namespace) -> Path | None:
+def get_trajectory_path(args: argparse.Namespace) -> Path | None:
     """Return the file of the requested trajectory; None without a request."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     return given if isinstance(given, Path) and read_markup(given).kind == "Line" else None
@@ -80,7 +80,7 @@ def to_metres(millimetres: float | None) -> float | None:
     return None if millimetres is None else 1e-3 * millimetres
 
 
-def describe_opening(args: argparse.Namespace) -> str:
+def describe_craniotomy(args: argparse.Namespace) -> str:
     """Describe the target of the craniotomy."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     if isinstance(given, Path):

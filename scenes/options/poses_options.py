@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 AUTO = "auto"  # Value of --clock that estimates the time offset.
 
 
-def add_poses(parser: argparse.ArgumentParser) -> None:
+def add_pose_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     group = parser.add_argument_group("poses of an external tracker with its own clock; see docs/external_tracker.md")
     group.add_argument(
@@ -84,14 +84,14 @@ def open_external_tracker(args: argparse.Namespace, calibration: Calibration) ->
     """
     from ..tracked.calibration_file import read_hand_eye
     from ..tracked.external_tracker import CameraMount, ExternalTracker
-    from ..tracked.pose_file import read_stream
+    from ..tracked.pose_file import read_pose_stream
 
     if args.poses is None:
         return None
-    tool, patient = (read_stream(path) for path in args.poses)
+    tool, patient = (read_pose_stream(path) for path in args.poses)
     eye = None
     if args.hand_eye is not None:
-        body = None if args.camera_poses is None else read_stream(args.camera_poses)
+        body = None if args.camera_poses is None else read_pose_stream(args.camera_poses)
         eye = CameraMount(*read_hand_eye(args.hand_eye), body)
     elsewhere = ExternalTracker(tool, patient, _choose_clock(args, calibration, tool, patient), eye)
     _report_mismatch(args, elsewhere)
@@ -102,15 +102,15 @@ def _report_mismatch(args: argparse.Namespace, elsewhere: ExternalTracker) -> No
     """Report the times of poses and images, if the video begins outside the poses."""
     from ar.tracking.image_sequences import read_video
 
-    from ..tracked.run import read_timed
+    from ..tracked.run import read_timed_images
 
-    first = next(read_timed(read_video(Path(args.pictures), args.rate))).picture.time
+    first = next(read_timed_images(read_video(Path(args.pictures), args.rate))).source.time
     outside = elsewhere.describe_mismatch(first)
     if not outside:
         return
     when = [
         f"the {name}'s poses of {each.times[0]:.2f} to {each.times[-1]:.2f} s"
-        for name, each in elsewhere.streams.items()
+        for name, each in elsewhere.pose_streams.items()
     ]
     clock = f"; --clock is {elsewhere.clock.offset:g} s" if elsewhere.clock.offset else ""
     message = f"{outside}. It is of {first:.2f} s, {', '.join(when)}{clock}. Give --clock S, or {AUTO}"
@@ -123,12 +123,12 @@ def _choose_clock(args: argparse.Namespace, calibration: Calibration, tool: Pose
     from ar.tracking.pose_stream import Clock
 
     from ..tracked.external_tracker import estimate_video_clock
-    from ..tracked.run import read_timed
+    from ..tracked.run import read_timed_images
 
     if args.clock != [AUTO]:
         return Clock(*_parse_clock(args.clock))
     try:
-        film = (each.picture for each in read_timed(read_video(Path(args.pictures), args.rate)))
+        film = (each.source for each in read_timed_images(read_video(Path(args.pictures), args.rate)))
         found = estimate_video_clock(film, calibration, tool, patient)
     except ValueError as error:
         raise InputError(f"--clock {AUTO}: {error}") from error

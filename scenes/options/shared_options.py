@@ -30,24 +30,24 @@ def add_device(parser: argparse.ArgumentParser, purpose: str = "") -> None:
     )
 
 
-def add_devices(parser: argparse.ArgumentParser, meant: str = "") -> None:
-    """Declare `--device` of several devices; `meant` describes how they share the work."""
+def add_devices(parser: argparse.ArgumentParser, purpose: str = "") -> None:
+    """Declare `--device` of several devices; `purpose` describes how they share the work."""
     parser.add_argument(
         "--device", default="auto", metavar="DEVICES",
-        help=f"compute devices: auto, cpu, cuda, all, or a list such as cuda:0,cuda:1 with one process each{meant}",
+        help=f"compute devices: auto, cpu, cuda, all, or a list such as cuda:0,cuda:1 with one process each{purpose}",
     )  # fmt: skip
 
 
 def add_seed(
-    parser: argparse.ArgumentParser, purpose: str = "the random draw", kind: Callable[[str], int] = int
+    parser: argparse.ArgumentParser, purpose: str = "the random draw", parse: Callable[[str], int] = int
 ) -> None:
-    """Declare `--seed` of a `purpose`, read as `kind`."""
-    parser.add_argument("--seed", type=kind, default=0, help=f"seed of {purpose}")
+    """Declare `--seed` of a `purpose`, read as `parse`."""
+    parser.add_argument("--seed", type=parse, default=0, help=f"seed of {purpose}")
 
 
-def add_json(parser: argparse.ArgumentParser, meaning: str = "print one JSON line instead of text") -> None:
+def add_json(parser: argparse.ArgumentParser, purpose: str = "print one JSON line instead of text") -> None:
     """Declare `--json`."""
-    parser.add_argument("--json", action="store_true", help=meaning)
+    parser.add_argument("--json", action="store_true", help=purpose)
 
 
 def to_json_line(value: Any) -> str:
@@ -63,11 +63,11 @@ def _replace_non_finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def add_style(parser: argparse.ArgumentParser, without: tuple[Style, ...] = ()) -> None:
-    """Declare the overlay's style: shared by every command that draws a scene; `without` excludes styles."""
+def add_style(parser: argparse.ArgumentParser, excluded: tuple[Style, ...] = ()) -> None:
+    """Declare the overlay's style: shared by every command that draws a scene; `excluded` excludes styles."""
     from ar.overlay.styles import STYLES
 
-    styles: list[Style] = [style for style in STYLES if style not in without]
+    styles: list[Style] = [style for style in STYLES if style not in excluded]
     descriptions = "; ".join(f"{style}: {STYLES[style]}" for style in styles if style != "none")
     parser.add_argument("--style", choices=styles, default="window", help=f"overlay style; {descriptions}")
 

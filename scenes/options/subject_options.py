@@ -18,7 +18,7 @@ from sim.errors import InputError
 from .placement_options import point
 
 
-def add_label_arguments(parser: argparse._ActionsContainer, *names: str) -> None:
+def add_label_options(parser: argparse._ActionsContainer, *names: str) -> None:
     """Declare --brain, --tumour, --mask, --tumour-in, and the option `names` for the label convention."""
     parser.add_argument("--brain", type=parse_labels, metavar="1,2", help="labels of brain, by number or segment name")
     parser.add_argument(
@@ -97,7 +97,7 @@ def list_label_options(args: argparse.Namespace) -> list[str]:
     return [f"--{name.replace('_', '-')}" for name in names if getattr(args, name)]
 
 
-def label_words(args: argparse.Namespace) -> list[str]:
+def to_label_args(args: argparse.Namespace) -> list[str]:
     """Return the options as arguments of `sulcus anatomy`."""
     given = {
         "--labels": args.labels,
@@ -119,7 +119,7 @@ MIN_BRAIN_ML = 20.0  # Smallest accepted volume of a brain [ml].
 MAX_BRAIN_ML = 5000.0  # Largest accepted volume of a brain [ml].
 
 
-def add_drawn_arguments(parser: argparse.ArgumentParser) -> None:
+def add_synthetic_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of a healthy head and of the synthetic tumour in it."""
     drawn = parser.add_argument_group("synthetic tumour in a healthy head, without --labels")
     drawn.add_argument(
@@ -155,7 +155,7 @@ def describe_source(args: argparse.Namespace) -> str:
     return str(args.labels or args.mask or (args.head if args.head == "fsaverage" else "the template"))
 
 
-def check_no_drawn_options(args: argparse.Namespace) -> None:
+def check_no_synthetic_options(args: argparse.Namespace) -> None:
     """Reject options of a synthetic tumour together with a label map, by an `InputError`."""
     for name in PLACING_OPTIONS:
         if getattr(args, name) is not None:

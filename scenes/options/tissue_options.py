@@ -32,13 +32,15 @@ AS_BRAIN = "the tissue of the brain"  # Default tissue of a region.
 AS_LEARNED = f"as in the models' training data, or {AS_BRAIN}"  # Default tissue of a region with models.
 
 
-def add_tissue_arguments(parser: argparse.ArgumentParser, whole: bool = False, default_regions: str = AS_BRAIN) -> None:
+def add_tissue_arguments(
+    parser: argparse.ArgumentParser, full_help: bool = False, default_regions: str = AS_BRAIN
+) -> None:
     """Declare --material, the constants of its laws, and --region, whose `default_regions` are reported.
 
-    The help describes each tissue if `whole`, else names it.
+    The help describes each tissue if `full_help`, else names it.
     """
     sets = f"{', '.join(MATERIALS)}; see docs/concepts/physics.md"
-    if whole:
+    if full_help:
         each = (f"{name} holds for {preset.time_scale}. Source: {preset.source}" for name, preset in MATERIALS.items())
         sets = ". ".join(each)
     parser.add_argument(
@@ -94,12 +96,12 @@ def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] =
     parser.add_argument("--skull", choices=choices, default=choices[0], help=f"boundary condition at skull; {meanings}")
 
 
-def add_element_argument(parser: argparse.ArgumentParser, meant: str = RECOMMENDED) -> None:
-    """Declare --element; None means `meant`, or p2 if the mesh has mid-edge nodes."""
+def add_element_argument(parser: argparse.ArgumentParser, default_element: str = RECOMMENDED) -> None:
+    """Declare --element; None means `default_element`, or p2 if the mesh has mid-edge nodes."""
     parser.add_argument(
         "--element", choices=ELEMENTS,
         help=". ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
-        + f" (default: {meant}; p2 for meshes with mid-edge nodes)",
+        + f" (default: {default_element}; p2 for meshes with mid-edge nodes)",
     )  # fmt: skip
 
 
@@ -172,31 +174,31 @@ def parse_optional_tissue(args: argparse.Namespace) -> Tissue | None:
     return parse_tissue(args) if given else None
 
 
-def reject_option(given: Mapping[str, object], material: str, owner: str) -> None:
+def reject_option(given_values: Mapping[str, object], material: str, owner: str) -> None:
     """Raise InputError if an option is given that only `owner` supports."""
-    for name, value in given.items():
+    for name, value in given_values.items():
         if value is not None:
             raise InputError(
                 f"{name} says nothing to --material {material}: it belongs to {owner}. Leave one of them out."
             )
 
 
-def apply_tissue_options(args: argparse.Namespace, scene: Scene, theatre: PatientSetup) -> Scene:
+def apply_tissue_options(args: argparse.Namespace, scene: Scene, patient: PatientSetup) -> Scene:
     """Return a scene with the requested tissue and element.
 
-    Regions not set by --region have the tissue of the scene, or of `find_learned_regions`; the latter are reported.
+    Regions not set by --region have the tissue of the scene, or of `find_trained_regions`; the latter are reported.
 
     Raises
     ------
     InputError
         See `parse_tissue`, `parse_region_tissues` and `Scene.replace_tissue`.
     """
-    from ..play.learned_regions import find_learned_regions
+    from ..play.learned_regions import find_trained_regions
 
     made = scene.replace_tissue(parse_optional_tissue(args), args.element)
     here = made.elasticity
-    own = parse_region_tissues(args.region, here.default or BRAIN, theatre.anatomy.mesh)
-    kept = find_learned_regions(here, theatre.learned_tissue, own)
+    own = parse_region_tissues(args.region, here.default or BRAIN, patient.anatomy.mesh)
+    kept = find_trained_regions(here, patient.learned_tissue, own)
     if own and kept:
         print(
             f"{scene.name} keeps the tissue from the models' training data: {Elasticity(None, kept)}", file=sys.stderr

@@ -18,11 +18,11 @@ from .requests import Requests
 
 
 class BackgroundStudy:
-    """Computation in a thread, repeated at each start; `show` receives results or the failure of `work` (HTML)."""
+    """Computation in a thread, repeated at each start; `show` receives results or the failure of `task` (HTML)."""
 
-    def __init__(self, work: Callable[[], Iterator[Any]], lock: threading.Lock, show: Callable[[Any], None]) -> None:
+    def __init__(self, task: Callable[[], Iterator[Any]], lock: threading.Lock, show: Callable[[Any], None]) -> None:
         """Prepare the study, which holds `lock` while it runs: no other solver is built at that time."""
-        self.work, self.lock, self.show = work, lock, show
+        self.work, self.lock, self.show = task, lock, show
         self.closed, self.thread = threading.Event(), threading.Thread()
 
     def start(self) -> None:
@@ -48,7 +48,7 @@ class BackgroundStudy:
 
 
 def build_studies(
-    theatre: PatientSetup, scene: Scene, requests: Requests, lock: threading.Lock, get_browser: Callable[[], Browser]
+    patient: PatientSetup, scene: Scene, requests: Requests, lock: threading.Lock, get_browser: Callable[[], Browser]
 ) -> tuple[BackgroundStudy, ...]:
     """Build the studies of a scene's effects and of the requested load, which the page of `get_browser` shows."""
 
@@ -56,13 +56,13 @@ def build_studies(
         number, _, touch, _ = requests.read_current()
         time = float(scene.times[number])
         registered_scene = replace(scene, registration=requests.registration or scene.registration)
-        return refine_error(theatre, registered_scene, touch or scene.path(time), time)
+        return refine_error(patient, registered_scene, touch or scene.path(time), time)
 
     def show_costs(texts: Mapping[str, str] | str) -> None:
         for label, text in ({EFFECT_COSTS: texts} if isinstance(texts, str) else texts).items():
             (get_browser().write if label == EFFECT_COSTS else get_browser().rename)(label, text)
 
     return (
-        BackgroundStudy(lambda: measure_costs(theatre, scene), lock, show_costs),
+        BackgroundStudy(lambda: measure_costs(patient, scene), lock, show_costs),
         BackgroundStudy(refine, lock, lambda texts: get_browser().write(REFINED_ERROR, texts)),
     )

@@ -15,9 +15,9 @@ from surrogate.evaluation.choose import find_pareto_front
 from ..play.frame_text import describe_outcome
 from ..play.player import Frame, Player
 from ..play.tip_reading import measure_tip_distance
-from ..script.tool_paths import compute_lift
+from ..script.tool_paths import compute_tool_height
 from .fem_worker import FemResult
-from .requests import Look
+from .requests import Display
 
 # Texts: the displayed result is FEM's; FEM's result is the reference.
 FEM_SHOWN, FEM_REFERENCE = "this is the result of the FEM solver", "the truth is the result of the FEM solver"
@@ -33,37 +33,37 @@ class Comparison:
 
     number: int
     seconds: float
-    doubt: str
+    warning: str
     motion: float
     mean: float | None
     largest: float | None
     distance: float | None = None
 
 
-def compare_with_fem(truth: FemResult, player: Player, is_fem: bool, shown: Deformation | None = None) -> Comparison:
+def compare_with_fem(fem: FemResult, player: Player, is_fem: bool, solution: Deformation | None = None) -> Comparison:
     """Compare a deformer with an FEM solution, for the same loads.
 
-    `shown` is the deformer's solution of these loads, if it depends on previous ones.
+    `solution` is the deformer's solution of these loads, if it depends on previous ones.
     """
-    nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
-    motion = float(np.linalg.norm(truth.deformation.restrict(nodes).displacement[0], axis=1).mean())
+    nodes = player.stage.select_stage(fem.loads).anatomy.tumour_nodes
+    motion = float(np.linalg.norm(fem.deformation.restrict(nodes).displacement[0], axis=1).mean())
     distances = None
     if not is_fem:
-        distances = compute_distances(truth, player, shown or player.deformer.deform(truth.loads, at=nodes))
+        distances = compute_node_errors(fem, player, solution or player.deformer.deform(fem.loads, at=nodes))
     mean_and_max = (None, None) if distances is None else (float(distances.mean()), float(distances.max()))
-    pushed = truth.loads.get_all(Pushed)
-    lift = compute_lift(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
-    tip = measure_tip_distance(player.site.anatomy, truth.loads, truth.deformation, player.scene.tool, lift)
+    pushed = fem.loads.get_all(Pushed)
+    lift = compute_tool_height(float(np.linalg.norm(pushed[0].force[0]))) if pushed else 0.0
+    tip = measure_tip_distance(player.site.anatomy, fem.loads, fem.deformation, player.scene.tool, lift)
     distance = None if tip is None else tip.distance
     return Comparison(
-        truth.number, truth.seconds, describe_outcome(truth.deformation.outcome[0]), motion, *mean_and_max, distance
+        fem.number, fem.seconds, describe_outcome(fem.deformation.outcome[0]), motion, *mean_and_max, distance
     )
 
 
-def compute_distances(truth: FemResult, player: Player, shown: Deformation) -> np.ndarray:
+def compute_node_errors(fem: FemResult, player: Player, shown: Deformation) -> np.ndarray:
     """Return the distance (n,) [m] of each tumour node in a solution from its position by FEM."""
-    nodes = player.stage.select_stage(truth.loads).anatomy.tumour_nodes
-    displacements = (solution.restrict(nodes).displacement[0] for solution in (truth.deformation, shown))
+    nodes = player.stage.select_stage(fem.loads).anatomy.tumour_nodes
+    displacements = (solution.restrict(nodes).displacement[0] for solution in (fem.deformation, shown))
     return np.linalg.norm(np.subtract(*displacements), axis=1)
 
 
@@ -80,15 +80,15 @@ def format_comparison(comparison: Comparison | None, stale: bool, waiting_text: 
     distance = "" if comparison.distance is None else f"tip to tumour {format_millimetres(comparison.distance)}, "
     details = f"{distance}tumour moved {1e3 * comparison.motion:.2f} mm (FEM, without its position error"
     details += f"; frame {comparison.number}, FEM {1e3 * comparison.seconds:.0f} ms"
-    details += f", {comparison.doubt})" if comparison.doubt else ")"
+    details += f", {comparison.warning})" if comparison.warning else ")"
     if stale:
         return f'<p class="stale">previous load: {result}; {details}. {escape(waiting_text)}</p>'
     return f"<p>{result}; {details}</p>"
 
 
-def describe_change(truth: FemResult, player: Player, shown: Deformation, disabled: Sequence[str]) -> str:
+def describe_change(fem: FemResult, player: Player, solution: Deformation, disabled: Sequence[str]) -> str:
     """Describe the tumour's distance from its position under all effects, for a solution with some effects disabled."""
-    mean = 1e3 * float(compute_distances(truth, player, shown).mean())
+    mean = 1e3 * float(compute_node_errors(fem, player, solution).mean())
     return f"<p>without {escape(', '.join(disabled))} the tumour position differs by {mean:.2f} mm</p>"
 
 
@@ -96,23 +96,23 @@ def describe_change(truth: FemResult, player: Player, shown: Deformation, disabl
 class PageState:
     """State of the page: the request, its solution, the frame, and the FEM comparison.
 
-    `goal` is the request that the frame is on the way to, `asked` the one that it fulfils, `look` the display style.
+    `goal` is the request that the frame is on the way to, `request` the one that it fulfils, `look` the display.
     If nothing changes for `still_time` [s], the page is still, from `still_at` on [s]. Images in motion are coarse if
     the `render_time` of a sharp one is above `max_render_time` [s].
     """
 
     goal: tuple | None = None
-    asked: tuple | None = None
+    request: tuple | None = None
     shown: FemResult | None = None
     shows_undeformed: bool = False
-    look: Look | None = None
+    look: Display | None = None
     load: str = ""
     frame: Frame | None = None
     still_at: float = 0.0
     render_time: float = 0.0
     coarse: bool = False
-    picture: np.ndarray | None = None
-    truth: FemResult | None = None
+    image: np.ndarray | None = None
+    reference: FemResult | None = None
     shown_fem: FemResult | None = None
     compared_deformer: tuple | None = None
     comparison: Comparison | None = None
@@ -145,13 +145,13 @@ MAX_RECENT_LOADS = 120  # Number of last loads that are kept for each deformer.
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """A deformer's medians over `loads` loads; `best`: True on the Pareto front of both, None without ranking."""
+    """A deformer's medians over `loads` loads; `is_optimal`: True on the Pareto front of both, None without ranking."""
 
     name: str
     milliseconds: float
     millimetres: float
     loads: int
-    best: bool | None
+    is_optimal: bool | None
 
 
 class AccuracyTimeTable:
@@ -161,13 +161,13 @@ class AccuracyTimeTable:
         self._times: dict[str, dict[str, float]] = {}
         self._errors: dict[str, dict[str, float]] = {}
 
-    def record_time(self, name: str, load: str, seconds: float) -> None:
+    def record_time(self, deformer: str, load_id: str, seconds: float) -> None:
         """Record the time of a deformer for a load, named by its stamp."""
-        _store_recent(self._times.setdefault(name, {}), load, 1e3 * seconds)
+        _store_recent(self._times.setdefault(deformer, {}), load_id, 1e3 * seconds)
 
-    def record_error(self, name: str, load: str, metres: float) -> None:
+    def record_error(self, deformer: str, load_id: str, error: float) -> None:
         """Record the error of a deformer for a load, relative to the converged FEM solution."""
-        _store_recent(self._errors.setdefault(name, {}), load, 1e3 * metres)
+        _store_recent(self._errors.setdefault(deformer, {}), load_id, 1e3 * error)
 
     @property
     def rows(self) -> list[ComparisonRow]:

@@ -48,13 +48,13 @@ def build_controls(
     requests: Requests,
     set_mode: Callable[[str], None],
     move: Callable[..., None],
-    effects: Fold,
-    refine: Callable[[], None],
+    effect_switches: Fold,
+    refine_error: Callable[[], None],
 ) -> list[Slider | Dropdown | Toggle | Fold | Note]:
     """Build all controls of a scene that these deformers support.
 
-    `set_mode` receives the control mode of the tool, `move` values of its touch, as `Requests.take_over` does;
-    `effects` are the switches of the effects; `refine` starts the refinement of the error.
+    `set_mode` receives the control mode of the tool, `move` values of its touch, see `Requests.take_over`;
+    `effect_switches` are the switches of the effects; `refine_error` starts the refinement of the error.
     """
     cameras = "scene default", STATIC_CAMERA, *PATHS
 
@@ -74,13 +74,13 @@ def build_controls(
             "model",
             "FEM solves every load; the fast models were trained on FEM",
         ),
-        add_overlay_controls(requests.style, lambda style: requests.set(style=style)),
+        build_style_controls(requests.style, lambda style: requests.set(style=style)),
         Dropdown("camera", cameras, requests.path or cameras[0], set_path, hint="motion of the camera"),
         *tool_controls[:1],
-        effects,
+        effect_switches,
         *tool_controls[1:],
         build_registration_control(scene, requests),
-        Toggle("refine the error", False, lambda on: refine() if on else None, hint=REFINE_HINT),
+        Toggle("refine the error", False, lambda on: refine_error() if on else None, hint=REFINE_HINT),
         Note(REFINED_ERROR),
         Fold("camera position", build_camera_sliders(scene, site, requests)),
         Note(PLAN),
@@ -88,14 +88,14 @@ def build_controls(
     ]
 
 
-def add_overlay_controls(current: Style, choose: Callable[[Style], None]) -> Dropdown:
+def build_style_controls(current_style: Style, set_style: Callable[[Style], None]) -> Dropdown:
     """Build the choice of overlay styles."""
     styles: dict[str, Style] = {label: style for style, label in STYLES.items()}
     return Dropdown(
         "overlay",
         tuple(styles),
-        STYLES[current],
-        lambda label: choose(styles[label]),
+        STYLES[current_style],
+        lambda label: set_style(styles[label]),
         hint="style of the overlay",
         key=STYLE_KEY,
     )
@@ -109,11 +109,11 @@ def build_registration_control(scene: Scene, requests: Requests) -> Dropdown:
     return Dropdown("registration", tuple(names), current, lambda key: requests.set(registration=names[key]), hint=hint)
 
 
-def build_slice_control(current: str, choose: Callable[[str], None]) -> Dropdown:
+def build_slice_control(current_position: str, set_position: Callable[[str], None]) -> Dropdown:
     """Build the choice of slice positions."""
     places = TUMOUR_MIDDLE, TIP
     hint = "position of the scan slices (tab slices)"
-    return Dropdown("slices", places, current or places[0], choose, hint=hint)
+    return Dropdown("slices", places, current_position or places[0], set_position, hint=hint)
 
 
 def build_camera_sliders(scene: Scene, site: CraniotomyFrame, requests: Requests) -> tuple[Slider, Slider]:
@@ -188,8 +188,8 @@ def build_strength_slider(scene: Scene, requests: Requests, move: Callable[..., 
     if scene.posed:
         low = -1e3 * IDLE_HEIGHT
         high = max(MAX_DEPTH, round(1e3 * scene.max_depth, 1))
-        current = min(max(1e3 * touch.depth, low), high)
+        start = min(max(1e3 * touch.depth, low), high)
         hint = "depth of the tool beyond first contact; negative: no contact"
-        return Slider("depth [mm]", low, high, 0.1, current, lambda value: move(depth=1e-3 * value), hint=hint)
-    current = min(touch.force, MAX_FORCE)
-    return Slider("force [N]", 0.0, MAX_FORCE, 0.01, current, lambda value: move(force=value), hint="force of the tool")
+        return Slider("depth [mm]", low, high, 0.1, start, lambda value: move(depth=1e-3 * value), hint=hint)
+    start = min(touch.force, MAX_FORCE)
+    return Slider("force [N]", 0.0, MAX_FORCE, 0.01, start, lambda value: move(force=value), hint="force of the tool")

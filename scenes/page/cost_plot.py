@@ -18,7 +18,7 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
     """Plot error [mm] against time [ms], both logarithmic; ranked only if all deformers have the same loads."""
     if not rows:
         return ""
-    if rows[0].best is not None:
+    if rows[0].is_optimal is not None:
         load_text = f"the same {_format_load_count(rows[0].loads)}; bold: no other is both faster and more accurate"
     else:
         load_text = "the loads up to now" if len(rows) == 1 else "different loads: not comparable"
@@ -38,10 +38,10 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
         is_right = x > 0.6 * WIDTH
         label = _draw_text(x + (-7 if is_right else 7), label_y, _format_name(row), "end" if is_right else "start")
         parts.append(
-            f"<g{' class=best' if row.best else ''}><title>{escape(describe_row(row))}</title>"
+            f"<g{' class=best' if row.is_optimal else ''}><title>{escape(describe_cost_row(row))}</title>"
             f'<circle cx="{x:.0f}" cy="{y:.0f}" r="4"/>{label}</g>'
         )
-    description = "; ".join(map(describe_row, rows))
+    description = "; ".join(map(describe_cost_row, rows))
     return (
         f'<svg class="cost" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(description)}">'
         f'<path d="{"".join(grid)}"/>{"".join(parts)}{_draw_text(WIDTH - RIGHT, HEIGHT - 4, "time [ms]", "end")}'
@@ -50,7 +50,7 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
     )
 
 
-def describe_row(row: ComparisonRow) -> str:
+def describe_cost_row(row: ComparisonRow) -> str:
     """Describe the time and the error of a deformer."""
     error = f"{row.millimetres:.3f}" if row.millimetres >= MIN_ERROR else f"under {MIN_ERROR:.3f}"
     return f"{_format_name(row)}: {row.milliseconds:.1f} ms, error {error} mm, {_format_load_count(row.loads)}"

@@ -18,10 +18,10 @@ from sim.loads import Loads
 from sim.runtime.threads import run_in_foreground
 from surrogate.data.dataset import compute_loads_digest
 
-from ..play.deformers import AtRest, PatientSetup
+from ..play.deformers import PatientSetup, RestDeformer
 from ..play.player import Frame, Player
 from ..play.stage import Stage
-from ..play.waiting_notice import Busy
+from ..play.waiting_notice import WaitingNotice
 from ..script.scene import Scene, find_scene
 from ..script.tool_paths import Touch
 from .background_study import build_studies
@@ -36,20 +36,20 @@ from .comparison import (
     format_comparison,
 )
 from .controls import PLAN, build_controls, is_animated, to_slider_values
-from .effect_costs import build_effect_fold
+from .effect_costs import build_effect_switches
 from .fem_worker import FemResult, FemWorker
-from .requests import HAND, SCRIPT, Look, Requests, describe_holder
+from .requests import HAND, SCRIPT, Display, Requests, describe_tool_control
 from .scene_solvers import SceneSolvers
-from .side_panels import build_sample, list_lines, render_slices
-from .text import describe_effect, describe_work, format_caption, format_pending, plan_words, report
+from .side_panels import build_history_sample, list_plot_lines, render_slices
+from .text import describe_effect, describe_solve, format_caption, format_pending, format_report, format_solver_list
 from .view import (
     FEM_COLOUR,
     STALE_COLOUR,
     build_page_bodies,
-    build_surroundings,
+    build_static_bodies,
     choose_viewpoint,
     move_bodies,
-    move_wire,
+    move_fem_tumour,
     render_page_image,
 )
 
@@ -66,28 +66,28 @@ class Demo:
 
     def __init__(
         self,
-        theatre: PatientSetup,
+        patient: PatientSetup,
         scene: Scene,
         deformer: str,
         host: str,
         port: int,
         anatomy: str = "the default",
-        find: Callable[[str], Scene] = find_scene,
+        get_scene: Callable[[str], Scene] = find_scene,
         style: Style = "window",
         origins: tuple[str, ...] = (),
     ) -> None:
-        """Open the page; `anatomy` describes the brain, and `find` builds the scenes that users choose, by name."""
-        self.theatre, self.anatomy, self.first, self.find = theatre, anatomy, scene, find
+        """Open the page; `anatomy` describes the brain, and `get_scene` builds a scene by name."""
+        self.patient, self.anatomy, self.first, self.find = patient, anatomy, scene, get_scene
         self.build_lock = threading.Lock()
         self._set_scene(scene, deformer)
         self.wish.set(style=style)
-        size, site = (scene.viewpoint.width, scene.viewpoint.height), theatre.site
+        size, site = (scene.viewpoint.width, scene.viewpoint.height), patient.site
         parts = self._build_contents(deformer)
         self.browser = Browser(
             parts[0], choose_viewpoint(site), *parts[1:],
-            host=host, port=port, size=size, signs=build_surroundings(self.stage), origins=origins,
+            host=host, port=port, size=size, signs=build_static_bodies(self.stage), origins=origins,
         )  # fmt: skip
-        self.busy = Busy(lambda line: self.browser.show_status(escape(line)))
+        self.busy = WaitingNotice(lambda line: self.browser.show_status(escape(line)))
         self.dismissed: list[FemWorker] = []
         self.asked, self.drawn = self.wish.read_current(), 0
 
@@ -124,7 +124,7 @@ class Demo:
             if clock.perf_counter() >= (deadline if self.wish.plays else end):
                 break
             clock.sleep(1.0 / self.stage.scene.frames_per_second)
-        self.wish.go_on(self.asked[0], len(self.stage.scene.times))
+        self.wish.step_playback(self.asked[0], len(self.stage.scene.times))
 
     def _run(self, seconds: float) -> None:
         """Play until the time is over or something fails."""
@@ -146,7 +146,7 @@ class Demo:
     def _show_tool_holder(self) -> None:
         """Show each user who controls the tool."""
         tool, holder, connected = self.stage.scene.tool, self.wish.holder, self.browser.here
-        self.browser.show_line(lambda client: "" if tool is None else describe_holder(client, holder, connected))
+        self.browser.show_line(lambda client: "" if tool is None else describe_tool_control(client, holder, connected))
 
     def close(self) -> None:
         """Stop the page and the FEM threads."""
@@ -163,18 +163,18 @@ class Demo:
         return self.cast.get_stage()
 
     @property
-    def referee(self) -> FemWorker:
+    def fem_worker(self) -> FemWorker:
         """FEM worker with all effects: the reference for the models."""
         return self.cast.get_worker()
 
     def _set_scene(self, scene: Scene, deformer: str) -> None:
         """Set the scene and the deformer, with new solvers, requests and readings."""
-        self.cast, self.tally = SceneSolvers(self.theatre, scene, deformer, self.build_lock), AccuracyTimeTable()
-        self.history = History(list_lines(scene))
+        self.cast, self.tally = SceneSolvers(self.patient, scene, deformer, self.build_lock), AccuracyTimeTable()
+        self.history = History(list_plot_lines(scene))
         # Number of the shown frame.
         self.reached: int | None = None
-        self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=is_animated(scene, self.theatre.site))
-        self.studies = build_studies(self.theatre, scene, self.wish, self.build_lock, lambda: self.browser)  # not open
+        self.wish = Requests(deformer, scene.path(0.0), scene.name, clocked=is_animated(scene, self.patient.site))
+        self.studies = build_studies(self.patient, scene, self.wish, self.build_lock, lambda: self.browser)  # not open
 
     def _change_scene(self, name: str) -> None:
         """Play another scene; if this anatomy does not support it, keep the scene and show the reason."""
@@ -182,7 +182,7 @@ class Demo:
         self.busy.begin_work(f"preparing the scene {name}")
         try:
             scene = self.first if name == self.first.name else self.find(name)
-            deformer = self.theatre.select_default(scene)
+            deformer = self.patient.select_default(scene)
             self._set_scene(scene, deformer)
             look = previous[2].look
             self.wish.set(style=look.style, path=look.path, through=look.through, registration=look.registration)
@@ -203,7 +203,7 @@ class Demo:
     def update_page(self, state: PageState) -> int:
         """Update the page towards the requested state; return the number of rendered frames, 0 or 1."""
         self.asked = self.wish.read_current()
-        if self.asked == state.asked:
+        if self.asked == state.request:
             self._mark_shown()
         elif (solution := self._find_result(state)) is not None:
             with run_in_foreground():
@@ -217,14 +217,14 @@ class Demo:
         """Mark the request as shown: nothing is pending, and playback continues."""
         self.busy.end_work()
         self.cast.stop_all()
-        self.wish.go_on(self.asked[0], len(self.stage.scene.times))
+        self.wish.step_playback(self.asked[0], len(self.stage.scene.times))
 
     def _find_result(self, state: PageState) -> FemResult | None:
         """Return the solution of the request, or of a frame on the way to it; None until there is one."""
         number, name, touch, disabled = self.asked
         request, scene = (number, touch), self.stage.scene
         if name != "fem" and not disabled:  # no model was trained with effects disabled
-            self.busy.begin_work(describe_work(scene, name, *request))
+            self.busy.begin_work(describe_solve(scene, name, *request))
             return self.cast.predict(name, request)
         if (solution := self.cast.solve(disabled, request, state.shown, 0.0)) is not None:
             return solution
@@ -235,14 +235,14 @@ class Demo:
         elif state.goal == self.asked and state.frame is not None:
             self.busy.begin_work(f"on the way to frame {number}: frame {state.frame.number} is solved")
         else:
-            self.busy.begin_work(describe_work(scene, "fem", *request))
+            self.busy.begin_work(describe_solve(scene, "fem", *request))
         return self.cast.solve(disabled, request, state.shown, 1.0 / scene.frames_per_second)
 
     def _show_undeformed(self, state: PageState) -> None:
         """Show the undeformed body while no solution is available."""
         number, _, touch, _ = self.asked
         stage = replace(self.stage, observer=None)  # no ground truth is available yet
-        player = Player(stage, AtRest(stage.site.anatomy), self.wish.style)
+        player = Player(stage, RestDeformer(stage.site.anatomy), self.wish.style)
         frame = player.draw(number, float(self.stage.scene.times[number]), touch or player.get_touch(number))
         move_bodies(self.browser, frame, player)
         self.browser.show(number, render_page_image(frame), UNDEFORMED_TEXT)
@@ -255,22 +255,22 @@ class Demo:
         look = self.wish.look
         player = replace(self._get_player(self.asked, look), coarse=state.choose_resolution())
         tool_touch = touch or player.get_touch(solution.number)
-        self.reached, state.goal, state.asked = solution.number, self.asked, (solution.number, name, touch, disabled)
+        self.reached, state.goal, state.request = solution.number, self.asked, (solution.number, name, touch, disabled)
         state.look, state.shown, state.shown_fem = look, solution, None
         state.load = compute_loads_digest(self._build_loads(solution.number, touch) if disabled else solution.loads)
         frame = player.draw_frame(solution.number, tool_touch, solution.loads, solution.deformation, solution.seconds)
         state.frame = frame
         state.record_rendering(frame.seconds["render"])
-        self.history.add(build_sample(frame, self.stage.scene, clock.monotonic()))
+        self.history.add(build_history_sample(frame, self.stage.scene, clock.monotonic()))
         if solution.number == number:
             self._mark_shown()
         if name == "fem" and not disabled:
             state.shown_fem = solution
         elif solution.number == number:
-            self.referee.ask(number, touch, COMPARISON_REST if self.wish.plays else 0.0)
+            self.fem_worker.request_frame(number, touch, COMPARISON_REST if self.wish.plays else 0.0)
         if not disabled:
             self.tally.record_time(name, state.load, solution.deformation.cost.total)
-        state.picture = render_page_image(frame)
+        state.image = render_page_image(frame)
         move_bodies(self.browser, frame, player)
         self._show_side_panels(frame, player)
         if touch is None:
@@ -284,14 +284,14 @@ class Demo:
 
     def _draw_in_style(self, state: PageState) -> None:
         """Render the shown solution in another style."""
-        assert state.frame is not None and state.asked is not None
+        assert state.frame is not None and state.request is not None
         frame, state.look, state.coarse = state.frame, self.wish.look, False
-        player, seconds = self._get_player(state.asked, state.look), frame.seconds["deform"]
+        player, seconds = self._get_player(state.request, state.look), frame.seconds["deform"]
         state.frame = player.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
-        state.picture = render_page_image(state.frame)
+        state.image = render_page_image(state.frame)
         self._show_side_panels(state.frame, player)
 
-    def _get_player(self, request: tuple, look: Look) -> Player:
+    def _get_player(self, request: tuple, look: Display) -> Player:
         """Return the player of a request, in the given style."""
         _, name, _, disabled = request
         return replace(self.cast.get_player_with_camera("fem" if disabled else name, disabled, look), style=look.style)
@@ -303,14 +303,14 @@ class Demo:
 
     def _update_comparison(self, state: PageState) -> None:
         """Show the FEM solution for the displayed frame, and whether it belongs to the same load."""
-        assert state.frame is not None and state.asked is not None
-        _, name, _, disabled = state.asked
+        assert state.frame is not None and state.request is not None
+        _, name, _, disabled = state.request
         name = "fem" if disabled else name
-        reference = state.shown_fem or self.referee.truth
+        reference = state.shown_fem or self.fem_worker.truth
         is_current = reference is not None and compute_loads_digest(reference.loads) == state.load
-        if reference is not None and (reference is not state.truth or state.compared_deformer != (name, disabled)):
+        if reference is not None and (reference is not state.reference or state.compared_deformer != (name, disabled)):
             player = self.cast.get_player(name)
-            move_wire(self.browser, self.stage, reference, player)
+            move_fem_tumour(self.browser, self.stage, reference, player)
             if player.follows and not is_current:
                 state.comparison = None
             elif not disabled:
@@ -319,14 +319,14 @@ class Demo:
                 if state.comparison.motion > MIN_COMPARED_MOTION:
                     if state.comparison.mean is not None:
                         self.tally.record_error(name, compute_loads_digest(reference.loads), state.comparison.mean)
-                    self.cast.compare_models(reference, self.tally, skip=name)
-            state.truth, state.compared_deformer = reference, (name, disabled)
+                    self.cast.compare_models(reference, self.tally, excluded_model=name)
+            state.reference, state.compared_deformer = reference, (name, disabled)
         if state.stale is not (not is_current):
             state.stale = not is_current
             self.browser.tint("finite elements", FEM_COLOUR if is_current else STALE_COLOUR)
         without = [describe_effect(effect) for effect in sorted(disabled)]
-        if self.referee.failure is not None:
-            scope, reason = "this" if self.referee.thread.is_alive() else "any more", escape(str(self.referee.failure))
+        if (worker := self.fem_worker).failure is not None:
+            scope, reason = "this" if worker.thread.is_alive() else "any more", escape(str(worker.failure))
             comparison = f'<p class="warn">error: the finite elements do not solve {scope} ({reason})</p>'
         elif disabled and reference is not None:
             comparison = format_comparison(None, True, WAITING_TEXT)
@@ -336,15 +336,15 @@ class Demo:
             fem_text = FEM_SHOWN if state.frame.estimate is None else FEM_REFERENCE
             shown = state.comparison if reference is not None else None
             comparison = format_comparison(shown, not is_current, WAITING_TEXT, fem_text)
-        if (plan := self.cast.get_worker(disabled).plan or self.referee.plan) != state.plan:
+        if (plan := self.cast.get_worker(disabled).plan or self.fem_worker.plan) != state.plan:
             state.plan = plan
-            self.browser.write(PLAN, plan_words(plan))
+            self.browser.write(PLAN, format_solver_list(plan))
         scene = self.stage.scene
-        text = report(state.frame, self.stage, name, comparison, self.tally.rows, len(scene.times), without)
-        if state.asked != self.asked and self.busy.noticed:
+        text = format_report(state.frame, self.stage, name, comparison, self.tally.rows, len(scene.times), without)
+        if state.request != self.asked and self.busy.noticed:
             text = format_pending(state.frame.number, self.asked[0], len(scene.times)) + text
-        assert state.picture is not None
-        self.browser.show(state.frame.number, state.picture, text, self.asked[0])
+        assert state.image is not None
+        self.browser.show(state.frame.number, state.image, text, self.asked[0])
 
     def _build_loads(self, number: int, touch: Touch | None) -> Loads:
         """Return the loads of a frame under all effects of the scene."""
@@ -353,15 +353,15 @@ class Demo:
 
     def _build_contents(self, deformer: str) -> tuple:
         """Build the contents of the page: bodies, playback, controls, title, text."""
-        scene, names = self.stage.scene, self.theatre.list_deformers(self.stage.scene)
-        effects = build_effect_fold(self.theatre, scene, self.wish, self.studies[0].start)
+        scene, names = self.stage.scene, self.patient.list_deformers(self.stage.scene)
+        effects = build_effect_switches(self.patient, scene, self.wish, self.studies[0].start)
         actions = self._set_control, self._take_over, effects, self.studies[1].start
         return (
             build_page_bodies(self.stage),
             Playback(len(scene.times), self._play, lambda number: self._set_control(SCRIPT, number=number)),
             build_controls(scene, self.stage.site, names, self.wish, *actions),
             f"sulcus: {scene.name}",
-            format_caption(self.theatre, scene, self.anatomy),
+            format_caption(self.patient, scene, self.anatomy),
         )
 
     def _play(self, plays: bool) -> None:

@@ -29,23 +29,23 @@ Figures = Mapping[str, tuple[float | None, float | None]]
 """Time [ms] and motion [mm] of the effects by class name, as in `EffectRecord`."""
 
 
-def build_effect_fold(theatre: PatientSetup, scene: Scene, requests: Requests, measure: Callable[[], None]) -> Fold:
+def build_effect_switches(patient: PatientSetup, scene: Scene, requests: Requests, measure: Callable[[], None]) -> Fold:
     """Build the switches of a scene's effects with their recorded costs; `measure` starts a measurement."""
-    record = theatre.find_effect_record(scene)
+    record = patient.find_effect_record(scene)
     figures: Figures = {} if record is None else record.effects
     switches = (
-        Toggle(name, True, partial(requests.switch, name), format_switch(name, figures), HINT)
-        for name in list_switchable_effects(scene, theatre.anatomy)
+        Toggle(name, True, partial(requests.switch_effect, name), format_switch_label(name, figures), HINT)
+        for name in list_switchable_effects(scene, patient.anatomy)
     )
     source = "" if record is None else f"Recorded on {record.day} with {record.machine}, {record.frames} frames"
-    note = format_costs(theatre, scene, record, source or "The costs are not measured for this scene and anatomy")
+    note = format_costs(patient, scene, record, source or "The costs are not measured for this scene and anatomy")
     measure_switch = Toggle(
         "measure costs", False, lambda on: measure() if on else None, "measure on this machine", MEASURE_HINT
     )
     return Fold(EFFECT_FOLD, (*switches, measure_switch, Note(EFFECT_COSTS, note, plain=True)), opened=True)
 
 
-def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[dict[str, str]]:
+def measure_costs(patient: PatientSetup, scene: Scene) -> Iterator[dict[str, str]]:
     """Yield the text of an effect's switch and of the note (HTML), by label, whenever an effect is measured.
 
     Raises
@@ -53,31 +53,31 @@ def measure_costs(theatre: PatientSetup, scene: Scene) -> Iterator[dict[str, str
     InputError
         See `measure_effects`.
     """
-    names, every = list_switchable_effects(scene, theatre.anatomy), max(1, len(scene.times) // SOLVED_FRAMES)
+    names, every = list_switchable_effects(scene, patient.anatomy), max(1, len(scene.times) // SOLVED_FRAMES)
     rows = []
     yield {EFFECT_COSTS: "<p>The scene is solved with and without each effect...</p>"}
-    for row in measure_effects(theatre, scene, every, names):
+    for row in measure_effects(patient, scene, every, names):
         rows.append(row)
-        record = build_record(theatre, scene, rows, every, "this machine")
+        record = build_record(patient, scene, rows, every, "this machine")
         remaining = len(names) + 1 - len(rows)
         source = f"Measured on {record.machine}, {record.frames} frames; effects left to measure: {remaining}"
-        switch_text = {name: format_switch(name, record.effects) for name in names if name == row.effect}
-        yield switch_text | {EFFECT_COSTS: format_costs(theatre, scene, record, source)}
+        switch_text = {name: format_switch_label(name, record.effects) for name in names if name == row.effect}
+        yield switch_text | {EFFECT_COSTS: format_costs(patient, scene, record, source)}
 
 
-def format_switch(name: str, figures: Figures) -> str:
+def format_switch_label(effect_name: str, figures: Figures) -> str:
     """Return the text of an effect's switch: its name, the time that it adds and the motion that it causes."""
-    milliseconds, motion = figures.get(name, (None, None))
+    milliseconds, motion = figures.get(effect_name, (None, None))
     if milliseconds is None or motion is None:
-        return f"{describe_effect(name)}: {'cannot be disabled' if name in figures else 'not measured'}"
-    return f"{describe_effect(name)}: {milliseconds:+.0f} ms, {motion:.2f} mm"
+        return f"{describe_effect(effect_name)}: {'cannot be disabled' if effect_name in figures else 'not measured'}"
+    return f"{describe_effect(effect_name)}: {milliseconds:+.0f} ms, {motion:.2f} mm"
 
 
-def format_costs(theatre: PatientSetup, scene: Scene, record: EffectRecord | None, source: str) -> str:
+def format_costs(patient: PatientSetup, scene: Scene, record: EffectRecord | None, source: str) -> str:
     """Describe the source and metrics of the figures, the whole scene, and effects that are always on (HTML)."""
     sentences = [source] if record is None else [source, f"Of each effect: {METRICS}", *_list_findings(record)]
-    switchable = list_switchable_effects(scene, theatre.anatomy)
-    names = (type(effect).__name__ for effect in scene.get_effects_on(theatre.anatomy))
+    switchable = list_switchable_effects(scene, patient.anatomy)
+    names = (type(effect).__name__ for effect in scene.get_effects_on(patient.anatomy))
     always_on = ", ".join(describe_effect(name) for name in names if name not in switchable)
     return f"<p>{escape('. '.join([*sentences, f'Always on: {always_on}']))}.</p>"
 

@@ -8,12 +8,12 @@ from ..play.deformers import PatientSetup
 from ..script.priors import sample_priors
 from ..script.scene import Scene
 from ..script.tool_paths import Touch
-from .text import format_tumour_trust, format_unbroken
+from .text import format_length, format_position_error
 
 DRAWS = 16  # Number of sampled patients: two for each fitted parameter.
 
 
-def refine_error(theatre: PatientSetup, scene: Scene, touch: Touch, time: float, count: int = DRAWS) -> Iterator[str]:
+def refine_error(patient: PatientSetup, scene: Scene, touch: Touch, time: float, count: int = DRAWS) -> Iterator[str]:
     """Yield the progress (HTML) of an ensemble of a scene whose tool stays at a touch, and its error at a time [s].
 
     `count` is the number of sampled patients.
@@ -25,14 +25,14 @@ def refine_error(theatre: PatientSetup, scene: Scene, touch: Touch, time: float,
     """
     static_scene, samples = replace(scene, path=lambda time: touch), sample_priors(count, 0)
     yield "<p>solving the load for sampled patients...</p>"
-    nominal, solutions = solve_nominal(theatre, static_scene), list[Answer]()
-    for result in solve_ensemble(theatre, static_scene, samples):
+    nominal, solutions = solve_nominal(patient, static_scene), list[Answer]()
+    for result in solve_ensemble(patient, static_scene, samples):
         solutions.append(result)
         yield f"<p>{len(solutions)} of {count} sampled patients are solved.</p>"
-    refined = estimate_uncertainty(theatre, static_scene, nominal, samples, solutions)
+    refined = estimate_uncertainty(patient, static_scene, nominal, samples, solutions)
     error = refined.evaluate(time, 0.0, scene.registration)
-    motion = format_unbroken(refined.read(refined.moved, time), error.moved)
+    motion = format_length(refined.interpolate(refined.moved, time), error.moved)
     yield (
         f"<p>Refined for this load, from {count} sampled patients: the tumour moves {motion}.</p>"
-        f"{format_tumour_trust(error)}"
+        f"{format_position_error(error)}"
     )

@@ -9,7 +9,7 @@ from sim.errors import InputError
 from sim.loads import Loads
 from sim.runtime.threads import enter_background
 
-from ..play.deformers import PatientSetup, explain_plan
+from ..play.deformers import PatientSetup, describe_solvers
 from ..play.player import Player
 from ..play.replay import ReplaySession
 from ..script.scene import Scene
@@ -30,7 +30,7 @@ class FemResult:
     loads: Loads
     deformation: Deformation
     seconds: float
-    asked: FrameRequest | None = None
+    request: FrameRequest | None = None
 
 
 class FemWorker:
@@ -42,7 +42,7 @@ class FemWorker:
     its request. After the setup, `player` has the solver, and `plan` lists its solvers as sentences.
     """
 
-    def __init__(self, theatre: PatientSetup, scene: Scene, build_lock: threading.Lock) -> None:
+    def __init__(self, patient: PatientSetup, scene: Scene, build_lock: threading.Lock) -> None:
         """Start the thread; it holds `build_lock` while it builds the solver: only one is built at a time."""
         self.newest: FrameRequest | None = None
         self.truth: FemResult | None = None
@@ -54,10 +54,10 @@ class FemWorker:
         self.solved_at = self.solve_time = self.rest = 0.0
         self.closed = threading.Event()
         self.wake = threading.Condition()
-        self.thread = threading.Thread(target=self._serve, args=(theatre, scene), name="fem", daemon=True)
+        self.thread = threading.Thread(target=self._serve, args=(patient, scene), name="fem", daemon=True)
         self.thread.start()
 
-    def ask(self, number: int, touch: Touch | None, rest: float = 0.0) -> None:
+    def request_frame(self, number: int, touch: Touch | None, rest: float = 0.0) -> None:
         """Replace the pending request; `touch` is the manual one, if the user has the tool.
 
         Nothing is solved twice: the request may be the one in progress, or the last one that was solved. `rest` is the
@@ -66,23 +66,23 @@ class FemWorker:
         result, request = self.truth, (number, touch)
         with self.wake:
             self.rest = rest
-            if result is not None and result.asked == request and result.number == number:
+            if result is not None and result.request == request and result.number == number:
                 self.newest = None
             elif self.newest != request:
                 self.newest = request
                 self.wake.notify_all()
 
-    def drop(self) -> None:
+    def drop_request(self) -> None:
         """Withdraw the request: nothing is solved after the current step."""
         with self.wake:
             self.newest = None
 
-    def wait_newer(self, request: FrameRequest, previous: FemResult | None, seconds: float) -> FemResult | None:
+    def wait_for_newer(self, request: FrameRequest, previous: FemResult | None, seconds: float) -> FemResult | None:
         """Wait up to `seconds` for another solution than `previous` for a request; None after that time."""
 
         def find_newer() -> FemResult | None:
             result = self.truth
-            return result if result is not None and result.asked == request and result is not previous else None
+            return result if result is not None and result.request == request and result is not previous else None
 
         with self.wake:
             return self.wake.wait_for(find_newer, seconds)
@@ -98,20 +98,20 @@ class FemWorker:
         self.stop_soon()
         self.thread.join()
 
-    def _serve(self, theatre: PatientSetup, scene: Scene) -> None:
+    def _serve(self, patient: PatientSetup, scene: Scene) -> None:
         enter_background()
         try:
-            self._solve_requests(theatre, scene)
+            self._solve_requests(patient, scene)
         except Exception as error:  # shown on the page; a traceback goes to the terminal
             self.failure = error
             if not isinstance(error, InputError):
                 raise
 
-    def _solve_requests(self, theatre: PatientSetup, scene: Scene) -> None:
+    def _solve_requests(self, patient: PatientSetup, scene: Scene) -> None:
         session = None
         while (request := self._wait_for_request()) is not None:
             if session is None:
-                session = self._prepare_session(theatre, scene)
+                session = self._prepare_session(patient, scene)
                 continue
             start, (requested, touch) = clock.perf_counter(), request
             try:
@@ -138,11 +138,11 @@ class FemWorker:
                 self.wake.wait(None if self.newest is None else left)
             return None
 
-    def _prepare_session(self, theatre: PatientSetup, scene: Scene) -> ReplaySession | None:
+    def _prepare_session(self, patient: PatientSetup, scene: Scene) -> ReplaySession | None:
         """Build the FEM session; None if the request was withdrawn while this thread waited for the lock."""
         with self.build_lock:
             if self.closed.is_set() or self.newest is None:
                 return None
-            session = ReplaySession(theatre.build_player("fem", scene))
-        self.player, self.plan = session.player, explain_plan(session.player.deformer)
+            session = ReplaySession(patient.build_player("fem", scene))
+        self.player, self.plan = session.player, describe_solvers(session.player.deformer)
         return session

@@ -13,7 +13,7 @@ from ..script.tool_paths import Touch
 SCRIPT, HAND = "automatic", "manual"  # Control of the tool: scripted, manual.
 
 
-class Look(NamedTuple):
+class Display(NamedTuple):
     """Display of a solution: overlay style, path and position of the camera, position of the slices, registration."""
 
     style: Style
@@ -70,48 +70,48 @@ class Requests:
             if plays and not self.clocked:
                 self.tool = SCRIPT
 
-    def switch(self, effect: str, on: bool) -> None:
+    def switch_effect(self, effect: str, enabled: bool) -> None:
         """Switch an effect on or off."""
         with self.lock:
-            self.off = self.off - {effect} if on else self.off | {effect}
+            self.off = self.off - {effect} if enabled else self.off | {effect}
 
     @property
-    def look(self) -> Look:
+    def look(self) -> Display:
         """Display style of a solution."""
         with self.lock:
-            return Look(self.style, self.path, self.through, self.tilt, self.distance, self.registration)
+            return Display(self.style, self.path, self.through, self.tilt, self.distance, self.registration)
 
     def read_current(self) -> tuple[int, str, Touch | None, frozenset[str]]:
         """Return frame number, deformer, manual touch (None: the script's) and disabled effects."""
         with self.lock:
             return self.number, self.deformer, self.touch if self.tool == HAND else None, self.off
 
-    def go_on(self, number: int, frames: int) -> None:
+    def step_playback(self, number: int, frame_count: int) -> None:
         """Advance playback after a frame was shown, unless a user has requested another one meanwhile."""
         with self.lock:
             if self.plays and self.number == number:
-                self.number = (number + 1) % frames
+                self.number = (number + 1) % frame_count
 
 
-def describe_holder(client: int, holder: int | None, connected: Collection[int]) -> str:
+def describe_tool_control(client_id: int, controlling_id: int | None, connected_ids: Collection[int]) -> str:
     """Describe who controls the tool, for one client.
 
     Parameters
     ----------
-    client
+    client_id
         Number of the client that reads the text.
-    holder
+    controlling_id
         Number of the client that took the tool last; None if the script moves the tool.
-    connected
+    connected_ids
         Numbers of the connected clients.
     """
-    if holder is None:
+    if controlling_id is None:
         text = "Automatic playback"
-    elif holder == client:
+    elif controlling_id == client_id:
         text = "**You control the tool**"
-    elif holder in connected:
-        text = f"Visitor {holder} controls the tool"
+    elif controlling_id in connected_ids:
+        text = f"Visitor {controlling_id} controls the tool"
     else:
-        text = f"Visitor {holder}, who controlled the tool, has left: it stays in place"
-    count = len(connected)
-    return text if count < 2 else f"{text}; {count} visitors, you are number {client}"
+        text = f"Visitor {controlling_id}, who controlled the tool, has left: it stays in place"
+    count = len(connected_ids)
+    return text if count < 2 else f"{text}; {count} visitors, you are number {client_id}"

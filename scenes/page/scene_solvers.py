@@ -15,9 +15,9 @@ from ..play.replay import ReplaySession
 from ..play.stage import Stage
 from ..script.camera_paths import PATHS
 from ..script.scene import Scene
-from .comparison import AccuracyTimeTable, compute_distances
+from .comparison import AccuracyTimeTable, compute_node_errors
 from .fem_worker import FemResult, FemWorker, FrameRequest
-from .requests import Look
+from .requests import Display
 
 ALL_ACTIVE: frozenset[str] = frozenset()
 """Disabled effects when all effects are active."""
@@ -29,7 +29,7 @@ class SceneSolvers:
     `playable` is true if one of them is ready to compute.
     """
 
-    def __init__(self, theatre: PatientSetup, scene: Scene, deformer: str, build_lock: threading.Lock) -> None:
+    def __init__(self, patient: PatientSetup, scene: Scene, deformer: str, build_lock: threading.Lock) -> None:
         """Start with the `deformer` of that name. FEM solvers are built one at a time, under `build_lock`.
 
         Raises
@@ -37,9 +37,9 @@ class SceneSolvers:
         InputError
             A deformer that does not support the scene.
         """
-        self.theatre, self.build_lock = theatre, build_lock
+        self.patient, self.build_lock = patient, build_lock
         # Not on a GPU: rendering while a solver's thread records a CUDA graph would be recorded, too.
-        self.stages = {ALL_ACTIVE: replace(theatre.build_stage(scene), device="cpu")}
+        self.stages = {ALL_ACTIVE: replace(patient.build_stage(scene), device="cpu")}
         self.players: dict[tuple[str, frozenset[str]], Player] = {}
         self.camera_stages: dict[tuple, Stage] = {}
         self.last: dict[str, Deformation] = {}
@@ -51,50 +51,51 @@ class SceneSolvers:
         if self.playable:
             self.get_player(deformer)
 
-    def get_stage(self, disabled: frozenset[str] = ALL_ACTIVE) -> Stage:
+    def get_stage(self, disabled_effects: frozenset[str] = ALL_ACTIVE) -> Stage:
         """Return the stage of the scene without some effects, with unchanged tissue."""
-        if disabled not in self.stages:
+        if disabled_effects not in self.stages:
             scene = self.stages[ALL_ACTIVE].scene
-            for effect in scene.get_effects_on(self.theatre.anatomy):
-                scene = remove_effect(scene, effect) if type(effect).__name__ in disabled else scene
-            self.stages[disabled] = replace(self.stages[ALL_ACTIVE], scene=scene)
-        return self.stages[disabled]
+            for effect in scene.get_effects_on(self.patient.anatomy):
+                scene = remove_effect(scene, effect) if type(effect).__name__ in disabled_effects else scene
+            self.stages[disabled_effects] = replace(self.stages[ALL_ACTIVE], scene=scene)
+        return self.stages[disabled_effects]
 
-    def get_worker(self, disabled: frozenset[str] = ALL_ACTIVE) -> FemWorker:
+    def get_worker(self, disabled_effects: frozenset[str] = ALL_ACTIVE) -> FemWorker:
         """Return the FEM worker of the scene without some effects."""
-        if disabled not in self.solvers:
-            self.solvers[disabled] = FemWorker(self.theatre, self.get_stage(disabled).scene, self.build_lock)
-        return self.solvers[disabled]
+        if disabled_effects not in self.solvers:
+            scene = self.get_stage(disabled_effects).scene
+            self.solvers[disabled_effects] = FemWorker(self.patient, scene, self.build_lock)
+        return self.solvers[disabled_effects]
 
-    def get_player(self, name: str, disabled: frozenset[str] = ALL_ACTIVE) -> Player:
+    def get_player(self, name: str, disabled_effects: frozenset[str] = ALL_ACTIVE) -> Player:
         """Return the player of the scene without some effects: a trained model, or FEM with a solution."""
-        if (name, disabled) not in self.players:
-            stage = self.get_stage(disabled)
+        if (name, disabled_effects) not in self.players:
+            stage = self.get_stage(disabled_effects)
             if name == "fem":
-                fem_player = self.get_worker(disabled).player
+                fem_player = self.get_worker(disabled_effects).player
                 assert fem_player is not None
                 deformer = fem_player.deformer
             else:
                 deformer = self._build_trained(name, stage.scene)
-            self.players[name, disabled] = self.theatre.build_player_of(stage, deformer, name)
-        return self.players[name, disabled]
+            self.players[name, disabled_effects] = self.patient.build_player_of(stage, deformer, name)
+        return self.players[name, disabled_effects]
 
-    def get_player_with_camera(self, name: str, disabled: frozenset[str], look: Look) -> Player:
+    def get_player_with_camera(self, deformer: str, disabled_effects: frozenset[str], display: Display) -> Player:
         """Return the player with the camera and the registration of a display style."""
-        player = self.get_player(name, disabled)
-        key = disabled, look.path, look.tilt, look.distance, look.registration
+        player = self.get_player(deformer, disabled_effects)
+        key = disabled_effects, display.path, display.tilt, display.distance, display.registration
         if key[1:] == ("", None, None, None):
             return player
         if key not in self.camera_stages:
             scene = player.scene
             viewpoint = scene.viewpoint
-            if look.path:
-                viewpoint = replace(viewpoint, path=PATHS[look.path](0) if look.path in PATHS else None)
-            if look.tilt is not None:
-                viewpoint = replace(viewpoint, tilt=look.tilt)
-            if look.distance is not None:
-                viewpoint = replace(viewpoint, distance=look.distance)
-            scene = replace(scene, viewpoint=viewpoint, registration=look.registration or scene.registration)
+            if display.path:
+                viewpoint = replace(viewpoint, path=PATHS[display.path](0) if display.path in PATHS else None)
+            if display.tilt is not None:
+                viewpoint = replace(viewpoint, tilt=display.tilt)
+            if display.distance is not None:
+                viewpoint = replace(viewpoint, distance=display.distance)
+            scene = replace(scene, viewpoint=viewpoint, registration=display.registration or scene.registration)
             # Only the newest stage is kept: a moving slider requests many.
             self.camera_stages = {key: replace(player.stage, scene=scene)}
         return replace(player, stage=self.camera_stages[key])
@@ -102,38 +103,38 @@ class SceneSolvers:
     def _build_trained(self, name: str, scene: Scene) -> Deformer:
         """Return a trained model. Its FEM fallback is built under `build_lock`, on the CPU like the stages."""
         with self.build_lock if name == GUARDED else nullcontext():
-            return replace(self.theatre, device="cpu").build_deformer(name, scene)
+            return replace(self.patient, device="cpu").build_deformer(name, scene)
 
-    def predict(self, name: str, request: FrameRequest) -> FemResult:
+    def predict(self, model_name: str, request: FrameRequest) -> FemResult:
         """Compute a trained model's solution; its FEM fallback starts from the last one.
 
         A model that integrates its tissue in time computes the previous frames first.
         """
-        start, player = clock.perf_counter(), self.get_player(name)
+        start, player = clock.perf_counter(), self.get_player(model_name)
         if player.follows:
-            session = self.sessions.setdefault(name, ReplaySession(player))
+            session = self.sessions.setdefault(model_name, ReplaySession(player))
             number, deformation = session.approach_frame(*request)
             while number != request[0]:
                 number, deformation = session.approach_frame(*request)
             return FemResult(number, player.build_loads(*request), deformation, clock.perf_counter() - start, request)
         loads = player.build_loads(*request)
-        deformation = self.last[name] = player.compute_deformation(loads, self.last.get(name))
+        deformation = self.last[model_name] = player.compute_deformation(loads, self.last.get(model_name))
         return FemResult(request[0], loads, deformation, clock.perf_counter() - start, request)
 
-    def compare_models(self, reference: FemResult, table: AccuracyTimeTable, skip: str) -> None:
-        """Record time and error of FEM and of each trained model but `skip`, for the load of an FEM solution."""
+    def compare_models(self, reference: FemResult, table: AccuracyTimeTable, excluded_model: str) -> None:
+        """Record time and error of FEM and of each trained model but `excluded_model`, for an FEM solution's load."""
         digest, scene = compute_loads_digest(reference.loads), self.get_stage().scene
         table.record_time("fem", digest, reference.deformation.cost.total)
         table.record_error("fem", digest, 0.0)
-        for name in self.theatre.select_models(scene):
+        for name in self.patient.select_models(scene):
             player = self.get_player(name)
-            if name != skip and not player.follows:
+            if name != excluded_model and not player.follows:
                 solution = player.compute_deformation(reference.loads)
                 table.record_time(name, digest, solution.cost.total)
-                table.record_error(name, digest, float(compute_distances(reference, player, solution).mean()))
+                table.record_error(name, digest, float(compute_node_errors(reference, player, solution).mean()))
 
     def solve(
-        self, disabled: frozenset[str], request: FrameRequest, previous: FemResult | None, timeout: float
+        self, disabled_effects: frozenset[str], request: FrameRequest, previous: FemResult | None, timeout: float
     ) -> FemResult | None:
         """Return the FEM solution of a frame, or of one on the way to it. The solver is started if necessary.
 
@@ -149,29 +150,29 @@ class SceneSolvers:
         Exception
             Any exception of the solver's thread.
         """
-        worker = self.get_worker(disabled)
+        worker = self.get_worker(disabled_effects)
         if self.pending != (worker, request):
             self._replace_pending(worker, request)
         if worker.failure is not None and (worker.refused == request or not worker.thread.is_alive()):
             self.pending = None
             if not worker.thread.is_alive():
-                del self.solvers[disabled]
+                del self.solvers[disabled_effects]
             raise worker.failure
-        result = worker.wait_newer(request, previous, timeout)
+        result = worker.wait_for_newer(request, previous, timeout)
         self.playable = self.playable or worker.player is not None
         return result
 
     def _replace_pending(self, worker: FemWorker, request: FrameRequest) -> None:
         """Request the next displayed solution, and drop the previous request."""
         if self.pending is not None and self.pending[0] is not worker:
-            self.pending[0].drop()
+            self.pending[0].drop_request()
         self.pending = worker, request
-        worker.ask(*request)
+        worker.request_frame(*request)
 
     def stop_all(self) -> None:
         """Withdraw the pending request: the worker stops after the current step."""
         if self.pending is not None:
-            self.pending[0].drop()
+            self.pending[0].drop_request()
             self.pending = None
 
     def stop_soon(self) -> list[FemWorker]:

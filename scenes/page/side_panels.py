@@ -24,22 +24,22 @@ SET_FORCE = Line("force", "N", "#ffa94d", "as it is set")  # Chart of the prescr
 TUMOUR_MOTION = Line("tumour moved", "mm", "#4cf28c", "band: motion error (95 %); dotted: not known")
 
 
-def list_lines(scene: Scene) -> tuple[Line, ...]:
+def list_plot_lines(scene: Scene) -> tuple[Line, ...]:
     """Return the plotted quantities of a scene: without a tool, the displacement of the tumour."""
     if scene.tool is None:
         return (TUMOUR_MOTION,)
     return DISTANCE, FORCE if scene.posed else SET_FORCE
 
 
-def build_sample(frame: Frame, scene: Scene, now: float) -> Sample:
-    """Build the readings, with errors, of a frame that is shown at a time [s], in the order of `list_lines`."""
+def build_history_sample(frame: Frame, scene: Scene, time: float) -> Sample:
+    """Build the readings, with errors, of a frame that is shown at a time [s], in the order of `list_plot_lines`."""
     if scene.tool is None:
         location = frame.estimate.location if frame.estimate is not None else None
         error = frame.tumour_error.bound if location is None else location.p95
-        return Sample(now, (1e3 * frame.moved,), (_scale_value(error, 1e3),))
+        return Sample(time, (1e3 * frame.moved,), (_scale_value(error, 1e3),))
     force, force_error = get_tool_force(frame.loads, frame.deformation)
     distance = _scale_value(frame.distance, 1e3), _scale_value(frame.distance_error, 1e3)
-    return Sample(now, (distance[0], force), (distance[1], force_error))
+    return Sample(time, (distance[0], force), (distance[1], force_error))
 
 
 def get_tool_force(loads: Loads, deformation: Deformation) -> tuple[float | None, float | None]:
@@ -54,7 +54,7 @@ def get_tool_force(loads: Loads, deformation: Deformation) -> tuple[float | None
     return float(np.linalg.norm(deformation.reaction[0, -1, :3])), bound if is_reliable else None
 
 
-def render_slices(frame: Frame, player: Player, through: str) -> np.ndarray:
+def render_slices(frame: Frame, player: Player, position: str) -> np.ndarray:
     """Render three slices (h, 3 h, 3) uint8 through the tumour's centre, or through the tool's tip if there is one."""
     stage, positions = player.stage.select_stage(frame.loads), player.estimate_positions(frame)
     other_layers, tool = [], player.scene.tool
@@ -62,17 +62,17 @@ def render_slices(frame: Frame, player: Player, through: str) -> np.ndarray:
         vertices = np.asarray(tool.mesh.vertices) @ frame.pose[:3, :3].T + frame.pose[:3, 3]
         other_layers.append(Layer("tool", TOOL, vertices, np.asarray(tool.mesh.faces), TOOL_COLOUR))
     if frame.estimate is not None:
-        other_layers.append(replace(stage.build_reference(player.compute_positions(frame.deformation)), name="truth"))
+        other_layers.append(replace(stage.build_fem_tumour(player.compute_positions(frame.deformation)), name="truth"))
     tumour, scan_tumour = stage.build_tumour(positions), stage.tumour_at_rest
     cut = Cut(tumour, scan_tumour, frame.tumour_error.bound, bool(frame.doubt), other_layers, frame.tip)
-    return draw_slices_through(player.stage, cut, through)
+    return draw_slices_through(player.stage, cut, position)
 
 
-def draw_slices_through(stage: Stage, cut: Cut, through: str) -> np.ndarray:
+def draw_slices_through(stage: Stage, cut: Cut, position: str) -> np.ndarray:
     """Draw three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above (no tip: the centre)."""
     tumour = cut.now if len(cut.now.vertices) else stage.tumour_at_rest
     centre = 0.5 * (tumour.vertices.min(axis=0) + tumour.vertices.max(axis=0))
-    return draw_slices(stage.anatomical_scan, cut.tip if through == TIP and cut.tip is not None else centre, cut)
+    return draw_slices(stage.head_scan_texture, cut.tip if position == TIP and cut.tip is not None else centre, cut)
 
 
 def _scale_value(value: float | None, factor: float) -> float | None:

@@ -46,26 +46,26 @@ EFFECTS = {
 """Names of a scene's effects for users."""
 
 
-def describe_effect(name: str) -> str:
+def describe_effect(effect_name: str) -> str:
     """Return the name of an effect class for users."""
-    return EFFECTS.get(name, name)
+    return EFFECTS.get(effect_name, effect_name)
 
 
-def format_caption(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
+def format_caption(patient: PatientSetup, scene: Scene, anatomy: str) -> str:
     """Describe the image: visible parts, meaning of the lines, and anatomy."""
     title = " ".join(scene.title.split())
     estimate_note = "" if scene.observation_model is None else f" {ESTIMATE_EXPLANATION}"
     return (
-        f'<p class="number">Simulation: {describe_location(theatre.anatomy)} tumour '
+        f'<p class="number">Simulation: {describe_location(patient.anatomy)} tumour '
         f"<small>{RESEARCH_ONLY}</small></p><p>{escape(title)}{estimate_note}</p>{format_page_legend(scene)}"
-        f'<p class="dim">{escape(describe_scene(theatre, scene, anatomy))}</p>'
+        f'<p class="dim">{escape(describe_scene(patient, scene, anatomy))}</p>'
     )
 
 
 def format_page_legend(scene: Scene) -> str:
     """Build the legend of the lines, each with a sample."""
     scan_key = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
-    predicted, fem, region = (to_stroke(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
+    predicted, fem, region = (to_svg_stroke(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
     hidden_key = (f'{predicted} stroke-width="3" stroke-dasharray="5 3"', "hidden by tool, drape or bone")
     keys = [
         (f'{predicted} stroke-width="3"', "predicted tumour"),
@@ -87,29 +87,29 @@ def format_page_legend(scene: Scene) -> str:
     return format_legend(keys)
 
 
-def format_legend(keys: Sequence[tuple[str, str]]) -> str:
+def format_legend(entries: Sequence[tuple[str, str]]) -> str:
     """Return a legend of lines, given the SVG attributes and the meaning of each."""
     samples = (
         f'<span><svg width="26" height="8"><line x1="1" y1="4" x2="25" y2="4" {attributes}/></svg>{text}</span>'
-        for attributes, text in keys
+        for attributes, text in entries
     )
     return f'<div class="legend">{"".join(samples)}</div>'
 
 
-def to_stroke(colour: Sequence[float]) -> str:
+def to_svg_stroke(colour: Sequence[float]) -> str:
     """Format a colour, sRGB in [0, 1], as the stroke attribute of an SVG line."""
     return 'stroke="#' + "".join(f"{round(255.0 * channel):02x}" for channel in colour) + '"'
 
 
-def describe_scene(theatre: PatientSetup, scene: Scene, anatomy: str) -> str:
+def describe_scene(patient: PatientSetup, scene: Scene, anatomy: str) -> str:
     """Describe the anatomy, the size of its mesh, and the FEM model."""
-    mesh = theatre.anatomy.mesh
-    return f"Brain: {anatomy}; {len(mesh.nodes)} mesh points. FEM: {describe_fem(theatre, scene)}."
+    mesh = patient.anatomy.mesh
+    return f"Brain: {anatomy}; {len(mesh.nodes)} mesh points. FEM: {describe_fem(patient, scene)}."
 
 
-def describe_fem(theatre: PatientSetup, scene: Scene) -> str:
+def describe_fem(patient: PatientSetup, scene: Scene) -> str:
     """Describe element and tissue of the FEM model of a scene."""
-    element, elasticity = theatre.choose_element(scene), scene.elasticity
+    element, elasticity = patient.choose_element(scene), scene.elasticity
     regions = (f"; the {name_region(key)} of {describe_tissue(tissue)}" for key, tissue in elasticity.regions.items())
     return f"{ELEMENTS.get(element, element)}, {describe_tissue(elasticity.default)}{''.join(regions)}"
 
@@ -134,7 +134,7 @@ def describe_deformer(name: str) -> str:
     return "FEM (reference)" if name == "fem" else f"fast model ({name})"
 
 
-def describe_work(scene: Scene, name: str, number: int, touch: Touch | None) -> str:
+def describe_solve(scene: Scene, name: str, number: int, touch: Touch | None) -> str:
     """Describe the running solve: a frame of the script, or the manual touch."""
     if touch is None:
         return f"solving frame {number} ({describe_deformer(name)})"
@@ -142,21 +142,22 @@ def describe_work(scene: Scene, name: str, number: int, touch: Touch | None) -> 
     return f"computing the deformation for the manual tool, {strength} ({describe_deformer(name)})"
 
 
-def format_pending(shown: int, requested: int, frames: int) -> str:
+def format_pending(shown_frame: int, requested_frame: int, frame_count: int) -> str:
     """Describe an image that does not show the requested frame yet."""
-    progress = f" frame {shown} of {frames - 1} is shown, on the way to frame {requested}" if shown != requested else ""
+    way = f" frame {shown_frame} of {frame_count - 1} is shown, on the way to frame {requested_frame}"
+    progress = way if shown_frame != requested_frame else ""
     return f'<p class="stale">Result pending:{progress or " it is being computed"}.</p>'
 
 
-def plan_words(lines: Sequence[str]) -> str:
+def format_solver_list(solvers: Sequence[str]) -> str:
     """List the solvers of FEM in HTML; empty without solvers."""
-    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>" if lines else ""
+    return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in solvers)}</ul>" if solvers else ""
 
 
-def format_trust(deformation: Deformation, name: str) -> str:
+def describe_result(deformation: Deformation, deformer: str) -> str:
     """Describe the source of a solution and its error; as a warning with the reason, if it is unreliable."""
     outcome = deformation.outcome[0]
-    source = f"<b>{escape(_describe_guarded(outcome) if name == GUARDED else describe_deformer(name))}</b>"
+    source = f"<b>{escape(_describe_guarded(outcome) if deformer == GUARDED else describe_deformer(deformer))}</b>"
     if outcome is Outcome.EXTRAPOLATED:
         return (
             f'<p>{source}</p><p class="warn">Do not rely on this result: the load lies outside the range that the '
@@ -182,7 +183,7 @@ def _describe_guarded(outcome: Outcome) -> str:
     return "fast model" if by_model else "FEM, because the error bound of the fast model is too large"
 
 
-def format_tumour_trust(error: TumourError) -> str:
+def format_position_error(error: TumourError) -> str:
     """Describe the error of the tumour position relative to the patient, which includes more than the model."""
     if error.bound is None:
         return (
@@ -192,27 +193,27 @@ def format_tumour_trust(error: TumourError) -> str:
     bound = hud.bound_words(error.bound, 1)
     text = f"Tumour position error (95 %): at most {bound} at any point of its surface"
     caveat = ": rough estimate (few samples, load outside the tissue model, or by the size of the motion)"
-    caveat = caveat if error.guess else ""
-    if error.registration_words:
-        text += f" ({error.registration_words})"
+    caveat = caveat if error.is_rough else ""
+    if error.registration_text:
+        text += f" ({error.registration_text})"
     if error.observed is None:
-        return f"<p>{text}{caveat or f'; the largest part is {escape(error.largest)}'}.</p>"
+        return f"<p>{text}{caveat or f'; the largest part is {escape(error.main_source)}'}.</p>"
     prior = "" if error.prior is None else f"; without cortex observation: {hud.bound_words(error.prior, 1)}{caveat}"
     return f"<p>{text}{prior}.</p>"
 
 
-def report(
+def format_report(
     frame: Frame,
     stage: Stage,
-    name: str,
-    verdict: str,
+    deformer: str,
+    comparison: str,
     rows: Sequence[ComparisonRow],
-    frames: int,
-    without: Sequence[str] = (),
+    frame_count: int,
+    disabled_effects: Sequence[str] = (),
 ) -> str:
     """Build the report of a solution: distance, motion and warnings; reliability, loads and times on demand."""
-    remaining = stage.select_stage(frame.loads).left
-    facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
+    remaining = stage.select_stage(frame.loads).remaining_body
+    facts = [f"frame {frame.number} of {frame_count - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
     if frame.distance_error is not None and frame.distance_error < np.inf:
         facts += [
             f"error of the tip-to-tumour distance <= {hud.bound_words(frame.distance_error, 1)} (95 %, relative to FEM)"
@@ -223,15 +224,15 @@ def report(
     parts.append(headline)
     if frame.estimate is not None or not is_undeformed(frame.deformation):
         parts.append(f"<p>{format_motion(frame)}</p>")
-    if without:
-        parts.append(f"<p>Switched off: {escape(', '.join(without))}.</p>")
-    details = [format_trust(frame.deformation, name), format_tumour_trust(frame.tumour_error), *estimate_texts]
+    if disabled_effects:
+        parts.append(f"<p>Switched off: {escape(', '.join(disabled_effects))}.</p>")
+    details = [describe_result(frame.deformation, deformer), format_position_error(frame.tumour_error), *estimate_texts]
     details.append(f"<p>{escape('; '.join(facts))}</p>")
     if remaining is not None and len(remaining.loose_tetrahedra):
         details.append(f"<p>{len(remaining.loose_tetrahedra)} loose elements were removed with the resection.</p>")
     labels = {"deform": "deformation", "render": "rendering", "overlay": "overlay"}
     times = ", ".join(f"{labels.get(task, task)} {1e3 * seconds:.1f}" for task, seconds in frame.seconds.items())
-    details += [verdict, f'<p class="dim">time [ms]: {times}</p></div>']
+    details += [comparison, f'<p class="dim">time [ms]: {times}</p></div>']
     warnings = [part for part in details if WARNING in part]
     parts += [*warnings, format_cost_plot(rows)]
     return "".join([*parts, OPEN_DETAILS, *(part for part in details if WARNING not in part)])
@@ -251,34 +252,34 @@ def format_motion(frame: Frame) -> str:
 
 def describe_estimate(estimate: TumourEstimate) -> list[str]:
     """Describe an estimate, its error and its input; or the reason of its rejection."""
-    reference = f"simulated (FEM): {format_unbroken(estimate.true_motion)}"
+    reference = f"simulated (FEM): {format_length(estimate.true_distance)}"
     if estimate.location is None:
         return [
             f'<p class="number">tumour position unknown ({reference})</p>',
-            f'<p class="warn">Observation rejected: {escape(estimate.refusal)}</p>',
+            f'<p class="warn">Observation rejected: {escape(estimate.rejection)}</p>',
         ]
-    motion = format_unbroken(estimate.moved, estimate.location.p95)
-    side = "inside" if estimate.held else "outside"
+    motion = format_length(estimate.motion_length, estimate.location.p95)
+    side = "inside" if estimate.is_covered else "outside"
     doubt = f" {estimate.location.doubt}" if estimate.location.doubt else ""
-    notice = "" if estimate.noticed else " No significant motion detected."
+    notice = "" if estimate.is_significant else " No significant motion detected."
     return [
         f'<p class="number">estimated tumour motion {motion} ({reference})</p>',
-        f"<p><b>estimate</b> from {escape(estimate.source)}: error {1e3 * estimate.off:.1f} mm; the simulated centre "
+        f"<p><b>estimate</b> from {escape(estimate.source)}: error {1e3 * estimate.error:.1f} mm; the simulated centre "
         f"is {side} the 95 % region. Causes: {estimate.location.named_causes}.{notice}{doubt}</p>",
     ]
 
 
-def format_tip_distance(distance: float, error: float | None, inside: bool) -> str:
+def format_tip_distance(distance: float, error: float | None, is_inside: bool) -> str:
     """Return the page's first line: from the tip to the tumour's surface, with its error [m], as HTML.
 
     None: not known.
     """
-    length = format_unbroken(distance, error)
-    text = f"tip inside the tumour, {length} below its surface" if inside else f"tip to tumour {length}"
+    length = format_length(distance, error)
+    text = f"tip inside the tumour, {length} below its surface" if is_inside else f"tip to tumour {length}"
     return f'<p class="number">{text}</p>'
 
 
-def format_unbroken(length: float, error: float | None = None) -> str:
+def format_length(length: float, error: float | None = None) -> str:
     """Format a length and its error [m] in millimetres, without line breaks."""
     text = hud.format_millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
     return text.replace(" ", "&nbsp;")

@@ -46,11 +46,11 @@ def build_page_bodies(stage: Stage) -> list[SceneSurface]:
 
 def build_brain(stage: Stage) -> list[SceneSurface]:
     """Build the undeformed brain, open cortex and tumour."""
-    brain, scan, cortex = stage.brain, stage.tumour_at_rest, split_cortex(stage, stage.site.anatomy.mesh.nodes)
+    brain, scan, cortex = stage.brain_surface, stage.tumour_at_rest, split_cortex(stage, stage.site.anatomy.mesh.nodes)
     return [
         SceneSurface("brain", brain.vertices, brain.triangles, BRAIN_COLOUR, side="back"),
         *(SceneSurface(*part, CORTEX_COLOURS[part[0]]) for part in cortex),
-        build_edge(stage),
+        build_craniotomy_edge(stage),
         SceneSurface("scan", scan.vertices, scan.triangles, SCAN_COLOUR, side="back", meaning="tumour in the scan"),
         SceneSurface("tumour", scan.vertices, scan.triangles, TUMOUR_COLOUR, meaning="tumour now"),
     ]
@@ -58,11 +58,11 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
 
 def split_cortex(stage: Stage, positions: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Split the open cortex at `positions` (V, 3) [m] into bright crowns and dark sulci: name, vertices, triangles."""
-    points = stage.relief.surface.place(positions[stage.relief.vertices])
-    return [(name, points[used], faces) for name, (used, faces) in zip(CORTEX_COLOURS, stage.relief_parts, strict=True)]
+    points = stage.coarse_gyri.surface.place(positions[stage.coarse_gyri.vertices])
+    return [(name, points[used], faces) for name, (used, faces) in zip(CORTEX_COLOURS, stage.gyri_parts, strict=True)]
 
 
-def build_edge(stage: Stage) -> SceneSurface:
+def build_craniotomy_edge(stage: Stage) -> SceneSurface:
     """Build a ring of bone round the craniotomy."""
     site, (points, _, edge) = stage.site, cut_hole(stage.site)
     inner = points[edge] + DRAPE_HEIGHT * site.axis
@@ -74,10 +74,10 @@ def build_edge(stage: Stage) -> SceneSurface:
     return SceneSurface("edge", vertices, triangles, EDGE_COLOUR, meaning="edge of the craniotomy")
 
 
-def build_surroundings(stage: Stage) -> list[Sign | ScenePicture]:
+def build_static_bodies(stage: Stage) -> list[Sign | ScenePicture]:
     """Build the static bodies: orientation letters round the brain, and planes of the scan behind the tumour."""
     surroundings: list[Sign | ScenePicture] = [*list_orientation_labels(stage.site)]
-    scan, centre = stage.anatomical_scan, stage.tumour_at_rest.vertices.mean(axis=0)
+    scan, centre = stage.head_scan_texture, stage.tumour_at_rest.vertices.mean(axis=0)
     for plane in PLANES if scan is not None else ():
         assert scan is not None
         grey = resample_view(plane, scan, centre)
@@ -116,9 +116,9 @@ def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
         browser.move("tool", tool.mesh.vertices @ frame.pose[:3, :3].T + frame.pose[:3, 3])
 
 
-def move_wire(browser: Browser, stage: Stage, result: FemResult, player: Player) -> None:
+def move_fem_tumour(browser: Browser, stage: Stage, fem_result: FemResult, player: Player) -> None:
     """Show the tumour position that FEM computes with all effects."""
-    tumour = stage.select_stage(result.loads).build_tumour(player.compute_positions(result.deformation))
+    tumour = stage.select_stage(fem_result.loads).build_tumour(player.compute_positions(fem_result.deformation))
     browser.move("finite elements", tumour.vertices, tumour.triangles)
 
 

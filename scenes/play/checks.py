@@ -14,10 +14,10 @@ from surrogate.locating.prior import compute_middle
 from ..script.scene import Bounds
 from .image_checks import (
     has_distance_at_tip,
+    has_hidden_mark,
     has_printed_numbers,
-    is_hidden_part_marked,
     measure_outline_error,
-    measure_truth_error,
+    measure_true_outline_error,
     render_silhouette,
 )
 from .player import Frame, Player
@@ -119,23 +119,23 @@ class SceneFigures:
         return {name: value if name == "doubt" or np.isfinite(value) else None for name, value in figures.items()}
 
 
-def measure(
-    player: Player, camera_at: Callable[[float], Camera], frames: Sequence[Frame], truth: Deformation
+def measure_frames(
+    player: Player, get_camera: Callable[[float], Camera], frames: Sequence[Frame], reference: Deformation
 ) -> SceneFigures:
     """Compare drawn frames with the FEM solutions of the same loads (one row per frame).
 
-    `camera_at` gives the reference camera at a time [s].
+    `get_camera` gives the reference camera at a time [s].
     """
-    doubts = _list_unreliable(frames, truth)
+    doubts = _list_unreliable(frames, reference)
     moved = [
         np.linalg.norm(
-            truth.restrict(player.stage.select_stage(frame.loads).anatomy.tumour_nodes).displacement[row], axis=1
+            reference.restrict(player.stage.select_stage(frame.loads).anatomy.tumour_nodes).displacement[row], axis=1
         ).mean()
         for row, frame in enumerate(frames)
     ]
     finite = [_is_finite(frame) and _is_cortex_embedded(player, frame) for frame in frames]
     misses = [
-        _measure_miss(player, camera_at(frame.time), frame, truth, row) if finite[row] else WORST_MISS
+        _measure_miss(player, get_camera(frame.time), frame, reference, row) if finite[row] else WORST_MISS
         for row, frame in enumerate(frames)
     ]
     overlap, error, pixels, drawn, visible, honestly = zip(*misses, strict=True)
@@ -153,12 +153,12 @@ def measure(
         answered=not doubts,
         in_step=all(
             bool(frame.deformation.time[0] == frame.time == time)
-            for frame, time in zip(frames, truth.time, strict=True)
+            for frame, time in zip(frames, reference.time, strict=True)
         ),
-        leaked=float(truth.leaked.max()),
-        bond=float(truth.bond.max()),
-        covered=_compute_coverage(player, frames, truth),
-        removed=_compute_removed_share(player, frames, truth) if all(finite) else np.nan,
+        leaked=float(reference.leaked.max()),
+        bond=float(reference.bond.max()),
+        covered=_compute_coverage(player, frames, reference),
+        removed=_compute_removed_share(player, frames, reference) if all(finite) else np.nan,
         doubt="" if not doubts else doubts[0] + (f" ({len(doubts) - 1} more)" if doubts[1:] else ""),
     )
 
@@ -175,9 +175,9 @@ def _compute_coverage(player: Player, frames: Sequence[Frame], truth: Deformatio
     return float(np.mean(held))
 
 
-def is_within_surface(closed: Layer, point: np.ndarray) -> bool:
+def is_within_surface(surface: Layer, point: np.ndarray) -> bool:
     """Return True if a closed convex surface, with triangles oriented outwards, contains a point (3,) [m]."""
-    a, b, c = np.moveaxis(closed.vertices[closed.triangles], 1, 0)
+    a, b, c = np.moveaxis(surface.vertices[surface.triangles], 1, 0)
     return bool((np.einsum("fi,fi->f", np.cross(b - a, c - a), point - a) <= 0.0).all())
 
 
@@ -201,21 +201,21 @@ def _list_unreliable(frames: Sequence[Frame], truth: Deformation) -> list[str]:
     return found
 
 
-def list_objections(frames: Sequence[Frame]) -> list[str]:
+def list_warnings(frames: Sequence[Frame]) -> list[str]:
     """List warnings about the estimates of a scene with an observation model, or about its frames.
 
     Frames that the locator rejects or doubts are counted, with the first reason. If the tumour is still in most frames,
     the removed share is mostly rigid error. These warnings explain exceeded limits, and are not limits themselves.
     """
     estimates = [frame.estimate for frame in frames if frame.estimate is not None]
-    refused = [estimate.refusal for estimate in estimates if estimate.location is None]
+    refused = [estimate.rejection for estimate in estimates if estimate.location is None]
     slipped = [estimate.location.doubt for estimate in estimates if estimate.location and estimate.location.slipped]
     found = [
         f"the locator {does} in {len(reasons)} of {len(estimates)} frames: {reasons[0]}"
         for does, reasons in {"rejects the observation": refused, "doubts its result": slipped}.items()
         if reasons
     ]
-    motion = np.linalg.norm([estimate.true for estimate in estimates], axis=1) if estimates else np.zeros(0)
+    motion = np.linalg.norm([estimate.true_motion for estimate in estimates], axis=1) if estimates else np.zeros(0)
     moving = np.count_nonzero(motion > STILL_SHARE * motion.max(initial=0.0))
     if moving < 0.5 * len(motion):
         found.append(
@@ -234,7 +234,7 @@ def _is_cortex_embedded(player: Player, frame: Frame) -> bool:
     stage = player.stage.select_stage(frame.loads)
     if not stage.scene.look.natural:
         return True
-    surface, at = stage.fine.surface, player.compute_positions(frame.deformation)[stage.fine.vertices]
+    surface, at = stage.fine_cortex.surface, player.compute_positions(frame.deformation)[stage.fine_cortex.vertices]
     away = surface.place(at) - surface.interpolate(at)
     normal = surface.interpolate(compute_vertex_normals(at, surface.coarse))
     aside = away - np.einsum("mi,mi->m", away, normal)[:, None] * normal / np.square(normal).sum(axis=1, keepdims=True)
@@ -263,7 +263,7 @@ def _measure_miss(player: Player, camera: Camera, frame: Frame, truth: Deformati
     mask = render_silhouette(camera, true if frame.estimate is None else shown)
     drawn = measure_outline_error(frame, mask)
     if frame.estimate is not None:  # both are in the image
-        drawn = max(drawn, measure_truth_error(frame, render_silhouette(camera, true)))
+        drawn = max(drawn, measure_true_outline_error(frame, render_silhouette(camera, true)))
     # NaN: a point is behind the camera.
     pixels = np.inf if np.isnan(pixels) else float(pixels)
-    return overlap, mean, pixels, drawn, visible, is_hidden_part_marked(frame, mask)
+    return overlap, mean, pixels, drawn, visible, has_hidden_mark(frame, mask)

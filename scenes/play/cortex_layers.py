@@ -23,7 +23,7 @@ class VesselSettings:
 
     voxel_across: float = 0.2e-3  # Edge of a voxel across the axis of the craniotomy [m].
     voxel_along: float = 1e-3  # Edge of a voxel along the axis of the craniotomy [m].
-    margin: float = 10e-3  # Margin of the voxels round the craniotomy [m].
+    border_width: float = 10e-3  # Margin of the voxels round the craniotomy [m].
     height_above: float = 5e-3  # Height of the voxels above the centre of the craniotomy [m].
     depth_below: float = 14e-3  # Depth of the voxels below the centre of the craniotomy [m].
     trunk_count: int = 14  # Number of vessels that enter at the border.
@@ -45,14 +45,14 @@ VESSELS = VesselSettings()
 
 @lru_cache(maxsize=2)
 def add_vessels(
-    intensity: Intensity | None, site: CraniotomyFrame, seed: int, dark: tuple[float, float, float], relief: float
+    intensity: Intensity | None, site: CraniotomyFrame, seed: int, absorption: tuple[float, float, float], relief: float
 ) -> Solid:
     """Return the scan around an opening as a solid texture with random vessels, which the seed determines.
 
-    Vessels move with the tissue, and have no height. Without a scan, brightness is uniform. `dark` and `relief` as of
+    Vessels move with the tissue, and have no height. Without a scan, brightness is uniform. `absorption`, `relief`: see
     `Solid`.
     """
-    half = site.radius + VESSELS.margin
+    half = site.radius + VESSELS.border_width
     wide, tall = VESSELS.voxel_across, VESSELS.voxel_along
     across, along = np.arange(-half, half, wide), np.arange(-VESSELS.height_above, VESSELS.depth_below, tall)
     T = np.eye(4)
@@ -63,15 +63,15 @@ def add_vessels(
         grey, inside = intensity.apply_window(site.anatomy.mesh), np.linalg.inv(intensity.affine) @ T
         scan = affine_transform(grey, inside, output_shape=scan.shape, order=1, mode="nearest")
     light = 1.0 - compute_vessel_absorption(across, np.random.default_rng([seed, 1])).astype(np.float32)
-    return Solid(scan * light[:, :, None], np.linalg.inv(T), dark, relief, height=scan)
+    return Solid(scan * light[:, :, None], np.linalg.inv(T), absorption, relief, height=scan)
 
 
 def compute_vessel_absorption(
-    across: np.ndarray, random: np.random.Generator, settings: VesselSettings = VESSELS
+    coordinates: np.ndarray, random: np.random.Generator, settings: VesselSettings = VESSELS
 ) -> np.ndarray:
-    """Compute the share of light (n, n) that vessels absorb, on a grid of coordinates `across` (n,) [m]."""
-    points, widths = sample_vessel_paths(float(np.abs(across).max()), random, settings)
-    here = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1)
+    """Compute the share of light (n, n) that vessels absorb, on a grid of coordinates `coordinates` (n,) [m]."""
+    points, widths = sample_vessel_paths(float(np.abs(coordinates).max()), random, settings)
+    here = np.stack(np.meshgrid(coordinates, coordinates, indexing="ij"), axis=-1)
     away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * settings.max_width)
     width = np.append(widths, settings.max_width)[nearest]
     vessels = settings.max_absorption * np.exp(-2.0 * (away / width) ** 2)
@@ -80,19 +80,19 @@ def compute_vessel_absorption(
 
 
 def sample_vessel_paths(
-    half: float, random: np.random.Generator, settings: VesselSettings
+    half_width: float, random: np.random.Generator, settings: VesselSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sample vessels that enter at the border of a square and branch: points (k, 2) [m] and widths (k,) [m]."""
     count = settings.trunk_count
     angles = 2.0 * np.pi * (np.arange(count) + random.uniform(0.0, 0.7, count)) / count
-    rim = half * np.column_stack([np.cos(angles), np.sin(angles)])
+    rim = half_width * np.column_stack([np.cos(angles), np.sin(angles)])
     ends = list(
         zip(rim, angles + np.pi, settings.max_width * random.uniform(settings.min_trunk_ratio, 1.0, count), strict=True)
     )
     points, widths = [], []
     while ends:
         at, way, width = ends.pop()
-        while width > settings.min_width and np.abs(at).max() <= half:
+        while width > settings.min_width and np.abs(at).max() <= half_width:
             points.append(at)
             widths.append(width)
             way = way + settings.turn_deviation * random.standard_normal()
@@ -122,21 +122,21 @@ class FingerSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Squares:
+class CottonoidSurface:
     """Squares of cotton as points of the cortex: vertices and weights (n, 3), and triangles (m, 3) of the points."""
 
     vertices: np.ndarray
     weights: np.ndarray
     triangles: np.ndarray
-    lift: np.ndarray
+    offsets: np.ndarray
 
     def build_layer(self, positions: np.ndarray) -> Layer:
         """Return the layer for mesh vertices at positions (V, 3) [m]."""
         carried = np.einsum("nk,nkd->nd", self.weights, positions[self.vertices])
-        return Layer("cotton", COTTON, carried + self.lift, self.triangles, COTTON_COLOUR, gloss=0.1)
+        return Layer("cotton", COTTON, carried + self.offsets, self.triangles, COTTON_COLOUR, gloss=0.1)
 
 
-def build_squares(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> Squares:
+def build_cottonoids(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> CottonoidSurface:
     """Lay squares of cotton on an open cortex."""
     steps = np.linspace(-0.5, 0.5, SQUARE_VERTICES)
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -149,7 +149,7 @@ def build_squares(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> Squ
         at = each.side * grid @ turn.T + (each.x, each.y)
         triangles.append(faces + len(places))
         places += [site.find_nearest(site.origin + x * site.right + y * site.up) for x, y in at]
-    return Squares(
+    return CottonoidSurface(
         np.array([place.vertices for place in places]), np.array([place.weights for place in places]),
         np.concatenate(triangles), -SQUARE_HEIGHT * np.array([place.inward for place in places]),
     )  # fmt: skip

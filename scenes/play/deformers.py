@@ -44,7 +44,7 @@ from ..script.uncertainty import (
 )
 from .effect_record import SUFFIX, EffectRecord, read_effect_records
 from .family_record import FamilyFigures, read_family_figures
-from .observer import Observer
+from .observer import PointObserver
 from .player import Player
 from .stage import Stage
 from .stereo_observer import StereoObserver
@@ -134,7 +134,7 @@ class PatientSetup:
             case None:
                 return stage
             case PointObservation():
-                return replace(stage, observer=Observer(self.site, self.locator, scene.observation_model))
+                return replace(stage, observer=PointObserver(self.site, self.locator, scene.observation_model))
             case StereoObservation():
                 return replace(stage, observer=StereoObserver(stage, self.locator, scene.observation_model))
 
@@ -302,7 +302,7 @@ class PatientSetup:
 
 
 @dataclass(frozen=True, eq=False)
-class AtRest:
+class RestDeformer:
     """Deformer without motion: the body stays undeformed, as in the scan."""
 
     anatomy: Anatomy
@@ -319,14 +319,14 @@ def read_template_uncertainties() -> Mapping[str, Uncertainty]:
     return read_uncertainties(to_uncertainty_path(get_template_path()))
 
 
-def explain_plan(deformer: Deformer) -> tuple[str, ...]:
+def describe_solvers(deformer: Deformer) -> tuple[str, ...]:
     """List the solvers that a deformer tries for a load, as sentences; empty for a model or a resected body."""
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 
 
-def to_model_path(anatomy: Path, kind: str = "model") -> Path:
+def to_model_path(anatomy: Path, scene_name: str = "model") -> Path:
     """Return the path of models next to MESH.vtu: MESH.model.npz by default, MESH.SCENE.npz for models of one scene."""
-    return anatomy.with_suffix(f".{kind}.npz")
+    return anatomy.with_suffix(f".{scene_name}.npz")
 
 
 def load_models(path: Path, anatomy: Anatomy) -> dict[str, Learned]:

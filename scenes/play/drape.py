@@ -24,11 +24,11 @@ FOLD_START = 9e-3  # Distance from the hole at which the folds have their height
 
 
 @lru_cache(maxsize=4)
-def build_drape(site: CraniotomyFrame, number: int, folded: bool) -> Layer:
+def build_drape(site: CraniotomyFrame, segment_id: int, folded: bool) -> Layer:
     """Build the surface lifted off the brain, with a round hole over the open cortex, and a wall round the hole.
 
-    `number` is its segmentation id. If `folded`, it is cloth with soft folds, which begin at the edge of the hole. All
-    scenes of a patient share the result.
+    If `folded`, it is cloth with soft folds, which begin at the edge of the hole. All scenes of a patient share the
+    result.
     """
     points, triangles, rim = cut_hole(site)
     colour = np.broadcast_to(DRAPE_COLOUR, points.shape)
@@ -40,7 +40,7 @@ def build_drape(site: CraniotomyFrame, number: int, folded: bool) -> Layer:
     wall = np.concatenate([corner[:, [0, 1, 3]], corner[:, [0, 3, 2]]])
     points = np.concatenate([points, np.concatenate([points[rim], low], axis=1).reshape(-1, 3)])
     colour = np.concatenate([colour, np.broadcast_to(DRAPE_COLOUR, (4 * len(rim), 3))])
-    return Layer("drape", number, points, np.concatenate([triangles, wall]), colour, gloss=0.05, still=True)
+    return Layer("drape", segment_id, points, np.concatenate([triangles, wall]), colour, gloss=0.05, still=True)
 
 
 def cut_hole(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -65,26 +65,26 @@ def fold_cloth(
         return CLOTH_EDGE + CLOTH_GROWTH * np.maximum(beyond, 0.0)
 
     smooth = trimesh.Trimesh(corners, triangles.reshape(-1, 3), process=False)
-    rim = np.unique(list_border(smooth.faces))
+    rim = np.unique(list_border_edges(smooth.faces))
     trimesh.smoothing.filter_taubin(smooth, iterations=SMOOTHING_STEPS)  # cloth spans sulci
     smooth.vertices[rim] = corners[rim]
     corners = np.asarray(smooth.vertices)
     fine = build_embedded_surface(corners, triangles.reshape(-1, 3), target)
     arm = fine.interpolate(corners) - site.origin
-    height = compute_folds(np.linalg.norm(arm, axis=1) - hole, np.arctan2(arm @ site.up, arm @ site.right))
+    height = compute_fold_heights(np.linalg.norm(arm, axis=1) - hole, np.arctan2(arm @ site.up, arm @ site.right))
     at = replace(fine, depth=-FOLD_HEIGHT * height, highest=1.1 * FOLD_HEIGHT).place(corners)
-    return at, fine.triangles, list_border(fine.triangles), (0.9 + 0.35 * height[:, None]) * DRAPE_COLOUR
+    return at, fine.triangles, list_border_edges(fine.triangles), (0.9 + 0.35 * height[:, None]) * DRAPE_COLOUR
 
 
-def list_border(triangles: np.ndarray) -> np.ndarray:
+def list_border_edges(triangles: np.ndarray) -> np.ndarray:
     """List the edges (k, 2) that belong to one triangle only."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
     return edges[trimesh.grouping.group_rows(edges, require_count=1)]
 
 
-def compute_folds(beyond: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def compute_fold_heights(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Compute the height (n,) of folds, 0 to 1, at distances beyond the hole [m] and angles about its axis [rad]."""
-    rise, away = np.clip(beyond / FOLD_START, 0.0, 1.0), beyond / 15e-3
+    rise, away = np.clip(distance / FOLD_START, 0.0, 1.0), distance / 15e-3
     folds = []
     for count, start in zip(FOLD_COUNTS, (0.0, 2.0), strict=True):
         bend = 1.8 * np.sin(2.0 * angle + 1.0 + start) + 1.5 * np.sin(3.0 * angle - 0.8 * away + start) + 0.5 * away
@@ -94,27 +94,27 @@ def compute_folds(beyond: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def clip_surface(
-    points: np.ndarray, triangles: np.ndarray, value: np.ndarray
+    points: np.ndarray, triangles: np.ndarray, field: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the part of a surface where a linear field is positive: points (n, 3), triangles (m, 3), cut edges (k, 2).
 
     points (V, 3), triangles (F, 3), value (V,). Triangles that the zero line crosses are cut along it.
     """
-    positive = value[triangles] > 0.0
+    positive = field[triangles] > 0.0
     whole = triangles[positive.all(axis=1)]
     mixed = triangles[positive.any(axis=1) & ~positive.all(axis=1)]
     added, pieces, rim = [], [], []
     for corners in mixed:
-        inside = value[corners] > 0.0
+        inside = field[corners] > 0.0
         # Permute the corners so that the corner alone on its side comes first.
         lone = int(np.argmax(inside) if inside.sum() == 1 else np.argmin(inside))
         a, b, c = np.roll(corners, -lone)
         cuts = []
         for other in (b, c):
-            share = value[a] / (value[a] - value[other])
+            share = field[a] / (field[a] - field[other])
             cuts.append(len(points) + len(added))
             added.append((1.0 - share) * points[a] + share * points[other])
-        if value[a] > 0.0:
+        if field[a] > 0.0:
             pieces.append([[a, cuts[0], cuts[1]]])
         else:
             pieces.append([[cuts[0], b, c], [cuts[0], c, cuts[1]]])

@@ -29,13 +29,13 @@ ALL = "all"  # Name of the run with all effects.
 class AblationRun:
     """FEM solutions of a scene's frames: displacements (F, V, 3) [m], NaN for resected vertices, and their cost.
 
-    `milliseconds`: median per frame; `held`: size [bytes] of the device arrays kept from frame to frame; `unphysical`:
+    `milliseconds`: median per frame; `memory_bytes`: device arrays kept from frame to frame; `unphysical`:
     number of frames with inverted or overstrained tetrahedra.
     """
 
     displacement: np.ndarray
     milliseconds: float
-    held: int
+    memory_bytes: int
     unphysical: int
 
 
@@ -71,65 +71,65 @@ def remove_effect(scene: Scene, effect: Effect) -> Scene:
 
 
 def measure_effects(
-    theatre: PatientSetup, scene: Scene, every: int, names: Collection[str] | None = None
+    patient: PatientSetup, scene: Scene, frame_step: int, effect_names: Collection[str] | None = None
 ) -> Iterator[AblationRow]:
-    """Yield the row of the scene, then of each effect, with the scene's own tissue; solve each `every`-th frame.
+    """Yield the row of the scene, then of each effect, with the scene's own tissue; solve each `frame_step`-th frame.
 
-    `names`: classes of the effects to measure; None: all.
+    `effect_names`: classes of the effects to measure; None: all.
 
     Raises
     ------
     InputError
         A scene that cannot be solved to the end.
     """
-    whole = run(theatre, scene, every)
-    nowhere = replace(whole, displacement=np.zeros_like(whole.displacement), milliseconds=0.0, held=0)
-    yield _build_row(theatre, ALL, whole, nowhere)
-    for effect in scene.get_effects_on(theatre.anatomy):
+    whole = solve_frames(patient, scene, frame_step)
+    nowhere = replace(whole, displacement=np.zeros_like(whole.displacement), milliseconds=0.0, memory_bytes=0)
+    yield _build_row(patient, ALL, whole, nowhere)
+    for effect in scene.get_effects_on(patient.anatomy):
         name = type(effect).__name__
-        if names is not None and name not in names:
+        if effect_names is not None and name not in effect_names:
             continue
         if isinstance(effect, Elasticity):
             yield AblationRow(name, refused="nothing else resists deformation")
             continue
         try:
-            less = run(theatre, remove_effect(scene, effect), every)
+            less = solve_frames(patient, remove_effect(scene, effect), frame_step)
         except InputError as error:
             yield AblationRow(name, refused=str(error))
             continue
         if less.unphysical > whole.unphysical:
             yield AblationRow(name, refused=f"{less.unphysical} frames have inverted or overstrained tetrahedra")
             continue
-        yield _build_row(theatre, name, whole, less)
+        yield _build_row(patient, name, whole, less)
 
 
 def build_record(
-    theatre: PatientSetup, scene: Scene, rows: Sequence[AblationRow], every: int, machine: str
+    patient: PatientSetup, scene: Scene, rows: Sequence[AblationRow], frame_step: int, machine: str
 ) -> EffectRecord:
-    """Build the record of measured effects of a scene, of which each `every`-th frame was solved on a `machine`."""
+    """Build the record of a scene's measured effects; each `frame_step`-th frame was solved on a `machine`."""
     figures = {row.effect: (row.milliseconds, row.tumour_mm) for row in rows}
-    frames = len(scene.times[::every])
+    frames = len(scene.times[::frame_step])
     return EffectRecord(
-        scene.name, theatre.compute_mark(scene), str(date.today()), machine, frames, figures,
+        scene.name, patient.compute_mark(scene), str(date.today()), machine, frames, figures,
         sum(row.unphysical for row in rows), {row.effect: row.refused for row in rows if row.refused},
     )  # fmt: skip
 
 
-def run(theatre: PatientSetup, scene: Scene, every: int) -> AblationRun:
-    """Solve each `every`-th frame of a scene in order, each starting from the previous one.
+def solve_frames(patient: PatientSetup, scene: Scene, frame_step: int) -> AblationRun:
+    """Solve each `frame_step`-th frame of a scene in order, each starting from the previous one.
 
     Raises
     ------
     InputError
         A body without fixed nodes, or a frame that is not in equilibrium. Unphysical equilibria are counted.
     """
-    before = list_device_arrays()  # arrays that existed before do not belong to the scene
-    fem = theatre.build_fem(scene, scene.accuracy, live=True)
-    times = scene.times[::every].tolist()
-    found, seconds, unphysical = _solve_frames(fem, scene, theatre.site, times)
+    before = list_arrays()  # arrays that existed before do not belong to the scene
+    fem = patient.build_fem(scene, scene.accuracy, live=True)
+    times = scene.times[::frame_step].tolist()
+    found, seconds, unphysical = _solve_frames(fem, scene, patient.site, times)
     wp.synchronize()
     earlier = {id(array) for array in before}
-    held = sum(array.capacity for array in list_device_arrays() if id(array) not in earlier)
+    held = sum(array.capacity for array in list_arrays() if id(array) not in earlier)
     milliseconds = 1e3 * float(np.median(seconds[min(WARM_UP, len(times) - 1) :]))
     return AblationRun(np.stack(found), milliseconds, held, unphysical)
 
@@ -152,14 +152,14 @@ def _solve_frames(
     return found, seconds, unphysical
 
 
-def list_device_arrays() -> list[wp.array]:
+def list_arrays() -> list[wp.array]:
     """List all live Warp arrays that own their memory."""
     gc.collect()
     return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]
 
 
-def _build_row(theatre: PatientSetup, name: str, whole: AblationRun, less: AblationRun) -> AblationRow:
-    anatomy = theatre.anatomy
+def _build_row(patient: PatientSetup, name: str, whole: AblationRun, less: AblationRun) -> AblationRow:
+    anatomy = patient.anatomy
 
     def apart(nodes: np.ndarray) -> float:
         difference = (whole.displacement - less.displacement)[:, nodes]
@@ -168,7 +168,7 @@ def _build_row(theatre: PatientSetup, name: str, whole: AblationRun, less: Ablat
     return AblationRow(
         name,
         whole.milliseconds - less.milliseconds,
-        1e-6 * (whole.held - less.held),
+        1e-6 * (whole.memory_bytes - less.memory_bytes),
         apart(anatomy.tumour_nodes),
         apart(np.unique(anatomy.open_surface)),
         unphysical=less.unphysical,

@@ -63,9 +63,9 @@ def read_effect_records(path: Path) -> dict[str, EffectRecord]:
         return {row.scene: row for row in rows}
 
 
-def write_effect_record(path: Path, found: EffectRecord) -> None:
+def write_effect_record(path: Path, record: EffectRecord) -> None:
     """Add a scene to a file, or replace it."""
-    rows = (read_effect_records(path) | {found.scene: found}).values()
+    rows = (read_effect_records(path) | {record.scene: record}).values()
     with write_atomically(path, ".json") as unfinished:
         stored = {"format": FORMAT, "units": ["ms", "mm"], "scenes": [asdict(row) for row in rows]}
         unfinished.write_text(json.dumps(stored, indent=1) + "\n")

@@ -34,7 +34,7 @@ class FamilyFigures(msgspec.Struct, array_like=True, frozen=True):
         return f"model <= {bound}" if brief else f"model error <= {bound} (95 % of {self.loads} pushes, relative to p2)"
 
 
-def read_family_figures(mesh: Path, digest: str) -> dict[str, FamilyFigures]:
+def read_family_figures(mesh_path: Path, anatomy_digest: str) -> dict[str, FamilyFigures]:
     """Read the figures of families in MESH.report.json, of the anatomy with this digest; empty without a file.
 
     Raises
@@ -42,13 +42,13 @@ def read_family_figures(mesh: Path, digest: str) -> dict[str, FamilyFigures]:
     InputError
         An invalid or unreadable file.
     """
-    if not (path := mesh.with_suffix(".report.json")).is_file():
+    if not (path := mesh_path.with_suffix(".report.json")).is_file():
         return {}
     with wrap_errors(path, "a report", f"Delete it. {REMEDY}"):
         report = msgspec.json.decode(path.read_bytes())
         found = {}
         for part in report["sections"]:
-            for row in part["rows"] if part["anatomy"] == digest else ():
+            for row in part["rows"] if part["anatomy"] == anatomy_digest else ():
                 if row["name"] in FAMILIES and row["reference"]:
                     errors = row["reference"]["loads"], row["reference"]["worst"]["p95"]
                     found[row["name"]] = part["tissue"], report["machine"], *errors, row["median"], row["set_up"]

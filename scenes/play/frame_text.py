@@ -38,12 +38,12 @@ def describe_outcome(outcome: Outcome) -> str:
     return "" if outcome.good else OUTCOME_WARNINGS.get(outcome, "not solved to the end: do not rely on it")
 
 
-def format_acting(loads: Loads, answer: Deformation, nodes: np.ndarray) -> str:
+def format_active_loads(loads: Loads, solution: Deformation, nodes: np.ndarray) -> str:
     """Describe the active loads of the first load case, and the measured tool force, as one line; empty without loads.
 
     `nodes` (V, 3) [m] are the undeformed vertices of the brain: the fluid level is given as a share of its height.
     """
-    return ", ".join(words for words in (_describe_cause(cause, answer, nodes) for cause in loads.causes) if words)
+    return ", ".join(words for words in (_describe_cause(cause, solution, nodes) for cause in loads.causes) if words)
 
 
 def _describe_cause(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
@@ -89,8 +89,8 @@ NOT_KNOWN_WORDS = "tumour position error: not known"
 
 
 def format_errors(
-    promised: float | None, error: TumourError, trained: bool, doubt: str = "", brief: bool = False,
-    recorded: FamilyFigures | None = None,
+    model_bound: float | None, tumour_error: TumourError, is_surrogate: bool, warning: str = "", brief: bool = False,
+    figures: FamilyFigures | None = None,
 ) -> list[str]:  # fmt: skip
     """Build the lines for an image: error of the model, and error of the tumour position.
 
@@ -98,33 +98,33 @@ def format_errors(
 
     Parameters
     ----------
-    promised
+    model_bound
         Error bound guaranteed by the model [m]; None if there is none.
-    trained
+    is_surrogate
         True if another model than FEM computed the deformation.
     brief
         True for the short form, for a small image.
-    recorded
+    figures
         Recorded figures of another family than FEM, which replace the bound.
     """
-    modelled = error.observed is None and not doubt
-    model = recorded.describe_error(brief) if recorded else format_model_error(promised, trained, brief)
-    return [*([model] if modelled else []), format_tumour_error(error, brief)]
+    modelled = tumour_error.observed is None and not warning
+    model = figures.describe_error(brief) if figures else format_model_error(model_bound, is_surrogate, brief)
+    return [*([model] if modelled else []), format_tumour_error(tumour_error, brief)]
 
 
-def is_of_other_family(deformation: Deformation) -> bool:
+def is_by_other_family(deformation: Deformation) -> bool:
     """Return True if neither finite elements nor a trained model, but another family of models computed a result."""
     method = deformation.source.partition(" (")[0]
     return method in FAMILIES or method in OTHER_METHODS.values()
 
 
-def format_model_error(promised: float | None, trained: bool, brief: bool = False) -> str:
+def format_model_error(bound: float | None, is_surrogate: bool, brief: bool = False) -> str:
     """Describe the error of the model relative to its FEM."""
-    if not trained:
+    if not is_surrogate:
         return "FEM reference" if brief else "FEM reference (no surrogate)"
-    if promised is None:
+    if bound is None:
         return "model: not known" if brief else "model error relative to FEM: not known"
-    within = bound_words(promised, 2)
+    within = bound_words(bound, 2)
     return f"model <= {within}" if brief else f"surrogate error <= {within} (95 %, relative to FEM)"
 
 
@@ -132,20 +132,20 @@ def format_tumour_error(error: TumourError, brief: bool = False) -> str:
     """Describe the error of the drawn tumour position relative to the patient."""
     if error.bound is None:
         return "tumour: not known" if brief else NOT_KNOWN_WORDS
-    within, guess = bound_words(error.bound, 1), ", rough estimate" if error.guess else ""
+    within, guess = bound_words(error.bound, 1), ", rough estimate" if error.is_rough else ""
     if brief:
         return f"tumour <= {within}{guess if error.observed is None else ''}"
     said = f"tumour position error <= {within} (95 %)"
-    of = error.registration_words
+    of = error.registration_text
     if error.observed is None:
-        if of and not guess and error.largest == REGISTRATION:
+        if of and not guess and error.main_source == REGISTRATION:
             return f"{said}, {of}"
-        return f"{said}{guess or f', mainly {error.largest}'}{f'; {of}' * bool(of)}"
+        return f"{said}{guess or f', mainly {error.main_source}'}{f'; {of}' * bool(of)}"
     said += f", {of}" * bool(of)
     return said if error.prior is None else f"{said}; without cortex observation: {bound_words(error.prior, 1)}{guess}"
 
 
-def find_worst(errors: Sequence[TumourError]) -> TumourError:
+def find_largest(errors: Sequence[TumourError]) -> TumourError:
     """Return the largest error of several frames; not available if it is not available for one frame."""
     known = [error for error in errors if error.bound is not None]
     if len(known) < len(errors) or not known:
@@ -153,13 +153,13 @@ def find_worst(errors: Sequence[TumourError]) -> TumourError:
     return max(known, key=lambda error: error.bound or 0.0)
 
 
-def annotate(over: Overlaid, number: int, remark: str) -> None:
+def annotate_image(overlaid: Overlaid, frame_number: int, remark: str) -> None:
     """Write a remark at the bottom of a composite image and a frame's number, in place."""
-    height, width = over.taken.shape
-    lay(over.colour, over.taken, wrap_line(remark, MAX_BOTTOM_WIDTH * width), (0, height))
-    lay(over.colour, over.taken, label_frame(number), (width, height))
+    height, width = overlaid.taken.shape
+    lay(overlaid.colour, overlaid.taken, wrap_line(remark, MAX_BOTTOM_WIDTH * width), (0, height))
+    lay(overlaid.colour, overlaid.taken, label_frame(frame_number), (width, height))
 
 
-def label_frame(number: int) -> list[str]:
+def label_frame(frame_number: int) -> list[str]:
     """Return the lines that label an image: its frame number, and a note that the image is simulated."""
-    return [f"frame {number}", "simulation"]
+    return [f"frame {frame_number}", "simulation"]

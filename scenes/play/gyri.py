@@ -39,7 +39,7 @@ class GyriSettings:
     """Settings of `build_cortex_maps`."""
 
     wavelength: float = 9.5e-3  # Distance between neighbouring sulci before they wander [m].
-    wander: float = 0.7e-3  # Standard deviation of the sulci's shift by smooth noise [m].
+    meander: float = 0.7e-3  # Standard deviation of the sulci's shift by smooth noise [m].
     sulcus_depth: float = 3.4e-3  # Largest depth of a sulcus [m].
     sulcus_width: float = 0.5e-3  # Half width of a sulcus [m].
     sulcus_length: float = 16e-3  # Smallest length of a sulcus [m].
@@ -56,15 +56,15 @@ GYRI = GyriSettings()
 
 @dataclass(frozen=True, eq=False)
 class CortexMaps:
-    """Maps (n, n, 4) over the tangent plane: depth [m] and colour (RGB, 0 to 1); `half` is half the side [m]."""
+    """Maps (n, n, 4) over the tangent plane: depth [m] and colour (RGB, 0 to 1); `half_width` is half the side [m]."""
 
     values: np.ndarray
-    half: float
+    half_width: float
 
     def sample(self, site: CraniotomyFrame, points: np.ndarray) -> np.ndarray:
         """Return values (m, 4) at undeformed points (m, 3) [m]."""
         across = np.stack([site.right, site.up]) @ (points - site.origin).T
-        index = (across / self.half + 1.0) * 0.5 * (len(self.values) - 1)
+        index = (across / self.half_width + 1.0) * 0.5 * (len(self.values) - 1)
         columns = [map_coordinates(each, index, order=1, mode="nearest") for each in np.moveaxis(self.values, 2, 0)]
         return np.stack(columns, axis=1)
 
@@ -98,7 +98,7 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
 
     fluid = _read_fluid(site, intensity, half, count // COARSE_STEP)
     field = _solve_swift_hohenberg(random, fluid, GYRI.wavelength / MAP_SPACING / COARSE_STEP)
-    field = warp(np.asarray(zoom(field, COARSE_STEP, order=3, mode="grid-wrap", grid_mode=True)), 2.5e-3, GYRI.wander)
+    field = warp(np.asarray(zoom(field, COARSE_STEP, order=3, mode="grid-wrap", grid_mode=True)), 2.5e-3, GYRI.meander)
     field /= np.sqrt(2.0 * gaussian_filter(field**2, 0.5 * GYRI.wavelength / MAP_SPACING, mode="wrap"))
     away, strength = _find_sulci(field, GYRI.wavelength / MAP_SPACING)
     across = np.arccos(np.clip(-field, -1.0, 1.0)) / np.pi  # 0 in a sulcus, 1 on a crown

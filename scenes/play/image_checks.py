@@ -50,7 +50,7 @@ def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
 
     Outlines drawn broken, because they are occluded or unreliable, may have gaps.
     """
-    ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), find_closed_ground(frame)
+    ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), mask_covered_pixels(frame)
     above = _mask_foreground(frame)
     gap = BROKEN_STROKES[1] + SOFT_LENGTH if frame.doubt else 0
     return max(
@@ -61,7 +61,7 @@ def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
     )
 
 
-def measure_truth_error(frame: Frame, mask: np.ndarray) -> float:
+def measure_true_outline_error(frame: Frame, mask: np.ndarray) -> float:
     """Compute the distance of the truth's outline [pixel]; the estimate's outline, drawn over it, is masked out."""
     above = _mask_foreground(frame) | find_ink(frame.shown, compute_ink(TUMOUR_COLOUR))
     return measure_outline_gap(frame.shown, compute_ink(TRUTH_COLOUR), mask, above, 2 * sum(TRUE_STROKES))
@@ -72,17 +72,17 @@ def _mask_foreground(frame: Frame) -> np.ndarray:
     return find_ink(frame.shown, WHITE, 0) | (frame.picture.segmentation == TOOL)
 
 
-def find_closed_ground(frame: Frame) -> np.ndarray:
+def mask_covered_pixels(frame: Frame) -> np.ndarray:
     """Return the mask (H, W) bool of pixels that show neither a tool nor cortex through which the tumour is seen."""
     return ~np.isin(frame.picture.segmentation, (*OPENING.ids, TOOL))
 
 
-def is_hidden_part_marked(frame: Frame, mask: np.ndarray) -> bool:
+def has_hidden_mark(frame: Frame, mask: np.ndarray) -> bool:
     """Return True if the image marks the occluded part of a silhouette (H, W) bool, if there is one.
 
     In this part the outline must be broken, without shading, and the image must name the occluder.
     """
-    ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), find_closed_ground(frame)
+    ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), mask_covered_pixels(frame)
     least, most = BROKEN_SHARES
     inked = compute_inked_share(frame.shown, ink, mask, _mask_foreground(frame) | ~shut)
     changed = compute_changed_share(frame.picture.colour, frame.shown, mask & shut & (frame.taken == 0))

@@ -62,7 +62,7 @@ SHAPES = {
 }
 
 
-def build_sweep(profile: np.ndarray, stations: np.ndarray, wide: Sequence[float]) -> trimesh.Trimesh:
+def build_sweep(profile: np.ndarray, stations: np.ndarray, wide_axis: Sequence[float]) -> trimesh.Trimesh:
     """Sweep a profile along a smooth centre line: a closed surface [m], with edges that are shaded as sharp.
 
     Parameters
@@ -71,20 +71,20 @@ def build_sweep(profile: np.ndarray, stations: np.ndarray, wide: Sequence[float]
         Points (k, 2) of a closed convex curve, counter-clockwise, along the wide axis and the normal.
     stations
         Rows (n, 5) [mm] along the centre line: point, and factors of the profile along both axes.
-    wide
+    wide_axis
         Direction (3,) of the wide axis, not parallel to the centre line.
     """
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(stations[:, :3], axis=0), axis=1)))
     at = np.interp(np.arange(0.0, len(way) - 0.9, 1.0 / SECTIONS), np.arange(len(way)), way)
     rows = 1e-3 * PchipInterpolator(way, stations)(at)
-    return build_loft(profile * rows[:, None, 3:], rows[:, :3], wide)
+    return build_loft(profile * rows[:, None, 3:], rows[:, :3], wide_axis)
 
 
-def build_loft(profiles: np.ndarray, centre: np.ndarray, wide: Sequence[float]) -> trimesh.Trimesh:
+def build_loft(profiles: np.ndarray, centre_line: np.ndarray, wide_axis: Sequence[float]) -> trimesh.Trimesh:
     """Join profiles (n, k, 2) [m] at the points (n, 3) [m] of a centre line; otherwise as `build_sweep`."""
-    tangent = normalise_vectors(np.gradient(centre, axis=0))
-    normal = normalise_vectors(np.cross(tangent, wide))
-    rings = centre[:, None] + profiles @ np.stack([np.cross(normal, tangent), normal], axis=1)
+    tangent = normalise_vectors(np.gradient(centre_line, axis=0))
+    normal = normalise_vectors(np.cross(tangent, wide_axis))
+    rings = centre_line[:, None] + profiles @ np.stack([np.cross(normal, tangent), normal], axis=1)
     count, around = rings.shape[:2]
     a, b = (around * np.arange(count - 1)[:, None] + np.roll(np.arange(around), -k) for k in (0, 1))
     fan = np.stack([np.zeros(around - 2, int), np.arange(1, around - 1), np.arange(2, around)], axis=1)
@@ -101,32 +101,32 @@ def has_instrument(tool: object) -> TypeGuard[Probe | Blade]:
 
 
 @lru_cache(maxsize=8)
-def build_instrument(tool: Probe | Blade, kind: BallInstrument, number: int) -> tuple[Layer, ...]:
+def build_instrument(tool: Probe | Blade, instrument: BallInstrument, segment_id: int) -> tuple[Layer, ...]:
     """Build the layers of a brain spatula, or of an instrument with a ball, in the tool's frame."""
     if isinstance(tool, Blade):
-        return (build_metal([build_spatula(tool)], [STEEL], number, BLADE_LIGHT),)
+        return (build_metal_layer([build_spatula(tool)], [STEEL], segment_id, BLADE_LIGHT),)
     lift = np.array([0.0, 0.0, 1e3 * tool.radius, 0.0, 0.0])
-    meshes = [build_sweep(CIRCLE, stations + lift, wide) for _, wide, stations in SHAPES[kind]]
-    colours, (unit, triangles) = [colour for colour, *_ in SHAPES[kind]], build_sphere(4)
-    if kind == "dissector":
+    meshes = [build_sweep(CIRCLE, stations + lift, wide) for _, wide, stations in SHAPES[instrument]]
+    colours, (unit, triangles) = [colour for colour, *_ in SHAPES[instrument]], build_sphere(4)
+    if instrument == "dissector":
         ball = trimesh.Trimesh(tool.radius * unit + 1e-3 * lift[:3], triangles)
-        return (build_metal([ball, *meshes], [STEEL, *colours], number, STEEL_LIGHT),)
+        return (build_metal_layer([ball, *meshes], [STEEL, *colours], segment_id, STEEL_LIGHT),)
     # Fibres of wet cotton: deeper is darker.
     deep = np.random.default_rng(5).uniform(size=(len(unit), 1))
     at, colour = (tool.radius - FIBRE_DEPTH * deep) * unit + 1e-3 * lift[:3], np.array(COTTON) * (1.0 - 0.12 * deep)
-    cotton = Layer("tool", number, at, triangles, colour, gloss=0.15, shininess=20.0, casts_shadow=True)
-    return cotton, build_metal(meshes, colours, number, STEEL_LIGHT)
+    cotton = Layer("tool", segment_id, at, triangles, colour, gloss=0.15, shininess=20.0, casts_shadow=True)
+    return cotton, build_metal_layer(meshes, colours, segment_id, STEEL_LIGHT)
 
 
-def build_metal(
-    meshes: Sequence[trimesh.Trimesh], colours: Sequence[Sequence[float]], number: int, light: tuple[float, float]
+def build_metal_layer(
+    meshes: Sequence[trimesh.Trimesh], colours: Sequence[Sequence[float]], segment_id: int, gloss: tuple[float, float]
 ) -> Layer:
     """Join meshes of polished metal, each with its colour; light: gloss and shininess."""
     whole = cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
     along = np.asarray(whole.vertex_normals) @ REFLECTED
     bands = np.exp(-(((along[:, None] - BANDS) / 0.15) ** 2)).sum(axis=1, keepdims=True)
     colour = np.repeat(np.array(colours), [len(mesh.vertices) for mesh in meshes], axis=0) * (0.75 + 0.75 * bands)
-    return Layer("tool", number, whole.vertices, whole.faces, colour.clip(0.0, 1.0), *light, casts_shadow=True)
+    return Layer("tool", segment_id, whole.vertices, whole.faces, colour.clip(0.0, 1.0), *gloss, casts_shadow=True)
 
 
 def build_spatula(blade: Blade) -> trimesh.Trimesh:

@@ -7,19 +7,19 @@ from sim.effects import Elasticity
 from sim.material import Material, Ogden, Tissue
 
 
-def find_learned_regions(
-    here: Elasticity, learned: Elasticity | None, named: Collection[int] = frozenset()
+def find_trained_regions(
+    tissue: Elasticity, trained_tissue: Elasticity | None, excluded: Collection[int] = frozenset()
 ) -> dict[int, Tissue]:
-    """Return tissues by label of the regions that a scene with tissue `here` takes from the models.
+    """Return tissues by label of the regions that a scene with tissue `tissue` takes from the models.
 
-    These are regions of the models' training without a tissue in the scene that are not among the `named`. Their
+    These are regions of the models' training without a tissue in the scene that are not among the `excluded`. Their
     stiffness relative to the brain is kept.
     """
-    brain = here.default
-    if learned is None or brain is None or learned.default is None:
+    brain = tissue.default
+    if trained_tissue is None or brain is None or trained_tissue.default is None:
         return {}
-    others = {label: one for label, one in learned.regions.items() if label not in {*here.regions, *named}}
-    return {label: _scale_tissue(brain, one, learned.default) for label, one in others.items()}
+    others = {label: one for label, one in trained_tissue.regions.items() if label not in {*tissue.regions, *excluded}}
+    return {label: _scale_tissue(brain, one, trained_tissue.default) for label, one in others.items()}
 
 
 def _scale_tissue(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:

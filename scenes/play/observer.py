@@ -51,9 +51,9 @@ class TumourEstimate:
         Observed points.
     location
         Result of the locator; None if it rejects the observation.
-    refusal
+    rejection
         Reason of the rejection in the locator's words; else empty.
-    middle, true
+    centroid, true_motion
         (3,) [m]: centroid of the tumour in the scan, and its true displacement.
     seconds
         Time of observation and localisation [s].
@@ -62,9 +62,9 @@ class TumourEstimate:
     anatomy: Anatomy
     observation: Observation
     location: Location | None
-    refusal: str
-    middle: np.ndarray
-    true: np.ndarray
+    rejection: str
+    centroid: np.ndarray
+    true_motion: np.ndarray
     seconds: float
 
     @property
@@ -73,12 +73,12 @@ class TumourEstimate:
         return np.zeros(3) if self.location is None else self.location.centroid
 
     @property
-    def moved(self) -> float:
+    def motion_length(self) -> float:
         """Length [m] of `motion`."""
         return float(np.linalg.norm(self.motion))
 
     @property
-    def worst(self) -> float | None:
+    def error_bound(self) -> float | None:
         """95 % bound on the error of the least certain tumour vertex [m]; None if the observation is rejected."""
         if self.location is None:
             return None
@@ -86,43 +86,43 @@ class TumourEstimate:
         return float(np.sqrt(RADIUS_SQUARED * largest))
 
     @property
-    def true_motion(self) -> float:
+    def true_distance(self) -> float:
         """True displacement of the tumour centroid [m]."""
-        return float(np.linalg.norm(self.true))
+        return float(np.linalg.norm(self.true_motion))
 
     @property
-    def off(self) -> float:
+    def error(self) -> float:
         """Error of the estimated tumour centroid [m]."""
-        return float(np.linalg.norm(self.motion - self.true))
+        return float(np.linalg.norm(self.motion - self.true_motion))
 
     @property
-    def noticed(self) -> bool:
+    def is_significant(self) -> bool:
         """True if the estimated motion is larger than its error (95 %)."""
-        return self.location is not None and self.moved > self.location.p95
+        return self.location is not None and self.motion_length > self.location.p95
 
     @property
-    def held(self) -> bool:
+    def is_covered(self) -> bool:
         """True if the ellipsoid contains the true tumour centroid; false if the observation is rejected."""
         if self.location is None:
             return False
-        away = self.true - self.motion
+        away = self.true_motion - self.motion
         return bool(away @ np.linalg.solve(self.location.centroid_covariance, away) <= RADIUS_SQUARED)
 
     @property
-    def words(self) -> str:
+    def remark(self) -> str:
         """Remark in the image, in a few words."""
         if self.location is None:
             return ""
-        still = "" if self.noticed else "no significant motion detected; "
+        still = "" if self.is_significant else "no significant motion detected; "
         guess = "" if self.location.calibrated else "rough estimate; "
-        motion, error = format_millimetres(self.true_motion), format_millimetres(self.off)
+        motion, error = format_millimetres(self.true_distance), format_millimetres(self.error)
         return f"{still}{guess}simulated motion {motion}; estimate error {error}"
 
     @property
     def source(self) -> str:
         """Description of the observation, or the reason of its rejection."""
         if self.location is None:
-            return f"rejected, {self.refusal}"
+            return f"rejected, {self.rejection}"
         tip = ", and where the tool touches" if len(self.observation.tips) else ""
         return f"{len(self.observation.now)} points of the cortex{tip}; no force, no stiffness"
 
@@ -140,47 +140,47 @@ class TumourEstimate:
             return None
         root = np.linalg.cholesky(self.location.centroid_covariance)
         at = np.sqrt(RADIUS_SQUARED) * SPHERE @ root.T
-        return Layer("ellipsoid", ELLIPSOID, self.middle + self.motion + at, SPHERE_FACES, ELLIPSOID_COLOUR)
+        return Layer("ellipsoid", ELLIPSOID, self.centroid + self.motion + at, SPHERE_FACES, ELLIPSOID_COLOUR)
 
 
 class TumourObserver(Protocol):
     """Observer that estimates the tumour position from observations, for a stage."""
 
-    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
-        """Estimate the tumour position in frame `number`, for a body at `positions` (V, 3) [m].
+    def estimate(self, frame_number: int, positions: np.ndarray, corners: np.ndarray | None = None) -> TumourEstimate:
+        """Estimate the tumour position in frame `frame_number`, for a body at `positions` (V, 3) [m].
 
-        `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
+        `corners` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
-class Observer:
+class PointObserver:
     """Observer that samples the points and errors of a `PointObservation`, and calls a locator without loads."""
 
     site: CraniotomyFrame
     locator: Locator
     observation_model: PointObservation
 
-    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
-        """Estimate the tumour position in frame `number`, for a body at `positions` (V, 3) [m].
+    def estimate(self, frame_number: int, positions: np.ndarray, corners: np.ndarray | None = None) -> TumourEstimate:
+        """Estimate the tumour position in frame `frame_number`, for a body at `positions` (V, 3) [m].
 
-        `tool` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
+        `corners` (t, 3) [m] are the corners of the tool's surface, if there is one: its pose is observed.
         """
         begun = clock.perf_counter()
         return locate_tumour(
-            self.site.anatomy, self.locator, lambda: self.observe(number, positions, tool), positions, begun
+            self.site.anatomy, self.locator, lambda: self.observe(frame_number, positions, corners), positions, begun
         )
 
-    def observe(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> Observation:
+    def observe(self, frame_number: int, positions: np.ndarray, corners: np.ndarray | None = None) -> Observation:
         """Sample the observation of a frame; for the arguments see `estimate`."""
-        model, random = self.observation_model, np.random.default_rng([self.observation_model.seed, 1 + number])
+        model, random = self.observation_model, np.random.default_rng([self.observation_model.seed, 1 + frame_number])
         now = self._interpolate_points(positions)
         off = self._smooth + model.white * random.standard_normal(now.shape)
         shown, tips = np.ones(len(now), bool), np.zeros((0, 3))
-        if tool is not None:
-            shown = KDTree(tool).query(now)[0] > HIDING_DISTANCE
-            tips = find_touched(self.site.anatomy, positions, tool)
+        if corners is not None:
+            shown = KDTree(corners).query(now)[0] > HIDING_DISTANCE
+            tips = find_touched_point(self.site.anatomy, positions, corners)
             tips = self._move_rigid(tips + model.white * random.standard_normal(tips.shape))
         sigma = np.full(shown.sum(), np.hypot(model.white, model.smooth))
         return Observation(self._move_rigid(now + off)[shown], self._interpolate_points(self._rest)[shown], sigma, tips)
@@ -226,12 +226,12 @@ class Observer:
 class RigidError:
     """Rigid registration error of all observations: a rotation vector (3,) [rad], and a translation (3,) [m]."""
 
-    turn: np.ndarray
-    shift: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
 
-    def apply(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    def apply(self, points: np.ndarray, centre: np.ndarray) -> np.ndarray:
         """Apply the rigid error to points (n, 3) [m], with the rotation about a centre (3,) [m]."""
-        return middle + Rotation.from_rotvec(self.turn).apply(points - middle) + self.shift
+        return centre + Rotation.from_rotvec(self.rotation).apply(points - centre) + self.translation
 
 
 def sample_rigid_error(model: PointObservation | StereoObservation, number: int) -> RigidError:
@@ -240,31 +240,31 @@ def sample_rigid_error(model: PointObservation | StereoObservation, number: int)
     return RigidError(model.turn * turn / np.linalg.norm(turn), model.shift * shift / np.linalg.norm(shift))
 
 
-def find_touched(anatomy: Anatomy, positions: np.ndarray, tool: np.ndarray) -> np.ndarray:
+def find_touched_point(anatomy: Anatomy, positions: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Find the point of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches.
 
     Empty, (0, 3), if the tool is in the air.
     """
     triangles = anatomy.open_surface
-    near = tool[np.argsort(KDTree(positions[np.unique(triangles)]).query(tool)[0])[:SEARCHED_CORNERS]]
+    near = corners[np.argsort(KDTree(positions[np.unique(triangles)]).query(corners)[0])[:SEARCHED_CORNERS]]
     place = find_closest_points(near, positions[triangles]).point
     away = np.linalg.norm(place - near, axis=1)
     return place[[away.argmin()]] if away.min() < TOUCH_DISTANCE else NO_POINTS.now
 
 
 def locate_tumour(
-    anatomy: Anatomy, locator: Locator, see: Callable[[], Observation], positions: np.ndarray, begun: float
+    anatomy: Anatomy, locator: Locator, observe: Callable[[], Observation], positions: np.ndarray, start_time: float
 ) -> TumourEstimate:
     """Locate the tumour from an observation, and compare with the truth at `positions` (V, 3) [m]; rejections are kept.
 
-    `begun` is the start time of the measurement, by `time.perf_counter`.
+    `start_time` is the start time of the measurement, by `time.perf_counter`.
     """
     observation, location, refusal = NO_POINTS, None, ""
     try:
-        observation = see()
+        observation = observe()
         location = locator.locate(observation)
     except InputError as error:
         refusal = str(error)
-    seconds, rest = clock.perf_counter() - begun, anatomy.mesh.nodes
+    seconds, rest = clock.perf_counter() - start_time, anatomy.mesh.nodes
     middle, true = compute_middle(anatomy, np.stack([rest, positions - rest]))
     return TumourEstimate(anatomy, observation, location, refusal, middle, true, seconds)

@@ -30,14 +30,14 @@ from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.registration import REGISTRATIONS
 from ..script.scene import Scene
 from ..script.tool import Instrument, Probe
-from ..script.tool_paths import Touch, compute_lift
+from ..script.tool_paths import Touch, compute_tool_height
 from ..script.uncertainty import NOT_KNOWN, MotionError, TumourError, Uncertainty
 from .cortex_layers import COTTON, GLOVE
 from .family_record import FamilyFigures
-from .frame_text import annotate, describe_outcome, format_acting, format_errors, is_of_other_family
+from .frame_text import annotate_image, describe_outcome, format_active_loads, format_errors, is_by_other_family
 from .observer import TumourEstimate
 from .stage import CORTEX, ESTIMATED_LINES, OPENING, PREDICTED_LINES, SIMULATED, TOOL, Stage
-from .tip_reading import read_tip_distance
+from .tip_reading import predict_tip_distance
 
 REJECTED_WARNING = "observation rejected, and the scan is shown: do not rely on it"  # Warning in the image.
 TRUE_STROKES = (12, 4)  # Stroke and gap lengths of the reference's outline [pixel].
@@ -133,7 +133,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldTool:
+class PlacedTool:
     """Drawn position of a tool: tip (3,) [m], and T_world_tool pose (4, 4).
 
     beyond [m]: penetration of the bone that its load requires.
@@ -141,7 +141,7 @@ class HeldTool:
 
     tip: np.ndarray
     pose: np.ndarray
-    beyond: float
+    bone_penetration: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +210,7 @@ class Player:
     def compute_deformation(self, loads: Loads, last: Deformation | None = None) -> Deformation:
         """Compute the deformation, starting from the last; a trained model or a table returns drawn vertices only."""
         if isinstance(self.deformer, Learned | LinearModel):
-            return self.deformer.deform(loads, start=last if self.follows else None, at=self.stage.nodes)
+            return self.deformer.deform(loads, start=last if self.follows else None, at=self.stage.drawn_vertices)
         return self.deformer.deform(loads, start=last)
 
     def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
@@ -226,15 +226,15 @@ class Player:
         positions = self.compute_positions(deformation)
         held = None if self.scene.tool is None else self.place_tool(self.scene.tool, touch, positions)
         stage, camera = self.stage.select_stage(loads), self.get_camera(float(loads.times[0]))
-        drawn = stage.plain if self.style == "rings" else stage  # rings lie on the FEM surface
+        drawn = stage.without_fine_cortex if self.style == "rings" else stage  # rings lie on the FEM surface
         pose, estimate = None if held is None else held.pose, None
         picture = drawn.render_view(camera, positions, pose, self.coarse, number)
         if stage.observer is not None:
-            estimate = stage.observer.estimate(number, positions, stage.compute_corners(pose))
+            estimate = stage.observer.estimate(number, positions, stage.compute_tool_corners(pose))
         seen, located = clock.perf_counter(), 0.0 if estimate is None else estimate.seconds  # without rendering
         tumour, rest = stage.build_tumour(_estimate_positions(positions, estimate)), stage.tumour_at_rest
         doubt = describe_outcome(deformation.outcome[0]) or (
-            BONE_WARNING if held is not None and held.beyond > BLOCKED_DEPTH else ""
+            BONE_WARNING if held is not None and held.bone_penetration > BLOCKED_DEPTH else ""
         )
         doubt = doubt or (REJECTED_WARNING if estimate is not None and estimate.location is None else "")
         gauge = None if held is None else self._measure_tip_gauge(held, loads, deformation, tumour)
@@ -243,15 +243,15 @@ class Player:
         bound = promised or (1e-3 * self.recorded.p95_mm if self.recorded else 0.0)
         error = NOT_KNOWN if doubt else self._compute_tumour_error(touch, loads, motion, bound, estimate)
         shown = None if gauge is None else replace(gauge, error=error.bound)
-        traces = () if estimate is None else list_traces(estimate, stage.build_reference(positions))
-        moved = (estimate.moved, estimate.location.p95) if estimate and estimate.location else (motion, None)
+        traces = () if estimate is None else list_estimate_traces(estimate, stage.build_fem_tumour(positions))
+        moved = (estimate.motion_length, estimate.location.p95) if estimate and estimate.location else (motion, None)
         if estimate is None and error.moved is not None and not is_undeformed(deformation):
             moved = motion, error.moved
         band = 0.0 if estimate is not None else error.bound or 0.0
-        trained = find_first_model(self.deformer, deformation) is not None or is_of_other_family(deformation)
+        trained = find_first_model(self.deformer, deformation) is not None or is_by_other_family(deformation)
         lines = format_errors(promised, error, trained, doubt, camera.width < NARROW_IMAGE_WIDTH, self.recorded)
         head = format_head_lines(lines, picture.segmentation == TOOL)
-        remarks = self.scene.describe_stop(self.site, touch), "" if estimate is None else estimate.words
+        remarks = self.scene.describe_stop(self.site, touch), "" if estimate is None else estimate.remark
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
             marks = Marks(band, shown, stage.smooth_tumour_at_rest, traces)
@@ -260,7 +260,7 @@ class Player:
             over = composite(picture, camera, outline, self.style, cover, marks, words)
             if estimate is not None and self.style != "none":
                 draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
-            annotate(over, number, remark)
+            annotate_image(over, number, remark)
         else:
             over = Overlaid(picture.colour, np.zeros((camera.height, camera.width), np.uint8))
         spent = seconds, seen - begun - located, clock.perf_counter() - seen
@@ -271,17 +271,17 @@ class Player:
             distance=None if gauge is None else gauge.distance, distance_error=None if gauge is None else gauge.error,
             named=over.named, inside=gauge is not None and gauge.inside, moved=moved[0], moved_error=moved[1],
             model_error=promised, tumour_error=error, doubt=doubt,
-            acts=format_acting(loads, deformation, self.site.anatomy.mesh.nodes), head=tuple(head), remark=remark,
+            acts=format_active_loads(loads, deformation, self.site.anatomy.mesh.nodes), head=tuple(head), remark=remark,
             seconds=took, estimate=estimate,
         )  # fmt: skip
 
-    def _measure_tip_gauge(self, held: HeldTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
+    def _measure_tip_gauge(self, held: PlacedTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
         """Measure from the tip to the tumour, with the error bound of the deformer, if known."""
-        gauge = measure_gauge(held.tip, tumour)
+        gauge = measure_tip_gauge(held.tip, tumour)
         read = (
             None
-            if held.beyond > CARRIED_DEPTH
-            else read_tip_distance(self.deformer, loads, answer, self.scene.tool, gauge.distance)
+            if held.bone_penetration > CARRIED_DEPTH
+            else predict_tip_distance(self.deformer, loads, answer, self.scene.tool, gauge.distance)
         )
         return gauge if read is None else replace(gauge, read=read.distance, error=read.bound)
 
@@ -310,8 +310,8 @@ class Player:
             error = self.motion_error.evaluate(motion, promised, registration)
         if estimate is None:
             return error
-        deviation = REGISTRATIONS[registration]
-        worst = None if estimate.worst is None else float(np.hypot(estimate.worst, RADIUS_SQUARED**0.5 * deviation))
+        deviation, bound = REGISTRATIONS[registration], estimate.error_bound
+        worst = None if bound is None else float(np.hypot(bound, RADIUS_SQUARED**0.5 * deviation))
         return replace(error, observed=worst, registration=deviation)
 
     def play_frames(self, every: int = 1, together: int = 1) -> Iterator[Frame]:
@@ -346,13 +346,13 @@ class Player:
         """Return the drawn positions (V, 3) [m] of all mesh vertices: the tumour's by the estimate, if there is one."""
         return _estimate_positions(self.compute_positions(frame.deformation), frame.estimate)
 
-    def place_tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> HeldTool:
+    def place_tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> PlacedTool:
         """Compute the tool position: a pushing tool rests on the deformed cortex from outside.
 
         An idle tool is lifted off. Displaced tissue may carry it to the craniotomy edge, which stops it.
         """
         if self.scene.posed:
-            return HeldTool(self.scene.compute_tip(self.site, touch), self.scene.compute_pose(self.site, touch), 0.0)
+            return PlacedTool(self.scene.compute_tip(self.site, touch), self.scene.compute_pose(self.site, touch), 0.0)
         inward = self.site.axis
         carried = self.scene.find_contact(self.site, touch).locate(positions)
         inside = self.site.clip_to_opening(carried, tool.radius)
@@ -360,9 +360,9 @@ class Player:
         tip = through = inside if beyond > CARRIED_DEPTH else carried
         if isinstance(tool, Probe):
             tip = find_resting_tip(positions, self.site.anatomy.open_surface, through, inward, tool.radius)
-        tip = tip - compute_lift(touch.force) * inward
+        tip = tip - compute_tool_height(touch.force) * inward
         pose = tool.pose(tip, inward, self.site.right)
-        return HeldTool(tip, pose, beyond)
+        return PlacedTool(tip, pose, beyond)
 
     # Former names, for one release.
     camera_at, touch, loads, answer = get_camera, get_touch, build_loads, compute_deformation
@@ -379,12 +379,12 @@ def _estimate_positions(positions: np.ndarray, estimate: TumourEstimate | None) 
     return positions if estimate is None else estimate.place_tumour(positions)
 
 
-def list_traces(estimate: TumourEstimate, truth: Layer) -> tuple[Trace, ...]:
+def list_estimate_traces(estimate: TumourEstimate, tumour: Layer) -> tuple[Trace, ...]:
     """Build the traces of an estimate: its ellipsoid, and the true tumour surface with its centroid."""
-    ellipsoid, true = estimate.build_ellipsoid(), Trace(truth, TRUE_STROKES, estimate.middle + estimate.true)
+    ellipsoid, true = estimate.build_ellipsoid(), Trace(tumour, TRUE_STROKES, estimate.centroid + estimate.true_motion)
     if ellipsoid is None:
         return (true,)
-    return Trace(ellipsoid, ELLIPSOID_STROKES, estimate.middle + estimate.motion), true
+    return Trace(ellipsoid, ELLIPSOID_STROKES, estimate.centroid + estimate.motion), true
 
 
 def get_legend_names(estimate: TumourEstimate | None) -> LegendNames:
@@ -394,7 +394,7 @@ def get_legend_names(estimate: TumourEstimate | None) -> LegendNames:
     return ESTIMATED_LINES if estimate.location is not None else replace(ESTIMATED_LINES, traces=(SIMULATED,))
 
 
-def measure_gauge(tip: np.ndarray, hidden: Layer) -> Gauge:
+def measure_tip_gauge(tip: np.ndarray, surface: Layer) -> Gauge:
     """Measure from a tip (3,) [m] to the nearest point of a hidden surface, and whether the tip is inside."""
-    corners = hidden.vertices[hidden.triangles]
+    corners = surface.vertices[surface.triangles]
     return Gauge(tip, find_closest_points(tip[None], corners).point[0], inside=is_enclosing(corners, tip))

@@ -16,26 +16,26 @@ from .deformers import PatientSetup
 BATCH_FRAMES = 16  # Number of frames that are solved together: small enough for regular progress reports.
 
 
-def build_reference_fem(theatre: PatientSetup, scene: Scene) -> Fem | ResectedFem:
+def build_reference_fem(patient: PatientSetup, scene: Scene) -> Fem | ResectedFem:
     """Build FEM for reference solutions of a scene: batches of frames on a GPU, frame after frame on the CPU.
 
     A frame that starts from the last one takes a quarter of the time of a frame solved alone.
     """
-    if find_device(theatre.device, TRAIN.precision).name != "cpu":
-        return theatre.build_fem(scene, TRAIN, BATCH_FRAMES)
-    return theatre.build_fem(scene, TRAIN, 1, live=True)
+    if find_device(patient.device, TRAIN.precision).name != "cpu":
+        return patient.build_fem(scene, TRAIN, BATCH_FRAMES)
+    return patient.build_fem(scene, TRAIN, 1, live=True)
 
 
-def is_history_dependent(fem: Deformer) -> bool:
+def is_history_dependent(deformer: Deformer) -> bool:
     """Return True if FEM must solve a frame after the previous ones.
 
     No history is needed if only forces act on an elastic intact body. A deformer that is not FEM needs no history.
     """
-    return isinstance(fem, ResectedFem) or (isinstance(fem, Fem) and not fem.problem.can_accelerate)
+    return isinstance(deformer, ResectedFem) or (isinstance(deformer, Fem) and not deformer.problem.can_accelerate)
 
 
 def solve_reference_frames(
-    theatre: PatientSetup,
+    patient: PatientSetup,
     scene: Scene,
     loads: Sequence[Loads],
     progress: Callable[[int], object] = lambda more: None,
@@ -46,7 +46,7 @@ def solve_reference_frames(
     `progress` receives the number of newly solved frames. `fem` is an existing solver, as
     `build_reference_fem` builds it.
     """
-    fem = fem or theatre.build_fem(scene, TRAIN, BATCH_FRAMES)
+    fem = fem or patient.build_fem(scene, TRAIN, BATCH_FRAMES)
     apart = not is_history_dependent(fem) and not (isinstance(fem, Fem) and fem.batch == 1)
     size = BATCH_FRAMES if apart else 1
     answers: list[Deformation] = []

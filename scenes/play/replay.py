@@ -22,17 +22,17 @@ class ReplayOrder:
 
     Parameters
     ----------
-    leap
+    max_step
         Maximum number of frames of one step. Longer distances are split at its multiples.
-    back
+    backward
         True if a frame may be computed from a later one.
-    kept
+    max_stored
         Number of solutions kept of a run, evenly spaced, to limit recomputation.
     """
 
-    leap: int = 1
-    back: bool = False
-    kept: int = 16
+    max_step: int = 1
+    backward: bool = False
+    max_stored: int = 16
 
 
 IN_ORDER = ReplayOrder()
@@ -54,20 +54,20 @@ class FrameCache(Generic[T]):
         Order in which frames are computed.
     """
 
-    def __init__(self, frames: int, step: Callable[[int, T | None], T], course: ReplayOrder = IN_ORDER) -> None:
-        self._step, self._course = step, course
-        self._every = course.leap * -(-frames // (course.leap * course.kept))
+    def __init__(self, count: int, compute_frame: Callable[[int, T | None], T], order: ReplayOrder = IN_ORDER) -> None:
+        self._step, self._course = compute_frame, order
+        self._every = order.max_step * -(-count // (order.max_step * order.max_stored))
         self.kept: dict[int, T] = {}
         """Frames that are not run again, by number."""
         self._last: dict[int, T] = {}
 
-    def approach_frame(self, number: int) -> tuple[int, T]:
+    def approach_frame(self, frame_number: int) -> tuple[int, T]:
         """Take at most one step towards a frame; return the number and the frame that is reached."""
         computed = self.kept | self._last
-        starts = computed if self._course.back else [other for other in computed if other <= number]
-        reached = min(starts, key=lambda other: abs(number - other), default=-1)
-        if reached != number:
-            before, reached = computed.get(reached), self._find_step_end(reached, number)
+        starts = computed if self._course.backward else [other for other in computed if other <= frame_number]
+        reached = min(starts, key=lambda other: abs(frame_number - other), default=-1)
+        if reached != frame_number:
+            before, reached = computed.get(reached), self._find_step_end(reached, frame_number)
             computed = {reached: self._step(reached, before)}
             if reached % self._every == 0:
                 self.kept |= computed
@@ -76,7 +76,7 @@ class FrameCache(Generic[T]):
 
     def _find_step_end(self, start: int, number: int) -> int:
         """Return the frame at which a step from `start` towards a frame ends."""
-        leap = self._course.leap
+        leap = self._course.max_step
         if start < number:
             return min(number, (start // leap + 1) * leap)
         return max(number, -(-start // leap) * leap - leap)
@@ -102,17 +102,17 @@ class ReplaySession:
             )
         self._last: Deformation | None = None
 
-    def approach_frame(self, number: int, touch: Touch | None = None) -> tuple[int, Deformation]:
+    def approach_frame(self, frame_number: int, touch: Touch | None = None) -> tuple[int, Deformation]:
         """Return number and solution of a frame, or of one on the way to it; `touch` under manual control."""
         player, last = self.player, self._last
         if self._reel is not None and touch is None:
-            number, self._last = self._reel.approach_frame(number)
-            return number, self._last
-        loads = player.build_loads(number, touch)
+            frame_number, self._last = self._reel.approach_frame(frame_number)
+            return frame_number, self._last
+        loads = player.build_loads(frame_number, touch)
         if player.remembers and last is not None:
             last = replace(last, time=loads.times - 1.0 / player.scene.frames_per_second)
         self._last = player.compute_deformation(loads, last)
-        return number, self._last
+        return frame_number, self._last
 
 
 def plan_replay_order(player: Player) -> ReplayOrder | None:
@@ -123,4 +123,4 @@ def plan_replay_order(player: Player) -> ReplayOrder | None:
     if not any(isinstance(effect, SkullContact) for effect in scene.get_effects_on(player.site.anatomy)):
         return None
     # Only displacements of states with skull contact are stored, a third of a megabyte each.
-    return ReplayOrder(max(1, round(MAX_TIME_STEP * scene.frames_per_second)), back=True, kept=64)
+    return ReplayOrder(max(1, round(MAX_TIME_STEP * scene.frames_per_second)), backward=True, max_stored=64)

@@ -17,19 +17,18 @@ LINE_LEGEND = "green estimate, pink simulated (FEM), blue 95 % of its centre"
 """Legend of the lines drawn with an estimate."""
 
 
-def label_lines(frame: Frame, name: str) -> list[str]:
+def list_cost_lines(frame: Frame, deformer: str) -> list[str]:
     """Build the panel's lines for a frame of a deformer, most important first."""
     answer, found = frame.deformation, frame.estimate
-    source, spent = shorten_source(answer.source or name), frame.seconds.items()
+    source, spent = shorten_source(answer.source or deformer), frame.seconds.items()
     doubt = [] if answer.outcome[0].good else [answer.outcome[0].value]
     moment = f"t {frame.time:.2f} s{', ' if frame.acts else ''}{frame.acts}"
     rest = [*doubt, moment, "ms: " + ", ".join(f"{stage} {1e3 * seconds:.1f}" for stage, seconds in spent)]
     if found is None:
-        return [f"{name}: tumour moved {_format_length(frame.moved, frame.moved_error)}", *rest, source]
-    moved = [f"simulated tumour motion: {1e3 * found.true_motion:.2f} mm"]
-    moved += (
-        [] if found.location is None else [f"estimate: tumour moved {_format_length(found.moved, frame.moved_error)}"]
-    )
+        return [f"{deformer}: tumour moved {_format_length(frame.moved, frame.moved_error)}", *rest, source]
+    moved = [f"simulated tumour motion: {1e3 * found.true_distance:.2f} mm"]
+    if found.location is not None:
+        moved.append(f"estimate: tumour moved {_format_length(found.motion_length, frame.moved_error)}")
     lines = [] if frame.named else [f"lines: {LINE_LEGEND}"]
     return [*moved, *rest, f"simulation: {source}", f"estimate: {found.source}", *lines]
 
@@ -39,14 +38,14 @@ def _format_length(length: float, error: float | None) -> str:
     return f"{1e3 * length:.2f} {'mm' if error is None else f'+- {bound_words(error, 1)}'}"
 
 
-def add_cost_label(frame: Frame, name: str) -> np.ndarray:
+def draw_cost_panel(frame: Frame, deformer: str) -> np.ndarray:
     """Draw a panel on the shown image (H, W, 3): deformer, loads, and milliseconds by stage; also of an estimate."""
     seen = frame.picture.segmentation
     # The panel may hide cortex, but no tool, line or text.
     hides = (frame.taken > 0) | (seen != DRAPE), (frame.taken > 0) | (seen == TOOL)
     sights = [each.view(np.uint8) for each in hides]
     return draw_text_panel(
-        frame.shown, label_lines(frame, name), below=HEAD_ROW + LINE_SPACING * len(frame.head), sights=sights
+        frame.shown, list_cost_lines(frame, deformer), below=HEAD_ROW + LINE_SPACING * len(frame.head), sights=sights
     )
 
 
@@ -54,22 +53,22 @@ def add_cost_label(frame: Frame, name: str) -> np.ndarray:
 class Thumbnail:
     """Image (H, W, 3) uint8; median milliseconds of a frame by stage; the tumour's largest mean motion [mm]."""
 
-    colour: np.ndarray
+    image: np.ndarray
     milliseconds: dict[str, float]
-    moved_mm: float
+    motion_mm: float
 
     @property
-    def total(self) -> float:
+    def total_milliseconds(self) -> float:
         """Milliseconds of a whole frame."""
         return sum(self.milliseconds.values())
 
 
-def render_thumbnail(player: Player, name: str) -> Thumbnail:
-    """Render a small image of the frame after the last cut in which the tumour has moved most, by deformer `name`."""
+def render_thumbnail(player: Player, deformer: str) -> Thumbnail:
+    """Render a small image of the frame after the last cut in which the tumour has moved most, by a `deformer`."""
     every = max(1, (len(player.scene.times) - 1) // (RENDERED_FRAMES - 1))
     frames = list(player.play_frames(every))
     best = max(frames, key=lambda frame: (_count_cuts(player, frame), frame.moved))
-    labelled = add_cost_label(best, name)
+    labelled = draw_cost_panel(best, deformer)
     taken = best.taken | (labelled != best.shown).any(axis=2).view(np.uint8)
     picture = draw_text_panel(labelled, [player.scene.name], "top right", 0.9, sights=[taken])
     return Thumbnail(
@@ -80,7 +79,7 @@ def render_thumbnail(player: Player, name: str) -> Thumbnail:
 
 
 def _count_cuts(player: Player, frame: Frame) -> int:
-    left = player.stage.select_stage(frame.loads).left
+    left = player.stage.select_stage(frame.loads).remaining_body
     return 0 if left is None else left.steps_done
 
 
@@ -88,10 +87,10 @@ def _compute_medians(frames: list[Frame]) -> dict[str, float]:
     return {stage: 1e3 * float(np.median([frame.seconds[stage] for frame in frames])) for stage in frames[0].seconds}
 
 
-def tile_images(pictures: list[np.ndarray], columns: int = 3) -> np.ndarray:
+def tile_images(images: list[np.ndarray], columns: int = 3) -> np.ndarray:
     """Arrange images (H, W, 3) uint8 of one size in rows of a sheet; empty cells are dark."""
-    blank = np.full_like(pictures[0], 12)
-    whole = [*pictures, *[blank] * (-len(pictures) % columns)]
+    blank = np.full_like(images[0], 12)
+    whole = [*images, *[blank] * (-len(images) % columns)]
     return np.concatenate(
         [np.concatenate(whole[first : first + columns], axis=1) for first in range(0, len(whole), columns)]
     )

@@ -26,7 +26,7 @@ from sim.loads import Loads, Resected
 from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
 from ..script.observation_models import StereoObservation
 from ..script.scene import Scene
-from .cortex_layers import COTTON, GLOVE, Squares, add_vessels, build_finger, build_squares
+from .cortex_layers import COTTON, GLOVE, CottonoidSurface, add_vessels, build_cottonoids, build_finger
 from .drape import DRAPE_DEPTH, build_drape
 from .fine_cortex import FineCortex, build_fine_cortex
 from .instruments import build_instrument, has_instrument
@@ -67,20 +67,20 @@ DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of th
 
 
 @dataclass(frozen=True, eq=False)
-class Cortex:
+class CortexSurface:
     """Part of the surface: mesh vertices (n,), their triangles (m, 3), the scan, and its sampling points (n, 3) [m]."""
 
     vertices: np.ndarray
     triangles: np.ndarray
-    rest: np.ndarray
-    solid: Solid | None
+    rest_points: np.ndarray
+    texture: Solid | None
     colour: np.ndarray | tuple[float, float, float] = CORTEX_COLOUR
 
     def build_layer(self, positions: np.ndarray) -> Layer:
         """Return the layer at `positions` (V, 3) [m]."""
-        rest = None if self.solid is None else self.rest
+        rest = None if self.texture is None else self.rest_points
         return Layer(
-            "cortex", CORTEX, positions[self.vertices], self.triangles, self.colour, 0.5, solid=self.solid, rest=rest
+            "cortex", CORTEX, positions[self.vertices], self.triangles, self.colour, 0.5, solid=self.texture, rest=rest
         )
 
 
@@ -94,14 +94,14 @@ class Stage:
     scene: Scene
     site: CraniotomyFrame
     intensity: Intensity | None = None
-    left: RemainingBody | None = None
+    remaining_body: RemainingBody | None = None
     device: str = "cpu"
     observer: TumourObserver | None = None
 
     @property
     def anatomy(self) -> Anatomy:
         """Anatomy, without resected tissue."""
-        return self.site.anatomy if self.left is None else self.left.anatomy
+        return self.site.anatomy if self.remaining_body is None else self.remaining_body.anatomy
 
     def select_stage(self, loads: Loads) -> Stage:
         """Return the stage of the first load case: after its completed resection steps."""
@@ -113,16 +113,17 @@ class Stage:
         """Stages after 0, 1, ... resection steps."""
         whole = self.site.anatomy
         return tuple(
-            replace(self, left=left) for left in list_remaining_bodies(whole, self.scene.get_effects_on(whole))
+            replace(self, remaining_body=left)
+            for left in list_remaining_bodies(whole, self.scene.get_effects_on(whole))
         )
 
     @cached_property
-    def plain(self) -> Stage:
+    def without_fine_cortex(self) -> Stage:
         """The stage with the FEM surface as its cortex."""
         return replace(self, scene=replace(self.scene, look=replace(self.scene.look, natural=False)))
 
     @cached_property
-    def nodes(self) -> np.ndarray:
+    def drawn_vertices(self) -> np.ndarray:
         """Sorted mesh vertices (n,) whose motion is rendered: open cortex and tumour."""
         anatomy = self.anatomy
         return np.union1d(np.unique(anatomy.open_surface), anatomy.tumour_nodes)
@@ -140,7 +141,7 @@ class Stage:
         turned = Rotation.from_rotvec(look.turn * site.axis).apply(lamp.position - site.origin)
         return replace(lamp, position=site.origin + turned, strength=look.lamp, ambient=look.ambient)
 
-    def build_visible(self, positions: np.ndarray) -> Layer:
+    def build_visible_cortex(self, positions: np.ndarray) -> Layer:
         """Build the open cortex, and the cortex just under the bone's edge, which becomes visible if the brain shifts.
 
         If the brain separates from the skull, the surface beyond the drape's hole is rendered below it. The drape
@@ -154,12 +155,12 @@ class Stage:
         return replace(layer, vertices=layer.vertices + below[:, None] * self.site.axis)
 
     def _build_fine(self, positions: np.ndarray) -> Layer:
-        fine, tint = self.fine, self.scene.look.tint
+        fine, tint = self.fine_cortex, self.scene.look.tint
         at = fine.surface.place(positions[fine.vertices])
         return Layer("cortex", CORTEX, at, fine.surface.triangles, fine.colour * tint, gloss=0.7, shininess=110.0)
 
     @cached_property
-    def relief(self) -> FineCortex:
+    def coarse_gyri(self) -> FineCortex:
         """The open cortex within the drape's hole, with coarse gyri."""
         mesh, site = self.anatomy.mesh, self.site
         fine = build_fine_cortex(site, mesh, self.anatomy.open_surface, self.intensity, RELIEF_EDGE)
@@ -168,15 +169,15 @@ class Stage:
         return replace(fine, surface=replace(fine.surface, triangles=fine.surface.triangles[seen]))
 
     @cached_property
-    def relief_parts(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    def gyri_parts(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
         """Bright crowns and dark sulci of `relief`: its vertices (n,), and triangles (m, 3) of them."""
-        triangles, colour = self.relief.surface.triangles, self.relief.colour
+        triangles, colour = self.coarse_gyri.surface.triangles, self.coarse_gyri.colour
         dark = colour[triangles].mean(axis=(1, 2)) < DARK_SHARE * colour.mean(axis=1).max()
         crowns, sulci = (np.unique(triangles[some], return_inverse=True) for some in (~dark, dark))
         return crowns, sulci
 
     @cached_property
-    def brain(self) -> Layer:
+    def brain_surface(self) -> Layer:
         """Undeformed surface of the brain without the open cortex."""
         mesh, craniotomy = self.anatomy.mesh, self.anatomy.craniotomy
         vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
@@ -186,12 +187,12 @@ class Stage:
         """Build cortex at `positions` (V, 3) [m], drape, and a tool, if any, at T_world_tool `pose` (4, 4)."""
         tool, look = self.scene.tool, self.scene.look
         if pose is None or not look.natural or not has_instrument(tool):
-            return self._list_layers(positions, self.compute_corners(pose))
+            return self._list_layers(positions, self.compute_tool_corners(pose))
         parts = build_instrument(tool, look.instrument, TOOL)
         placed = (replace(part, vertices=part.vertices @ pose[:3, :3].T + pose[:3, 3]) for part in parts)
         return [*self._list_layers(positions, None), *placed]
 
-    def compute_corners(self, pose: np.ndarray | None) -> np.ndarray | None:
+    def compute_tool_corners(self, pose: np.ndarray | None) -> np.ndarray | None:
         """Compute the corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
         if self.scene.tool is None or pose is None:
             return None
@@ -199,7 +200,7 @@ class Stage:
 
     def _list_layers(self, positions: np.ndarray, corners: np.ndarray | None) -> list[Layer]:
         look = self.scene.look
-        seen = [self.build_visible(positions), self._drape]
+        seen = [self.build_visible_cortex(positions), self._drape]
         seen += [] if look.finger is None else [self._finger]
         seen += [self._squares.build_layer(positions)] if look.cottonoids else []
         if self.scene.tool is None or corners is None:
@@ -212,20 +213,20 @@ class Stage:
         return self._draw(camera, self.build_layers(positions, pose))
 
     def render_view(
-        self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, coarse: bool, number: int = 0
+        self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, coarse: bool, frame_number: int = 0
     ) -> Picture:
-        """Return frame `number` with the look's camera effects in the round field of the scene's microscope.
+        """Return frame `frame_number` with the look's camera effects in the round field of the scene's microscope.
 
         If `coarse`, it has half the resolution.
         """
         seen_by, look = _halve_resolution(camera) if coarse else camera, self.scene.look
         picture = self.render(seen_by, positions, pose)
-        picture = add_camera_effects(picture, seen_by, self.site.origin, look.aperture, look.noise, number)
+        picture = add_camera_effects(picture, seen_by, self.site.origin, look.aperture, look.noise, frame_number)
         if self.scene.viewpoint.field is not None:
             picture = add_vignette(picture, self.scene.viewpoint.field)
         return scale_picture(picture, camera.width, camera.height) if coarse else picture
 
-    def render_tool_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
+    def render_with_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
         """Render as `render`, with the tool given by its corners (t, 3) [m]; None: without a tool."""
         return self._draw(camera, self._list_layers(positions, corners))
 
@@ -236,8 +237,8 @@ class Stage:
         return self._renderers[counts].render(camera, [layer.vertices for layer in layers if not layer.still])
 
     @cached_property
-    def _squares(self) -> Squares:
-        return build_squares(self.site, self.scene.look.cottonoids)
+    def _squares(self) -> CottonoidSurface:
+        return build_cottonoids(self.site, self.scene.look.cottonoids)
 
     @cached_property
     def _finger(self) -> Layer:
@@ -255,12 +256,12 @@ class Stage:
 
     def smooth_tumour(self, tumour: Layer) -> Layer:
         """Return a layer of the tumour's surface with rounded facets: for its outline, not for measurements."""
-        surface = self.round_tumour
+        surface = self.rounded_tumour
         return replace(
             tumour, vertices=surface.place(tumour.vertices), triangles=surface.triangles, colour=tumour.colour[0]
         )
 
-    def build_reference(self, positions: np.ndarray) -> Layer:
+    def build_fem_tumour(self, positions: np.ndarray) -> Layer:
         """Return the tumour surface computed by FEM, drawn for comparison with an estimate."""
         return replace(self.build_tumour(positions), name="truth", colour=np.array(TRUTH_COLOUR))
 
@@ -281,7 +282,7 @@ class Stage:
 
     @property
     def visible_vertices(self) -> np.ndarray:
-        """Mesh vertices (n,) of the layer of `build_visible`, in the order in which they are drawn."""
+        """Mesh vertices (n,) of the layer of `build_visible_cortex`, in the order in which they are drawn."""
         return self._visible.vertices
 
     @cached_property
@@ -289,40 +290,40 @@ class Stage:
         return np.unique(self.anatomy.tumour_surface, return_inverse=True)
 
     @cached_property
-    def round_tumour(self) -> EmbeddedSurface:
+    def rounded_tumour(self) -> EmbeddedSurface:
         """Fine surface with rounded facets on the tumour's surface."""
         at, triangles = self.site.anatomy.mesh.nodes[self._tumour[0]], self._tumour[1]
         fine = build_embedded_surface(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
         return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, highest=TUMOUR_HEIGHT)
 
     @cached_property
-    def _visible(self) -> Cortex:
+    def _visible(self) -> CortexSurface:
         vertices, triangles = np.unique(_list_visible(self.site, self.anatomy), return_inverse=True)
         at = self.anatomy.mesh.nodes[vertices]
         colour = np.array(CORTEX_COLOUR) * self.scene.look.tint
-        return Cortex(
-            vertices, triangles, at - READING_DEPTH * compute_vertex_normals(at, triangles), self.scan, colour
+        return CortexSurface(
+            vertices, triangles, at - READING_DEPTH * compute_vertex_normals(at, triangles), self.scan_texture, colour
         )
 
     @cached_property
-    def fine(self) -> FineCortex:
+    def fine_cortex(self) -> FineCortex:
         """Fine surface that embeds gyri and vessels in the visible FEM surface."""
-        if self.left is None:
+        if self.remaining_body is None:
             return _build_whole_cortex(self.site, self.intensity)
         return build_fine_cortex(self.site, self.anatomy.mesh, _list_visible(self.site, self.anatomy), self.intensity)
 
     @cached_property
-    def scan(self) -> Solid | None:
+    def scan_texture(self) -> Solid | None:
         """The scan as a solid texture, with the vessels of the scene; None without scan and vessels."""
         model, seed = self.scene.observation_model, self.scene.look.vessels
         if isinstance(model, StereoObservation) and model.vessels:
             seed = model.seed
         if seed is not None:
             return add_vessels(self.intensity, self.site, seed, DARK_SHARES, RELIEF_DEPTH)
-        return self.anatomical_scan
+        return self.head_scan_texture
 
     @cached_property
-    def anatomical_scan(self) -> Solid | None:
+    def head_scan_texture(self) -> Solid | None:
         """The scan of the whole head as a solid texture, if there is one."""
         if self.intensity is None:
             return None

@@ -12,9 +12,9 @@ from surrogate.locating.locator import Locator
 from surrogate.locating.observation import Observation
 
 from ..script.observation_models import StereoObservation
-from .observer import NO_POINTS, RigidError, TumourEstimate, find_touched, locate_tumour, sample_rigid_error
+from .observer import NO_POINTS, RigidError, TumourEstimate, find_touched_point, locate_tumour, sample_rigid_error
 from .stage import Stage
-from .stereo_update import FirstView, StereoPair, observe_first, observe_point_cloud, observe_points
+from .stereo_update import FirstView, StereoPair, observe_first_pair, observe_point_cloud, observe_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,54 +28,54 @@ class StereoObserver:
     locator: Locator
     observation_model: StereoObservation
 
-    def estimate(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> TumourEstimate:
-        """Estimate the tumour in a frame; arguments: see `Observer.estimate`. Rendering time is not counted."""
-        shot, anatomy = self.render_pair(number, positions, tool), self.stage.site.anatomy
-        tips = NO_POINTS.now if tool is None else find_touched(anatomy, positions, tool)
+    def estimate(self, frame_number: int, positions: np.ndarray, corners: np.ndarray | None = None) -> TumourEstimate:
+        """Estimate the tumour in a frame; arguments: see `PointObserver.estimate`. Rendering time is not counted."""
+        shot, anatomy = self.render_pair(frame_number, positions, corners), self.stage.site.anatomy
+        tips = NO_POINTS.now if corners is None else find_touched_point(anatomy, positions, corners)
         _ = self._first_shot  # rendered here, so that its time is not counted
         begun = clock.perf_counter()
         return locate_tumour(anatomy, self.locator, lambda: self.observe(shot, tips), positions, begun)
 
-    def observe(self, shot: StereoPair, tips: np.ndarray) -> Observation:
-        """Extract the observation from a stereo pair, with contact points of a tool, `tips` (k, 3) [m].
+    def observe(self, pair: StereoPair, contact_points: np.ndarray) -> Observation:
+        """Extract the observation from a stereo pair, with contact points of a tool, `contact_points` (k, 3) [m].
 
         Raises
         ------
         InputError
-            See `observe_points`, or `observe_point_cloud` without correspondences; see also `observe_first`.
+            See `observe_points`, or `observe_point_cloud` without correspondences; see also `observe_first_pair`.
         """
         site, model = self.stage.site, self.observation_model
         if not model.named:
-            return observe_point_cloud(site, shot, model.points, self._build_microscope(0), tips)
-        return observe_points(site, self.first, shot, self._build_microscope(1), tips)
+            return observe_point_cloud(site, pair, model.points, self._build_microscope(0), contact_points)
+        return observe_points(site, self.first_view, pair, self._build_microscope(1), contact_points)
 
-    def render_pair(self, number: int, positions: np.ndarray, tool: np.ndarray | None = None) -> StereoPair:
+    def render_pair(self, frame_number: int, positions: np.ndarray, corners: np.ndarray | None = None) -> StereoPair:
         """Render both eyes' images of a frame, for positions (V, 3) [m] and a tool's corners (t, 3) [m].
 
         Number -1 is before the first frame.
         """
         scene = self.stage.scene
-        time = float(scene.times[min(max(number, 0), len(scene.times) - 1)])
+        time = float(scene.times[min(max(frame_number, 0), len(scene.times) - 1)])
         left, right = (
             replace(scene.viewpoint, eye=eye).build_camera(self.stage.site, time) for eye in ("left", "right")
         )
         pictures = [
-            self._add_noise(stage.render_tool_corners(camera, positions, tool).colour, number, eye)
+            self._add_noise(stage.render_with_corners(camera, positions, corners).colour, frame_number, eye)
             for eye, (stage, camera) in enumerate(zip(self._stages, (left, right), strict=True))
         ]
-        seen = None if tool is None or scene.tool is None else (tool, np.asarray(scene.tool.mesh.faces))
+        seen = None if corners is None or scene.tool is None else (corners, np.asarray(scene.tool.mesh.faces))
         return StereoPair((left, right), (pictures[0], pictures[1]), seen)
 
     @cached_property
-    def first(self) -> FirstView:
+    def first_view(self) -> FirstView:
         """First image pair, of the brain as in the scan.
 
         Raises
         ------
         InputError
-            See `observe_first`.
+            See `observe_first_pair`.
         """
-        return observe_first(
+        return observe_first_pair(
             self.stage.site, self._first_shot, self.observation_model.points, self._build_microscope(0)
         )
 
@@ -95,17 +95,17 @@ class StereoObserver:
         lit = np.float32(1.0 - eye * self.observation_model.darker) * picture + noise
         return np.clip(np.rint(lit), 0.0, 255.0).astype(np.uint8)
 
-    def _build_microscope(self, number: int) -> TrackedMicroscope:
-        return TrackedMicroscope(sample_rigid_error(self.observation_model, 2 + number), self.stage.site.origin)
+    def _build_microscope(self, number: int) -> MicroscopeTrackingError:
+        return MicroscopeTrackingError(sample_rigid_error(self.observation_model, 2 + number), self.stage.site.origin)
 
 
 @dataclass(frozen=True, eq=False)
-class TrackedMicroscope:
+class MicroscopeTrackingError:
     """Rigid error of a tracked microscope about the centre (3,) [m] of the craniotomy."""
 
     error: RigidError
-    middle: np.ndarray
+    centre: np.ndarray
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
         """Return positions (n, 3) [m] with the tracking error."""
-        return self.error.apply(places, self.middle)
+        return self.error.apply(places, self.centre)

@@ -20,10 +20,10 @@ from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
 
 @dataclass(frozen=True)
 class StereoUpdateSettings:
-    """Settings of `observe_first`, `observe_points` and `observe_point_cloud`."""
+    """Settings of `observe_first_pair`, `observe_points` and `observe_point_cloud`."""
 
     resolution: float = 6000.0  # Resolution of the rectified images [pixel/m of cortex].
-    half_width: float = 1.05  # Half-width of the rectified images [radii of the craniotomy].
+    half_width_ratio: float = 1.05  # Half-width of the rectified images [radii of the craniotomy].
     # Minimum distance of points from the drape [m]: it is above the cortex, and its disparity differs.
     min_drape_distance: float = 1.5e-3
     # Largest median distance of the first pair's points from the scan's cortex [m]: beyond, the calibration is of other
@@ -54,14 +54,14 @@ class StereoPair:
 
     Parameters
     ----------
-    cameras, pictures
+    cameras, images
         Cameras of the left and the right eye; images (H, W, 3) uint8.
     tool
         The surface of the tool in view, corners (t, 3) [m] and faces (f, 3), if there is one: its pose is known.
     """
 
     cameras: tuple[Camera, Camera]
-    pictures: tuple[np.ndarray, np.ndarray]
+    images: tuple[np.ndarray, np.ndarray]
     tool: tuple[np.ndarray, np.ndarray] | None = None
 
     def rectify(self, site: CraniotomyFrame) -> StereoView:
@@ -75,8 +75,8 @@ class StereoPair:
         masks = None if self.tool is None else tuple(compute_silhouette(camera, *self.tool) for camera in self.cameras)
         target = cast(tuple[float, float, float], tuple(site.origin.tolist()))
         try:
-            geometry = rectify(*self.cameras, target, STEREO.half_width * site.radius, STEREO.resolution)
-            return compute_stereo_view(geometry, *self.pictures, cast(tuple[np.ndarray, np.ndarray] | None, masks))
+            geometry = rectify(*self.cameras, target, STEREO.half_width_ratio * site.radius, STEREO.resolution)
+            return compute_stereo_view(geometry, *self.images, cast(tuple[np.ndarray, np.ndarray] | None, masks))
         except ValueError as error:
             raise InputError(str(error)) from error
 
@@ -87,23 +87,23 @@ class FirstView:
 
     Parameters
     ----------
-    view
+    stereo_view
         Rectified view of the pair.
-    pixels, rest
-        Pixels (n, 2) of cortex points, and their positions in the scan (n, 3) [m]. `asked`: number of searched points.
-    around, still
+    pixels, rest_positions
+        Pixels (n, 2) of cortex points, and their positions in the scan (n, 3) [m]. Searched: `requested_count`.
+    static_pixels, static_positions
         Pixels (m, 2) of the surroundings of the opening, and their positions (m, 3) [m].
     """
 
-    view: StereoView
+    stereo_view: StereoView
     pixels: np.ndarray
-    rest: np.ndarray
-    asked: int
-    around: np.ndarray
-    still: np.ndarray
+    rest_positions: np.ndarray
+    requested_count: int
+    static_pixels: np.ndarray
+    static_positions: np.ndarray
 
 
-def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Rigid) -> FirstView:
+def observe_first_pair(site: CraniotomyFrame, pair: StereoPair, count: int, add_rigid_error: Rigid) -> FirstView:
     """Match the first pair, of an undeformed brain: `count` points, each at the nearest point of the scan.
 
     Raises
@@ -111,11 +111,11 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
     InputError
         See `StereoPair.rectify`; too few points; points too far from the scan's cortex.
     """
-    view = shot.rectify(site)
+    view = pair.rectify(site)
     pixels = build_pixel_grid(site, view, count)
-    found = triangulate_seen_points(site, view, pixels)
-    points = rigid(found.points)
-    rest, off = find_on_cortex(site, points)
+    found = triangulate_pixels(site, view, pixels)
+    points = add_rigid_error(found.points)
+    rest, off = find_nearest_on_cortex(site, points)
     if len(off) and np.median(off) > STEREO.max_cortex_distance:
         raise InputError(
             f"the first image pair shows a cortex {1e3 * np.median(off):.1f} mm from the scan's: check that eyes "
@@ -123,51 +123,51 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
         )
     good = find_supported(rest, points - rest)
     require_points(int(good.sum()), len(pixels))
-    around, still = find_surroundings(site, view)
-    return FirstView(view, pixels[found.which[good]], rest[good], len(pixels), around, rigid(still))
+    around, still = find_static_points(site, view)
+    return FirstView(view, pixels[found.which[good]], rest[good], len(pixels), around, add_rigid_error(still))
 
 
 def observe_points(
-    site: CraniotomyFrame, first: FirstView, shot: StereoPair, rigid: Rigid, tips: np.ndarray
+    site: CraniotomyFrame, first_view: FirstView, pair: StereoPair, add_rigid_error: Rigid, contact_points: np.ndarray
 ) -> Observation:
-    """Track the points of the first pair in a later pair; `tips` (k, 3) [m] are contact points of a tool.
+    """Track the points of the first pair in a later pair; `contact_points` (k, 3) [m] are contact points of a tool.
 
     Raises
     ------
     InputError
         See `StereoPair.rectify`; too few points; apparent motion of the surroundings; motions outside the search range.
     """
-    view = shot.rectify(site)
-    check_no_motion(first, view, rigid)
-    which, there = follow_pixels(first.view, view, first.pixels)
-    found = triangulate_seen_points(site, view, there)
-    now, rest = rigid(found.points), first.rest[which[found.which]]
+    view = pair.rectify(site)
+    check_surroundings_static(first_view, view, add_rigid_error)
+    which, there = follow_pixels(first_view.stereo_view, view, first_view.pixels)
+    found = triangulate_pixels(site, view, there)
+    now, rest = add_rigid_error(found.points), first_view.rest_positions[which[found.which]]
     good = find_supported(rest, now - rest)
-    require_points(int(good.sum()), first.asked, LARGE_MOTION_HINT)
+    require_points(int(good.sum()), first_view.requested_count, LARGE_MOTION_HINT)
     motion = float(np.median(np.linalg.norm(now - rest, axis=1)))
     if motion > STEREO.max_motion:
         raise InputError(
             f"half of the points seem to have moved by {1e3 * motion:.0f} mm, farther than they are searched for: "
             "check that eyes are not swapped, or begin with a new scan."
         )
-    return Observation(now[good], rest[good], compute_deviations(found.sigma[good]), rigid(tips))
+    return Observation(now[good], rest[good], scale_deviations(found.sigma[good]), add_rigid_error(contact_points))
 
 
 def observe_point_cloud(
-    site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Rigid, tips: np.ndarray
+    site: CraniotomyFrame, pair: StereoPair, count: int, add_rigid_error: Rigid, contact_points: np.ndarray
 ) -> Observation:
     """Return `count` cortex points without correspondences, from one pair.
 
     For arguments and errors see `observe_points`.
     """
-    view = shot.rectify(site)
+    view = pair.rectify(site)
     pixels = build_pixel_grid(site, view, count)
-    found = triangulate_seen_points(site, view, pixels)
-    points = rigid(found.points)
-    rest, _ = find_on_cortex(site, points)
+    found = triangulate_pixels(site, view, pixels)
+    points = add_rigid_error(found.points)
+    rest, _ = find_nearest_on_cortex(site, points)
     good = find_supported(rest, points - rest)
     require_points(int(good.sum()), len(pixels))
-    return Observation(points[good], None, compute_deviations(found.sigma[good]), rigid(tips))
+    return Observation(points[good], None, scale_deviations(found.sigma[good]), add_rigid_error(contact_points))
 
 
 def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.ndarray:
@@ -181,7 +181,7 @@ def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.
     return view.geometry.place(places)[0]
 
 
-def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> Cloud:
+def triangulate_pixels(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> Cloud:
     """Triangulate pixels (n, 2), and keep the points inside the drape's hole.
 
     Raises
@@ -197,7 +197,7 @@ def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.
     return Cloud(found.which[inside], found.points[inside], found.sigma[inside])
 
 
-def find_surroundings(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
+def find_static_points(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels (m, 2) of the left window that show surroundings of the opening, and their positions (m, 3) [m]."""
     ticks = np.linspace(0.0, view.geometry.size - 1.0, 40)
     pixels = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
@@ -207,16 +207,16 @@ def find_surroundings(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarr
     return pixels[found.which[some]], found.points[some]
 
 
-def check_no_motion(first: FirstView, view: StereoView, rigid: Rigid) -> None:
+def check_surroundings_static(first_view: FirstView, view: StereoView, add_rigid_error: Rigid) -> None:
     """Raise InputError if the surroundings of the opening seem to have moved since the first pair."""
-    which, there = follow_pixels(first.view, view, first.around)
+    which, there = follow_pixels(first_view.stereo_view, view, first_view.static_pixels)
     try:
         found = triangulate_cloud(view, there)
     except ValueError as error:
         raise InputError(str(error)) from error
     if len(found.which) < STEREO.min_static_points:
         return
-    motion = np.linalg.norm(rigid(found.points) - first.still[which[found.which]], axis=1)
+    motion = np.linalg.norm(add_rigid_error(found.points) - first_view.static_positions[which[found.which]], axis=1)
     moved = float(np.quantile(motion, 0.25))
     if moved > STEREO.static_tolerance:
         raise InputError(
@@ -225,7 +225,7 @@ def check_no_motion(first: FirstView, view: StereoView, rigid: Rigid) -> None:
         )
 
 
-def find_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_nearest_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the points of the scan's cortex nearest to points (n, 3) [m], and their distances (n,) [m]."""
     if not len(points):
         return points, np.zeros(0)
@@ -234,15 +234,15 @@ def find_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[np.ndarra
     return place, np.linalg.norm(points - place, axis=1)
 
 
-def compute_deviations(sigma: np.ndarray) -> np.ndarray:
+def scale_deviations(sigma: np.ndarray) -> np.ndarray:
     """Scale standard deviations (n,) [m] of independent noise to a locator's `sigma`, which adds correlated noise."""
     return sigma * (SIGMA / NOISE.independent_error)
 
 
-def require_points(count: int, asked: int, other_reason: str = "") -> None:
+def require_points(count: int, requested: int, other_reason: str = "") -> None:
     """Raise InputError if too few of the searched points are visible; `other_reason` is added to the message."""
-    if count < STEREO.min_found_share * asked:
+    if count < STEREO.min_found_share * requested:
         raise InputError(
-            f"both eyes see {count} of {asked} places of the cortex surely: check light, focus and texture, and what "
-            f"hides it.{other_reason}"
+            f"both eyes see {count} of {requested} places of the cortex surely: check light, focus and texture, and "
+            f"what hides it.{other_reason}"
         )

@@ -33,8 +33,8 @@ class TipDistance:
         return format_millimetres(self.distance, self.bound)
 
 
-def read_tip_distance(
-    deformer: Deformer, loads: Loads, answer: Deformation, tool: Instrument | None, apart: float
+def predict_tip_distance(
+    deformer: Deformer, loads: Loads, solution: Deformation, tool: Instrument | None, drawn_distance: float
 ) -> TipDistance | None:
     """Read the distance in the first load case of a solution; None unless a single ball pushes or is moved.
 
@@ -42,28 +42,28 @@ def read_tip_distance(
 
     Parameters
     ----------
-    apart
+    drawn_distance
         Distance [m] between the drawn tip and the drawn tumour.
     """
     if _get_ball(loads, tool) is None:
         return None
-    model = find_first_model(deformer, answer)
+    model = find_first_model(deformer, solution)
     if model is None:
-        return TipDistance(apart, None)
-    found = model.predict_distance(loads, answer, np.array([apart]))
+        return TipDistance(drawn_distance, None)
+    found = model.predict_distance(loads, solution, np.array([drawn_distance]))
     promised = float(found.bound[0, 0])
-    kept = answer.outcome[0].good and promised < float("inf")
+    kept = solution.outcome[0].good and promised < float("inf")
     return TipDistance(float(found.value[0]), promised if kept else None)
 
 
 def measure_tip_distance(
-    anatomy: Anatomy, loads: Loads, answer: Deformation, tool: Instrument | None, lift: float
+    anatomy: Anatomy, loads: Loads, solution: Deformation, tool: Instrument | None, lift: float
 ) -> TipDistance | None:
     """Measure the distance in a solution of any deformer, without error bound.
 
     Parameters
     ----------
-    answer
+    solution
         Solution that contains at least the open cortex and the tumour.
     lift
         Height [m] above the tissue at which an idle pushing tool is drawn.
@@ -76,7 +76,7 @@ def measure_tip_distance(
     ball = _get_ball(loads, tool)
     if ball is None:
         return None
-    found = build_tip_gauge(anatomy).compute_distances(loads, answer.displacement, answer.nodes, ball.shape, lift)
+    found = build_tip_gauge(anatomy).compute_distances(loads, solution.displacement, solution.nodes, ball.shape, lift)
     return TipDistance(float(found[0]), None)
 
 

@@ -8,11 +8,11 @@ MIN_REPORTED_TIME = 0.3  # Waiting time that is reported [s].
 POLL_INTERVAL = 0.1  # Polling interval [s].
 
 
-class Busy:
+class WaitingNotice:
     """Thread that passes the running task and its duration to `say`, and an empty line at its end."""
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
+    def __init__(self, show: Callable[[str], None]) -> None:
+        self._say = show
         self._since: float | None = None
         self._what = ""
         self.noticed = False

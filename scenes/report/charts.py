@@ -137,7 +137,7 @@ def _scatter(
             row.name,
             row.family if row.against == ERROR else DIFFERENT_LAW,
             *places[row.name],
-            pale=row.name not in best,
+            is_pale=row.name not in best,
             y_range=_find_central_range(get_errors(row)),
             hint=_describe(row),
         )

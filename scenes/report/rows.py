@@ -176,7 +176,7 @@ def measure_on_workers(study: ReportStudy, specs: Sequence[Spec], address: str) 
             except KilledWorker:
                 yield ReportRow(spec.name, FAMILY_NAMES[type(spec)], state="its workers were killed: out of memory?")
             except CancelledError as error:
-                raise describe_scheduler_end(workers.where) from error
+                raise describe_scheduler_end(workers.description) from error
 
 
 def measure_rows(

@@ -22,15 +22,15 @@ ITERATIONS = 6  # Number of iterations from a point in the tangent plane to one 
 class Approach:
     """Entry point of the tool in the tangent plane (x, y) [m], and tilt of its path against the axis [rad].
 
-    Both as in `Touch`; with `line`, a shaft is aligned with the path.
+    Both as in `Touch`; with `along_line`, a shaft is aligned with the path.
     """
 
     x: float
     y: float
     tilt: tuple[float, float] = (0.0, 0.0)
-    line: bool = False
+    along_line: bool = False
 
-    def follow(self, path: Path) -> Path:
+    def shift_path(self, path: Path) -> Path:
         """Return the tool path shifted from the centre to the entry, and along the trajectory."""
 
         def along(time: float) -> Touch:
@@ -45,7 +45,7 @@ class Approach:
 
         A blade keeps its orientation, on which its contact depends.
         """
-        if not (self.line and isinstance(tool, Probe)):
+        if not (self.along_line and isinstance(tool, Probe)):
             return tool
         right, up = -np.tan(self.tilt)
         return replace(tool, lean=float(np.arctan(np.hypot(right, up))), turn=float(np.arctan2(up, right)))
@@ -98,7 +98,7 @@ def parse_approach(markup: Markup, site: CraniotomyFrame) -> Approach:
             f"{1e3 * MAX_CORTEX_DISTANCE:g} mm is "
             "the most that a line is drawn out by. See that it is of this opening, and draw it through the cortex."
         )
-    return replace(_compute_approach(site, entry, way), line=True)
+    return replace(_compute_approach(site, entry, way), along_line=True)
 
 
 def _compute_approach(site: CraniotomyFrame, entry: np.ndarray, way: np.ndarray) -> Approach:

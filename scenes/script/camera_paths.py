@@ -15,7 +15,7 @@ BREATHING_FREQUENCY = 0.25  # Breathing frequency [Hz]: fifteen breaths a minute
 
 @dataclass(frozen=True)
 class HandSettings:
-    """Settings of `sample_wandering`."""
+    """Settings of `sample_hand_motion`."""
 
     # Frequencies of the slow drift of a hand that holds a camera [Hz].
     drift_frequencies: tuple[float, float] = (0.2, 2.5)
@@ -61,7 +61,7 @@ class HandHeld:
 
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
         """Return the camera at a time [s]."""
-        way = sample_wandering(self.seed, time)
+        way = sample_hand_motion(self.seed, time)
         lifted = np.array([0.0, self.breath * np.sin(2.0 * np.pi * BREATHING_FREQUENCY * time), 0.0])
         turn = self.turn * way[3:]
         moved = camera.move(self.shift * way[:3] + lifted)
@@ -150,7 +150,7 @@ class Microscope:
 
 
 @lru_cache(maxsize=16)
-def sample_waves(seed: int, settings: HandSettings = HandSettings()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sample_hand_waves(seed: int, settings: HandSettings = HandSettings()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sample frequencies [Hz], phases [rad] and amplitudes (6, n) of a hand's motion, for 3 shifts and 3 turns."""
     random = np.random.default_rng(seed)
     count, frequencies = settings.wave_count, (settings.drift_frequencies, settings.tremor_frequencies)
@@ -159,9 +159,9 @@ def sample_waves(seed: int, settings: HandSettings = HandSettings()) -> tuple[np
     return np.hstack(bands), random.uniform(0.0, 2.0 * np.pi, (6, 2 * count)), np.hstack(sizes)
 
 
-def sample_wandering(seed: int, time: float, settings: HandSettings = HandSettings()) -> np.ndarray:
+def sample_hand_motion(seed: int, time: float, settings: HandSettings = HandSettings()) -> np.ndarray:
     """Return six numbers (6,) that vary smoothly with time [s] about 0, with a standard deviation of 1."""
-    frequencies, phases, sizes = sample_waves(seed, settings)
+    frequencies, phases, sizes = sample_hand_waves(seed, settings)
     return (sizes * np.sin(2.0 * np.pi * frequencies * time + phases)).sum(axis=1)
 
 

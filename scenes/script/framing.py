@@ -29,18 +29,18 @@ FIELD = np.radians(16.0)  # Vertical field of view while directions are compared
 class Framing:
     """Direction (3,) from the target to the camera, target (3,) [m] and vertical field of view [rad].
 
-    `visible` is the share of the undeformed tumour's outline inside the craniotomy.
+    `visible_share` is the share of the undeformed tumour's outline inside the craniotomy.
     """
 
-    outward: np.ndarray
+    direction: np.ndarray
     target: np.ndarray
     fov: float
-    visible: float
+    visible_share: float
 
 
 @lru_cache(maxsize=8)
 def find_framing(
-    site: CraniotomyFrame, distance: float, aspect: float, direction: tuple[float, float] | None = None
+    site: CraniotomyFrame, distance: float, aspect_ratio: float, direction: tuple[float, float] | None = None
 ) -> Framing:
     """Find the most oblique view in which the tumour's outline lies inside the craniotomy.
 
@@ -51,14 +51,14 @@ def find_framing(
     ----------
     distance
         Distance of the camera from the target [m].
-    aspect
+    aspect_ratio
         Width of the image over its height.
     direction
         Tilt from the outward normal and turn about the axis [rad], to use instead of the best one.
     """
     anatomy = site.anatomy
     surface = anatomy.mesh.nodes[np.unique(anatomy.tumour_surface)]
-    rims = build_rims(site)
+    rims = build_hole_edges(site)
     if direction is None:
         views = [(tilt, turn) for tilt in TILTS for turn in TURNS]
         # A view from the lower edge shows the tool from its side.
@@ -67,7 +67,7 @@ def find_framing(
         views = [direction]
     best = -1.0, views[0]
     for tilt, turn in views:
-        outward = compute_outward(site, tilt, turn)
+        outward = compute_view_direction(site, tilt, turn)
         camera = look_at(site.origin + distance * outward, site.origin, site.up, FIELD, 640, 480)
         share = compute_visible_share(camera, surface, rims)
         if share > best[0]:
@@ -77,18 +77,18 @@ def find_framing(
     centre = surface.mean(axis=0)
     arm = surface - centre
     band = surface + BAND_MARGIN * arm / np.linalg.norm(arm, axis=1, keepdims=True)
-    outward = compute_outward(site, *best[1])
-    target, fov = fit_field(np.vstack([rims[0], band]), site, outward, distance, aspect)
+    outward = compute_view_direction(site, *best[1])
+    target, fov = fit_field_of_view(np.vstack([rims[0], band]), site, outward, distance, aspect_ratio)
     return Framing(outward, target, fov, best[0])
 
 
-def compute_outward(site: CraniotomyFrame, tilt: float, turn: float = 0.0) -> np.ndarray:
+def compute_view_direction(site: CraniotomyFrame, tilt: float, azimuth: float = 0.0) -> np.ndarray:
     """Return the unit direction (3,) to a camera tilted from the outward normal [rad], towards `-up` at turn 0."""
-    aside = np.cos(turn) * site.up + np.sin(turn) * site.right
+    aside = np.cos(azimuth) * site.up + np.sin(azimuth) * site.right
     return -np.cos(tilt) * site.axis - np.sin(tilt) * aside
 
 
-def build_rims(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray]:
+def build_hole_edges(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray]:
     """Return the edge of the drape's hole (n, 3) [m]: its upper border, and the cortex below."""
     angle = np.linspace(0.0, 2.0 * np.pi, RIM_COUNT, endpoint=False)
     circle = np.outer(np.cos(angle), site.right) + np.outer(np.sin(angle), site.up)
@@ -98,7 +98,7 @@ def build_rims(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray]:
     return cortex - DRAPE_HEIGHT * site.axis, cortex
 
 
-def compute_visible_share(camera: Camera, surface: np.ndarray, rims: tuple[np.ndarray, np.ndarray]) -> float:
+def compute_visible_share(camera: Camera, surface: np.ndarray, hole_edges: tuple[np.ndarray, np.ndarray]) -> float:
     """Return the share of a surface's outline inside the opening, as a camera sees it; surface (n, 3) [m]."""
     hull = _find_hull(camera.project(surface)[0])
     steps = np.linalg.norm(np.roll(hull, -1, axis=0) - hull, axis=1)
@@ -107,7 +107,7 @@ def compute_visible_share(camera: Camera, surface: np.ndarray, rims: tuple[np.nd
     closed = np.vstack([hull, hull[:1]])
     outline = np.stack([np.interp(at, along, closed[:, axis]) for axis in (0, 1)], axis=1)
     inside = np.ones(OUTLINE_COUNT, bool)
-    for rim in rims:
+    for rim in hole_edges:
         polygon = _find_hull(camera.project(rim)[0])
         edge = np.roll(polygon, -1, axis=0) - polygon
         arm = outline[:, None] - polygon
@@ -120,20 +120,20 @@ def _find_hull(points: np.ndarray) -> np.ndarray:
     return points[ConvexHull(points).vertices]
 
 
-def fit_field(
-    points: np.ndarray, site: CraniotomyFrame, outward: np.ndarray, distance: float, aspect: float
+def fit_field_of_view(
+    points: np.ndarray, site: CraniotomyFrame, view_direction: np.ndarray, distance: float, aspect_ratio: float
 ) -> tuple[np.ndarray, float]:
     """Return the target (3,) [m] and vertical field of view [rad] of a camera whose image just contains points (n, 3).
 
-    The camera is `distance` [m] from the target, in the direction `outward` (3,).
+    The camera is `distance` [m] from the target, in the direction `view_direction` (3,).
     """
     target, half = points.mean(axis=0), 0.1
     for _ in range(4):
-        camera = look_at(target + distance * outward, target, site.up)
+        camera = look_at(target + distance * view_direction, target, site.up)
         seen = camera.to_camera_frame(points)
         slope = seen[:, :2] / seen[:, 2:]
         low, high = slope.min(axis=0), slope.max(axis=0)
         x, y = 0.5 * distance * (low + high)
         target = target + x * camera.T_camera_world[0, :3] + y * camera.T_camera_world[1, :3]
-        half = float(max((high - low)[1], (high - low)[0] / aspect)) / (2.0 * FILLED)
+        half = float(max((high - low)[1], (high - low)[0] / aspect_ratio)) / (2.0 * FILLED)
     return target, 2.0 * float(np.arctan(max(half, 0.5 * MIN_FIELD / distance)))

@@ -8,7 +8,7 @@ import numpy as np
 from sim.bodies.fluid_level import compute_fluid_level
 from sim.loads import Posture
 
-from .tool_paths import smooth
+from .tool_paths import smooth_step
 
 SUPINE = (0.0, -1.0, 0.0)  # Direction of gravity for a patient lying supine (RAS).
 
@@ -45,20 +45,20 @@ def get_supine_pose(time: float) -> HeadPose:
     return HeadPose()
 
 
-def build_drainage(seconds: float, to: float = 0.0) -> Lie:
-    """Return a supine pose whose fluid falls to a share of its height within `seconds`."""
-    return lambda time: HeadPose(fluid=1.0 - (1.0 - to) * smooth(time / seconds))
+def build_drainage(duration: float, level: float = 0.0) -> Lie:
+    """Return a supine pose whose fluid falls to a share of its height within `duration`."""
+    return lambda time: HeadPose(fluid=1.0 - (1.0 - level) * smooth_step(time / duration))
 
 
-def build_drained_turn(drain: float, pause: float, turn: float, angle: float, to: float = 0.0) -> Lie:
-    """Build a pose: supine while fluid falls to a share in `drain` [s]; `pause` [s]; then a turn by `angle` [rad].
+def build_drained_turn(drain_time: float, pause_time: float, turn_time: float, angle: float, level: float = 0.0) -> Lie:
+    """Build a pose: supine while fluid falls to a share `level`, a pause, then a turn by `angle` [rad]; times in s.
 
-    A positive angle brings the left side down; the turn takes `turn` [s].
+    A positive angle brings the left side down; the turn takes `turn_time` [s].
     """
-    falling = build_drainage(drain, to)
+    falling = build_drainage(drain_time, level)
 
     def lie(time: float) -> HeadPose:
-        turned = angle * smooth((time - drain - pause) / turn)
+        turned = angle * smooth_step((time - drain_time - pause_time) / turn_time)
         return HeadPose((-float(np.sin(turned)), -float(np.cos(turned)), 0.0), falling(time).fluid)
 
     return lie

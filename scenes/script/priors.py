@@ -48,16 +48,16 @@ class ParameterPrior:
     meaning: str
     source: str
 
-    def compute_quantiles(self, share: np.ndarray) -> np.ndarray:
-        """Return the quantiles of the distribution at probabilities `share` (n,) in (0, 1)."""
+    def compute_quantiles(self, probabilities: np.ndarray) -> np.ndarray:
+        """Return the quantiles of the distribution at probabilities `probabilities` (n,) in (0, 1)."""
         low, high = self.range
         match self.law:
             case "uniform":
-                return low + (high - low) * share
+                return low + (high - low) * probabilities
             case "log-uniform":
-                return low * (high / low) ** share
+                return low * (high / low) ** probabilities
             case _:
-                return high * ndtri(share)
+                return high * ndtri(probabilities)
 
 
 STIFFNESS = ParameterPrior(
@@ -152,12 +152,12 @@ def sample_priors(count: int, seed: int = 0) -> list[PatientSample]:
 
 
 def sample_from_fit(
-    tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0, ratio: float = 1.0
+    tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0, tumour_ratio: float = 1.0
 ) -> list[PatientSample]:
     """Draw `count` samples whose tissue and skull are from a fit; the other parameters as in `sample_priors`.
 
-    `young` [Pa] is the scene's own modulus, `ratio` its tumour's relative stiffness, and `skulls` the skulls that it
-    may have. Parameters that were not fitted keep their prior.
+    `young` [Pa] is the scene's own modulus, `tumour_ratio` its tumour's relative stiffness, and `skulls` its possible
+    skulls. Parameters that were not fitted keep their prior.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def sample_from_fit(
     for number, one in enumerate(sample_priors(count, seed)):
         stiffness = one.stiffness if moduli is None else float(moduli[number]) / young
         skull = (list(skulls).index(names[number]) + 0.5) / len(skulls)
-        own = {"poisson": float(poisson[number]), "ratio": float(ratios[number]) / ratio}
+        own = {"poisson": float(poisson[number]), "ratio": float(ratios[number]) / tumour_ratio}
         made.append(replace(one, stiffness=stiffness, skull=skull, **own))
     return made
 
@@ -187,6 +187,6 @@ def sample_rigid_errors(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarr
     return shift, SEGMENTATION_PRIOR.range[1] * random.standard_normal(count)
 
 
-def choose_name(share: float, names: Sequence[str]) -> str:
+def choose_name(probability: float, names: Sequence[str]) -> str:
     """Return the name that a share in [0, 1) selects, all with equal probability."""
-    return names[min(int(share * len(names)), len(names) - 1)]
+    return names[min(int(probability * len(names)), len(names) - 1)]

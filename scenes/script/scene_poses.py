@@ -15,7 +15,7 @@ DEPTHS = 8  # Number of depths at each place.
 DEPTH_MARGIN = 1.05  # Largest sampled depth over the largest depth of the script.
 
 
-def draw_scene_poses(scene: Scene, site: CraniotomyFrame, count: int, seed: int) -> tuple[BuiltIn, Loads]:
+def sample_scene_poses(scene: Scene, site: CraniotomyFrame, count: int, seed: int) -> tuple[BuiltIn, Loads]:
     """Sample `count` poses of a scene's tool, and return both: places uniform by area, each with eight depths.
 
     Load i depends on the seed and on i alone: places are a Halton sequence, shifted by the seed (Cranley, Patterson

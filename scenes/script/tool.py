@@ -25,15 +25,15 @@ def build_capsule(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]
     return np.asarray(rod.vertices), np.asarray(rod.faces)
 
 
-def add_shaft(shape: BuiltIn, top: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the surface of a tool with a known shape only, on a straight shaft to `top` (3,) [m].
+def add_shaft(shape: BuiltIn, shaft_end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the surface of a tool with a known shape only, on a straight shaft to `shaft_end` (3,) [m].
 
     Vertices (n, 3) [m] in the tool's own frame, and triangles (m, 3).
     """
     core = get_core(shape)
     ball = core.radius * build_sphere(3)[0]
     head = trimesh.convex.convex_hull((core.corners[:, None] + ball).reshape(-1, 3))
-    shaft = trimesh.creation.cylinder(SHAFT_RADIUS, segment=[core.centre, top], sections=24)
+    shaft = trimesh.creation.cylinder(SHAFT_RADIUS, segment=[core.centre, shaft_end], sections=24)
     both = head + shaft
     return np.asarray(both.vertices), np.asarray(both.faces)
 

@@ -40,12 +40,12 @@ IDLE_HEIGHT = 4e-3  # Height of an idle tool above the tissue [m].
 MIN_VISIBLE_FORCE = 2e-3
 
 
-def compute_lift(force: float) -> float:
+def compute_tool_height(force: float) -> float:
     """Return the height [m] above the tissue of a drawn tool that pushes with a force [N]: `IDLE_HEIGHT` when idle."""
     return IDLE_HEIGHT * max(0.0, 1.0 - force / MIN_VISIBLE_FORCE)
 
 
-def smooth(t: float) -> float:
+def smooth_step(t: float) -> float:
     """Return the minimum-jerk polynomial 6 t^5 - 15 t^4 + 10 t^3, from 0 to 1 for t from 0 to 1, at rest at both ends.
 
     Flash, Hogan 1985, J. Neurosci. 5:1688-1703.
@@ -71,7 +71,7 @@ def press(force: float, rise: float = 1.5, hold: float = 1.0, at: tuple[float, f
     """
 
     def path(time: float) -> Touch:
-        return Touch(*at, force * (smooth(time / rise) - smooth((time - rise - hold) / rise)))
+        return Touch(*at, force * (smooth_step(time / rise) - smooth_step((time - rise - hold) / rise)))
 
     return path
 
@@ -82,9 +82,10 @@ def slide(
     """Press with `force` [N], move from `start` to `end` [m] within `seconds`, and release."""
 
     def path(time: float) -> Touch:
-        share = smooth((time - rise) / seconds)
+        share = smooth_step((time - rise) / seconds)
         x, y = (1.0 - share) * np.array(start) + share * np.array(end)
-        return Touch(float(x), float(y), force * (smooth(time / rise) - smooth((time - rise - seconds) / rise)))
+        pressed = smooth_step(time / rise) - smooth_step((time - rise - seconds) / rise)
+        return Touch(float(x), float(y), force * pressed)
 
     return path
 
@@ -93,9 +94,9 @@ def draw(force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tu
     """Press, then draw the tissue aside: the force turns by `tilt` [rad] towards x while it rises; hold; release."""
 
     def path(time: float) -> Touch:
-        drawn = smooth((time - 0.5 * rise) / rise)
-        let_go = smooth((time - 1.5 * rise - hold) / rise)
-        return Touch(*at, force * (smooth(time / rise) - let_go), (tilt * drawn, 0.0))
+        drawn = smooth_step((time - 0.5 * rise) / rise)
+        let_go = smooth_step((time - 1.5 * rise - hold) / rise)
+        return Touch(*at, force * (smooth_step(time / rise) - let_go), (tilt * drawn, 0.0))
 
     return path
 
@@ -119,7 +120,7 @@ def lay(
     """Lower by `IDLE_HEIGHT` and on to `depth` [m] within `rise` [s], `tilt` [rad] towards x; hold [s]; lift off."""
 
     def path(time: float) -> Touch:
-        share = smooth(time / rise) - smooth((time - rise - hold) / rise)
+        share = smooth_step(time / rise) - smooth_step((time - rise - hold) / rise)
         return Touch(*at, tilt=(tilt, 0.0), depth=_interpolate_depth(share, depth))
 
     return path

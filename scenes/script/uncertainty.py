@@ -37,27 +37,27 @@ class TumourError:
     ----------
     prior
         95 % bound on the maximum error over its surface [m], without observation; None: not known.
-    largest
+    main_source
         Name of the largest contributor to `prior`.
     observed
         Bound with observations of the brain [m]; None without observations.
     moved
         95 % bound on the error of its mean displacement since the scan [m], without observation.
-    guess
+    is_rough
         True if `prior` is a rough estimate, as in `Uncertainty.guess` and by `MotionError`.
     registration
         Standard deviation along each axis [m] of the registration that the bound includes; None: not available.
     """
 
     prior: float | None
-    largest: str = ""
+    main_source: str = ""
     observed: float | None = None
     moved: float | None = None
-    guess: bool = False
+    is_rough: bool = False
     registration: float | None = field(default=None, compare=False)
 
     @property
-    def registration_words(self) -> str:
+    def registration_text(self) -> str:
         """Description of the registration's standard deviation along each axis; empty if not available."""
         if self.registration is None or self.bound is None:
             return ""
@@ -126,28 +126,28 @@ class Uncertainty:
     deviation: float | None = None
 
     @property
-    def few(self) -> bool:
+    def has_few_draws(self) -> bool:
         """True if fewer than two draws were solved per fitted parameter."""
         return self.draws - self.failed < 2 * self.numbers
 
     @property
-    def guess(self) -> bool:
+    def is_rough(self) -> bool:
         """True if the bound is only a rough estimate: few draws, or a load beyond the range of the tissue law."""
-        return self.few or self.folded > 0
+        return self.has_few_draws or self.folded > 0
 
-    def evaluate(self, time: float, surrogate: float = 0.0, registration: Registration = "clinical") -> TumourError:
+    def evaluate(self, time: float, model_bound: float = 0.0, registration: Registration = "clinical") -> TumourError:
         """Return the error at a time [s], where a trained model adds its own bound [m]."""
         deviation = REGISTRATIONS[registration]
-        parts = {name: self.read(values, time) for name, values in self.parts.items()}
-        parts[SURROGATE] = surrogate / BOUND_DEVIATIONS
+        parts = {name: self.interpolate(values, time) for name, values in self.parts.items()}
+        parts[SURROGATE] = model_bound / BOUND_DEVIATIONS
         if not deviation:
             parts.pop(REGISTRATION, None)
-        worst = float(np.hypot(self.read(self.worst if deviation else self.registered, time), surrogate))
-        moved = float(np.hypot(self.read(self.motion, time), surrogate))
+        worst = float(np.hypot(self.interpolate(self.worst if deviation else self.registered, time), model_bound))
+        moved = float(np.hypot(self.interpolate(self.motion, time), model_bound))
         largest = max(parts, key=lambda name: parts[name])
-        return TumourError(worst, largest, moved=moved, guess=self.guess, registration=deviation)
+        return TumourError(worst, largest, moved=moved, is_rough=self.is_rough, registration=deviation)
 
-    def read(self, values: tuple[float, ...], time: float) -> float:
+    def interpolate(self, values: tuple[float, ...], time: float) -> float:
         """Interpolate one of the lists linearly at a time [s]."""
         return float(np.interp(time, self.times, values))
 
@@ -169,20 +169,20 @@ class MotionError:
     surface: float
     mean: float
 
-    def evaluate(self, motion: float, surrogate: float, registration: Registration) -> TumourError:
+    def evaluate(self, motion: float, model_bound: float, registration: Registration) -> TumourError:
         """Return the error at a mean motion [m], where a trained model adds its own bound [m]."""
-        worst = float(np.linalg.norm([self.rest[registration], self.surface * motion, surrogate]))
-        moved = float(np.hypot(self.mean * motion, surrogate))
-        return TumourError(worst, moved=moved, guess=True, registration=REGISTRATIONS[registration])
+        worst = float(np.linalg.norm([self.rest[registration], self.surface * motion, model_bound]))
+        moved = float(np.hypot(self.mean * motion, model_bound))
+        return TumourError(worst, moved=moved, is_rough=True, registration=REGISTRATIONS[registration])
 
 
-def fit_motion_error(found: Uncertainty) -> MotionError | None:
+def fit_motion_error(ensemble: Uncertainty) -> MotionError | None:
     """Fit the error of a scene's motion in proportion to it; None if the tumour hardly moves in the scene."""
-    moved, worst, mean = (np.array(values) for values in (found.moved, found.registered, found.motion))
+    moved, worst, mean = (np.array(values) for values in (ensemble.moved, ensemble.registered, ensemble.motion))
     if moved.max() < MIN_MOTION:
         return None
     enough = moved > MIN_MOTION_RATIO * moved.max()
-    rest: dict[Registration, float] = {"perfect": found.registered[0], "clinical": found.worst[0]}
+    rest: dict[Registration, float] = {"perfect": ensemble.registered[0], "clinical": ensemble.worst[0]}
     surface = np.sqrt(np.maximum(worst**2 - worst[0] ** 2, 0.0))[enough] / moved[enough]
     return MotionError(rest, float(surface.max()), float((mean[enough] / moved[enough]).max()))
 
@@ -246,9 +246,9 @@ def _read(row: dict) -> Uncertainty:
     )  # fmt: skip
 
 
-def write_uncertainties(path: Path, found: Iterable[Uncertainty]) -> None:
+def write_uncertainties(path: Path, uncertainties: Iterable[Uncertainty]) -> None:
     """Add scenes to a file; replace those with the same name."""
-    scenes = read_uncertainties(path) | {one.scene: one for one in found}
+    scenes = read_uncertainties(path) | {one.scene: one for one in uncertainties}
     rows = {name: asdict(scenes[name]) for name in sorted(scenes)}
     stored = {"format": FORMAT, "unit": "m", "level": LEVEL, "scenes": rows}
     with write_atomically(path, ".json") as unfinished:

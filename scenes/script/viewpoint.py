@@ -13,7 +13,7 @@ from sim.errors import InputError
 
 from .camera_paths import CameraPath
 from .craniotomy_frame import CraniotomyFrame
-from .framing import Framing, compute_outward, find_framing
+from .framing import Framing, compute_view_direction, find_framing
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Viewpoint:
     def build_camera(self, site: CraniotomyFrame, time: float = 0.0) -> Camera:
         """Return the camera that looks at a site at a time [s]."""
         target = self.find_target(site)
-        outward = self.find_framing(site).outward if self.tilt is None else compute_outward(site, -self.tilt)
+        outward = self.find_framing(site).direction if self.tilt is None else compute_view_direction(site, -self.tilt)
         fov = self.find_framing(site).fov if self.fov is None else self.fov
         away = self.distance
         if self.calibration is not None and self.tilt is None:  # far enough for its own field of view

@@ -34,35 +34,36 @@ class Agreement:
 
     Parameters
     ----------
-    places
+    positions
         Positions in the body's frame (n, 3) [m], by the target's name.
-    doubts
+    inconsistencies
         Inconsistency of the poses with the last image of the target, by its name; empty: none.
     settings
         Limits of the warnings.
     """
 
-    places: Mapping[str, np.ndarray] = field(default_factory=dict)
-    doubts: Mapping[str, str] = field(default_factory=dict)
+    positions: Mapping[str, np.ndarray] = field(default_factory=dict)
+    inconsistencies: Mapping[str, str] = field(default_factory=dict)
     settings: AgreementSettings = AgreementSettings()
 
     @property
-    def doubt(self) -> str:
+    def inconsistency(self) -> str:
         """Description of the inconsistency of the poses; empty: none."""
-        return next(filter(None, self.doubts.values()), "")
+        return next(filter(None, self.inconsistencies.values()), "")
 
-    def add_image(self, name: str, target: Pose, body: Pose, swapped: Pose | None) -> Agreement:
+    def add_image(self, name: str, target_pose: Pose, body_pose: Pose, swapped_pose: Pose | None) -> Agreement:
         """Add an image: observed target pose, its body's pose, and the body's pose with swapped files.
 
         All are in one frame. A target whose position is too uncertain is skipped.
         """
-        if np.linalg.eigvalsh(target.covariance[:3, :3])[-1] > self.settings.max_pose_deviation**2:
+        if np.linalg.eigvalsh(target_pose.covariance[:3, :3])[-1] > self.settings.max_pose_deviation**2:
             return self
-        place, other = (None if each is None else _compute_target_position(target, each) for each in (body, swapped))
+        bodies = body_pose, swapped_pose
+        place, other = (None if each is None else _compute_target_position(target_pose, each) for each in bodies)
         assert place is not None
-        places = np.vstack([self.places.get(name, np.empty((0, 3))), place])[-self.settings.max_kept_images :]
+        places = np.vstack([self.positions.get(name, np.empty((0, 3))), place])[-self.settings.max_kept_images :]
         doubt = _describe_doubt(name, places, other, self.settings)
-        return Agreement({**self.places, name: places}, {**self.doubts, name: doubt}, self.settings)
+        return Agreement({**self.positions, name: places}, {**self.inconsistencies, name: doubt}, self.settings)
 
 
 def _compute_target_position(target: Pose, body: Pose) -> np.ndarray:

@@ -20,14 +20,14 @@ class BoardDetections:
         Views of the board, from the images that show it.
     width, height
         Size of all images [pixel].
-    looked_at
+    image_count
         Number of examined images.
     """
 
     views: tuple[BoardView, ...]
     width: int
     height: int
-    looked_at: int
+    image_count: int
 
 
 def detect_board(path: Path, board: Target, size: tuple[int, int] | None = None) -> BoardDetections:

@@ -80,7 +80,7 @@ def build_intrinsics_header(calibration: Calibration, covariance: np.ndarray) ->
     }
 
 
-def write_exactly_known(path: str | Path, calibration: Calibration) -> None:
+def write_exact_intrinsics(path: str | Path, calibration: Calibration) -> None:
     """Write, atomically, the K.json of an exactly known camera, for example of a rendered video.
 
     Raises

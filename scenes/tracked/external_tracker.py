@@ -20,7 +20,7 @@ from sim.errors import InputError
 from sim.runtime.outside_files import wrap_errors
 
 from .agreement import Agreement
-from .pose_file import TrackedRow
+from .pose_file import TrackedPose
 
 REST_POSE = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
 """Pose of the camera in its own coordinate system."""
@@ -28,8 +28,8 @@ REST_POSE = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
 MAX_TIME_GAP = 1.0
 
 
-def track_rows(film: Iterable[Named], calibration: Calibration, body: str, frame: str) -> Iterator[TrackedRow]:
-    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `frame` of a visible one of them.
+def track_images(images: Iterable[Named], calibration: Calibration, body: str, reference: str) -> Iterator[TrackedPose]:
+    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `reference` of a visible one of them.
 
     Raises
     ------
@@ -37,20 +37,20 @@ def track_rows(film: Iterable[Named], calibration: Calibration, body: str, frame
         Images of another size than the camera was calibrated at.
     """
     targets = {each.name: each for each in list_targets()}
-    wanted = [each for each in (body, frame) if each != "camera"]
+    wanted = [each for each in (body, reference) if each != "camera"]
     tracker = Tracker(calibration.build_camera(np.eye(4)), tuple(targets[name] for name in wanted))
     state: TrackedTargets | None = None
-    for picture in film:
+    for picture in images:
         begun = time.perf_counter()
         state = tracker.track(picture.grey, state)
         verdict, pose, lacks = _select_pose(state, wanted)
         if pose is not None and body == "camera":
             pose = REST_POSE.transform_to(pose)
-        yield TrackedRow(picture.time, verdict, pose, time.perf_counter() - begun, lacks)
+        yield TrackedPose(picture.time, verdict, pose, time.perf_counter() - begun, lacks)
 
 
-def follow_body(path: Path, calibration: Calibration, body: str, frame: str, rate: float) -> Iterator[TrackedRow]:
-    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `frame` of a visible one of them.
+def track_video(path: Path, calibration: Calibration, body: str, reference: str, rate: float) -> Iterator[TrackedPose]:
+    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `reference` of a visible one of them.
 
     Times are the stamps in the images, or else those of the video.
 
@@ -62,7 +62,7 @@ def follow_body(path: Path, calibration: Calibration, body: str, frame: str, rat
     count = 0
     with wrap_errors(path, "a video", REMEDY):
         try:
-            for row in track_rows(map(_set_stamped_time, read_video(path, rate)), calibration, body, frame):
+            for row in track_images(map(_set_stamped_time, read_video(path, rate)), calibration, body, reference):
                 count += 1
                 yield row
         except ValueError as error:
@@ -96,13 +96,13 @@ class CameraMount:
         (4, 4) [m]: from the camera to the body that it is fixed to.
     covariance
         Covariance (6, 6) of a camera translation [m] and a small rotation about it [rad], in the axes of that body.
-    body
+    poses
         Poses of that body; None: the tracker's own frame.
     """
 
     T_body_camera: np.ndarray
     covariance: np.ndarray
-    body: PoseStream | None = None
+    poses: PoseStream | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,59 +111,58 @@ class ExternalTracker:
 
     Parameters
     ----------
-    tool, patient
+    tool_poses, reference_poses
         Poses of the tool and of the patient's reference.
     clock
         Offset of its clock from that of the images.
-    eye
+    mount
         Pose of the camera; None: its images determine it relative to the printed reference.
     """
 
-    tool: PoseStream
-    patient: PoseStream
+    tool_poses: PoseStream
+    reference_poses: PoseStream
     clock: Clock = field(default_factory=Clock)
-    eye: CameraMount | None = None
+    mount: CameraMount | None = None
 
-    def find_tool(self, time: float) -> Pose | None:
+    def find_tool_pose(self, time: float) -> Pose | None:
         """Return the tool relative to the reference, in the image of a time [s]; None if the poses are missing."""
         return self._interpolate_pose(time, self._interpolate_tool)
 
-    def find_reference(self, time: float) -> Pose | None:
+    def find_reference_pose(self, time: float) -> Pose | None:
         """Return the reference in the camera's frame, in the image of a time [s]; None if it is unknown."""
         return self._interpolate_pose(time, self._locate_in_camera)
 
     @property
-    def swapped(self) -> ExternalTracker:
+    def swapped_tracker(self) -> ExternalTracker:
         """External tracker with the poses of tool and reference exchanged."""
-        return replace(self, tool=self.patient, patient=self.tool)
+        return replace(self, tool_poses=self.reference_poses, reference_poses=self.tool_poses)
 
-    def compare_targets(self, time: float, seen: Mapping[str, Pose], before: Agreement) -> Agreement:
+    def compare_targets(self, time: float, observed: Mapping[str, Pose], agreement: Agreement) -> Agreement:
         """Check these poses against the printed targets that are visible in the image of a time [s].
 
-        `seen` has the targets in the camera's frame, by name. If images determine the camera relative to the reference,
-        only
-        the tool's poses can be compared.
+        `observed` has the targets in the camera's frame, by name. If images determine the camera relative to the
+        reference, only the tool's poses can be compared.
         """
-        reference, tool = (seen.get(target().name) for target in (build_patient_reference, build_tool_cube))
-        if self.eye is None:
-            body, other = self.find_tool(time), self.swapped.find_tool(time)
+        reference, tool = (observed.get(target().name) for target in (build_patient_reference, build_tool_cube))
+        if self.mount is None:
+            body, other = self.find_tool_pose(time), self.swapped_tracker.find_tool_pose(time)
             if tool is None or reference is None or body is None:
-                return before
-            return before.add_image(build_tool_cube().name, tool.transform_to(reference), body, other)
-        body, other = self.find_reference(time), self.swapped.find_reference(time)
+                return agreement
+            return agreement.add_image(build_tool_cube().name, tool.transform_to(reference), body, other)
+        body, other = self.find_reference_pose(time), self.swapped_tracker.find_reference_pose(time)
         for each, target, a, b in (("patient", reference, body, other), ("tool", tool, other, body)):
-            before = before if target is None or a is None else before.add_image(each, target, a, b)
-        return before
+            agreement = agreement if target is None or a is None else agreement.add_image(each, target, a, b)
+        return agreement
 
     @property
-    def streams(self) -> dict[str, PoseStream]:
+    def pose_streams(self) -> dict[str, PoseStream]:
         """Streams of poses by body: tool, patient, and a tracked camera."""
-        camera = {} if self.eye is None or self.eye.body is None else {"camera": self.eye.body}
-        return {"tool": self.tool, "patient": self.patient, **camera}
+        camera = {} if self.mount is None or self.mount.poses is None else {"camera": self.mount.poses}
+        return {"tool": self.tool_poses, "patient": self.reference_poses, **camera}
 
     def describe_mismatch(self, time: float) -> str:
         """Describe the body whose poses are all far from the image of a time [s], and by how much; empty: none."""
-        for name, stream in self.streams.items():
+        for name, stream in self.pose_streams.items():
             at = stream.to_stream_day(time + self.clock.offset)
             first, last = stream.times[[0, -1]].tolist()
             if at < first - MAX_TIME_GAP:
@@ -175,7 +174,7 @@ class ExternalTracker:
     def compute_age(self, time: float) -> float | None:
         """Return the age [s] of the poses at an image's time [s]; None if current ones exist."""
         time = time + self.clock.offset
-        missing = [each.compute_age(time) for each in self.streams.values() if each.interpolate(time) is None]
+        missing = [each.compute_age(time) for each in self.pose_streams.values() if each.interpolate(time) is None]
         return max(missing) if missing else None
 
     def _interpolate_pose(self, time: float, pose_at: Callable[[float], Pose | None]) -> Pose | None:
@@ -192,41 +191,41 @@ class ExternalTracker:
         return Pose(T, pose.covariance + np.outer(step, step), pose.residual, pose.corners)
 
     def _interpolate_tool(self, time: float) -> Pose | None:
-        tool, patient = self.tool.interpolate(time), self.patient.interpolate(time)
+        tool, patient = self.tool_poses.interpolate(time), self.reference_poses.interpolate(time)
         return None if tool is None or patient is None else tool.transform_to(patient)
 
     def _locate_in_camera(self, time: float) -> Pose | None:
-        assert self.eye is not None
-        patient = self.patient.interpolate(time)
-        body = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 0) if self.eye.body is None else self.eye.body.interpolate(time)
+        assert self.mount is not None
+        patient, poses = self.reference_poses.interpolate(time), self.mount.poses
+        body = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 0) if poses is None else poses.interpolate(time)
         if patient is None or body is None:
             return None
         beside = patient.transform_to(body)
-        T_camera_body = np.linalg.inv(self.eye.T_body_camera)
-        arm = beside.T_camera_target[:3, 3] - self.eye.T_body_camera[:3, 3]
+        T_camera_body = np.linalg.inv(self.mount.T_body_camera)
+        arm = beside.T_camera_target[:3, 3] - self.mount.T_body_camera[:3, 3]
         slope = np.block([[-np.eye(3), build_cross_matrices(arm)], [np.zeros((3, 3)), -np.eye(3)]])
-        whole = beside.covariance + slope @ self.eye.covariance @ slope.T
+        whole = beside.covariance + slope @ self.mount.covariance @ slope.T
         turned = np.kron(np.eye(2), T_camera_body[:3, :3])
         return Pose(T_camera_body @ beside.T_camera_target, turned @ whole @ turned.T, 0.0, 0)
 
 
 def estimate_video_clock(
-    film: Iterable[Named], calibration: Calibration, tool: PoseStream, patient: PoseStream
+    images: Iterable[Named], calibration: Calibration, tool_poses: PoseStream, reference_poses: PoseStream
 ) -> Clock:
     """Estimate the clock offset between the tracker and a video that shows the printed cube and reference.
 
     Raises
     ------
     ValueError
-        See `estimate_clock_by_motion` and `track_rows`.
+        See `estimate_clock_by_motion` and `track_images`.
     """
-    film_rows = track_rows(film, calibration, build_tool_cube().name, build_patient_reference().name)
+    film_rows = track_images(images, calibration, build_tool_cube().name, build_patient_reference().name)
     seen = [(row.time, row.pose) for row in film_rows if row.pose is not None]
     times, places = [time for time, _ in seen], [pose.T_camera_target[:3, 3] for _, pose in seen]
     both = [
         (time, pose)
-        for time in tool.times.tolist()
-        if (pose := ExternalTracker(tool, patient).find_tool(time)) is not None
+        for time in tool_poses.times.tolist()
+        if (pose := ExternalTracker(tool_poses, reference_poses).find_tool_pose(time)) is not None
     ]
     others = [pose.T_camera_target[:3, 3] for _, pose in both]
     if not both:

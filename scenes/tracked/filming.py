@@ -70,7 +70,7 @@ def place_reference(site: CraniotomyFrame, camera: Camera) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Trouble:
+class Disturbance:
     """Disturbance of the images from one time to another [s].
 
     Raises
@@ -80,28 +80,28 @@ class Trouble:
     """
 
     kind: str
-    since: float
-    until: float
+    start: float
+    end: float
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise InputError(f"no trouble is called {self.kind!r}: choose one of {', '.join(KINDS)}.")
-        if not 0.0 <= self.since < self.until < np.inf:
-            raise InputError(f"{self.kind} is from {self.since:g} to {self.until:g} s: give two times in order.")
+        if not 0.0 <= self.start < self.end < np.inf:
+            raise InputError(f"{self.kind} is from {self.start:g} to {self.end:g} s: give two times in order.")
 
 
 @dataclass(frozen=True)
-class Taking:
+class Artefacts:
     """Image degradation: blur [pixel] and noise [of 255] as standard deviations, and disturbances."""
 
     blur: float = 0.5
     noise: float = 2.0
-    troubles: tuple[Trouble, ...] = ()
+    disturbances: tuple[Disturbance, ...] = ()
     seed: int = 0
 
     def list_disturbances(self, time: float) -> set[str]:
         """Return the disturbances at a time [s]."""
-        return {each.kind for each in self.troubles if each.since <= time < each.until}
+        return {each.kind for each in self.disturbances if each.start <= time < each.end}
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,7 @@ class VideoFrame:
     ----------
     time
         [s].
-    colour
+    image
         Image (H, W, 3) uint8.
     T_camera_scan, T_scan_tool
         Poses (4, 4) [m].
@@ -121,21 +121,21 @@ class VideoFrame:
     """
 
     time: float
-    colour: np.ndarray
+    image: np.ndarray
     T_camera_scan: np.ndarray
     T_scan_tool: np.ndarray
     displacement: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class Mounted:
+class Mounts:
     """Printed targets of a video: the tool with its cube, and T_scan_patient (4, 4) of the reference."""
 
     tool: TrackedTool
     T_scan_patient: np.ndarray
 
 
-def mount_targets(player: Player) -> Mounted:
+def mount_targets(player: Player) -> Mounts:
     """Mount a cube on the scene's tool and a reference near the opening, both facing the initial camera.
 
     Raises
@@ -156,23 +156,25 @@ def mount_targets(player: Player) -> Mounted:
     towards = pose[:3, :3].T @ (camera.centre - pose[:3, :3] @ T_tool_cube[:3, 3] - pose[:3, 3])
     turn = np.arctan2(towards[1], towards[0]) - 0.25 * np.pi  # the edge between two sides of the cube faces the camera
     T_tool_cube[:3, :3] = Rotation.from_euler("z", turn).as_matrix()
-    return Mounted(TrackedTool(shape, np.linalg.inv(T_tool_cube)), place_reference(site, camera))
+    return Mounts(TrackedTool(shape, np.linalg.inv(T_tool_cube)), place_reference(site, camera))
 
 
-def register_with_error(site: CraniotomyFrame, mounts: Mounted, shift: float, turn: float, seed: int) -> Registration:
+def register_with_error(
+    site: CraniotomyFrame, targets: Mounts, shift_mm: float, angle_deg: float, seed: int
+) -> Registration:
     """Draw the reference's registration to the scan, with one random error of the given standard deviations.
 
-    `shift` [mm] and `turn` [degree] are its standard deviations along and about each axis, about the opening's centre.
+    The deviations are along and about each axis through the opening's centre.
     """
-    deviations = np.repeat([1e-3 * shift, np.radians(turn)], 3)
+    deviations = np.repeat([1e-3 * shift_mm, np.radians(angle_deg)], 3)
     error = deviations * np.random.default_rng([seed, 1]).standard_normal(6)
     centre = site.origin
-    T = move_about(np.linalg.inv(mounts.T_scan_patient), centre, error)
+    T = move_about(np.linalg.inv(targets.T_scan_patient), centre, error)
     return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scanned=describe_scan(site.anatomy))
 
 
-def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1) -> Iterator[VideoFrame]:
-    """Render the images of a scene, one in `every` frames; the deformer's solutions are the ground truth.
+def render_frames(player: Player, mounts: Mounts, artefacts: Artefacts, step: int = 1) -> Iterator[VideoFrame]:
+    """Render the images of a scene, one in `step` frames; the deformer's solutions are the ground truth.
 
     With a rolling shutter, each row is rendered from its own camera pose; tool and tissue are those of the image's
     time. The ground-truth camera of such an image is that of the row that shows the tumour's centroid.
@@ -183,10 +185,10 @@ def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1
     calibration = player.scene.viewpoint.calibration
     readout = 0.0 if calibration is None else calibration.readout
     rest = site.anatomy.mesh.nodes
-    for number in range(0, len(player.scene.times), every):
+    for number in range(0, len(player.scene.times), step):
         time, touch = float(player.scene.times[number]), player.get_touch(number)
         last = player.compute_deformation(player.build_loads(number, touch), last)
-        wrong = taking.list_disturbances(time)
+        wrong = artefacts.list_disturbances(time)
         if "gap" in wrong:
             continue
         positions = player.compute_positions(last)
@@ -216,7 +218,7 @@ def render_shots(player: Player, mounts: Mounted, taking: Taking, every: int = 1
         moved = tumour - rest[stage.tumour_vertices]
         yield VideoFrame(
             time,
-            stamp_time(_apply_disturbances(shown, taking, wrong, number), time),
+            stamp_time(_apply_disturbances(shown, artefacts, wrong, number), time),
             camera.T_camera_world,
             pose,
             moved,
@@ -254,16 +256,16 @@ def _draw_hand(colour: np.ndarray, camera: Camera, target: Target, T_scan_target
     return out
 
 
-def _apply_disturbances(colour: np.ndarray, taking: Taking, wrong: Sequence[str] | set[str], number: int) -> np.ndarray:
+def _apply_disturbances(image: np.ndarray, noise: Artefacts, wrong: Sequence[str] | set[str], frame: int) -> np.ndarray:
     """Apply blur, noise and the global disturbances to an image."""
-    out = colour.astype(np.float32)
+    out = image.astype(np.float32)
     if "bright" in wrong:
         out *= BRIGHT_FACTOR
     if "smear" in wrong:
         out = uniform_filter1d(out, SMEAR_LENGTH, axis=1)
-    if taking.blur > 0.0:
-        out = gaussian_filter(out, (taking.blur, taking.blur, 0.0))
-    if taking.noise > 0.0:
-        random = np.random.default_rng([taking.seed, number])
-        out = out + taking.noise * random.standard_normal(out.shape, np.float32)
+    if noise.blur > 0.0:
+        out = gaussian_filter(out, (noise.blur, noise.blur, 0.0))
+    if noise.noise > 0.0:
+        random = np.random.default_rng([noise.seed, frame])
+        out = out + noise.noise * random.standard_normal(out.shape, np.float32)
     return np.clip(np.rint(out), 0.0, 255.0).astype(np.uint8)

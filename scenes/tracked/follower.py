@@ -18,7 +18,7 @@ from ar.tracking.targets import build_patient_reference, build_tool_cube
 from ..script.uncertainty import BOUND_DEVIATIONS, LEVEL
 from .agreement import Agreement
 from .external_tracker import ExternalTracker
-from .plausible import describe_implausible, describe_misplaced_tool
+from .plausible import describe_implausible_registration, describe_misplaced_tool
 from .tool_motion import BrainMotion, ToolMotion
 from .tracked_tool import TrackedTool
 
@@ -71,9 +71,9 @@ class TrackingResult:
     ----------
     time
         Time of the image [s].
-    state, words
+    state, warning
         State of the tumour, and the reason why it is limited or unreliable, for users; empty if it is reliable.
-    tracked
+    targets
         Detected targets.
     motion
         Estimated motion of the brain.
@@ -81,17 +81,17 @@ class TrackingResult:
         Camera with T_camera_scan; None if the reference has been lost for longer than `FollowerSettings.hold_time`.
     T_scan_tool, tip_covariance
         Pose (4, 4) [m] and covariance (3, 3) [m^2], if the tool is visible.
-    band
+    bound
         95 % bound on the tumour's error across the line of sight [m]; None if unknown.
-    parts
+    sources
         Contributions to the bound, by source [m].
     reference_time, tool_time
         Time of the last detection of the reference, and of the tool relative to it [s]; None: never.
     interval
         Shortest interval between two images up to now [s].
-    near
+    was_near
         True once the tool has been near the head: until then the registration may be of another patient.
-    pace
+    image_speed
         Recent speed of the brain across the image [m/s]; None: not known.
     agreement
         Consistency of an external tracker's poses with printed targets in the images.
@@ -99,23 +99,23 @@ class TrackingResult:
 
     time: float
     state: TumourState
-    words: str
-    tracked: TrackedTargets
+    warning: str
+    targets: TrackedTargets
     motion: BrainMotion
     camera: Camera | None = None
     T_scan_tool: np.ndarray | None = None
     tip_covariance: np.ndarray | None = None
-    band: float | None = None
-    parts: Mapping[str, float] = field(default_factory=dict)
+    bound: float | None = None
+    sources: Mapping[str, float] = field(default_factory=dict)
     reference_time: float | None = None
     tool_time: float | None = None
     interval: float = MAX_INTERVAL
-    near: bool = False
-    pace: float | None = None
+    was_near: bool = False
+    image_speed: float | None = None
     agreement: Agreement = field(default_factory=Agreement)
 
     @property
-    def relied(self) -> bool:
+    def is_reliable(self) -> bool:
         """True if the tumour is drawn as reliable."""
         return self.state in (TumourState.GOOD, TumourState.REST)
 
@@ -134,9 +134,9 @@ class Follower:
         Tool with its cube; None: no tool is tracked.
     motion
         Model of the brain's motion under the tool.
-    elsewhere
+    external
         Poses of an external tracker, which replace those of the cube; with a tracked camera, also of the reference.
-    intrinsic
+    intrinsic_covariance
         Covariance (9, 9) of the camera's calibration, of `ar.tracking.intrinsics.PARAMETERS`; None: not available.
     settings
         Limits and factors.
@@ -146,8 +146,8 @@ class Follower:
     registration: Registration
     tool: TrackedTool | None
     motion: ToolMotion
-    elsewhere: ExternalTracker | None = None
-    intrinsic: np.ndarray | None = None
+    external: ExternalTracker | None = None
+    intrinsic_covariance: np.ndarray | None = None
     settings: FollowerSettings = FollowerSettings()
 
     @cached_property
@@ -156,30 +156,30 @@ class Follower:
         wanted = (build_patient_reference(),) if self.tool is None else (build_patient_reference(), build_tool_cube())
         return Tracker(self.calibration.build_camera(np.eye(4)), wanted)
 
-    def step(self, grey: np.ndarray, time: float, before: TrackingResult | None = None) -> TrackingResult:
-        """Compute the tracking result of an image (H, W) uint8 taken at a time [s], from the result `before`.
+    def step(self, grey_image: np.ndarray, time: float, previous: TrackingResult | None = None) -> TrackingResult:
+        """Compute the tracking result of an image (H, W) uint8 taken at a time [s], from the result `previous`.
 
         Raises
         ------
         ValueError
             See `Tracker.track`.
         """
-        known = self._compare_targets(self._compute_result(grey, time, before), before)
-        if before is None:
+        known = self._compare_targets(self._compute_result(grey_image, time, previous), previous)
+        if previous is None:
             return known
-        apart = time - before.time
-        known = replace(known, near=known.near or before.near)
-        return replace(known, interval=min(before.interval, apart) if apart > 0.0 else before.interval)
+        apart = time - previous.time
+        known = replace(known, was_near=known.was_near or previous.was_near)
+        return replace(known, interval=min(previous.interval, apart) if apart > 0.0 else previous.interval)
 
     def _compare_targets(self, known: TrackingResult, before: TrackingResult | None) -> TrackingResult:
         """Check external poses against printed targets; if inconsistent, the tumour position is unreliable."""
-        if self.elsewhere is None:
+        if self.external is None:
             return known
         agreement = Agreement() if before is None else before.agreement
-        known = replace(known, agreement=self.elsewhere.compare_targets(known.time, known.tracked.poses, agreement))
-        if not known.agreement.doubt or not (known.relied or known.state is TumourState.UNSURE):
+        known = replace(known, agreement=self.external.compare_targets(known.time, known.targets.poses, agreement))
+        if not known.agreement.inconsistency or not (known.is_reliable or known.state is TumourState.UNSURE):
             return known
-        return replace(known, state=TumourState.UNSURE, words=known.agreement.doubt, band=None, parts={})
+        return replace(known, state=TumourState.UNSURE, warning=known.agreement.inconsistency, bound=None, sources={})
 
     def _compute_result(self, grey: np.ndarray, time: float, before: TrackingResult | None) -> TrackingResult:
         """Compute the result of `step`, for any intervals."""
@@ -188,9 +188,10 @@ class Follower:
         longest = max(self.settings.max_gap, self.settings.max_gap_intervals * usual)
         stale = apart is not None and not 0.0 < apart <= longest
         forgotten = before is None or (apart is not None and not 0.0 <= apart <= longest)
-        tracked = self.tracker.track(grey, None if before is None or forgotten else before.tracked)
-        other = self.elsewhere
-        reference = tracked.poses.get(PATIENT) if other is None or other.eye is None else other.find_reference(time)
+        tracked = self.tracker.track(grey, None if before is None or forgotten else before.targets)
+        other, reference = self.external, tracked.poses.get(PATIENT)
+        if other is not None and other.mount is not None:
+            reference = other.find_reference_pose(time)
         if reference is None:
             return self._build_without_reference(tracked, time, before)
         T_patient_scan = self.registration.T_patient_scan
@@ -200,32 +201,32 @@ class Follower:
         known = self._compute_motion(tracked, reference, time, before, shutter)
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
         band, parts = self._compute_band(reference, middle, known.motion, shutter)
-        known = replace(known, camera=camera, band=band, parts=parts, reference_time=time, pace=pace)
+        known = replace(known, camera=camera, bound=band, sources=parts, reference_time=time, image_speed=pace)
         doubt, near = self._describe_implausible(camera, known.T_scan_tool, before)
-        known = replace(known, near=near)
-        if known.relied and pace is None and self.calibration.readout > 0.0:
-            known = replace(known, state=TumourState.UNSURE, words=NO_PACE_WARNING)
-        if known.relied and self.registration.scanned is None:
-            known = replace(known, state=TumourState.UNSURE, words=UNCHECKED_WARNING)
+        known = replace(known, was_near=near)
+        if known.is_reliable and pace is None and self.calibration.readout > 0.0:
+            known = replace(known, state=TumourState.UNSURE, warning=NO_PACE_WARNING)
+        if known.is_reliable and self.registration.scanned is None:
+            known = replace(known, state=TumourState.UNSURE, warning=UNCHECKED_WARNING)
         if doubt:
-            known = replace(known, state=TumourState.UNSURE, words=doubt)
+            known = replace(known, state=TumourState.UNSURE, warning=doubt)
         if doubt or known.state is TumourState.UNKNOWN:
-            known = replace(known, band=None, parts={})
+            known = replace(known, bound=None, sources={})
         if stale and apart is not None:
             why = f"no image for {apart:.1f} s" if apart > 0.0 else "the camera repeats an image"
-            return replace(known, state=TumourState.STALE, words=f"stale, {why}: do not rely on it")
+            return replace(known, state=TumourState.STALE, warning=f"stale, {why}: do not rely on it")
         if known.state in (TumourState.GOOD, TumourState.REST) and band > self.settings.max_overlay_error:
-            return replace(known, state=TumourState.UNSURE, words=describe_wide_band(band))
+            return replace(known, state=TumourState.UNSURE, warning=describe_large_error(band))
         return known
 
     def _describe_implausible(
         self, camera: Camera, tool: np.ndarray | None, before: TrackingResult | None
     ) -> tuple[str, bool]:
         """Describe why the registration is implausible for this patient; and return the updated `near`."""
-        stage, near = self.motion.stage, before is not None and before.near
-        theirs = "is this its registration?" if self.elsewhere is None else "are these its poses and registration?"
+        stage, near = self.motion.stage, before is not None and before.was_near
+        theirs = "is this its registration?" if self.external is None else "are these its poses and registration?"
         misplaced, near = ("", near) if tool is None else describe_misplaced_tool(self.tool, tool, stage, near, theirs)
-        doubt = describe_implausible(self.registration, stage, camera) or misplaced
+        doubt = describe_implausible_registration(self.registration, stage, camera) or misplaced
         return doubt, near
 
     def _build_without_reference(
@@ -233,7 +234,7 @@ class Follower:
     ) -> TrackingResult:
         """Return the result without a visible reference: the overlay keeps its position for a short time."""
         seen = None if before is None else before.reference_time
-        motion = self.motion.rest if before is None else before.motion
+        motion = self.motion.rest_motion if before is None else before.motion
         held = before is not None and seen is not None and 0.0 <= time - seen < self.settings.hold_time + TIME_ROUNDING
         camera = before.camera if before is not None and held else None
         why = self._describe_age(time) or ("not seen yet" if seen is None else "lost")
@@ -248,13 +249,13 @@ class Follower:
 
         A hand trembles: the speed during one image may be larger than that between two images.
         """
-        last = None if before is None else before.tracked.poses.get(PATIENT)
+        last = None if before is None else before.targets.poses.get(PATIENT)
         if before is None or last is None or not time > before.time:
             return None
         scan = self.registration.T_patient_scan @ np.append(self.motion.stage.site.origin, 1.0)
         now, then = ((pose.T_camera_target @ scan)[:2] for pose in (reference, last))
         speed = float(np.linalg.norm(now - then)) / (time - before.time)
-        return max(speed, self.settings.speed_decay ** (time - before.time) * (before.pace or 0.0))
+        return max(speed, self.settings.speed_decay ** (time - before.time) * (before.image_speed or 0.0))
 
     def _compute_motion(
         self, tracked: TrackedTargets, reference: Pose, time: float, before: TrackingResult | None, shutter: float
@@ -264,11 +265,11 @@ class Follower:
         beside = self._find_tool(tracked, reference, time)
         if self.tool is None or beside is None:
             if self.motion.deformer is None:
-                state, rest = TumourState.UNKNOWN, self.motion.rest
+                state, rest = TumourState.UNKNOWN, self.motion.rest_motion
                 return TrackingResult(time, state, UNKNOWN_WARNING, tracked, rest, tool_time=tool_time)
             if tool_time is None or last is None:
                 words = f"tool {self._describe_age(time) or 'not seen yet'}: the tumour as in the scan"
-                return TrackingResult(time, TumourState.NO_TOOL, words, tracked, self.motion.rest)
+                return TrackingResult(time, TumourState.NO_TOOL, words, tracked, self.motion.rest_motion)
             words = f"tool {self._describe_age(time) or 'lost'}: the tumour as {time - tool_time:.1f} s ago"
             return TrackingResult(time, TumourState.NO_TOOL, words, tracked, last, tool_time=tool_time)
         into = np.linalg.inv(self.registration.T_patient_scan)
@@ -276,24 +277,24 @@ class Follower:
         spread = compute_tip_covariance(self.registration, self.tool, beside)
         spread = spread + (self.settings.tip_factor * shutter / BOUND_DEVIATIONS) ** 2 * np.eye(3)
         motion = self.motion.compute_motion(pose, spread, last)
-        moved = TumourState.GOOD if motion.moved > 0.0 else TumourState.REST
-        state = TumourState.UNSURE if motion.doubt else moved if motion.known else TumourState.UNKNOWN
-        words = UNKNOWN_WARNING if state is TumourState.UNKNOWN else motion.doubt
+        moved = TumourState.GOOD if motion.distance > 0.0 else TumourState.REST
+        state = TumourState.UNSURE if motion.warning else moved if motion.supported else TumourState.UNKNOWN
+        words = UNKNOWN_WARNING if state is TumourState.UNKNOWN else motion.warning
         return TrackingResult(time, state, words, tracked, motion, None, pose, spread, tool_time=time)
 
     def _find_tool(self, tracked: TrackedTargets, reference: Pose, time: float) -> Pose | None:
         """Return the tool's cube relative to the reference."""
-        if self.elsewhere is not None:
-            return self.elsewhere.find_tool(time)
+        if self.external is not None:
+            return self.external.find_tool_pose(time)
         cube = tracked.poses.get(TOOL)
         return None if cube is None else cube.transform_to(reference)
 
     def _describe_age(self, time: float) -> str:
         """Describe the age of an external tracker's last poses if current ones are missing; else empty."""
-        age = None if self.elsewhere is None else self.elsewhere.compute_age(time)
-        if self.elsewhere is None or age is None:
+        age = None if self.external is None else self.external.compute_age(time)
+        if self.external is None or age is None:
             return ""
-        if outside := self.elsewhere.describe_mismatch(time):
+        if outside := self.external.describe_mismatch(time):
             return f"not known, {outside} (see --clock)"
         return f"stale, no pose for {age:.1f} s" if np.isfinite(age) else "not seen yet by the other tracker"
 
@@ -306,41 +307,41 @@ class Follower:
         turned = reference.T_camera_target[:3, :3]
         registered = turned @ beside @ turned.T
         camera = None
-        if self.intrinsic is not None and (self.elsewhere is None or self.elsewhere.eye is None):
+        if self.intrinsic_covariance is not None and (self.external is None or self.external.mount is None):
             corners = build_patient_reference().faces[0].corners
             camera = compute_calibration_error(
-                self.tracker.camera, reference.T_camera_target, corners, place, self.intrinsic
+                self.tracker.camera, reference.T_camera_target, corners, place, self.intrinsic_covariance
             )
         seen = tracked + registered + (0.0 if camera is None else camera)
         parts = {
-            "tracking": compute_radius_across(tracked, at),
-            **({} if camera is None else {"camera": compute_radius_across(camera, at)}),
-            "registration": compute_radius_across(registered, at),
-            "tool": motion.tool,
-            "model": motion.model,
+            "tracking": compute_error_radius(tracked, at),
+            **({} if camera is None else {"camera": compute_error_radius(camera, at)}),
+            "registration": compute_error_radius(registered, at),
+            "tool": motion.tool_error,
+            "model": motion.model_error,
             **({"shutter": shutter} if self.calibration.readout > 0.0 else {}),
         }
-        return float(np.linalg.norm([compute_radius_across(seen, at), motion.error, shutter])), parts
+        return float(np.linalg.norm([compute_error_radius(seen, at), motion.error, shutter])), parts
 
 
-def describe_wide_band(band: float) -> str:
-    """Describe an error `band` [m] that is too large for a reliable position."""
-    return f"the place is known to {1e3 * band:.0f} mm only: do not rely on it"
+def describe_large_error(error_bound: float) -> str:
+    """Describe an error `error_bound` [m] that is too large for a reliable position."""
+    return f"the place is known to {1e3 * error_bound:.0f} mm only: do not rely on it"
 
 
-def compute_tip_covariance(registration: Registration, tool: TrackedTool, beside: Pose) -> np.ndarray:
+def compute_tip_covariance(registration: Registration, tool: TrackedTool, tool_pose: Pose) -> np.ndarray:
     """Compute a tool tip's covariance (3, 3) [m^2] in the scan: by pose, tool calibration and registration."""
     T = registration.T_patient_scan
-    arm, tracked = beside.point(tool.T_cube_tool[:3, 3])
-    turned = beside.T_camera_target[:3, :3]
+    arm, tracked = tool_pose.point(tool.T_cube_tool[:3, 3])
+    turned = tool_pose.T_camera_target[:3, :3]
     _, registered = registration.point((arm - T[:3, 3]) @ T[:3, :3])
     whole = tracked + turned @ tool.tip_covariance @ turned.T + registered
     return T[:3, :3].T @ whole @ T[:3, :3]
 
 
-def compute_radius_across(covariance: np.ndarray, sight: np.ndarray) -> float:
+def compute_error_radius(covariance: np.ndarray, view_direction: np.ndarray) -> float:
     """Return the radius [m] of 95 % of an error with covariance (3, 3) [m^2] across a line of sight along (3,)."""
-    ray = sight / np.linalg.norm(sight)
+    ray = view_direction / np.linalg.norm(view_direction)
     plane = np.eye(3) - np.outer(ray, ray)
     largest = float(np.linalg.eigvalsh(plane @ covariance @ plane)[-1])
     return float(np.sqrt(chi2.ppf(LEVEL, 2) * max(largest, 0.0)))

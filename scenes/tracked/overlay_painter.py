@@ -15,7 +15,7 @@ from ar.overlay.styles import MIN_REPORTED_SHARE, Opening, Style
 from ar.rendering.layer import Layer
 from ar.rendering.real_image import build_real_image
 
-from ..play.player import measure_gauge
+from ..play.player import measure_tip_gauge
 from ..play.stage import CORTEX, PREDICTED_LINES, TOOL, TOOL_COLOUR, Stage
 from ..script.uncertainty import BOUND_DEVIATIONS
 from .follower import TrackingResult, TumourState
@@ -49,30 +49,30 @@ class Painter:
     style: Style = "window"
     device: str = "cpu"
 
-    def paint(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None = None) -> Overlaid:
+    def paint(self, image: np.ndarray, tracking: TrackingResult, occlusion_mask: np.ndarray | None = None) -> Overlaid:
         """Draw a tracking result on an image (H, W, 3) uint8.
 
         covered (H, W) bool marks foreground in front of the brain, such as a hand. Nothing is drawn over it, and the
         image
         shows the share of the tumour that it hides.
         """
-        if known.state in GREY_STATES or known.camera is None:
-            return self._draw_grey(colour, known, covered)
-        camera, tumour = known.camera, self.stage.build_tumour(known.motion.positions)
-        gauge = self.measure_tip(known, tumour)
-        before = self.stage.tumour_at_rest if known.motion.known and known.motion.moved > 0.0 else None
-        doubt = "" if known.relied else known.words
-        band = 0.0 if known.band is None else known.band
+        if tracking.state in GREY_STATES or tracking.camera is None:
+            return self._draw_grey(image, tracking, occlusion_mask)
+        camera, tumour = tracking.camera, self.stage.build_tumour(tracking.motion.positions)
+        gauge = self.measure_tip_distance(tracking, tumour)
+        before = self.stage.tumour_at_rest if tracking.motion.supported and tracking.motion.distance > 0.0 else None
+        doubt = "" if tracking.is_reliable else tracking.warning
+        band = 0.0 if tracking.bound is None else tracking.bound
         box = find_pixel_box(camera, tumour.vertices)
         if gauge is not None:
             box = join_boxes(box, find_pixel_box(camera, np.stack([gauge.tip, gauge.nearest])))
-        layers = [] if box is None else self._build_layers(known)
+        layers = [] if box is None else self._build_layers(tracking)
         whole = slice(0, camera.height), slice(0, camera.width)
-        picture = build_real_image(colour, camera, layers, box or whole, self.device)
-        lines = [*format_head_lines(known), *self._describe_hidden(camera, tumour, covered)]
+        picture = build_real_image(image, camera, layers, box or whole, self.device)
+        lines = [*format_top_lines(tracking), *self._describe_hidden(camera, tumour, occlusion_mask)]
         head = [part for line in lines for part in wrap_line(line, HEAD_WIDTHS[0] * camera.width)]
-        cover = Cover((TOOL,), SEEN_THROUGH, covered)
-        words = Words(doubt, head, PREDICTED_LINES, (known.motion.moved, known.motion.error), known.band)
+        cover = Cover((TOOL,), SEEN_THROUGH, occlusion_mask)
+        words = Words(doubt, head, PREDICTED_LINES, (tracking.motion.distance, tracking.motion.error), tracking.bound)
         return composite(picture, camera, tumour, self.style, cover, Marks(band, gauge, before), words)
 
     def _describe_hidden(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
@@ -90,21 +90,21 @@ class Painter:
         tool = self.build_tool_layer(known)
         return [*self.stage.build_layers(known.motion.positions, None), *([] if tool is None else [tool])]
 
-    def build_tool_layer(self, known: TrackingResult, cubed: bool = True) -> Layer | None:
+    def build_tool_layer(self, tracking: TrackingResult, with_cube: bool = True) -> Layer | None:
         """Return the tool's surface if its pose is available, with or without its cube."""
-        pose = known.T_scan_tool
+        pose = tracking.T_scan_tool
         if self.tool is None or pose is None:
             return None
-        return Layer("tool", TOOL, *self.tool.build_surface(pose, cubed), TOOL_COLOUR)
+        return Layer("tool", TOOL, *self.tool.build_surface(pose, with_cube), TOOL_COLOUR)
 
-    def measure_tip(self, known: TrackingResult, tumour: Layer) -> Gauge | None:
+    def measure_tip_distance(self, tracking: TrackingResult, tumour: Layer) -> Gauge | None:
         """Measure from the tool's tip to the tumour, with the error of both; None if a position is unknown."""
-        if known.T_scan_tool is None or known.tip_covariance is None or known.band is None:
+        if tracking.T_scan_tool is None or tracking.tip_covariance is None or tracking.bound is None:
             return None
-        gauge = measure_gauge(known.T_scan_tool[:3, 3], tumour)
+        gauge = measure_tip_gauge(tracking.T_scan_tool[:3, 3], tumour)
         along = (gauge.nearest - gauge.tip) / max(gauge.distance, np.finfo(float).tiny)
-        spread = BOUND_DEVIATIONS * float(np.sqrt(along @ known.tip_covariance @ along))
-        return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, known.motion.error)))
+        spread = BOUND_DEVIATIONS * float(np.sqrt(along @ tracking.tip_covariance @ along))
+        return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, tracking.motion.error)))
 
     def _draw_grey(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None) -> Overlaid:
         """Draw the outline in grey at the last position, if there is one, with the reason."""
@@ -114,7 +114,7 @@ class Painter:
             if covered is not None:
                 over.colour[covered] = colour[covered]
         write_head(over, [])
-        write_doubt(over, known.words)
+        write_doubt(over, known.warning)
         return over
 
     def _draw_dotted(self, over: Overlaid, camera: Camera, tumour: Layer) -> None:
@@ -125,14 +125,14 @@ class Painter:
         draw_dashes(over.colour[box], find_outlines(mask), compute_ink(BEFORE_COLOUR), BEFORE_STROKES)
 
 
-def format_head_lines(known: TrackingResult) -> Sequence[str]:
+def format_top_lines(tracking: TrackingResult) -> Sequence[str]:
     """Describe the tumour position and its error, for the top of the image."""
-    if known.band is None:
+    if tracking.bound is None:
         return ()
-    largest = max(known.parts, key=lambda name: known.parts[name])
-    lines = [NO_CONTACT_TEXT] if known.state is TumourState.REST else []
-    if known.relied:
-        lines.append(f"overlay error <= {bound_words(known.band, 1)} across the view (95 %), mainly {largest}")
-    motion = "; of motion: not known" if not known.motion.known else ""
-    camera = "" if "camera" in known.parts else ", camera"
+    largest = max(tracking.sources, key=lambda name: tracking.sources[name])
+    lines = [NO_CONTACT_TEXT] if tracking.state is TumourState.REST else []
+    if tracking.is_reliable:
+        lines.append(f"overlay error <= {bound_words(tracking.bound, 1)} across the view (95 %), mainly {largest}")
+    motion = "; of motion: not known" if not tracking.motion.supported else ""
+    camera = "" if "camera" in tracking.sources else ", camera"
     return (*lines, f"error by tissue{camera} and segmentation: not known{motion}")

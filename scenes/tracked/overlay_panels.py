@@ -16,31 +16,31 @@ DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion
 OVERLAY_ERROR = Line("error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation")
 
 
-def list_lines(tooled: bool) -> tuple[Line, ...]:
+def list_plot_lines(has_tool: bool) -> tuple[Line, ...]:
     """Return the plotted quantities of each image."""
-    return (DISTANCE, OVERLAY_ERROR) if tooled else (OVERLAY_ERROR,)
+    return (DISTANCE, OVERLAY_ERROR) if has_tool else (OVERLAY_ERROR,)
 
 
-def build_history_sample(known: TrackingResult, gauge: Gauge | None, tooled: bool, now: float) -> Sample:
-    """Build the readings of an image that is shown at a time [s], in the order of `list_lines`."""
-    within = 1e3 * known.band if known.relied and known.band is not None else None
-    if not tooled:
-        return Sample(now, (within,), (0.0,))
+def build_history_sample(tracking: TrackingResult, gauge: Gauge | None, has_tool: bool, time: float) -> Sample:
+    """Build the readings of an image that is shown at a time [s], in the order of `list_plot_lines`."""
+    within = 1e3 * tracking.bound if tracking.is_reliable and tracking.bound is not None else None
+    if not has_tool:
+        return Sample(time, (within,), (0.0,))
     distance = None if gauge is None else 1e3 * gauge.distance
-    error = 1e3 * gauge.error if gauge is not None and gauge.error is not None and known.relied else None
-    return Sample(now, (distance, within), (error, 0.0))
+    error = 1e3 * gauge.error if gauge is not None and gauge.error is not None and tracking.is_reliable else None
+    return Sample(time, (distance, within), (error, 0.0))
 
 
-def render_slices(known: TrackingResult, painter: Painter, through: str) -> np.ndarray:
+def render_slices(tracking: TrackingResult, painter: Painter, position: str) -> np.ndarray:
     """Render three slices (h, 3 h, 3) uint8 of the scan, through one of the places of `scenes.page.side_panels`.
 
     The error band is that of the motion: tracking and registration do not move the tumour in the scan.
     """
-    stage, tool = painter.stage, painter.build_tool_layer(known, cubed=False)
-    tip = None if known.T_scan_tool is None else known.T_scan_tool[:3, 3]
+    stage, tool = painter.stage, painter.build_tool_layer(tracking, with_cube=False)
+    tip = None if tracking.T_scan_tool is None else tracking.T_scan_tool[:3, 3]
     others = [] if tool is None else [tool]
-    error = known.motion.error if known.relied and known.motion.known else None
-    now = stage.build_tumour(known.motion.positions)
+    error = tracking.motion.error if tracking.is_reliable and tracking.motion.supported else None
+    now = stage.build_tumour(tracking.motion.positions)
     return draw_slices_through(
-        stage, Cut(now, stage.tumour_at_rest, error, not known.relied, others, tip, "motion"), through
+        stage, Cut(now, stage.tumour_at_rest, error, not tracking.is_reliable, others, tip, "motion"), position
     )

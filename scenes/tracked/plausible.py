@@ -17,7 +17,7 @@ MAX_TOOL_DEPTH = 0.03  # Largest depth of a tool's tip or markers inside the bra
 MAX_TOOL_DISTANCE = 1.0
 
 
-def describe_implausible(registration: Registration, stage: Stage, camera: Camera) -> str:
+def describe_implausible_registration(registration: Registration, stage: Stage, camera: Camera) -> str:
     """Describe why the opening's position in a registration is implausible for a camera; empty: plausible."""
     opening = stage.site.origin
     middle = 0.5 * np.array([*build_patient_reference().faces[0].size, 0.0])
@@ -35,7 +35,7 @@ def measure_head_distance(tip: np.ndarray, stage: Stage) -> float:
     return float(np.linalg.norm(tip - np.clip(tip, nodes.min(axis=0), nodes.max(axis=0))))
 
 
-def describe_penetration(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stage) -> str:
+def describe_tool_penetration(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stage) -> str:
     """Describe a tool pose (4, 4) [m] whose tip or markers are deep in the brain; empty: plausible."""
     mesh = stage.anatomy.mesh
     corners = mesh.nodes[mesh.surface]
@@ -48,18 +48,18 @@ def describe_penetration(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stag
 
 
 def describe_misplaced_tool(
-    tool: TrackedTool | None, T_scan_tool: np.ndarray, stage: Stage, near: bool, theirs: str
+    tool: TrackedTool | None, T_scan_tool: np.ndarray, stage: Stage, was_near_head: bool, possible_cause: str
 ) -> tuple[str, bool]:
     """Describe why a tool pose (4, 4) [m] is implausible; and return True if the tool has been near the head.
 
-    `near`: True if it was near before; `theirs`: question about the possible cause.
+    `was_near_head`: True if it was near before; `possible_cause`: question about the possible cause.
     """
     away = measure_head_distance(T_scan_tool[:3, 3], stage)
-    near = near or away <= NEAR_DISTANCE
-    if not near:
+    was_near_head = was_near_head or away <= NEAR_DISTANCE
+    if not was_near_head:
         never = f"the tool is {1e3 * away:.0f} mm from the head, and was never nearer than {1e3 * NEAR_DISTANCE:.0f}"
-        return f"{never}: {theirs}", near
+        return f"{never}: {possible_cause}", was_near_head
     if away > MAX_TOOL_DISTANCE:
-        return f"the tool is {away:.1f} m from the head, which is not plausible: {theirs}", near
-    deep = "" if tool is None else describe_penetration(tool, T_scan_tool, stage)
-    return f"{deep}: {theirs}" if deep else "", near
+        return f"the tool is {away:.1f} m from the head, which is not plausible: {possible_cause}", was_near_head
+    deep = "" if tool is None else describe_tool_penetration(tool, T_scan_tool, stage)
+    return f"{deep}: {possible_cause}" if deep else "", was_near_head

@@ -60,7 +60,7 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return kept + 2, times[kept], poses[kept]
 
 
-def read_stream(path: str | Path) -> PoseStream:
+def read_pose_stream(path: str | Path) -> PoseStream:
     """Read the poses of an external tracker, in a file of `read_poses`; its clock may restart at midnight.
 
     Covariances are read from the columns `cov_00` to `cov_55`, as written by `write_poses`; default:
@@ -153,20 +153,20 @@ def _is_valid_covariance(matrices: np.ndarray) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackedRow:
+class TrackedPose:
     """Result of an image: its time [s], verdict on the body, pose if it is certain, and processing time [s].
 
-    Without a pose, `lacks` names the target of the verdict.
+    Without a pose, `missing_target` names the target of the verdict.
     """
 
     time: float
     verdict: Verdict
     pose: Pose | None
     seconds: float
-    lacks: str = ""
+    missing_target: str = ""
 
 
-def write_poses(path: Path, rows: Iterable[TrackedRow], tip: np.ndarray) -> None:
+def write_poses(path: Path, rows: Iterable[TrackedPose], tip: np.ndarray) -> None:
     """Write a row for each image, atomically; those without a pose have blanks.
 
     `tip` (3,) [m] is the position of the tool's tip in its own frame. The covariance is of x, y, z [mm] and a small

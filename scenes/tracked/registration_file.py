@@ -109,7 +109,7 @@ def _check_covariance(covariance: np.ndarray) -> None:
         raise InputError("covariance is no covariance: it is symmetric, finite, and nowhere negative.")
 
 
-def as_stored(registration: Registration) -> dict[str, object]:
+def to_json(registration: Registration) -> dict[str, object]:
     """Build the file content of a registration."""
     T = registration.T_patient_scan.copy()
     T[:3, 3] *= 1e3
@@ -145,4 +145,4 @@ def write_registration(path: str | Path, registration: Registration) -> None:
         A file that cannot be written, or a wrong file ending.
     """
     with write_atomically(to_path(path), ".json") as partial:
-        partial.write_text(json.dumps(as_stored(registration), indent=1) + "\n", encoding="utf-8")
+        partial.write_text(json.dumps(to_json(registration), indent=1) + "\n", encoding="utf-8")

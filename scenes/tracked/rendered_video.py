@@ -22,12 +22,12 @@ from ..script.viewpoint import PLAIN_APPEARANCE
 from .filming import (
     USUAL_CALIBRATION,
     VIEW,
-    Mounted,
-    Taking,
-    Trouble,
+    Artefacts,
+    Disturbance,
+    Mounts,
     VideoFrame,
     mount_targets,
-    render_shots,
+    render_frames,
     scale_distance,
 )
 
@@ -39,12 +39,12 @@ FRAME_RATE = 10.0  # Frame rate [1/s].
 DURATION = 1.7  # Length of the video [s].
 START_TIME = 0.5  # Start time in the scene [s]: the ball makes contact at 0.4 s.
 # Covered targets and gaps, with their times [s].
-DISTURBANCES = (Trouble("reference", 0.25, 0.55), Trouble("tool", 0.85, 1.05), Trouble("gap", 1.25, 1.55))
+DISTURBANCES = (Disturbance("reference", 0.25, 0.55), Disturbance("tool", 0.85, 1.05), Disturbance("gap", 1.25, 1.55))
 TISSUE_SPREAD = 25e-3  # Standard deviation of the tissue displacement around a tool's tip [m].
 
 
 @dataclass(frozen=True, eq=False)
-class Dent:
+class DentDeformer:
     """Deformer by a formula: tissue moves with the tool's tip, with a weight that decreases with distance."""
 
     anatomy: Anatomy
@@ -69,33 +69,33 @@ class Dent:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnFilm:
+class RenderedVideo:
     """Images with their ground truth.
 
     Parameters
     ----------
-    stage, mounts, calibration, deformer
+    stage, targets, calibration, deformer
         Scene, printed targets, camera, and deformer that gives the true motion.
-    shots
+    frames
         Images in temporal order.
-    taking
+    degradation
         Image degradation, with covered targets and their times.
     """
 
     stage: Stage
-    mounts: Mounted
+    targets: Mounts
     calibration: Calibration
     deformer: Deformer
-    shots: tuple[VideoFrame, ...]
-    taking: Taking
+    frames: tuple[VideoFrame, ...]
+    degradation: Artefacts
 
-    def get_image(self, shot: VideoFrame) -> Named:
+    def get_image(self, frame: VideoFrame) -> Named:
         """Return an image in the form that a video reader yields."""
-        return to_named_image(f"{shot.time:.1f} s", shot.colour, shot.time)
+        return to_named_image(f"{frame.time:.1f} s", frame.image, frame.time)
 
 
-def build_synthetic_video(theatre: PatientSetup) -> DrawnFilm:
-    """Render the video of a theatre's anatomy.
+def render_synthetic_video(patient: PatientSetup) -> RenderedVideo:
+    """Render the video of a patient's anatomy.
 
     Raises
     ------
@@ -108,8 +108,8 @@ def build_synthetic_video(theatre: PatientSetup) -> DrawnFilm:
         whole, path=lambda time: whole.path(time + START_TIME), viewpoint=scale_distance(view),
         frames_per_second=FRAME_RATE, duration=DURATION, look=PLAIN_APPEARANCE,
     )  # fmt: skip
-    stage = theatre.build_stage(scene)
-    deformer = Dent(theatre.anatomy, stage.site)
+    stage = patient.build_stage(scene)
+    deformer = DentDeformer(patient.anatomy, stage.site)
     player = Player(stage, deformer)
-    mounts, taking = mount_targets(player), Taking(troubles=DISTURBANCES)
-    return DrawnFilm(stage, mounts, CAMERA, deformer, tuple(render_shots(player, mounts, taking)), taking)
+    mounts, taking = mount_targets(player), Artefacts(disturbances=DISTURBANCES)
+    return RenderedVideo(stage, mounts, CAMERA, deformer, tuple(render_frames(player, mounts, taking)), taking)

@@ -33,55 +33,55 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class Overlay:
     """Image with its overlay.
 
     Parameters
     ----------
-    known
+    result
         Drawn tracking result.
-    colour
+    image
         Image (H, W, 3) uint8.
     seconds
         Processing time from the image's arrival [s].
-    middle
+    centroid
         Centroid of the drawn tumour in the scan (3,) [m].
     latency
         Time from the image's acquisition to its overlay [s], for live images.
-    stamped
+    has_stamp
         True if the time was read from the image's pixels.
     """
 
-    known: TrackingResult
-    colour: np.ndarray
+    result: TrackingResult
+    image: np.ndarray
     seconds: float
-    middle: np.ndarray
+    centroid: np.ndarray
     latency: float | None = None
-    stamped: bool = False
+    has_stamp: bool = False
 
-    def drop_image(self) -> Shown:
+    def drop_image(self) -> Overlay:
         """Return the result without the image's colours, which take memory."""
-        return replace(self, colour=np.empty((0, 0, 3), np.uint8))
+        return replace(self, image=np.empty((0, 0, 3), np.uint8))
 
-    def drop_mesh(self) -> Shown:
+    def drop_mesh(self) -> Overlay:
         """Return the result without the brain's vertex positions, and without the image's colours."""
-        motion = replace(self.known.motion, positions=np.empty((0, 3)), solution=None)
-        return replace(self.drop_image(), known=replace(self.known, motion=motion))
+        motion = replace(self.result.motion, positions=np.empty((0, 3)), solution=None)
+        return replace(self.drop_image(), result=replace(self.result, motion=motion))
 
 
 @dataclass(frozen=True, eq=False)
-class Timed:
+class TimedImage:
     """Image with its time [s], read from a stamp in its pixels if there is one, otherwise from the source.
 
-    `covered` (H, W) bool is the foreground in front of the brain, such as a hand, if a mask is given.
+    `occluded` (H, W) bool is the foreground in front of the brain, such as a hand, if a mask is given.
     """
 
-    picture: Named
-    stamped: bool
-    covered: np.ndarray | None = None
+    source: Named
+    has_stamp: bool
+    occluded: np.ndarray | None = None
 
 
-def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[Timed]:
+def read_timed_images(images: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[TimedImage]:
     """Yield images with their time stamps, and with their masks, in which pixels that are not black are foreground.
 
     A 24-hour clock is continued at midnight.
@@ -92,14 +92,14 @@ def read_timed(film: Iterator[Named], masks: Iterator[Named] | None = None) -> I
         An image without a mask, a mask without an image, or one of another size.
     """
     before, days = -np.inf, 0.0
-    for number, picture in enumerate(film):
+    for number, picture in enumerate(images):
         covered = None if masks is None else _get_mask(masks, picture, number)
         stamp = read_stamp(picture.grey)
         time = days + (picture.time if stamp is None else stamp)
         if time < before - 0.5 * DAY_SECONDS:
             time, days = time + DAY_SECONDS, days + DAY_SECONDS
         before = time
-        yield Timed(replace(picture, time=time), stamp is not None, covered)
+        yield TimedImage(replace(picture, time=time), stamp is not None, covered)
     if masks is not None and next(masks, None) is not None:
         raise ValueError("there are more masks than images. Give one for each image, in order.")
 
@@ -114,25 +114,27 @@ def _get_mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray
     return mask.grey >= (1 if mask.name.lower().endswith(".png") else MIN_OCCLUDER_GREY)
 
 
-def pace_images(film: Iterator[Timed]) -> Iterator[tuple[Timed, float]]:
+def pace_images(images: Iterator[TimedImage]) -> Iterator[tuple[TimedImage, float]]:
     """Yield images like a live camera: the newest image at each request, and the clock time [s] of image time 0.
 
     Images that arrive between requests are lost.
     """
-    waiting = next(film, None)
+    waiting = next(images, None)
     if waiting is None:
         return
-    begun = clock.perf_counter() - waiting.picture.time
+    begun = clock.perf_counter() - waiting.source.time
     while waiting is not None:
-        newer = next(film, None)
-        while newer is not None and newer.picture.time <= clock.perf_counter() - begun:
-            waiting, newer = newer, next(film, None)
-        clock.sleep(max(0.0, waiting.picture.time - (clock.perf_counter() - begun)))
+        newer = next(images, None)
+        while newer is not None and newer.source.time <= clock.perf_counter() - begun:
+            waiting, newer = newer, next(images, None)
+        clock.sleep(max(0.0, waiting.source.time - (clock.perf_counter() - begun)))
         yield waiting, begun
         waiting = newer
 
 
-def draw_overlays(film: Iterator[Timed], follower: Follower, painter: Painter, live: bool = False) -> Iterator[Shown]:
+def draw_overlays(
+    images: Iterator[TimedImage], follower: Follower, painter: Painter, live: bool = False
+) -> Iterator[Overlay]:
     """Yield every image with its overlay; `live`: in real time, so that late images are skipped and old ones marked.
 
     Raises
@@ -141,58 +143,58 @@ def draw_overlays(film: Iterator[Timed], follower: Follower, painter: Painter, l
         See `Follower.step`; also errors of the video.
     """
     known: TrackingResult | None = None
-    for taken, begun in pace_images(film) if live else ((each, None) for each in film):
-        shown = overlay_one(taken, begun, known, follower, painter)
-        known = shown.known
+    for taken, begun in pace_images(images) if live else ((each, None) for each in images):
+        shown = overlay_image(taken, begun, known, follower, painter)
+        known = shown.result
         yield shown
 
 
-def overlay_one(
-    taken: Timed, begun: float | None, before: TrackingResult | None, follower: Follower, painter: Painter
-) -> Shown:
-    """Compute the overlay of one image, from the result `before`.
+def overlay_image(
+    image: TimedImage, start_time: float | None, previous: TrackingResult | None, follower: Follower, painter: Painter
+) -> Overlay:
+    """Compute the overlay of one image, from the result `previous`.
 
-    `begun` is the clock time [s] of the images' time 0, if they are live: old images are marked stale.
+    `start_time` is the clock time [s] of the images' time 0, if they are live: old images are marked stale.
 
     Raises
     ------
     ValueError
         See `Follower.step`.
     """
-    arrived, picture = clock.perf_counter(), taken.picture
+    arrived, picture = clock.perf_counter(), image.source
     assert picture.colour is not None
-    known = follower.step(picture.grey, picture.time, before)
-    drawn = known if begun is None else to_aged(known, clock.perf_counter() - begun - picture.time)
-    colour = painter.paint(picture.colour, drawn, taken.covered).colour
+    known = follower.step(picture.grey, picture.time, previous)
+    drawn = known if start_time is None else mark_stale(known, clock.perf_counter() - start_time - picture.time)
+    colour = painter.paint(picture.colour, drawn, image.occluded).colour
     ready = clock.perf_counter()
-    latency = None if begun is None else ready - begun - picture.time
+    latency = None if start_time is None else ready - start_time - picture.time
     middle = drawn.motion.positions[painter.stage.tumour_vertices].mean(axis=0)
-    return Shown(drawn, colour, ready - arrived, middle, latency, taken.stamped)
+    return Overlay(drawn, colour, ready - arrived, middle, latency, image.has_stamp)
 
 
-def to_aged(known: TrackingResult, age: float) -> TrackingResult:
+def mark_stale(tracking: TrackingResult, age: float) -> TrackingResult:
     """Return the result of an image of the given age [s]: it is stale beyond `STALE_AGE`."""
-    if age <= STALE_AGE or not known.relied:
-        return known
-    return replace(known, state=TumourState.STALE, words=f"stale, the image is {age:.1f} s old: do not rely on it")
+    if age <= STALE_AGE or not tracking.is_reliable:
+        return tracking
+    return replace(tracking, state=TumourState.STALE, warning=f"stale, the image is {age:.1f} s old: do not rely on it")
 
 
-def summarise_latencies(shown: list[Shown]) -> dict[str, object]:
+def summarise_latencies(overlays: list[Overlay]) -> dict[str, object]:
     """Compute median, 95th percentile and histogram [ms] of the latency of live images, or else of processing times."""
-    live = [each.latency for each in shown if each.latency is not None]
-    milliseconds = 1e3 * np.array(live or [each.seconds for each in shown])
+    live = [each.latency for each in overlays if each.latency is not None]
+    milliseconds = 1e3 * np.array(live or [each.seconds for each in overlays])
     counts = np.histogram(milliseconds, [*LATENCY_EDGES, np.inf])[0]
     names = [*(f"{low}-{high}" for low, high in pairwise(LATENCY_EDGES)), f"over {LATENCY_EDGES[-1]}"]
     return {
         "what": "from the image's time to its overlay" if live else "from the image's arrival to its overlay",
-        "time_from": "pixels" if all(each.stamped for each in shown) else "the source",
+        "time_from": "pixels" if all(each.has_stamp for each in overlays) else "the source",
         "p50_ms": float(np.median(milliseconds)),
         "p95_ms": float(np.percentile(milliseconds, 95.0)),
         "histogram_ms": {name: int(count) for name, count in zip(names, counts, strict=True) if count},
     }
 
 
-def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[OverlayError | None]) -> None:
+def write_tracking_table(path: Path, overlays: Sequence[Overlay], errors: Sequence[OverlayError | None]) -> None:
     """Write a row for each image, atomically; unknown values are blank.
 
     The position is that of the tumour's centroid in the scan, RAS. `within_mm` is the 95 % bound across the line of
@@ -202,24 +204,26 @@ def write_rows(path: Path, shown: Sequence[Shown], errors: Sequence[OverlayError
     with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(COLUMNS)
-        table.writerows(_format_row(each, error) for each, error in zip(shown, errors, strict=True))
+        table.writerows(_format_row(each, error) for each, error in zip(overlays, errors, strict=True))
 
 
-def _format_row(shown: Shown, error: OverlayError | None) -> list[str]:
-    known = shown.known
+def _format_row(shown: Overlay, error: OverlayError | None) -> list[str]:
+    known = shown.result
     placed = known.camera is not None
-    lengths: list[float | None] = [*shown.middle, known.motion.moved if known.motion.known else None]
-    lengths.append(known.motion.error if known.motion.known else None)
+    lengths: list[float | None] = [*shown.centroid, known.motion.distance if known.motion.supported else None]
+    lengths.append(known.motion.error if known.motion.supported else None)
     lengths += [
-        known.band,
-        *(known.parts.get(name) for name in ("tracking", "camera", "registration", "tool", "model", "shutter")),
+        known.bound,
+        *(known.sources.get(name) for name in ("tracking", "camera", "registration", "tool", "model", "shutter")),
     ]
     cells = [_format_number(None if value is None or not placed else 1e3 * value) for value in lengths]
     late = None if shown.latency is None else 1e3 * shown.latency
-    against = (None,) * 4 if error is None else (error.outline, error.overlap, 1e3 * error.middle, 1e3 * error.worst)
+    against = (None,) * 4
+    if error is not None:
+        against = error.outline, error.overlap, 1e3 * error.centroid, 1e3 * error.maximum
     return [
         f"{known.time:.6f}", known.state.name.lower(), *cells, f"{1e3 * shown.seconds:.1f}", _format_number(late, 1),
-        known.words, *(_format_number(value, 3) for value in against), "RAS",
+        known.warning, *(_format_number(value, 3) for value in against), "RAS",
     ]  # fmt: skip
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from ar.tracking.image_sequences import count_frames, read_video
 
-from .run import Timed, read_timed
+from .run import TimedImage, read_timed_images
 
 
 @dataclass(eq=False)
-class SeekableFilm:
+class SeekableVideo:
     """Video, or folder of images.
 
     Parameters
@@ -26,23 +26,23 @@ class SeekableFilm:
     path: Path
     rate: float
     count: int = field(init=False)
-    film: Iterator[Timed] = field(init=False)
-    next: int = field(default=0, init=False)
+    images: Iterator[TimedImage] = field(init=False)
+    next_number: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
         """Open the video."""
         self.count = count_frames(self.path)
-        self.film = self._read_from(0)
+        self.images = self._read_from(0)
 
-    def _read_from(self, number: int) -> Iterator[Timed]:
-        return read_timed(read_video(self.path, self.rate, colour=True, first=number))
+    def _read_from(self, number: int) -> Iterator[TimedImage]:
+        return read_timed_images(read_video(self.path, self.rate, colour=True, first=number))
 
-    def read_image(self, number: int) -> Timed | None:
+    def read_image(self, number: int) -> TimedImage | None:
         """Return an image by its number; None if the video ends before this image; `count` is then corrected."""
-        if number != self.next:
+        if number != self.next_number:
             # Read from the start: seeking in a video does not reach every frame.
-            self.film = self._read_from(number)
-        found, self.next = next(self.film, None), number + 1
+            self.images = self._read_from(number)
+        found, self.next_number = next(self.images, None), number + 1
         if found is None:
-            self.count, self.next = min(self.count, number), -1
+            self.count, self.next_number = min(self.count, number), -1
         return found

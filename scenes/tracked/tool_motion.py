@@ -27,30 +27,30 @@ class BrainMotion:
     ----------
     positions
         Positions of all mesh vertices (V, 3) [m]; undeformed for those that are not drawn.
-    known
+    supported
         True if a deformer supports the tool's pose.
-    moved
+    distance
         Mean distance of the tumour's surface from its position in the scan [m].
-    model, tool
+    model_error, tool_error
         95 % bounds on a vertex's error by the model, and by the error of the tool's position [m].
-    doubt
+    warning
         Reason why the motion is unreliable, as text for the image; empty if it is reliable.
     solution
         The solution, from which the next one may start.
     """
 
     positions: np.ndarray
-    known: bool = False
-    moved: float = 0.0
-    model: float = 0.0
-    tool: float = 0.0
-    doubt: str = ""
+    supported: bool = False
+    distance: float = 0.0
+    model_error: float = 0.0
+    tool_error: float = 0.0
+    warning: str = ""
     solution: Deformation | None = None
 
     @property
     def error(self) -> float:
         """Known error of the motion at 95 % [m]."""
-        return float(np.hypot(self.model, self.tool))
+        return float(np.hypot(self.model_error, self.tool_error))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,28 +61,28 @@ class ToolMotion:
     deformer: Deformer | None = None
 
     @property
-    def rest(self) -> BrainMotion:
+    def rest_motion(self) -> BrainMotion:
         """The brain as in the scan."""
         return BrainMotion(self.stage.anatomy.mesh.nodes)
 
     def compute_motion(
-        self, T_scan_tool: np.ndarray, tip_covariance: np.ndarray, before: BrainMotion | None = None
+        self, T_scan_tool: np.ndarray, tip_covariance: np.ndarray, previous: BrainMotion | None = None
     ) -> BrainMotion:
         """Compute the brain under a tool at a pose (4, 4) [m], whose tip has an error covariance (3, 3) [m^2].
 
         Its influence on the tumour is found by a second solution, for a tool that is 1.96 standard deviations deeper.
         """
         if self.deformer is None:
-            return self.rest
+            return self.rest_motion
         deviation = float(np.sqrt(max(np.linalg.eigvalsh(tip_covariance)[-1], 0.0)))
         deeper = T_scan_tool.copy()
         deeper[:3, 3] += BOUND_DEVIATIONS * deviation * self.stage.site.axis
-        start = None if before is None else before.solution
+        start = None if previous is None else previous.solution
         try:
             result, further = self._solve_poses(T_scan_tool, deeper, start)
         except InputError:
-            return BrainMotion(self.rest.positions, doubt=TOO_DEEP_WARNING)
-        vertices, rest = self.stage.tumour_vertices, self.rest.positions
+            return BrainMotion(self.rest_motion.positions, warning=TOO_DEEP_WARNING)
+        vertices, rest = self.stage.tumour_vertices, self.rest_motion.positions
         moved, beyond = (each.restrict(vertices).displacement[0] for each in (result, further))
         positions, doubt = rest.copy(), describe_outcome(result.outcome[0])
         positions[result.nodes] += result.displacement[0]
@@ -106,7 +106,8 @@ class ToolMotion:
         """Compute the solutions of both poses; FEM starts from the last one."""
         assert self.deformer is not None
         if isinstance(self.deformer, Learned):
-            both = self.deformer.deform(Loads((Touching(np.stack([pose, deeper])[:, None]),)), at=self.stage.nodes)
+            loads = Loads((Touching(np.stack([pose, deeper])[:, None]),))
+            both = self.deformer.deform(loads, at=self.stage.drawn_vertices)
             return both.select(np.array([0])), both.select(np.array([1]))
         first = self.deformer.deform(Loads((Touching(pose[None, None]),)), start=start)
         return first, self.deformer.deform(Loads((Touching(deeper[None, None]),)), start=first)

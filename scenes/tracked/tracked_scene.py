@@ -19,20 +19,20 @@ REST = "rest"
 """Name of the deformer that leaves the brain undeformed, as in the scan."""
 
 
-def build_tracked_scene(args: argparse.Namespace, shape: BuiltIn | None) -> Scene:
+def build_tracked_scene(args: argparse.Namespace, tool_shape: BuiltIn | None) -> Scene:
     """Build the scene of the brain: the tool, moved by pose, and the skull."""
     from sim.effects import SKULLS, Elasticity, Held, ToolContact
 
     from ..script.scene import Scene
     from ..script.viewpoint import PLAIN_APPEARANCE
 
-    touched = () if shape is None else (ToolContact((shape,)),)
+    touched = () if tool_shape is None else (ToolContact((tool_shape,)),)
     effects = (Elasticity(), Held(), SKULLS[args.skull], *touched)
     return Scene(args.command, "A tracked tool.", effects=effects, look=PLAIN_APPEARANCE)
 
 
-def build_mover(
-    args: argparse.Namespace, theatre: PatientSetup, scene: Scene, tooled: bool
+def build_requested_deformer(
+    args: argparse.Namespace, patient: PatientSetup, scene: Scene, has_tool: bool
 ) -> tuple[Deformer | None, str]:
     """Select the deformer of the brain under a tracked tool, if there is one, with its description.
 
@@ -44,18 +44,18 @@ def build_mover(
     from ..play.deformers import GUARDED
 
     still = "none: the brain stays as in the scan"
-    if not tooled:
+    if not has_tool:
         return None, still
     name = args.deformer
-    if name is None and not theatre.select_models(scene):
-        refused = next(iter(theatre.list_rejections(scene).values()), "there is none")
+    if name is None and not patient.select_models(scene):
+        refused = next(iter(patient.list_rejections(scene).values()), "there is none")
         said = f"no model says how the brain moves: {refused}. Give --deformer fem, or a model of the tool's poses"
         print(f"{args.program}: {said}", file=sys.stderr)
         name = REST
     if name == REST:
         return None, still
-    name = name or theatre.select_default(scene)
-    names = (*theatre.list_deformers(scene), REST)
-    if name not in (*names, *theatre.models, GUARDED):
+    name = name or patient.select_default(scene)
+    names = (*patient.list_deformers(scene), REST)
+    if name not in (*names, *patient.models, GUARDED):
         raise InputError(f"no deformer is called {name!r} here: choose one of {', '.join(names)}.")
-    return theatre.build_deformer(name, scene), theatre.describe_deformer(name, scene)
+    return patient.build_deformer(name, scene), patient.describe_deformer(name, scene)

@@ -50,7 +50,7 @@ class TrackedTool:
     tip_covariance: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
 
     @cached_property
-    def bare(self) -> tuple[np.ndarray, np.ndarray]:
+    def bare_mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Surface without the cube, which would occlude: vertices (n, 3) [m], triangles (m, 3)."""
         return add_shaft(self.shape, np.linalg.inv(self.T_cube_tool)[:3, 3])
 
@@ -60,14 +60,14 @@ class TrackedTool:
 
         Only the printed faces are included, with their borders.
         """
-        T_tool_cube, (vertices, triangles) = np.linalg.inv(self.T_cube_tool), self.bare
+        T_tool_cube, (vertices, triangles) = np.linalg.inv(self.T_cube_tool), self.bare_mesh
         box, sides = _build_cube()
         at = box @ T_tool_cube[:3, :3].T + T_tool_cube[:3, 3]
         return np.concatenate([vertices, at]), np.concatenate([triangles, sides + len(vertices)])
 
-    def build_surface(self, T_scan_tool: np.ndarray, cubed: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    def build_surface(self, T_scan_tool: np.ndarray, with_cube: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Return the surface at a pose (4, 4) [m], with or without its cube: vertices (n, 3) [m], triangles (m, 3)."""
-        vertices, triangles = self.mesh if cubed else self.bare
+        vertices, triangles = self.mesh if with_cube else self.bare_mesh
         return vertices @ T_scan_tool[:3, :3].T + T_scan_tool[:3, 3], triangles
 
 

@@ -16,8 +16,8 @@ from ..play.stage import TUMOUR_COLOUR
 from .filming import VideoFrame, register_with_error
 from .follower import Follower, TrackingResult
 from .overlay_painter import Painter
-from .rendered_video import DrawnFilm
-from .run import STALE_AGE, Timed, overlay_one
+from .rendered_video import RenderedVideo
+from .run import STALE_AGE, TimedImage, overlay_image
 from .tool_motion import ToolMotion
 
 LOST_TEXTS = {"reference": "reference lost", "tool": "tool lost"}  # Text required in an image, by covered target.
@@ -82,50 +82,50 @@ class TrackingFigures:
 
 
 @dataclass(frozen=True, eq=False)
-class Event:
+class ArrivingImage:
     """Image at its arrival, with its age [s] and the required text, which is empty without a disturbance."""
 
-    shot: VideoFrame
-    late: float = 0.0
-    words: str = ""
+    frame: VideoFrame
+    age: float = 0.0
+    required_text: str = ""
 
 
-def replay_events(film: DrawnFilm) -> Iterator[Event]:
+def replay_images(video: RenderedVideo) -> Iterator[ArrivingImage]:
     """Yield the images of a video in order: one is repeated, one is delayed, and one comes after a gap."""
     before = 0.0
-    for shot in film.shots:
-        covered = film.taking.list_disturbances(shot.time)
+    for shot in video.frames:
+        covered = video.degradation.list_disturbances(shot.time)
         words = next((LOST_TEXTS[kind] for kind in LOST_TEXTS if kind in covered), "")
         if shot.time - before > STALE_AGE:
             words = STALE_TEXT
         late = CHECK.image_delay if np.isclose(shot.time, CHECK.delayed_time) else 0.0
-        yield Event(shot, late, STALE_TEXT if late else words)
+        yield ArrivingImage(shot, late, STALE_TEXT if late else words)
         if np.isclose(shot.time, CHECK.repeated_time):
-            yield Event(shot, words=STALE_TEXT)
+            yield ArrivingImage(shot, required_text=STALE_TEXT)
         before = shot.time
 
 
-def build_default_pipeline(film: DrawnFilm, style: Style = "window") -> tuple[Follower, Painter]:
+def build_default_pipeline(video: RenderedVideo, style: Style = "window") -> tuple[Follower, Painter]:
     """Build the default follower and painter for a video, with exact registration."""
-    mounts, stage = film.mounts, film.stage
+    mounts, stage = video.targets, video.stage
     exact = register_with_error(stage.site, mounts, 0.0, 0.0, 0)
-    follower = Follower(film.calibration, exact, mounts.tool, ToolMotion(stage, film.deformer))
+    follower = Follower(video.calibration, exact, mounts.tool, ToolMotion(stage, video.deformer))
     return follower, Painter(stage, mounts.tool, style, stage.device)
 
 
-def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> TrackingFigures:
+def measure_tracking(video: RenderedVideo, follower: Follower, painter: Painter) -> TrackingFigures:
     """Track a video, draw the results, and measure what the images show."""
     known: TrackingResult | None = None
     confident, unsaid, waits, worst, waiting, count = 0, 0, [0], 0.0, True, 0
-    for event in replay_events(film):
+    for event in replay_images(video):
         count += 1
-        begun = clock.perf_counter() - event.shot.time - event.late if event.late else None
-        shown = overlay_one(Timed(film.get_image(event.shot), True), begun, known, follower, painter)
-        known = shown.known
-        drawn = bool(np.count_nonzero(find_ink(shown.colour, compute_ink(TUMOUR_COLOUR))) >= CHECK.min_line_pixels)
-        if event.words:
+        begun = clock.perf_counter() - event.frame.time - event.age if event.age else None
+        shown = overlay_image(TimedImage(video.get_image(event.frame), True), begun, known, follower, painter)
+        known = shown.result
+        drawn = bool(np.count_nonzero(find_ink(shown.image, compute_ink(TUMOUR_COLOUR))) >= CHECK.min_line_pixels)
+        if event.required_text:
             confident += drawn
-            unsaid += not _has_warning(shown.colour, known.words, event.words)
+            unsaid += not _has_warning(shown.image, known.warning, event.required_text)
             waits += [] if waiting else [0]
             waiting = True
             continue
@@ -133,7 +133,7 @@ def measure_tracking(film: DrawnFilm, follower: Follower, painter: Painter) -> T
             waits[-1] += 1
         waiting = waiting and not drawn
         if drawn:
-            worst = max(worst, _measure_outline_error(film, event.shot, shown.colour))
+            worst = max(worst, _measure_outline_error(video, event.frame, shown.image))
     return TrackingFigures(count, confident, unsaid, np.inf if waiting else max(waits), worst)
 
 
@@ -145,11 +145,11 @@ def _has_warning(colour: np.ndarray, words: str, wanted: str) -> bool:
     )
 
 
-def _measure_outline_error(film: DrawnFilm, shot: VideoFrame, colour: np.ndarray) -> float:
+def _measure_outline_error(film: RenderedVideo, shot: VideoFrame, colour: np.ndarray) -> float:
     """Compute the distance between the outline in an image and the true one [pixel]."""
     camera, rest = film.calibration.build_camera(shot.T_camera_scan), film.stage.tumour_at_rest
     mask = compute_silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
-    tool = compute_silhouette(camera, *film.mounts.tool.build_surface(shot.T_scan_tool))
+    tool = compute_silhouette(camera, *film.targets.tool.build_surface(shot.T_scan_tool))
     words = find_ink(colour, WHITE, 0)
     return measure_outline_gap(
         colour, compute_ink(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN_STROKES[1] + SOFT_LENGTH

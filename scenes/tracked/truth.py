@@ -68,10 +68,10 @@ def write_truth(path: Path, truth: VideoGroundTruth) -> None:
         )
 
 
-def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = MAX_TRUTH_BYTES) -> VideoGroundTruth:
-    """Read the ground truth of an anatomy with this digest and number of `vertices` on its tumour's surface.
+def read_truth(path: str | Path, digest: str, vertex_count: int, max_bytes: int = MAX_TRUTH_BYTES) -> VideoGroundTruth:
+    """Read the ground truth of an anatomy with this digest and number of `vertex_count` on its tumour's surface.
 
-    The uncompressed arrays have at most `largest` bytes.
+    The uncompressed arrays have at most `max_bytes` bytes.
 
     Raises
     ------
@@ -80,24 +80,24 @@ def read_truth(path: str | Path, anatomy: str, vertices: int, largest: int = MAX
     """
     path = to_path(path)
     with wrap_errors(path, "the ground truth of a video", REMEDY), path.open("rb") as raw:
-        archive = Archive(raw, REMEDY, largest)
+        archive = Archive(raw, REMEDY, max_bytes)
         header = json.loads(archive.read_text("header"))
         if header["format"] != FORMAT:
             raise InputError(f"its format is not {FORMAT!r}. {REMEDY}")
-        if header["anatomy"] != anatomy:
+        if header["anatomy"] != digest:
             raise InputError("is of another anatomy: give the one in the video, by --anatomy.")
         arrays = archive.read_arrays(("times", "displacement", *POSE_ARRAYS))
         times, moved, cameras, tools = (arrays[name].astype(float) for name in ("times", "displacement", *POSE_ARRAYS))
     count = len(times)
     shapes = (times.shape, cameras.shape, tools.shape, moved.shape)
-    if not count or shapes != ((count,), (count, 4, 4), (count, 4, 4), (count, vertices, 3)):
+    if not count or shapes != ((count,), (count, 4, 4), (count, 4, 4), (count, vertex_count, 3)):
         raise InputError(f"{path}: has arrays of other shapes. {REMEDY}")
     if not all(np.isfinite(each).all() for each in (times, cameras, tools, moved)):
         raise InputError(f"{path}: has numbers that are not finite. {REMEDY}")
     return VideoGroundTruth(str(header["anatomy"]), times, cameras, tools, moved)
 
 
-def write_table(path: Path, truth: VideoGroundTruth, rest: np.ndarray) -> None:
+def write_truth_table(path: Path, truth: VideoGroundTruth, rest_surface: np.ndarray) -> None:
     """Write the ground truth as a table, a row for each image; rest (n, 3) [m]: the tumour's surface in the scan.
 
     Poses are rows of 12 numbers, of the matrix from the scan to the camera, and from the tool to the scan [mm].
@@ -108,7 +108,7 @@ def write_table(path: Path, truth: VideoGroundTruth, rest: np.ndarray) -> None:
         table.writerow(("time_s", "tumour_x_mm", "tumour_y_mm", "tumour_z_mm", "moved_mm", *names, "space"))
         for number, time in enumerate(truth.times):
             moved = truth.displacement[number]
-            middle = 1e3 * (rest + moved).mean(axis=0)
+            middle = 1e3 * (rest_surface + moved).mean(axis=0)
             poses = np.stack([truth.T_camera_scan[number], truth.T_scan_tool[number]])[:, :3] * [1.0, 1.0, 1.0, 1e3]
             mean = 1e3 * float(np.linalg.norm(moved, axis=1).mean())
             table.writerow((f"{time:.6f}", *(f"{each:.5f}" for each in (*middle, mean, *poses.ravel())), "RAS"))
@@ -122,31 +122,31 @@ class OverlayError:
     ----------
     outline, overlap
         Mean distance of the drawn outline from the true one [pixel]; intersection over union of the silhouettes.
-    middle, worst
+    centroid, maximum
         Error of the tumour's centroid, and maximum over its surface, across the true line of sight [m].
-    held
+    is_covered
         True if the maximum is within the band.
     """
 
     outline: float
     overlap: float
-    middle: float
-    worst: float
-    held: bool
+    centroid: float
+    maximum: float
+    is_covered: bool
 
 
 def compute_overlay_error(
-    known: TrackingResult, truth: VideoGroundTruth, calibration: Calibration, stage: Stage
+    tracking: TrackingResult, truth: VideoGroundTruth, calibration: Calibration, stage: Stage
 ) -> OverlayError | None:
     """Compute the error of a tracking result; None if no position is drawn, or without ground truth at its time."""
-    row = truth.find_image(known.time)
-    if row is None or known.camera is None:
+    row = truth.find_image(tracking.time)
+    if row is None or tracking.camera is None:
         return None
     camera, triangles = calibration.build_camera(truth.T_camera_scan[row]), stage.tumour_at_rest.triangles
     true = stage.tumour_at_rest.vertices + truth.displacement[row]
-    here = known.motion.positions[stage.tumour_vertices]
-    masks = compute_silhouette(camera, true, triangles), compute_silhouette(known.camera, here, triangles)
-    seen, apart = camera.to_camera_frame(true), known.camera.to_camera_frame(here) - camera.to_camera_frame(true)
+    here = tracking.motion.positions[stage.tumour_vertices]
+    masks = compute_silhouette(camera, true, triangles), compute_silhouette(tracking.camera, here, triangles)
+    seen, apart = camera.to_camera_frame(true), tracking.camera.to_camera_frame(here) - camera.to_camera_frame(true)
     across = _compute_lateral_lengths(apart, seen)
     middle = float(_compute_lateral_lengths(apart.mean(axis=0)[None], seen.mean(axis=0)[None])[0])
     return OverlayError(
@@ -154,7 +154,7 @@ def compute_overlay_error(
         compute_iou(*masks),
         middle,
         float(across.max()),
-        known.band is not None and across.max() <= known.band,
+        tracking.bound is not None and across.max() <= tracking.bound,
     )
 
 
@@ -173,22 +173,22 @@ def _compute_edge_distance(true: np.ndarray, drawn: np.ndarray) -> float:
     return float(max(there[edges[1]].mean(), back[edges[0]].mean()))
 
 
-def summarise_errors(known: Sequence[TrackingResult], errors: Sequence[OverlayError | None]) -> dict[str, object]:
+def summarise_errors(results: Sequence[TrackingResult], errors: Sequence[OverlayError | None]) -> dict[str, object]:
     """Compute medians and 95th percentiles over images whose tumour is drawn as known; number of wrong ones."""
-    relied = [(each, error) for each, error in zip(known, errors, strict=True) if each.relied and error is not None]
+    relied = [(each, error) for each, error in zip(results, errors, strict=True) if each.is_reliable and error]
     if not relied:
         return {"pictures": 0}
     rows = [error for _, error in relied]
-    wrong = [each for each, error in relied if error.worst > (each.band or 0.0) + ERROR_TOLERANCE]
+    wrong = [each for each, error in relied if error.maximum > (each.bound or 0.0) + ERROR_TOLERANCE]
     return {
         "pictures": len(rows),
         **_compute_percentiles("outline_px", [row.outline for row in rows]),
         "overlap_p50": float(np.median([row.overlap for row in rows])),
         "overlap_least": min(row.overlap for row in rows),
-        **_compute_percentiles("middle_mm", [1e3 * row.middle for row in rows]),
-        **_compute_percentiles("worst_mm", [1e3 * row.worst for row in rows]),
-        **_compute_percentiles("band_mm", [1e3 * (each.band or 0.0) for each, _ in relied]),
-        "held_percent": 100.0 * float(np.mean([row.held for row in rows])),
+        **_compute_percentiles("middle_mm", [1e3 * row.centroid for row in rows]),
+        **_compute_percentiles("worst_mm", [1e3 * row.maximum for row in rows]),
+        **_compute_percentiles("band_mm", [1e3 * (each.bound or 0.0) for each, _ in relied]),
+        "held_percent": 100.0 * float(np.mean([row.is_covered for row in rows])),
         "wrong": len(wrong),
     }
 

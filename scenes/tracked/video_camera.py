@@ -17,14 +17,14 @@ FIRST_IMAGES = 120  # Number of first images of a video among which some are exa
 IMAGE_STRIDE = 10  # Stride of the examined images.
 
 
-def check_video(film: Path, rate: float, calibration: Calibration, camera: str) -> None:
+def check_video(path: Path, frame_rate: float, calibration: Calibration, camera: str) -> None:
     """Reject an invalid video, or one of another camera, by its first images, before any long computation.
 
     Without markers the focal length is not checked.
 
     Parameters
     ----------
-    film, rate
+    path, frame_rate
         A video, or a folder of images with this frame rate [1/s].
     camera
         Name of the calibration's file.
@@ -37,21 +37,21 @@ def check_video(film: Path, rate: float, calibration: Calibration, camera: str) 
     """
     targets = {target.name: target for target in list_targets()}
     detector, seen, count = Detector(tuple(targets.values())), [], 0
-    with wrap_errors(film, "a video", REMEDY):
+    with wrap_errors(path, "a video", REMEDY):
         try:
-            for picture in islice(read_video(film, rate), 0, FIRST_IMAGES, IMAGE_STRIDE):
+            for picture in islice(read_video(path, frame_rate), 0, FIRST_IMAGES, IMAGE_STRIDE):
                 check_image_size(picture.grey, calibration.width, calibration.height)
                 seen += [(targets[name], corners) for name, corners in detector.detect(picture.grey).items()]
                 count += 1
         except ValueError as error:
             raise InputError(str(error)) from error
     if not count:
-        raise InputError(f"{film}: holds no image. {REMEDY}")
+        raise InputError(f"{path}: holds no image. {REMEDY}")
     fit = fit_focal_length(calibration.build_camera(np.eye(4)), seen)
     if fit is not None and fit.is_significant:
         way = "longer" if fit.factor > 1.0 else "shorter"
         raise InputError(
-            f"{film}: its markers are seen with focal lengths that are {abs(fit.factor - 1.0):.0%} {way} "
+            f"{path}: its markers are seen with focal lengths that are {abs(fit.factor - 1.0):.0%} {way} "
             f"(+- {fit.deviation:.1%}) than {camera} states. It is of another camera or zoom: calibrate this one by "
             "`sulcus calibrate`."
         )

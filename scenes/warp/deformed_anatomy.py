@@ -19,7 +19,7 @@ from sim.loads import Loads, Pushed
 from sim.resected_fem import ResectedFem
 from surrogate.locating.calibration import RADIUS_SQUARED
 
-from ..play.deformers import AtRest, PatientSetup
+from ..play.deformers import PatientSetup, RestDeformer
 from ..play.player import Player
 from ..play.reference import is_history_dependent, solve_reference_frames
 from ..play.stage import Stage
@@ -34,18 +34,18 @@ NODE_TOLERANCE = 1e-6  # Largest distance of corresponding nodes in two meshes o
 class Cause:
     """Cause of a displacement: a description, and a record of its `kind` and properties."""
 
-    words: str
+    description: str
     record: Mapping[str, Any]
 
 
-def play_scene_cause(scene: Scene, number: int) -> Cause:
+def describe_scene_cause(scene: Scene, number: int) -> Cause:
     """Describe frame `number` of a scene as a cause."""
     time = float(scene.times[number])
     record = {"kind": "scene", "scene": scene.name, "frame": number, "time_s": time}
     return Cause(f"scene {scene.name}, frame {number}, {time:.2f} s", record)
 
 
-def load_cause(loads: Loads) -> Cause:
+def describe_load_cause(loads: Loads) -> Cause:
     """Describe the single push of a load case as a cause."""
     (pushed,) = loads.get_all(Pushed)
     place, force = 1e3 * pushed.point[0], pushed.force[0]
@@ -76,13 +76,13 @@ class DeformedAnatomy:
     ----------
     cause
         Cause of the displacement.
-    anatomy, left
+    anatomy, remaining
         Anatomy, and its remaining part after a resection.
     displacement
         Displacement of the vertices (V, 3) [m].
     converged
         True if the solution is reliable.
-    bound, bound_words
+    bound, bound_text
         95 % bound of the tumour's surface error [m], None if not available; and its description.
     tip
         Tip of the tool (3,) [m]; None without a tool.
@@ -90,15 +90,15 @@ class DeformedAnatomy:
 
     cause: Cause
     anatomy: Anatomy
-    left: Anatomy
+    remaining: Anatomy
     displacement: np.ndarray
     converged: bool = True
     bound: float | None = None
-    bound_words: str = "no uncertainty was solved for this"
+    bound_text: str = "no uncertainty was solved for this"
     tip: np.ndarray | None = None
 
     @property
-    def now(self) -> np.ndarray:
+    def positions(self) -> np.ndarray:
         """Displaced vertices (V, 3) [m]."""
         return self.anatomy.mesh.nodes + self.displacement
 
@@ -107,57 +107,57 @@ class DeformedAnatomy:
 
         None without a tip or a tumour.
         """
-        triangles = self.left.tumour_surface
+        triangles = self.remaining.tumour_surface
         if self.tip is None or not len(triangles):
             return None
-        corners = self.now[triangles]
+        corners = self.positions[triangles]
         point = find_closest_points(self.tip[None], corners).point[0]
         return point, 0.0 if is_enclosing(corners, self.tip) else float(np.linalg.norm(point - self.tip))
 
 
 @dataclass(frozen=True, eq=False)
-class Played:
-    """Scene on a body, or a `load` as a scene, with the FEM that solves it."""
+class PlayedScene:
+    """Scene on a body, or a `is_load` as a scene, with the FEM that solves it."""
 
-    theatre: PatientSetup
+    patient: PatientSetup
     scene: Scene
-    load: bool = False
+    is_load: bool = False
 
-    def list_moments(
+    def solve_frames(
         self, frames: Sequence[int], progress: Callable[[int], object] = lambda more: None
     ) -> list[DeformedAnatomy]:
         """Return the moments of some frames, in ascending order."""
-        fem = self.theatre.build_fem(self.scene, TRAIN, 1, live=True)
+        fem = self.patient.build_fem(self.scene, TRAIN, 1, live=True)
         needed = range(frames[-1] + 1) if is_history_dependent(fem) else frames
         answers = solve_reference_frames(
-            self.theatre, self.scene, [self._build_loads(number) for number in needed], progress, fem
+            self.patient, self.scene, [self._build_loads(number) for number in needed], progress, fem
         )
         rows = {number: row for row, number in enumerate(needed)}
         return [self._build_moment(number, answers.select(np.array([rows[number]])), fem) for number in frames]
 
     def _build_loads(self, number: int):
         scene, time = self.scene, float(self.scene.times[number])
-        return scene.build_loads(self.theatre.site, scene.path(time), time)
+        return scene.build_loads(self.patient.site, scene.path(time), time)
 
     def _build_moment(self, number: int, result: Deformation, fem: Fem | ResectedFem) -> DeformedAnatomy:
-        scene, site, time = self.scene, self.theatre.site, float(self.scene.times[number])
+        scene, site, time = self.scene, self.patient.site, float(self.scene.times[number])
         moved = result.displacement[0]
         # Nothing is located here, so that no locator is needed.
         stage = Stage(replace(scene, observation_model=None), site)
-        player = Player(stage, AtRest(site.anatomy))
+        player = Player(stage, RestDeformer(site.anatomy))
         now = site.anatomy.mesh.nodes + moved
         tip = None if scene.tool is None else player.place_tool(scene.tool, scene.path(time), now).tip
-        known = self.theatre.estimate_uncertainty(scene)
+        known = self.patient.estimate_uncertainty(scene)
         bound = None if known is None else known.evaluate(time).prior
         loads = self._build_loads(number)
-        cause = load_cause(loads) if self.load else play_scene_cause(scene, number)
-        cause = replace(cause, words=f"{cause.words}, by {result.source}")
-        said = {} if bound is None else {"bound_words": ENSEMBLE}
+        cause = describe_load_cause(loads) if self.is_load else describe_scene_cause(scene, number)
+        cause = replace(cause, description=f"{cause.description}, by {result.source}")
+        said = {} if bound is None else {"bound_text": ENSEMBLE}
         left = stage.select_stage(loads).anatomy
         return DeformedAnatomy(cause, site.anatomy, left, moved, result.outcome[0].good, bound, tip=tip, **said)
 
 
-def read_moment(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
+def read_deformed_anatomy(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
     """Return the moment in a result of `sulcus locate` or `sulcus solve` for an anatomy.
 
     Raises

@@ -14,12 +14,12 @@ from sim.errors import InputError
 from sim.fields.warp_fields import WarpFields, build_warp_grid, compute_cutoff, compute_forward, remove_negligible
 
 from .deformed_anatomy import DeformedAnatomy
-from .images import PatientImage, Warped, write_field_nifti, write_warped
+from .images import PatientImage, WarpedImage, write_field_nifti, write_warped_image
 from .landmarks import CENTROID, Landmark, compute_centroid
 from .markups import write_markups
 from .meshes import build_surface_mesh, write_glb, write_stl, write_vtp
 from .nrrd_files import write_field_nrrd, write_field_sequence, write_segmentation
-from .places import Folded, SamplePlaces, SpacingSettings, compute_fields, find_folds, list_places
+from .places import FoldedRegion, SamplePoints, SpacingSettings, compute_fields, find_folds, list_points
 from .readme import write_readme
 
 MESH_COLOURS = {"brain": (0.86, 0.72, 0.66, 0.35), "cortex": (0.86, 0.60, 0.54, 1.0), "tumour": (0.20, 0.94, 0.42, 1.0)}
@@ -44,10 +44,10 @@ class WarpSettings:
 
 
 def write_warp(
-    place: Path,
-    moment: DeformedAnatomy,
-    pictures: Sequence[PatientImage],
-    asked: WarpSettings,
+    folder: Path,
+    deformed: DeformedAnatomy,
+    images: Sequence[PatientImage],
+    settings: WarpSettings,
     sequence: Sequence[tuple[float, DeformedAnatomy]],
 ) -> dict[str, Any]:
     """Write a moment into the folder of `write_folder_atomically`, and moments of a `sequence` with their times [s].
@@ -60,30 +60,30 @@ def write_warp(
         See `compute_fields`; a sequence that is too long.
     """
     begun = process_time()
-    fields = compute_fields(moment, asked.spacing, asked.step)
+    fields = compute_fields(deformed, settings.spacing, settings.step)
     seconds = process_time() - begun
-    write_field_nifti(place / "field_resampling.nii.gz", fields.grid, fields.backward)
-    write_field_nrrd(place / "field_modeling.nrrd", fields.grid, fields.forward, "modeling")
-    asked.step(1)
+    write_field_nifti(folder / "field_resampling.nii.gz", fields.grid, fields.backward)
+    write_field_nrrd(folder / "field_modeling.nrrd", fields.grid, fields.forward, "modeling")
+    settings.step(1)
     if sequence:
-        _write_sequence(place / "field_sequence.seq.nrrd", sequence)
-        asked.step(1)
+        _write_sequence(folder / "field_sequence.seq.nrrd", sequence)
+        settings.step(1)
     warped = []
-    for picture in pictures:
-        warped.append(write_warped(place, picture, fields, asked.order))
-        asked.step(1)
-    _write_surfaces(place, moment)
-    places = list_places(moment)
-    _write_points(place, moment, places.marks)
-    asked.step(1)
-    report = collect_figures(moment, fields, places, warped, len(sequence))
+    for picture in images:
+        warped.append(write_warped_image(folder, picture, fields, settings.order))
+        settings.step(1)
+    _write_surfaces(folder, deformed)
+    places = list_points(deformed)
+    _write_points(folder, deformed, places.named)
+    settings.step(1)
+    report = collect_figures(deformed, fields, places, warped, len(sequence))
     report["fields_cpu_s"] = round(seconds, 1)
-    report["anatomy"] = {"file": asked.source, "digest": moment.anatomy.digest}
-    (place / "README.txt").write_text(write_readme(report, warped))
-    files = sorted(path.name for path in place.iterdir())
-    sums = {name: _compute_sha256(place / name) for name in files}
+    report["anatomy"] = {"file": settings.source, "digest": deformed.anatomy.digest}
+    (folder / "README.txt").write_text(write_readme(report, warped))
+    files = sorted(path.name for path in folder.iterdir())
+    sums = {name: _compute_sha256(folder / name) for name in files}
     report = {"format": "sulcus warp 1", "files": files, "spaces": describe_spaces(files), "sha256": sums, **report}
-    (place / "warp.json").write_text(json.dumps(report, indent=1) + "\n")
+    (folder / "warp.json").write_text(json.dumps(report, indent=1) + "\n")
     return report
 
 
@@ -94,9 +94,9 @@ def _compute_sha256(path: Path) -> str:
 
 def _write_surfaces(place: Path, moment: DeformedAnatomy) -> None:
     triangles = {
-        "brain": moment.left.mesh.surface,
-        "cortex": moment.left.open_surface,
-        "tumour": moment.left.tumour_surface,
+        "brain": moment.remaining.mesh.surface,
+        "cortex": moment.remaining.open_surface,
+        "tumour": moment.remaining.tumour_surface,
     }
     nodes = moment.anatomy.mesh.nodes
     meshes = [
@@ -111,24 +111,24 @@ def _write_surfaces(place: Path, moment: DeformedAnatomy) -> None:
 
 
 def _write_points(place: Path, moment: DeformedAnatomy, marks: Sequence[Landmark]) -> None:
-    points = name_points(moment, marks)
+    points = list_named_points(moment, marks)
     if points:
         write_markups(place / "landmarks.mrk.json", "Fiducial", points)
     gap = moment.find_gap()
     if gap is not None and moment.tip is not None:
         write_markups(place / "tip_to_tumour.mrk.json", "Line", {"tip": moment.tip, "tumour": gap[0]})
-    tumour = moment.left.mesh.tets[moment.left.in_tumour]
+    tumour = moment.remaining.mesh.tets[moment.remaining.in_tumour]
     if len(tumour):
-        write_segmentation(place / "tumour.seg.nrrd", moment.now, tumour, moment.bound)
+        write_segmentation(place / "tumour.seg.nrrd", moment.positions, tumour, moment.bound)
 
 
-def name_points(moment: DeformedAnatomy, marks: Sequence[Landmark]) -> dict[str, np.ndarray]:
+def list_named_points(deformed: DeformedAnatomy, landmarks: Sequence[Landmark]) -> dict[str, np.ndarray]:
     """List points (3,) [m] by name: tissue in the scan and deformed, the tumour's deformed centroid, and the tip."""
     points = {}
-    for one in marks:
-        points |= {f"{one.name}, in the scan": one.rest, f"{one.name}, now": one.now}
-    centroid = compute_centroid(moment.left, moment.displacement)
-    others = {CENTROID: centroid, "tip": moment.tip}
+    for one in landmarks:
+        points |= {f"{one.name}, in the scan": one.rest, f"{one.name}, now": one.deformed}
+    centroid = compute_centroid(deformed.remaining, deformed.displacement)
+    others = {CENTROID: centroid, "tip": deformed.tip}
     return points | {name: point for name, point in others.items() if point is not None}
 
 
@@ -139,7 +139,7 @@ def _write_sequence(path: Path, sequence: Sequence[tuple[float, DeformedAnatomy]
     if 3 * np.prod(grid.shape) * len(sequence) > MAX_VALUES:
         raise InputError(f"--sequence: {len(sequence)} moments are too many. Give a larger step.")
     pairs = zip(sequence, moved, strict=True)
-    fields = [compute_forward(grid, moment.left, displacement)[0] for (_, moment), displacement in pairs]
+    fields = [compute_forward(grid, moment.remaining, displacement)[0] for (_, moment), displacement in pairs]
     write_field_sequence(path, grid, fields, [time for time, _ in sequence])
 
 
@@ -152,37 +152,37 @@ def describe_spaces(files: Sequence[str]) -> dict[str, str]:
 
 
 def collect_figures(
-    moment: DeformedAnatomy, fields: WarpFields, places: SamplePlaces, warped: Sequence[Warped], frames: int
+    deformed: DeformedAnatomy, fields: WarpFields, samples: SamplePoints, images: Sequence[WarpedImage], frames: int
 ) -> dict[str, Any]:
     """Collect the report of a warp: millimetres, shares, counts of voxels, and warnings."""
-    error = 1e3 * places.compute_errors(fields)
-    moving = np.linalg.norm(places.moved, axis=1) > MIN_MOTION
-    gap, largest = moment.find_gap(), 1e3 * float(np.linalg.norm(moment.displacement, axis=1).max())
-    of_tumour = _summarise_errors(error[places.tumour])
-    folds = find_folds(moment, fields)
+    error = 1e3 * samples.compute_errors(fields)
+    moving = np.linalg.norm(samples.displacement, axis=1) > MIN_MOTION
+    gap, largest = deformed.find_gap(), 1e3 * float(np.linalg.norm(deformed.displacement, axis=1).max())
+    of_tumour = _summarise_errors(error[samples.tumour])
+    folds = find_folds(deformed, fields)
     return {
-        "moved_by": moment.cause.words,
-        "cause": dict(moment.cause.record),
-        "converged": moment.converged,
+        "moved_by": deformed.cause.description,
+        "cause": dict(deformed.cause.record),
+        "converged": deformed.converged,
         "largest_displacement_mm": largest,
         "tip_to_tumour_mm": None if gap is None else 1e3 * gap[1],
-        "bound_mm": None if moment.bound is None else 1e3 * moment.bound,
-        "bound_of": moment.bound_words,
+        "bound_mm": None if deformed.bound is None else 1e3 * deformed.bound,
+        "bound_of": deformed.bound_text,
         "spacing_mm": round(1e3 * fields.grid.spacing, 6),
         "nodes": list(fields.grid.shape),
         "reach_mm": 1e3 * fields.fade_distance,
-        "faint_mm": 1e3 * compute_cutoff(moment.displacement),
+        "faint_mm": 1e3 * compute_cutoff(deformed.displacement),
         "least_jacobian": dict(zip(("modeling", "resampling", "tetrahedra"), fields.min_determinants, strict=True)),
         "grid_error_mm": {
             "median": float(np.median(error)),
             "moved_p95": _summarise_errors(error[moving])["p95"],
             "worst": float(error.max()),
             "tumour": of_tumour,
-            "cortex": _summarise_errors(error[places.cortex]),
-            "landmarks_worst": _summarise_errors(error[places.landmarks])["worst"],
+            "cortex": _summarise_errors(error[samples.cortex]),
+            "landmarks_worst": _summarise_errors(error[samples.landmarks])["worst"],
         },
-        "landmarks": [one.name for one in places.marks],
-        "images": [vars(one) for one in warped],
+        "landmarks": [one.name for one in samples.named],
+        "images": [vars(one) for one in images],
         "sequence_frames": frames,
         "fields_fold": fields.has_folds,
         "folds": [_summarise_fold(fold) for fold in folds],
@@ -196,22 +196,22 @@ def _summarise_errors(error: np.ndarray) -> dict[str, float]:
     return {"p95": float(np.quantile(error, 0.95)), "worst": float(error.max())}
 
 
-def _summarise_fold(fold: Folded) -> dict[str, Any]:
+def _summarise_fold(fold: FoldedRegion) -> dict[str, Any]:
     return {
         "tetrahedra": fold.tetrahedra,
-        "middle_in_scan_mm": [round(1e3 * value, 3) for value in fold.middle],
+        "middle_in_scan_mm": [round(1e3 * value, 3) for value in fold.centre],
         "volume_in_scan_mm3": 1e9 * fold.volume,
-        "fields_off_mm": 1e3 * fold.off,
+        "fields_off_mm": 1e3 * fold.field_error,
     }
 
 
-def _list_warnings(largest: float, of_tumour: float, folds: Sequence[Folded]) -> list[str]:
+def _list_warnings(largest: float, of_tumour: float, folds: Sequence[FoldedRegion]) -> list[str]:
     found = []
     for fold in folds:
-        x, y, z = (f"{1e3 * value:.1f}" for value in fold.middle)
+        x, y, z = (f"{1e3 * value:.1f}" for value in fold.centre)
         found.append(
             f"the finite elements fold {1e9 * fold.volume:.2f} mm3 at {x}, {y}, {z} mm in the scan (RAS). The fields "
-            f"do not: there they differ by up to {1e3 * fold.off:.2f} mm, and are not to be relied on."
+            f"do not: there they differ by up to {1e3 * fold.field_error:.2f} mm, and are not to be relied on."
         )
     if of_tumour > max(MAX_GRID_ERROR * largest, 1e3 * SpacingSettings().tolerance):
         found.append(

@@ -50,13 +50,13 @@ MOTION_TOLERANCE = 1e-8  # Displacement below which voxels stay unchanged [m].
 BATCH_SLICES = 8  # Number of slices processed together: limits memory.
 
 
-def measure_shown_share(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:
+def measure_brain_coverage(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:
     """Return the volume share of a brain inside the grid of voxels (I, J, K) with an affine to metres (RAS)."""
     _, inside = _find_voxels(affine, shape, _compute_centroids(anatomy))
     return float(np.average(inside, weights=anatomy.mesh.volumes))
 
 
-def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy: Anatomy) -> list[str]:
+def list_warnings(values: np.ndarray, affine: np.ndarray, is_label_map: bool, anatomy: Anatomy) -> list[str]:
     """List warnings, as predicates, about an image (I, J, K) that shows a part of a brain."""
     found, middles, volumes = [], _compute_centroids(anatomy), anatomy.mesh.volumes
     index, inside = _find_voxels(affine, values.shape, middles)
@@ -64,20 +64,20 @@ def list_warnings(values: np.ndarray, affine: np.ndarray, labels: bool, anatomy:
     if share < IMAGE_WARNINGS.min_inside_share:
         found.append(f"shows {share:.0%} of the brain; what lies outside is not in it")
     empty = float(np.average(values[tuple(index[inside].T)] == 0, weights=volumes[inside]))
-    turned = _is_turned(values, affine, labels, middles, volumes)
+    turned = _is_turned(values, affine, is_label_map, middles, volumes)
     if turned:
         found.append(
             f"fits the brain in {turned[0]:.0%} of its volume, but in {turned[1]:.0%} with x and y negated: "
             "it may be LPS marked as RAS"
         )
-    elif not labels and 1.0 - empty < IMAGE_WARNINGS.min_nonzero_share:
+    elif not is_label_map and 1.0 - empty < IMAGE_WARNINGS.min_nonzero_share:
         found.append(
             f"is 0 in {empty:.0%} of the brain's volume: it may be in another space than the labels that the anatomy "
             "was made from"
         )
-    if not labels and _is_label_like(values):
+    if not is_label_map and _is_label_like(values):
         found.append("holds few values, all whole, as label maps do: give one by --labels, or labels are mixed")
-    elif labels and (alike := _compute_equal_share(values)) < IMAGE_WARNINGS.min_equal_neighbours:
+    elif is_label_map and (alike := _compute_equal_share(values)) < IMAGE_WARNINGS.min_equal_neighbours:
         found.append(
             f"has the same value in {alike:.0%} of neighbouring voxels, as intensities do: give them by --image, or "
             "values are not interpolated"
@@ -125,12 +125,12 @@ def _compute_centroids(anatomy: Anatomy) -> np.ndarray:
 
 def _find_voxels(affine: np.ndarray, shape: tuple[int, ...], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest voxels (n, 3) to points (n, 3) [m], and which of these lie within the volume (n,)."""
-    index, last = compute_index(affine, points), np.array(shape) - 1
+    index, last = compute_voxel_indices(affine, points), np.array(shape) - 1
     inside = np.asarray(((index >= -0.5) & (index <= last + 0.5)).all(axis=1))
     return np.clip(np.rint(index), 0, last).astype(int), inside
 
 
-def compute_index(affine: np.ndarray, points: np.ndarray) -> np.ndarray:
+def compute_voxel_indices(affine: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return indices (n, 3) of points (n, 3) [m] in a volume of an affine (4, 4)."""
     return (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
 
@@ -147,7 +147,7 @@ class PatientImage:
 
 
 @dataclass(frozen=True)
-class Warped:
+class WarpedImage:
     """Name of a warped image, and numbers of voxels that moved, came from outside, and were resected."""
 
     name: str
@@ -156,7 +156,7 @@ class Warped:
     resected: int
 
 
-def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> PatientImage:
+def read_patient_image(path: Path, anatomy: Anatomy, is_label_map: bool, axes: str = "") -> PatientImage:
     """Read an image or a label map of the brain of an anatomy.
 
     Raises
@@ -167,17 +167,17 @@ def read_picture(path: Path, anatomy: Anatomy, labels: bool, axes: str = "") -> 
     volume = read_volume(path, VoxelSpec(axes=axes), require_finite=False)
     image = _as_nifti(path, volume)
     values = volume.values
-    if labels and not has_integers(values):
+    if is_label_map and not has_integers(values):
         raise InputError(f"{path}: holds values that are not whole, so it is no label map. Give it by --image.")
-    if measure_shown_share(volume.affine, values.shape, anatomy) == 0.0:
+    if measure_brain_coverage(volume.affine, values.shape, anatomy) == 0.0:
         low, high = (1e3 * end for end in (anatomy.mesh.nodes.min(axis=0), anatomy.mesh.nodes.max(axis=0)))
         raise InputError(
             f"{path}: shows none of this brain, which reaches from {_format_millimetres(low)} to "
             f"{_format_millimetres(high)} mm (RAS). Give an image "
             "in the space of the labels that the anatomy was made from, or register it to them first."
         )
-    warnings = [*volume.notes, *list_warnings(values, volume.affine, labels, anatomy)]
-    return PatientImage(path, image, volume, labels, tuple(warnings))
+    warnings = [*volume.notes, *list_warnings(values, volume.affine, is_label_map, anatomy)]
+    return PatientImage(path, image, volume, is_label_map, tuple(warnings))
 
 
 def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
@@ -202,7 +202,7 @@ def to_warped_name(path: Path) -> str:
     return f"{path.name[: len(path.name) - len(ending)]}_deformed.nii.gz"
 
 
-def write_warped(folder: Path, picture: PatientImage, fields: WarpFields, order: str) -> Warped:
+def write_warped_image(folder: Path, picture: PatientImage, fields: WarpFields, order: str) -> WarpedImage:
     """Write an image of the deformed brain, with the original header: type, scale, sform and qform.
 
     Label maps use nearest-neighbour interpolation. Voxels whose source is outside the image, or in resected
@@ -216,26 +216,26 @@ def write_warped(folder: Path, picture: PatientImage, fields: WarpFields, order:
     values, counts = warp_values(stored, picture.volume.affine, fields, 0 if picture.labels else ORDERS[order])
     blank = 0.0 if shift == 0.0 else -shift / slope
     if blank:
-        values[counts.blank] = np.rint(blank) if values.dtype.kind in "iu" else blank
+        values[counts.unfilled] = np.rint(blank) if values.dtype.kind in "iu" else blank
     out = nibabel.Nifti1Image(values.reshape(image.shape), None, image.header)
     if (slope, shift) != (1.0, 0.0):
         out.header.set_slope_inter(slope, shift)
     name = to_warped_name(picture.path)
     nibabel.save(out, folder / name)
-    return Warped(name, counts.moved, counts.outside, counts.resected)
+    return WarpedImage(name, counts.moved, counts.outside, counts.resected)
 
 
 @dataclass(frozen=True, eq=False)
 class Counts:
     """Numbers of voxels that moved, that came from outside the image, and that came from resected tissue.
 
-    `blank` (I, J, K) bool: voxels without a source.
+    `unfilled` (I, J, K) bool: voxels without a source.
     """
 
     moved: int
     outside: int
     resected: int
-    blank: np.ndarray
+    unfilled: np.ndarray
 
 
 def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, order: int) -> tuple[np.ndarray, Counts]:
@@ -259,7 +259,7 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
         if not len(rows):
             continue
         then = now[rows] + went
-        place = compute_index(affine, then)
+        place = compute_voxel_indices(affine, then)
         off = ((place < -0.5) | (place > last + 0.5)).any(axis=1)
         cut = np.zeros(len(rows), bool)
         if fields.resected.any():

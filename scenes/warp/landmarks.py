@@ -30,7 +30,7 @@ class Landmark:
 
     name: str
     rest: np.ndarray
-    now: np.ndarray
+    deformed: np.ndarray
 
 
 def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, ...]:

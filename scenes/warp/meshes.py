@@ -27,22 +27,22 @@ class NamedSurface:
 
     name: str
     vertices: np.ndarray
-    moved: np.ndarray
+    displacement: np.ndarray
     triangles: np.ndarray
     colour: tuple[float, float, float, float]
 
 
 def build_surface_mesh(
-    name: str, triangles: np.ndarray, nodes: np.ndarray, moved: np.ndarray, colour: tuple[float, float, float, float]
+    name: str, triangles: np.ndarray, nodes: np.ndarray, motion: np.ndarray, colour: tuple[float, float, float, float]
 ) -> NamedSurface:
     """Build the surface of some triangles of nodes (V, 3) [m], displaced by (V, 3) [m], without unused vertices."""
     used, numbers = np.unique(triangles, return_inverse=True)
-    return NamedSurface(name, nodes[used] + moved[used], moved[used], numbers.reshape(-1, 3), colour)
+    return NamedSurface(name, nodes[used] + motion[used], motion[used], numbers.reshape(-1, 3), colour)
 
 
 def write_vtp(path: Path, mesh: NamedSurface) -> None:
     """Write VTK's XML of polygons in millimetres, LPS, as its field SPACE records; `displacement` [mm] at points."""
-    points, moved = (1e3 * values * LPS for values in (mesh.vertices, mesh.moved))
+    points, moved = (1e3 * values * LPS for values in (mesh.vertices, mesh.displacement))
     ends = 3 * np.arange(1, len(mesh.triangles) + 1)
     space = " ".join(str(code) for code in (*b"LPS", 0))
     path.write_text(

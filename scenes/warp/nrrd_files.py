@@ -45,13 +45,13 @@ def write_field_sequence(path: Path, grid: Grid, fields: Sequence[np.ndarray], t
     write_nrrd(path, vectors, header, {**index, **_build_displacement_header("modeling")})
 
 
-def write_labels_nrrd(path: Path, grid: Grid, labels: np.ndarray, pairs: Mapping[str, str]) -> None:
+def write_labels_nrrd(path: Path, grid: Grid, labels: np.ndarray, metadata: Mapping[str, str]) -> None:
     """Write labels (I, J, K) uint8 on a grid, with pairs of names and values behind the header."""
     header = {"kinds": "domain domain domain", **_build_space_header(grid, "{axes}")}
-    write_nrrd(path, labels, header, pairs)
+    write_nrrd(path, labels, header, metadata)
 
 
-def write_nrrd(path: Path, values: np.ndarray, header: Mapping[str, str], pairs: Mapping[str, str]) -> None:
+def write_nrrd(path: Path, values: np.ndarray, header: Mapping[str, str], metadata: Mapping[str, str]) -> None:
     """Write an array, whose first axis runs fastest in the file, under header fields and pairs of names and values."""
     lines = [
         "NRRD0005",
@@ -62,7 +62,7 @@ def write_nrrd(path: Path, values: np.ndarray, header: Mapping[str, str], pairs:
         *(f"{name}: {value}" for name, value in header.items()),
         "endian: little",
         "encoding: gzip",
-        *(f"{name}:={value}" for name, value in pairs.items()),
+        *(f"{name}:={value}" for name, value in metadata.items()),
     ]
     with path.open("wb") as file:
         file.write(("\n".join(lines) + "\n\n").encode("ascii"))

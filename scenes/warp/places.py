@@ -37,38 +37,38 @@ class SpacingSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class SamplePlaces:
+class SamplePoints:
     """Sample points: vertices of a mesh, points in its tetrahedra and on its open cortex, and landmarks.
 
     Parameters
     ----------
-    rest, moved
+    rest, displacement
         Positions in the scan, and displacements (n, 3) [m].
     tumour, cortex, landmarks
         Masks (n,): True for points of the tumour, of the open cortex, and for landmarks.
-    marks
+    named
         Landmarks, in the order of their points.
     """
 
     rest: np.ndarray
-    moved: np.ndarray
+    displacement: np.ndarray
     tumour: np.ndarray
     cortex: np.ndarray
     landmarks: np.ndarray
-    marks: tuple[Landmark, ...]
+    named: tuple[Landmark, ...]
 
     def compute_errors(self, fields: WarpFields) -> np.ndarray:
         """Return the distance [m] between fields and FEM at each place (n,): the larger one of the two fields."""
-        grid, now = fields.grid, self.rest + self.moved
-        forward = grid.interpolate(fields.forward, self.rest) - self.moved
-        backward = grid.interpolate(fields.backward, now) + self.moved
+        grid, now = fields.grid, self.rest + self.displacement
+        forward = grid.interpolate(fields.forward, self.rest) - self.displacement
+        backward = grid.interpolate(fields.backward, now) + self.displacement
         return np.maximum(np.linalg.norm(forward, axis=1), np.linalg.norm(backward, axis=1))
 
 
-def list_places(moment: DeformedAnatomy) -> SamplePlaces:
+def list_points(deformed: DeformedAnatomy) -> SamplePoints:
     """List the vertices of the remaining body, four points per tetrahedron, three per open triangle, and landmarks."""
-    body, mesh = moment.left, moment.left.mesh
-    used, marks = np.unique(mesh.tets), list_landmarks(body, moment.displacement)
+    body, mesh = deformed.remaining, deformed.remaining.mesh
+    used, marks = np.unique(mesh.tets), list_landmarks(body, deformed.displacement)
     within, on = len(INNER_WEIGHTS) * len(mesh.tets), len(FACE_WEIGHTS) * len(body.open_surface)
     part = np.repeat(np.arange(4), [len(used), within, on, len(marks)])
 
@@ -84,34 +84,34 @@ def list_places(moment: DeformedAnatomy) -> SamplePlaces:
     tumour[part == 1] = np.repeat(body.in_tumour, len(INNER_WEIGHTS))
     cortex[part == 0], cortex[part == 2] = np.isin(used, body.open_surface), True
     rest = at(mesh.nodes, [one.rest for one in marks])
-    moved = at(moment.displacement, [one.now - one.rest for one in marks])
-    return SamplePlaces(rest, moved, tumour, cortex, part == 3, marks)
+    moved = at(deformed.displacement, [one.deformed - one.rest for one in marks])
+    return SamplePoints(rest, moved, tumour, cortex, part == 3, marks)
 
 
 @dataclass(frozen=True)
-class Folded:
+class FoldedRegion:
     """Connected inverted tetrahedra: number, centre in the scan [m, RAS] and volume in the scan [m3].
 
-    `off`: error of the fields relative to FEM there [m]; no field can represent a fold.
+    `field_error`: error of the fields relative to FEM there [m]; no field can represent a fold.
     """
 
     tetrahedra: int
-    middle: tuple[float, ...]
+    centre: tuple[float, ...]
     volume: float
-    off: float
+    field_error: float
 
 
-def find_folds(moment: DeformedAnatomy, fields: WarpFields) -> tuple[Folded, ...]:
+def find_folds(deformed: DeformedAnatomy, fields: WarpFields) -> tuple[FoldedRegion, ...]:
     """Find places where FEM folds, largest first."""
-    mesh = moment.left.mesh
-    bad = mesh.tets[compute_signed_volumes(mesh.nodes + moment.displacement, mesh.tets) <= 0.0]
+    mesh = deformed.remaining.mesh
+    bad = mesh.tets[compute_signed_volumes(mesh.nodes + deformed.displacement, mesh.tets) <= 0.0]
     if not len(bad):
         return ()
     count = len(bad)
     sides = np.repeat(np.arange(count), 4), count + bad.ravel()
     graph = coo_matrix((np.ones(4 * count), sides), (count + len(mesh.nodes),) * 2)
     groups = connected_components(graph, directed=False)[1][:count]
-    errors = list_places(moment).compute_errors(fields)
+    errors = list_points(deformed).compute_errors(fields)
     off = np.zeros(len(mesh.nodes))
     used = np.unique(mesh.tets)
     off[used] = errors[: len(used)]
@@ -120,7 +120,7 @@ def find_folds(moment: DeformedAnatomy, fields: WarpFields) -> tuple[Folded, ...
         tets = bad[groups == group]
         volumes = compute_signed_volumes(mesh.nodes, tets)
         middle = np.average(mesh.nodes[tets].mean(axis=1), axis=0, weights=volumes)
-        found.append(Folded(len(tets), tuple(middle.tolist()), float(volumes.sum()), float(off[tets].max())))
+        found.append(FoldedRegion(len(tets), tuple(middle.tolist()), float(volumes.sum()), float(off[tets].max())))
     return tuple(sorted(found, key=lambda fold: -fold.volume))
 
 
@@ -130,7 +130,7 @@ def count_steps(spacing: float | None, settings: SpacingSettings = SpacingSettin
 
 
 def compute_fields(
-    moment: DeformedAnatomy,
+    deformed: DeformedAnatomy,
     spacing: float | None,
     step: Callable[[int], object],
     settings: SpacingSettings = SpacingSettings(),
@@ -144,31 +144,31 @@ def compute_fields(
     InputError
         A spacing that makes too many nodes.
     """
-    if spacing is not None and (nodes := _count_nodes(moment, spacing)) > MAX_REQUESTED_NODES:
+    if spacing is not None and (nodes := _count_nodes(deformed, spacing)) > MAX_REQUESTED_NODES:
         raise InputError(
             f"--spacing {1e3 * spacing:g}: the fields would have {nodes / 1e6:.0f} million nodes, and "
             f"{MAX_REQUESTED_NODES / 1e6:.0f} million are the most. Give a larger one."
         )
     left = count_steps(spacing, settings) - 2
-    fields = _compute_fields(moment, spacing or settings.first, step)
-    while left and (finer := find_finer_spacing(moment, fields, settings)) is not None:
-        fields, left = _compute_fields(moment, finer, step), left - 2
+    fields = _compute_fields(deformed, spacing or settings.first, step)
+    while left and (finer := find_finer_spacing(deformed, fields, settings)) is not None:
+        fields, left = _compute_fields(deformed, finer, step), left - 2
     step(left)
     return fields
 
 
 def find_finer_spacing(
-    moment: DeformedAnatomy, fields: WarpFields, settings: SpacingSettings = SpacingSettings()
+    deformed: DeformedAnatomy, fields: WarpFields, settings: SpacingSettings = SpacingSettings()
 ) -> float | None:
     """Return a finer spacing [m] that meets the tolerance, or is as near as size allows; None if none is needed."""
     now = fields.grid.spacing
-    places = list_places(moment)
+    places = list_points(deformed)
     worst = float(places.compute_errors(fields)[places.tumour | places.landmarks].max(initial=0.0))
     if worst <= settings.tolerance:
         return None
     steps = math.floor(settings.safety_factor * now * settings.tolerance / worst / settings.step)
     steps = max(steps, round(MIN_SPACING / settings.step))
-    while _count_nodes(moment, settings.step * steps) > settings.max_nodes:
+    while _count_nodes(deformed, settings.step * steps) > settings.max_nodes:
         steps += 1
     return settings.step * steps if steps < round(now / settings.step) else None
 
@@ -178,4 +178,4 @@ def _count_nodes(moment: DeformedAnatomy, spacing: float) -> float:
 
 
 def _compute_fields(moment: DeformedAnatomy, spacing: float, step: Callable[[int], object]) -> WarpFields:
-    return compute_warp_fields(moment.anatomy, moment.displacement, spacing, moment.left, lambda: step(1))
+    return compute_warp_fields(moment.anatomy, moment.displacement, spacing, moment.remaining, lambda: step(1))

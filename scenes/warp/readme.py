@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from .images import Warped
+from .images import WarpedImage
 from .landmarks import CENTROID, DESCRIPTIONS, NEAREST, TUMOUR
 from .places import INNER_WEIGHTS
 
@@ -55,7 +55,7 @@ These are errors of the grid. How far the tumour may be off: {bound}
 """
 
 
-def write_readme(report: dict, images: Sequence[Warped]) -> str:
+def write_readme(report: dict, images: Sequence[WarpedImage]) -> str:
     """Return the text of README.txt from the figures of a warp."""
     sequence = (
         "field_sequence.seq.nrrd  the same of many moments, which Slicer plays.\n" if report["sequence_frames"] else ""

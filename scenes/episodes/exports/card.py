@@ -79,7 +79,7 @@ def write_card(
         f"{len(rows)} episodes of scripted surgery on simulated brains with a tumour: images, depth, poses of camera "
         "and tool, forces, and tumour positions by FEM."
     )
-    date = max(str(one.said.get("date", ""))[:10] for one in episodes) or datetime.now(UTC).date().isoformat()
+    date = max(str(one.attributes.get("date", ""))[:10] for one in episodes) or datetime.now(UTC).date().isoformat()
     described = build_croissant_metadata(
         folder.resolve().name, description, date, TABLE, sha256(table.encode()).hexdigest(), inside
     )
@@ -91,7 +91,7 @@ def write_card(
     return {"out": str(folder), "episodes": len(rows), "frames": sum(one.frames for one in episodes), "files": NAMES}
 
 
-def keep_card(
+def update_card(
     folder: Path, numbers: Set[int], changed: bool, progress: Callable[[Iterable], Iterable] = iter
 ) -> str | None:
     """Rewrite the card of a run's folder if it does not match the episodes; return the reason if this failed.
@@ -166,12 +166,12 @@ def build_row(contents: EpisodeContents, folder: Path) -> dict[str, object]:
         "seconds": round(float(times[-1] - times[0]), 6),
         "width": width,
         "height": height,
-        "seed": contents.said.get("seed", ""),
-        "anatomy": contents.said.get("anatomy", ""),
-        "deformer": contents.said.get("deformer", ""),
+        "seed": contents.attributes.get("seed", ""),
+        "anatomy": contents.attributes.get("anatomy", ""),
+        "deformer": contents.attributes.get("deformer", ""),
         "largest_error_mm": "" if error is None else round(error[1], 6),
         "bytes": path.stat().st_size,
-        "sha256": contents.said.get("sha256", ""),
+        "sha256": contents.attributes.get("sha256", ""),
     }
 
 

@@ -38,12 +38,12 @@ def mark_held_out(episodes: Sequence[EpisodeContents]) -> list[bool]:
 
     Of two to nine episodes, the last one is held out.
     """
-    bodies = list(dict.fromkeys(str(one.said.get("anatomy")) for one in episodes))
+    bodies = list(dict.fromkeys(str(one.attributes.get("anatomy")) for one in episodes))
     if len(bodies) < HELD_OUT_STRIDE:
         every = min(HELD_OUT_STRIDE, max(len(episodes), 2))
         return [number % every == every - 1 for number in range(len(episodes))]
     out = set(bodies[HELD_OUT_STRIDE - 1 :: HELD_OUT_STRIDE])
-    return [str(one.said.get("anatomy")) in out for one in episodes]
+    return [str(one.attributes.get("anatomy")) in out for one in episodes]
 
 
 TIME_STEP_TOLERANCE = 1e-4  # Largest deviation of the time between frames from the mean [s].
@@ -63,7 +63,7 @@ SHEET, LICENCE = "DATASHEET.md", "LICENSE.md"
 """File names of the data sheet and the licence."""
 
 
-def list_shared_images(episodes: Sequence[EpisodeContents], wanted: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
+def list_shared_images(episodes: Sequence[EpisodeContents], names: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
     """List the requested images that every episode has.
 
     Raises
@@ -75,7 +75,7 @@ def list_shared_images(episodes: Sequence[EpisodeContents], wanted: Sequence[str
         if one.size != episodes[0].size:
             sizes = " and ".join(f"{width} x {height}" for width, height in (episodes[0].size, one.size))
             raise InputError(f"{one.path}: images of {sizes} pixels cannot be in one set: convert them separately.")
-    return tuple(name for name in wanted if all(name in one.shapes for one in episodes))
+    return tuple(name for name in names if all(name in one.shapes for one in episodes))
 
 
 def list_shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
@@ -190,7 +190,7 @@ def collect_texts(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
     return found
 
 
-def write_along(episodes: Sequence[EpisodeContents], folder: Path) -> None:
+def write_notices(episodes: Sequence[EpisodeContents], folder: Path) -> None:
     """Write the data sheets and licences of the episodes into a folder."""
     for name, text in collect_texts(episodes).items():
         (folder / name).write_text(text, encoding="utf-8")

@@ -55,7 +55,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
 
 
 def build_croissant_metadata(
-    name: str, description: str, date: str, table: str, sha256: str, inside: str
+    name: str, description: str, date: str, table: str, sha256: str, folder: str
 ) -> dict[str, Any]:
     """Return the metadata, as JSON.
 
@@ -63,7 +63,7 @@ def build_croissant_metadata(
     ----------
     table, sha256
         The file with a row for each episode, and its checksum.
-    inside
+    folder
         Pattern of the episodes' files.
     """
     return {
@@ -97,7 +97,7 @@ def build_croissant_metadata(
                 "name": "episode-files",
                 "description": "One HDF5 file for each episode; attributes say what each array is.",
                 "encodingFormat": "application/x-hdf5",
-                "includes": inside,
+                "includes": folder,
             },
         ],
         "recordSet": [

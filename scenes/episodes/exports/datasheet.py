@@ -20,7 +20,7 @@ def read_parameters(contents: EpisodeContents) -> dict[str, Any]:
     Tumours are sampled for synthetic anatomies only; those of others have no effect and are excluded.
     """
     try:
-        found = dict(list_leaves(json.loads(contents.said.get("parameters", "{}"))))
+        found = dict(list_leaves(json.loads(contents.attributes.get("parameters", "{}"))))
     except (TypeError, ValueError, RecursionError):
         return {}
     placed = found.get("bodies.anatomies", "drawn") == "drawn"
@@ -49,12 +49,12 @@ def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str
         ]
 
 
-def format_range_row(key: str, found: Sequence[Any]) -> str:
+def format_range_row(key: str, values: Sequence[Any]) -> str:
     """Format the table row of a varied parameter."""
-    if all(is_number(one) for one in found):
-        return f"| `{key}` | {format_cell(min(found))} | {format_cell(max(found))} | {len(found)} |"
-    often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, found)).most_common(8))
-    return f"| `{key}` | {often} | | {len(found)} |"
+    if all(is_number(one) for one in values):
+        return f"| `{key}` | {format_cell(min(values))} | {format_cell(max(values))} | {len(values)} |"
+    often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, values)).most_common(8))
+    return f"| `{key}` | {often} | | {len(values)} |"
 
 
 def is_number(value: Any) -> bool:
@@ -92,7 +92,7 @@ def find_origin(contents: EpisodeContents) -> str:
     stated = read_parameters(contents).get("bodies.anatomies")
     if stated is not None:
         return str(stated)
-    return TEMPLATE if is_template(str(contents.said.get("anatomy"))) else UNSTATED
+    return TEMPLATE if is_template(str(contents.attributes.get("anatomy"))) else UNSTATED
 
 
 def get_template_notice() -> str:
@@ -200,7 +200,7 @@ def describe_composition(
 
 def describe_bodies(episodes: Sequence[EpisodeContents]) -> str:
     """Describe the numbers of anatomies and image sizes."""
-    bodies = len({one.said.get("anatomy") for one in episodes})
+    bodies = len({one.attributes.get("anatomy") for one in episodes})
     sizes = sorted({one.size for one in episodes})
     said_sizes = ", ".join(f"{width} x {height}" for width, height in sizes)
     return "\n".join([f"Anatomies: {bodies}. Images: {said_sizes} pixels.\n", *format_origins(episodes)])
@@ -238,7 +238,7 @@ def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
 
 def format_value(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
     """Format the values of an attribute over all episodes that have it."""
-    return [one.said[key] for one in episodes if key in one.said]
+    return [one.attributes[key] for one in episodes if key in one.attributes]
 
 
 def format_plans(episodes: Sequence[EpisodeContents]) -> Iterator[str]:

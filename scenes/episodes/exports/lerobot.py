@@ -32,7 +32,7 @@ from .columns import (
     measure_stored_size,
     name_axes,
     split_into_blocks,
-    write_along,
+    write_notices,
 )
 
 
@@ -40,11 +40,11 @@ from .columns import (
 class RowStatistics:
     """Statistics of `count` rows: each a float64 array of one row's shape. NaN values are excluded."""
 
-    least: np.ndarray
-    greatest: np.ndarray
+    minimum: np.ndarray
+    maximum: np.ndarray
     total: np.ndarray
     squares: np.ndarray
-    known: np.ndarray
+    counted: np.ndarray
     count: int
 
     @classmethod
@@ -65,21 +65,21 @@ class RowStatistics:
     def __add__(self, other: RowStatistics) -> RowStatistics:
         """Return the statistics of both sets."""
         return RowStatistics(
-            np.minimum(self.least, other.least),
-            np.maximum(self.greatest, other.greatest),
+            np.minimum(self.minimum, other.minimum),
+            np.maximum(self.maximum, other.maximum),
             self.total + other.total,
             self.squares + other.squares,
-            self.known + other.known,
+            self.counted + other.counted,
             self.count + other.count,
         )
 
     def to_lists(self) -> dict[str, list]:
         """Return lists of min, max, mean, std and count; zeros without data."""
-        known = np.maximum(self.known, 1)
+        known = np.maximum(self.counted, 1)
         mean = self.total / known
         deviation = np.sqrt(np.maximum(self.squares / known - np.square(mean), 0.0))
-        arrays = {"min": self.least, "max": self.greatest, "mean": mean, "std": deviation}
-        lists = {name: np.where(self.known, array, 0.0) for name, array in arrays.items()}
+        arrays = {"min": self.minimum, "max": self.maximum, "mean": mean, "std": deviation}
+        lists = {name: np.where(self.counted, array, 0.0) for name, array in arrays.items()}
         return {**{name: np.atleast_1d(array).tolist() for name, array in lists.items()}, "count": [self.count]}
 
 
@@ -113,20 +113,18 @@ def write_lerobot(
     tasks = list(dict.fromkeys(describe_task(one) for one in episodes))
     rates: set[float] = set()
     with write_folder_atomically(folder, measure_stored_size(episodes)) as partial:
-        tables = Tables(partial)
+        tables = TableWriter(partial)
         rows, whole, shapes = [], {}, {}
         first = 0
         try:
-            for number, contents in enumerate(progress(episodes)):
+            for index, contents in enumerate(progress(episodes)):
                 with open_episode(contents.path) as file:
                     numbers = collect_numbers(file, contents, names)
                     rates.add(compute_frame_rate(contents, numbers.pop("time")))
                     if len(rates) > 1:
                         slow, fast = sorted(rates)
                         raise InputError(f"{contents.path}: {slow:g} and {fast:g} frames a second: convert them apart.")
-                    columns = build_columns(
-                        contents.frames, number, first, tasks.index(describe_task(contents)), *rates
-                    )
+                    columns = build_columns(contents.frames, index, first, tasks.index(describe_task(contents)), *rates)
                     columns |= {to_key(name): rows_ for name, rows_ in numbers.items()}
                     place = tables.write(file, contents, columns, pictures)
                     spreads = {name: RowStatistics.compute(array) for name, array in columns.items()}
@@ -136,7 +134,7 @@ def write_lerobot(
                     }
                 rows.append(
                     {
-                        "episode_index": number,
+                        "episode_index": index,
                         "tasks": [describe_task(contents)],
                         "length": contents.frames,
                         "data/chunk_index": place[0],
@@ -168,7 +166,7 @@ def write_lerobot(
         described = build_info(len(episodes), first, len(tasks), rates.pop(), features)
         write_json(partial / "meta/info.json", described)
         write_json(partial / "meta/spaces.json", {"spaces": SPACE})
-        write_along(episodes, partial)
+        write_notices(episodes, partial)
     return {"out": str(folder), "episodes": len(episodes), "frames": first, "features": sorted(features)}
 
 
@@ -186,7 +184,7 @@ def build_columns(frames: int, episode: int, first: int, task: int, rate: float)
 
 
 @dataclass
-class Tables:
+class TableWriter:
     """Writer of data tables of limited size; frames are written in blocks."""
 
     folder: Path
@@ -253,9 +251,9 @@ def measure_image_statistics(file: h5py.File, contents: EpisodeContents, name: s
     return RowStatistics.compute(np.concatenate(found))
 
 
-def to_lerobot_statistics(name: str, spread: RowStatistics) -> dict[str, list]:
+def to_lerobot_statistics(name: str, statistics: RowStatistics) -> dict[str, list]:
     """Convert statistics to LeRobot's form; those of an image have shape (channels, 1, 1)."""
-    said = spread.to_lists()
+    said = statistics.to_lists()
     if not name.startswith("observation.images."):
         return said
     return {key: value if key == "count" else [[[one]] for one in value] for key, value in said.items()}

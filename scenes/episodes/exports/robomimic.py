@@ -55,7 +55,7 @@ def write_robomimic(
                 rates.append(compute_frame_rate(contents, numbers.pop("time")))
                 obs = demo.create_group("obs")
                 write_demo(demo, obs, contents, numbers)
-                write_pictures(obs, file, contents, pictures, stream)
+                write_images(obs, file, contents, pictures, stream)
             total += contents.frames
         data.attrs.update(
             {"total": total, "env_args": json.dumps(describe_environment(episodes, rates)), "space": SPACE}
@@ -69,27 +69,27 @@ def write_robomimic(
     return {"out": str(path), "episodes": len(episodes), "frames": total, "held_out": int(out_of.sum())}
 
 
-def write_demo(demo: h5py.Group, obs: h5py.Group, contents: EpisodeContents, numbers: dict[str, np.ndarray]) -> None:
+def write_demo(demo: h5py.Group, obs: h5py.Group, contents: EpisodeContents, values: dict[str, np.ndarray]) -> None:
     """Write one episode without images: a state is that of the tool, then of the tumour if exported."""
-    actions, state = numbers.pop("action"), numbers.pop("state")
-    tumour = [numbers[name].reshape(contents.frames, -1) for name in ("tumour_predicted",) if name in numbers]
+    actions, state = values.pop("action"), values.pop("state")
+    tumour = [values[name].reshape(contents.frames, -1) for name in ("tumour_predicted",) if name in values]
     dones = np.zeros(contents.frames, np.int64)
     dones[-1] = 1
     demo.create_dataset("actions", data=actions)
     demo.create_dataset("states", data=np.concatenate([state, *tumour], axis=1))
     demo.create_dataset("rewards", data=np.zeros(contents.frames))
     demo.create_dataset("dones", data=dones)
-    for name, rows in {"tool_position": state[:, :3], "tool_quaternion": state[:, 3:], **numbers}.items():
+    for name, rows in {"tool_position": state[:, :3], "tool_quaternion": state[:, 3:], **values}.items():
         obs.create_dataset(name, data=rows.reshape(contents.frames, -1))
     demo.attrs.update({"num_samples": contents.frames, "task": describe_task(contents), "episode": contents.path.name})
 
 
-def write_pictures(
-    obs: h5py.Group, file: h5py.File, contents: EpisodeContents, pictures: Sequence[str], stream: Stream
+def write_images(
+    obs: h5py.Group, file: h5py.File, contents: EpisodeContents, names: Sequence[str], stream: Stream
 ) -> None:
     """Write decoded images, (T, H, W, channels): uint8, and depth as float32 [m]."""
     width, height = contents.size
-    for name in pictures:
+    for name in names:
         kind = np.float32 if name == "depth" else np.uint8
         channels = 3 if PICTURES[name] == COLOUR else 1
         shape = (height, width, channels)

@@ -14,7 +14,7 @@ from sim.runtime.atomic_files import write_folder_atomically, write_stream_atomi
 from ..reading.bodies import find_anatomy, find_surface_rows
 from ..reading.contents import EpisodeContents, get_array, open_episode
 from ..reading.windows import read_numbers
-from .columns import SPACE, measure_stored_size, name_files, write_along
+from .columns import SPACE, measure_stored_size, name_files, write_notices
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
 """Exported surfaces, and the attribute of the anatomy with the triangles of each."""
@@ -50,10 +50,10 @@ def write_xdmf(
                         triangles = None if anatomy is None else find_surface_rows(getattr(anatomy, surface), nodes)
                         group = out.create_group(name)
                         write_arrays(group, file, contents, name, triangles)
-                        add_series(domain, group, f"{names[contents]}.h5", times)
+                        add_surface_series(domain, group, f"{names[contents]}.h5", times)
             indent(root)
             ElementTree(root).write(partial / f"{names[contents]}.xdmf", "utf-8", xml_declaration=True)
-        write_along(episodes, partial)
+        write_notices(episodes, partial)
     return {"out": str(folder), "episodes": len(episodes), "points_only": bare}
 
 
@@ -65,7 +65,7 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
 
 
 def write_arrays(
-    out: h5py.Group, file: h5py.File, contents: EpisodeContents, name: str, triangles: np.ndarray | None
+    group: h5py.Group, file: h5py.File, contents: EpisodeContents, name: str, triangles: np.ndarray | None
 ) -> None:
     """Write positions, displacement and difference of each frame, single precision."""
     at = read_numbers(file, contents, f"{name}_predicted")
@@ -76,34 +76,32 @@ def write_arrays(
     for key, rows in arrays.items():
         for frame, row in enumerate(rows):
             if np.isfinite(row).all():
-                out.create_dataset(f"{key}/{frame:06d}", data=row.astype(np.float32), compression="gzip")
+                group.create_dataset(f"{key}/{frame:06d}", data=row.astype(np.float32), compression="gzip")
     cells = np.arange(at.shape[1])[:, None] if triangles is None or not len(triangles) else triangles
-    out.create_dataset("cells", data=cells.astype(np.int32), compression="gzip")
+    group.create_dataset("cells", data=cells.astype(np.int32), compression="gzip")
 
 
-def add_series(domain: Element, group: h5py.Group, name: str, times: np.ndarray) -> None:
+def add_surface_series(domain: Element, group: h5py.Group, name: str, times: np.ndarray) -> None:
     """Describe the frames of one surface, a grid per frame."""
-    series = SubElement(
-        domain, "Grid", Name=str(group.name).strip("/"), GridType="Collection", CollectionType="Temporal"
-    )
+    item = SubElement(domain, "Grid", Name=str(group.name).strip("/"), GridType="Collection", CollectionType="Temporal")
     cells = get_array(group, "cells")
     kind = (
         {"TopologyType": "Triangle"} if cells.shape[1] == 3 else {"TopologyType": "Polyvertex", "NodesPerElement": "1"}
     )
     for frame in map(str, group.require_group("positions")):
-        grid = SubElement(series, "Grid", Name=frame, GridType="Uniform")
+        grid = SubElement(item, "Grid", Name=frame, GridType="Uniform")
         SubElement(grid, "Time", Value=repr(float(times[int(frame)])))
-        add_item(SubElement(grid, "Topology", kind, NumberOfElements=str(len(cells))), cells, name)
-        add_item(SubElement(grid, "Geometry", GeometryType="XYZ"), get_array(group, f"positions/{frame}"), name)
+        add_data_item(SubElement(grid, "Topology", kind, NumberOfElements=str(len(cells))), cells, name)
+        add_data_item(SubElement(grid, "Geometry", GeometryType="XYZ"), get_array(group, f"positions/{frame}"), name)
         for key, form in (("displacement", "Vector"), ("from_finite_elements", "Scalar")):
             if f"{key}/{frame}" in group:
                 attribute = SubElement(grid, "Attribute", Name=f"{key} [m]", AttributeType=form, Center="Node")
-                add_item(attribute, get_array(group, f"{key}/{frame}"), name)
+                add_data_item(attribute, get_array(group, f"{key}/{frame}"), name)
 
 
-def add_item(above: Element, array: h5py.Dataset, name: str) -> None:
+def add_data_item(parent: Element, array: h5py.Dataset, name: str) -> None:
     """Refer to an array of the HDF5 file."""
     kind, size = ("Int", "4") if array.dtype.kind == "i" else ("Float", "4")
     shape = " ".join(map(str, array.shape))
-    item = SubElement(above, "DataItem", Dimensions=shape, NumberType=kind, Precision=size, Format="HDF")
+    item = SubElement(parent, "DataItem", Dimensions=shape, NumberType=kind, Precision=size, Format="HDF")
     item.text = f"{name}:{array.name}"

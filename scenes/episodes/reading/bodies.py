@@ -18,7 +18,7 @@ def find_anatomy(contents: EpisodeContents) -> Anatomy | None:
 
     It is searched in `bodies/*/anatomy.vtu` of the episode's folder, and of the folder above.
     """
-    return _find_anatomy(str(contents.said.get("anatomy")), contents.path.resolve().parent)
+    return _find_anatomy(str(contents.attributes.get("anatomy")), contents.path.resolve().parent)
 
 
 def is_template(digest: str) -> bool:

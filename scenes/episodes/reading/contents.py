@@ -16,7 +16,7 @@ from sim.errors import InputError
 from sim.runtime.file_limits import MAX_ARRAY_BYTES, MAX_INFLATION
 from sim.runtime.outside_files import to_path, wrap_errors
 
-from .schema import ARRAYS, FORMATS, FRAMES, PICTURES, REQUIRED_ARRAYS, SOLVED, Array
+from .schema import ARRAYS, FORMATS, FRAMES, PICTURES, REQUIRED_ARRAYS, SOLVED, ArraySpec
 
 HINT = "`sulcus validate` gives details; "  # Hint in error messages.
 REMEDY = f"{HINT}make it again, or leave it out."  # Remedy in error messages.
@@ -33,21 +33,21 @@ def format_finding(error: InputError, path: Path) -> str:
     return str(error).removeprefix(f"{path}: ").replace(f"{HINT}make", "Make")
 
 
-class OpenFiles:
+class FileCache:
     """Cache of open files: each is opened at its first use, and the least recently used one is closed.
 
     Forked processes, and processes that unpickle this object, open their own files.
     """
 
-    def __init__(self, most: int = 16) -> None:
-        if most < 1:
-            raise InputError(f"{most} open files: at least one must be.")
-        self.most = most
+    def __init__(self, max_files: int = 16) -> None:
+        if max_files < 1:
+            raise InputError(f"{max_files} open files: at least one must be.")
+        self.most = max_files
         self._process = os.getpid()
         self._open: OrderedDict[Path, h5py.File] = OrderedDict()
 
-    def __reduce__(self) -> tuple[type[OpenFiles], tuple[int]]:
-        return OpenFiles, (self.most,)
+    def __reduce__(self) -> tuple[type[FileCache], tuple[int]]:
+        return FileCache, (self.most,)
 
     def __len__(self) -> int:
         return len(self._open)
@@ -96,7 +96,7 @@ class EpisodeContents:
     ----------
     path
         The file.
-    said
+    attributes
         Attributes of the file: texts, numbers.
     shapes
         Shapes of all known arrays, by name; images without the group's name.
@@ -105,7 +105,7 @@ class EpisodeContents:
     """
 
     path: Path
-    said: Mapping[str, Any]
+    attributes: Mapping[str, Any]
     shapes: Mapping[str, tuple[int, ...]]
     fem_frames: np.ndarray
 
@@ -117,17 +117,17 @@ class EpisodeContents:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of its images [pixel]."""
-        return int(self.said["width"]), int(self.said["height"])
+        return int(self.attributes["width"]), int(self.attributes["height"])
 
     @property
     def family(self) -> str:
         """Family of the episode; in the former format its scene."""
-        return str(self.said.get("family", self.said.get("scene", "episode")))
+        return str(self.attributes.get("family", self.attributes.get("scene", "episode")))
 
     @property
     def depth_scale(self) -> float:
         """Length of one step of the depth images [m]."""
-        return float(self.said.get("depth_scale_m", np.nan))
+        return float(self.attributes.get("depth_scale_m", np.nan))
 
 
 def read_contents(path: str | Path) -> EpisodeContents:
@@ -234,7 +234,7 @@ def _check_shapes(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ..
             continue
         inside, _, last = name.rpartition("/")
         picture = inside == "pictures" and last in PICTURES
-        wanted = Array((FRAMES,), "O") if picture else ARRAYS.get(name)
+        wanted = ArraySpec((FRAMES,), "O") if picture else ARRAYS.get(name)
         if wanted is None:
             continue
         array = arrays[name]
@@ -247,7 +247,7 @@ def _check_shapes(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ..
     return shapes
 
 
-def _check_shape(name: str, shape: tuple[int, ...], wanted: Array, sizes: dict[str, int]) -> None:
+def _check_shape(name: str, shape: tuple[int, ...], wanted: ArraySpec, sizes: dict[str, int]) -> None:
     """Reject a shape that contradicts known lengths; record new ones."""
     axes = wanted.axes
     if axes[-1] is None:

@@ -16,8 +16,8 @@ from sim.runtime.outside_files import wrap_errors
 from sim.runtime.processes import LostProcessError, map_parallel
 
 from ...play.reference import build_reference_fem, is_history_dependent, solve_reference_frames
-from ..make import OpenedEpisode, open_body, to_body_path
-from ..plan import plan_from
+from ..make import OpenedBody, open_body, to_body_path
+from ..plan import parse_plan
 from ..scripted import build_scene, sample_episode
 from .contents import REMEDY, format_finding, inspect_contents
 from .validation import Report, validate_episode
@@ -28,7 +28,7 @@ LIVE_TOLERANCE_MM = 0.2  # Largest difference of two solutions in played frames,
 MAX_MEMORY = 8 * 1024**3  # Maximum memory for the examination of one file [bytes].
 
 
-def solve_again(report: Report, count: int, device: str = "auto") -> Report:
+def solve_frames_again(report: Report, count: int, device: str = "auto") -> Report:
     """Return a report extended by solving `count` of its frames again: differences of the tumour position.
 
     Frames are spread evenly. For history-dependent solutions, all solved frames before them are solved too, in order.
@@ -36,20 +36,20 @@ def solve_again(report: Report, count: int, device: str = "auto") -> Report:
     try:
         with wrap_errors(report.path, "an episode", REMEDY), h5py.File(report.path, "r") as file:
             contents = inspect_contents(file, report.path)
-            missing = [name for name in ("plan", "seed", "episode", "body") if name not in contents.said]
+            missing = [name for name in ("plan", "seed", "episode", "body") if name not in contents.attributes]
             if missing or "tumour_fem" not in contents.shapes:
                 return _add_skipped(report, f"frames solved again: it states no {(*missing, 'tumour_fem')[0]}")
-            place = to_body_path(report.path.parent, int(contents.said["body"]))
+            place = to_body_path(report.path.parent, int(contents.attributes["body"]))
             if not place.is_dir():
                 return _add_skipped(report, "frames solved again: its body is not next to it")
-            frames, found = _solve_again(contents.said, open_body(place, device), contents.fem_frames, count)
+            frames, found = _solve_again(contents.attributes, open_body(place, device), contents.fem_frames, count)
             stored = read_numbers(file, contents, "tumour_fem")[frames]
             rest = read_numbers(file, contents, "tumour_rest")
     except InputError as error:
         words = f"frames cannot be solved again: {format_finding(error, report.path)}"
         return replace(report, problems=[*report.problems, words])
     off = 1e3 * np.linalg.norm(rest + found - stored, axis=2).max(axis=1)
-    allowed = LIVE_TOLERANCE_MM if contents.said.get("deformer") == "fem" else TRAINING_TOLERANCE_MM
+    allowed = LIVE_TOLERANCE_MM if contents.attributes.get("deformer") == "fem" else TRAINING_TOLERANCE_MM
     wrong = [f"frame {frame}, solved again: {far:.3f} mm error." for frame, far in zip(frames, off, strict=True)]
     broken = [words for words, far in zip(wrong, off, strict=True) if not far <= allowed]
     return replace(report, problems=[*report.problems, *broken], again_mm=float(off.max()), again=len(frames))
@@ -60,30 +60,30 @@ def _add_skipped(report: Report, words: str) -> Report:
 
 
 def _solve_again(
-    said: Mapping[str, Any], opened: OpenedEpisode, solved: np.ndarray, count: int
+    said: Mapping[str, Any], opened: OpenedBody, solved: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve frames again: numbers of the frames (k,), and the tumour's displacement (k, n, 3) [m] in each."""
-    plan = plan_from(str(said["plan"]), str(said.get("plan_name", "plan")), Path())
+    plan = parse_plan(str(said["plan"]), str(said.get("plan_name", "plan")), Path())
     seed, number = int(said["seed"]), int(said["episode"])
-    body, theatre = opened.body, opened.theatre
-    scene = build_scene(plan, body, theatre.site, sample_episode(plan.contents, seed, number), seed, number)
-    fem = build_reference_fem(theatre, scene)
+    body, patient = opened.body, opened.patient
+    scene = build_scene(plan, body, patient.site, sample_episode(plan.contents, seed, number), seed, number)
+    fem = build_reference_fem(patient, scene)
     rows = np.unique(np.linspace(0, len(solved) - 1, min(count, len(solved))).astype(int))
     asked = np.arange(rows[-1] + 1) if is_history_dependent(fem) else rows
-    loads = [scene.build_loads(theatre.site, scene.path(time), time) for time in map(float, scene.times[solved[asked]])]
-    result = solve_reference_frames(theatre, scene, loads, fem=fem).restrict(theatre.anatomy.tumour_nodes)
+    loads = [scene.build_loads(patient.site, scene.path(time), time) for time in map(float, scene.times[solved[asked]])]
+    result = solve_reference_frames(patient, scene, loads, fem=fem).restrict(patient.anatomy.tumour_nodes)
     return solved[rows], result.displacement[np.searchsorted(asked, rows)]
 
 
 def validate_files(
-    paths: Sequence[Path], workers: int, look: Callable[[Path], Report] = validate_episode
+    paths: Sequence[Path], workers: int, validate: Callable[[Path], Report] = validate_episode
 ) -> Iterator[Report]:
     """Yield a report of each file, in order of completion; `workers` processes at a time.
 
     Files of a crashed process are checked again, each in its own process.
     """
     left = list(dict.fromkeys(paths))
-    look_at = partial(_run_limited, look)
+    look_at = partial(_run_limited, validate)
     try:
         for path, report in map_parallel(look_at, tuple(left), workers):
             left.remove(path)

@@ -9,7 +9,7 @@ FRAMES, SOLVED = "frames", "solved"  # Names of array axes: frames, frames solve
 
 
 @dataclass(frozen=True)
-class Array:
+class ArraySpec:
     """Specification of an array of an episode.
 
     Parameters
@@ -33,7 +33,7 @@ class Array:
     limited: bool = True
 
     @property
-    def framed(self) -> bool:
+    def has_frame_axis(self) -> bool:
         """True if there is a row for each frame."""
         return bool(self.axes) and self.axes[0] == FRAMES
 
@@ -54,53 +54,53 @@ def get_suffix(name: str) -> str:
     return "jpg" if PICTURES[name] == COLOUR else "png"
 
 
-_POSE = Array((FRAMES, 4, 4))  # Pose of a body.
-_PLACE = Array((FRAMES, 3), known=False)  # Position, which may be unknown.
-_ERROR = Array((FRAMES,), known=False, limited=False)  # Error bound, which may be unknown or infinite.
-_FORCE = Array((FRAMES, 3), unit="N", known=False)  # Force [N], which may be unknown.
+_POSE = ArraySpec((FRAMES, 4, 4))  # Pose of a body.
+_PLACE = ArraySpec((FRAMES, 3), known=False)  # Position, which may be unknown.
+_ERROR = ArraySpec((FRAMES,), known=False, limited=False)  # Error bound, which may be unknown or infinite.
+_FORCE = ArraySpec((FRAMES, 3), unit="N", known=False)  # Force [N], which may be unknown.
 
-ARRAYS: Mapping[str, Array] = {
-    "time": Array((FRAMES,), unit="s"),
-    "seconds": Array((FRAMES, "stages"), unit="s"),
-    "K": Array((3, 3), unit="pixel"),
-    "K_of_frame": Array((FRAMES, 3, 3), unit="pixel"),
-    "distortion": Array((8,), unit="1"),
+ARRAYS: Mapping[str, ArraySpec] = {
+    "time": ArraySpec((FRAMES,), unit="s"),
+    "seconds": ArraySpec((FRAMES, "stages"), unit="s"),
+    "K": ArraySpec((3, 3), unit="pixel"),
+    "K_of_frame": ArraySpec((FRAMES, 3, 3), unit="pixel"),
+    "distortion": ArraySpec((8,), unit="1"),
     "T_camera_world": _POSE,
-    "T_camera_world_tracked": Array((FRAMES, 4, 4), known=False),
+    "T_camera_world_tracked": ArraySpec((FRAMES, 4, 4), known=False),
     "T_camera_world_right": _POSE,
     "T_world_tool": _POSE,
-    "T_world_tool_tracked": Array((FRAMES, 4, 4), known=False),
+    "T_world_tool_tracked": ArraySpec((FRAMES, 4, 4), known=False),
     "force": _FORCE,
     "force_read": _FORCE,
     "contact": _PLACE,
-    "tip": Array((FRAMES, 3)),
-    "distance": Array((FRAMES,), known=False),
+    "tip": ArraySpec((FRAMES, 3)),
+    "distance": ArraySpec((FRAMES,), known=False),
     "distance_error": _ERROR,
-    "bound": Array((FRAMES, 2), known=False, limited=False),
+    "bound": ArraySpec((FRAMES, 2), known=False, limited=False),
     "model_error": _ERROR,
     "tumour_error": _ERROR,
     "tumour_error_unobserved": _ERROR,
-    "reaction_predicted": Array((FRAMES, "tools", 6), unit="N, N m", known=False),
-    "reaction_fem": Array((SOLVED, "tools", 6), unit="N, N m"),
-    "reaction_bound": Array((FRAMES, 2), unit="N", known=False, limited=False),
-    "direction": Array((FRAMES, 3), unit="1"),
-    "csf_level": Array((FRAMES,)),
-    "share": Array((FRAMES,), unit="1"),
-    "done": Array((FRAMES,), "iuf", "1"),
-    "pose": Array((FRAMES, None)),
-    "displacement": Array((FRAMES, None)),
-    "fem_frames": Array((SOLVED,), "iu", "1"),
-    "outcome_predicted": Array((FRAMES,), "O", "text"),
-    "outcome_fem": Array((SOLVED,), "O", "text"),
-    "tumour_predicted": Array((FRAMES, "tumour", 3)),
-    "tumour_fem": Array((SOLVED, "tumour", 3)),
-    "tumour_left": Array((FRAMES, "tumour"), "b", "1"),
-    "tumour_nodes": Array(("tumour",), "iu", "1"),
-    "tumour_rest": Array(("tumour", 3)),
-    "cortex_predicted": Array((FRAMES, "cortex", 3)),
-    "cortex_fem": Array((SOLVED, "cortex", 3)),
-    "cortex_nodes": Array(("cortex",), "iu", "1"),
-    "cortex_rest": Array(("cortex", 3)),
+    "reaction_predicted": ArraySpec((FRAMES, "tools", 6), unit="N, N m", known=False),
+    "reaction_fem": ArraySpec((SOLVED, "tools", 6), unit="N, N m"),
+    "reaction_bound": ArraySpec((FRAMES, 2), unit="N", known=False, limited=False),
+    "direction": ArraySpec((FRAMES, 3), unit="1"),
+    "csf_level": ArraySpec((FRAMES,)),
+    "share": ArraySpec((FRAMES,), unit="1"),
+    "done": ArraySpec((FRAMES,), "iuf", "1"),
+    "pose": ArraySpec((FRAMES, None)),
+    "displacement": ArraySpec((FRAMES, None)),
+    "fem_frames": ArraySpec((SOLVED,), "iu", "1"),
+    "outcome_predicted": ArraySpec((FRAMES,), "O", "text"),
+    "outcome_fem": ArraySpec((SOLVED,), "O", "text"),
+    "tumour_predicted": ArraySpec((FRAMES, "tumour", 3)),
+    "tumour_fem": ArraySpec((SOLVED, "tumour", 3)),
+    "tumour_left": ArraySpec((FRAMES, "tumour"), "b", "1"),
+    "tumour_nodes": ArraySpec(("tumour",), "iu", "1"),
+    "tumour_rest": ArraySpec(("tumour", 3)),
+    "cortex_predicted": ArraySpec((FRAMES, "cortex", 3)),
+    "cortex_fem": ArraySpec((SOLVED, "cortex", 3)),
+    "cortex_nodes": ArraySpec(("cortex",), "iu", "1"),
+    "cortex_rest": ArraySpec(("cortex", 3)),
 }
 """Arrays other than images, by name. Only `time` is required."""
 

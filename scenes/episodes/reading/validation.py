@@ -14,7 +14,7 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.runtime.outside_files import wrap_errors
 
-from ..checksums import CHECKSUM_ATTRIBUTE, find_broken
+from ..checksums import CHECKSUM_ATTRIBUTE, find_errors
 from .bodies import find_anatomy, find_surface_rows
 from .contents import REMEDY, EpisodeContents, format_finding, get_array, inspect_contents, read_attributes
 from .schema import ARRAYS, LABELS, PICTURES
@@ -29,7 +29,7 @@ ROTATION_TOLERANCE = 1e-6  # Tolerance of a rotation's rows from unit length and
 POSES = ("T_camera_world", "T_camera_world_right", "T_camera_world_tracked", "T_world_tool", "T_world_tool_tracked")
 
 
-def mask_findings(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy | None) -> tuple[list[str], list[str]]:
+def check_mask(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy | None) -> tuple[list[str], list[str]]:
     """List the faults of `tumour_mask`, and what could not be checked, as sentences."""
     shapes = contents.shapes
     missing = [
@@ -122,13 +122,13 @@ def validate_episode(path: Path) -> Report:
             contents = inspect_contents(file, path)
             for check in (check_units, check_numbers, check_poses, check_images):
                 problems += check(file, contents)
-            if CHECKSUM_ATTRIBUTE in contents.said:
-                problems += [f"{words}." for words in find_broken(file)]
+            if CHECKSUM_ATTRIBUTE in contents.attributes:
+                problems += [f"{words}." for words in find_errors(file)]
             else:
                 skipped.append("checksums: it states none")
             if not problems:
                 anatomy = find_anatomy(contents)
-                wrong, left = mask_findings(file, contents, anatomy)
+                wrong, left = check_mask(file, contents, anatomy)
                 problems += wrong
                 skipped += left
             solved, unsolved, error = count_solved_frames(file, contents)
@@ -193,7 +193,8 @@ def check_poses(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
 
 def check_images(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
     """Yield findings on images that cannot be decoded, have another size than declared, or have undeclared labels."""
-    labels = {int(word.split()[0]) for word in str(contents.said.get("segmentation", "")).split(",") if word.strip()}
+    stored = str(contents.attributes.get("segmentation", ""))
+    labels = {int(word.split()[0]) for word in stored.split(",") if word.strip()}
     for name, kind in PICTURES.items():
         if name not in contents.shapes:
             continue
@@ -218,7 +219,7 @@ def count_solved_frames(file: h5py.File, contents: EpisodeContents) -> tuple[int
     unsolved = 0
     if "outcome_fem" in contents.shapes:
         unsolved = sum(not text.startswith(b"CONVERGED") for text in get_array(file, "outcome_fem")[:])
-    played = contents.said.get("deformer") == "fem"
+    played = contents.attributes.get("deformer") == "fem"
     if played or not solved or not {"tumour_fem", "tumour_predicted"} <= set(contents.shapes):
         return solved, unsolved, None
     truth, total, worst = get_array(file, "tumour_fem"), 0.0, 0.0

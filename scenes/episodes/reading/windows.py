@@ -14,7 +14,7 @@ from ar.screen import decode_colour, decode_depth, decode_labels
 from sim.errors import InputError
 from sim.runtime.outside_files import to_path, wrap_errors
 
-from .contents import REMEDY, EpisodeContents, OpenFiles, get_array, read_contents
+from .contents import REMEDY, EpisodeContents, FileCache, get_array, read_contents
 from .schema import ARRAYS, COLOUR, DEPTH, PICTURES, SOLVED
 
 Rows = np.ndarray | list[str]
@@ -40,7 +40,7 @@ def read_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: ran
         array = get_array(file, name)
         if ARRAYS[name].axes[0] == SOLVED and name != "fem_frames":
             return _read_solved_rows(array, contents, frames)
-        return _read(array, frames) if ARRAYS[name].framed else array[:]
+        return _read(array, frames) if ARRAYS[name].has_frame_axis else array[:]
 
 
 def read_numbers(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> np.ndarray:
@@ -157,7 +157,7 @@ class Episodes(Sequence[dict[str, Any]]):
     window: int = 1
     step: int = 1
     stride: int = 1
-    files: OpenFiles = field(default_factory=OpenFiles)
+    files: FileCache = field(default_factory=FileCache)
 
     def __post_init__(self) -> None:
         for name in ("window", "step", "stride"):
@@ -264,7 +264,7 @@ def read_episodes(
     if keys is None:
         common = set.intersection(*(set(one.shapes) for one in contents)) - {"fem_frames"}
         keys = sorted(name for name in common if name in PICTURES or ARRAYS[name].kind != "O")
-    return Episodes(contents, tuple(keys), window, step, stride, OpenFiles(most_open))
+    return Episodes(contents, tuple(keys), window, step, stride, FileCache(most_open))
 
 
 def _stack_rows(name: str, rows: list[Any]) -> Rows | list[Any]:

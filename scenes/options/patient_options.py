@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
 
 
-def add_bodies(parser: argparse.ArgumentParser) -> None:
+def add_model_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options of anatomy and models."""
     add_anatomy(parser)
     parser.add_argument(
@@ -40,9 +40,9 @@ def add_trajectory(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def add_theatre(parser: argparse.ArgumentParser) -> None:
+def add_patient(parser: argparse.ArgumentParser) -> None:
     """Declare deformer, anatomy and models: shared by every command that plays a scene."""
-    add_bodies(parser)
+    add_model_options(parser)
     parser.add_argument(
         "--deformer",
         help="deformation model: a trained one (linear, ann, svr, ...); fem; a family of models (condensed, ...); "
@@ -71,8 +71,8 @@ def add_theatre(parser: argparse.ArgumentParser) -> None:
     add_device(parser, "FEM")
 
 
-def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> PatientSetup:
-    """Open the anatomy and models requested by `add_theatre`'s arguments, for scenes of these names.
+def open_patient(args: argparse.Namespace, *scenes: str) -> PatientSetup:
+    """Open the anatomy and models requested by `add_patient`'s arguments, for scenes of these names.
 
     Raises
     ------
@@ -81,16 +81,16 @@ def build_requested_theatre(args: argparse.Namespace, *scenes: str) -> PatientSe
     """
     from ..play.deformers import open_theatre
 
-    theatre = open_theatre(args.anatomy, args.model, args.device, scenes)
+    patient = open_theatre(args.anatomy, args.model, args.device, scenes)
     if args.guard is None:
-        return theatre
+        return patient
     if not 0.0 < args.guard < float("inf"):
         raise InputError(f"--guard {args.guard:g}: give a positive number of millimetres, or leave it out.")
-    return replace(theatre, limit=1e-3 * args.guard)
+    return replace(patient, limit=1e-3 * args.guard)
 
 
-def build_requested_scene(args: argparse.Namespace, name: str, theatre: PatientSetup) -> Scene:
-    """Return a scene by name, with the registration, tissue and element of `add_theatre`'s arguments if given.
+def build_requested_scene(args: argparse.Namespace, name: str, patient: PatientSetup) -> Scene:
+    """Return a scene by name, with the registration, tissue and element of `add_patient`'s arguments if given.
 
     Raises
     ------
@@ -102,8 +102,8 @@ def build_requested_scene(args: argparse.Namespace, name: str, theatre: PatientS
     scene = find_scene(name)
     if getattr(args, "registration", None) is not None:
         scene = replace(scene, registration=args.registration)
-    scene = apply_tissue_options(args, scene, theatre)
-    return scene if args.trajectory is None else _follow_trajectory(args, scene, theatre.site)
+    scene = apply_tissue_options(args, scene, patient)
+    return scene if args.trajectory is None else _follow_trajectory(args, scene, patient.site)
 
 
 def _follow_trajectory(args: argparse.Namespace, scene: Scene, site: CraniotomyFrame) -> Scene:
@@ -117,15 +117,15 @@ def _follow_trajectory(args: argparse.Namespace, scene: Scene, site: CraniotomyF
     if scene.tool is None:
         print(f"{args.program}: {scene.name} has no tool that could follow {args.trajectory}", file=sys.stderr)
         return scene
-    stopped = scene.describe_stop(site, approach.follow(keep_idle)(0.0))
+    stopped = scene.describe_stop(site, approach.shift_path(keep_idle)(0.0))
     if stopped:
         print(f"{args.program}: where {args.trajectory} enters, {stopped}", file=sys.stderr)
-    return replace(scene, path=approach.follow(scene.path), tool=approach.align_tool(scene.tool))
+    return replace(scene, path=approach.shift_path(scene.path), tool=approach.align_tool(scene.tool))
 
 
-def list_playable(args: argparse.Namespace, theatre: PatientSetup, scenes: Sequence[Scene]) -> list[Scene]:
+def list_playable(args: argparse.Namespace, patient: PatientSetup, scenes: Sequence[Scene]) -> list[Scene]:
     """Return the named scenes; by default all except those without a required locator, with a notice."""
-    left = [] if args.scenes else [scene for scene in scenes if theatre.is_without_locator(scene)]
+    left = [] if args.scenes else [scene for scene in scenes if patient.is_without_locator(scene)]
     if left:
         names = ", ".join(scene.name for scene in left)
         message = f"no {names}: this anatomy has no locator. Make one with `sulcus locator`"
@@ -133,7 +133,7 @@ def list_playable(args: argparse.Namespace, theatre: PatientSetup, scenes: Seque
     return [scene for scene in scenes if scene not in left]
 
 
-def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scene, default: str | None = None) -> str:
+def choose_deformer(args: argparse.Namespace, patient: PatientSetup, scene: Scene, default: str | None = None) -> str:
     """Return the requested deformation model; one that a budget selected is reported, with the reason.
 
     `default`: the one without any request; None: that of the scene.
@@ -147,7 +147,7 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
     if args.deformer != "auto" and budget == (None, None):
         if asked := args.deformer or default:
             return asked
-        usual, best = theatre.select_default(scene), theatre.select_best(scene)
+        usual, best = patient.select_default(scene), patient.select_best(scene)
         if usual == "fem":
             from ..play.deformers import TRUTH_TEXT
 
@@ -156,12 +156,12 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
                 if scene.observation_model is None
                 else TRUTH_TEXT
             )
-            reason = next(iter(theatre.list_rejections(scene).values()), none)
+            reason = next(iter(patient.list_rejections(scene).values()), none)
             print(f"{args.program}: FEM is used for {scene.name} instead of a trained model: {reason}", file=sys.stderr)
-        if best in theatre.models and usual != scene.deformer:
+        if best in patient.models and usual != scene.deformer:
             from surrogate.model.guarded import describe_error, get_reported_errors
 
-            model = theatre.models[best]
+            model = patient.models[best]
             if get_reported_errors(model).weak:
                 print(f"{args.program}: on held-out cortex, {best}: {describe_error(model)}", file=sys.stderr)
         return usual
@@ -169,6 +169,6 @@ def choose_deformer(args: argparse.Namespace, theatre: PatientSetup, scene: Scen
         raise InputError(f"--deformer {args.deformer} leaves a budget nothing to choose: give one of them, or auto.")
     from ..analysis.budget import choose_within
 
-    choice = choose_within(theatre, scene, budget, lambda words: print(f"{args.program}: {words}", file=sys.stderr))
+    choice = choose_within(patient, scene, budget, lambda words: print(f"{args.program}: {words}", file=sys.stderr))
     print(f"{args.program}: {choice.reason}", file=sys.stderr)
     return choice.offer.name
