@@ -29,7 +29,7 @@ def test_held_out_solutions_do_not_influence_training(study, tmp_path, name, mon
     for data, folder in ((study.data, "as-it-is"), (path, "wild")):
         here = replace(study, data=data)
         kept = tmp_path / folder / "series.npz"
-        vars(here)["expansion"] = Expansion(here.dataset, "cpu", kept=kept)
+        vars(here)["expansion"] = Expansion(here.dataset, "cpu", table_path=kept)
         with limit_to_one_thread():
             found.append(measure_learner(here, LearnerSpec(name)))
     row, wild = found

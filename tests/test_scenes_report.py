@@ -19,7 +19,7 @@ from sim.effects import build_push_effects
 from sim.families.registry import build_family
 from sim.fem import Fem
 from surrogate.data.dataset import read_dataset
-from surrogate.data.splits import leave_sectors_out
+from surrogate.data.splits import hold_out_sectors
 from surrogate.training.train import train
 
 
@@ -61,7 +61,7 @@ def test_report_figures_match_independent_recomputation(study, page, study_box):
         assert np.allclose([stored[0]["reference"][kind][name] for name in names], values, rtol=2e-3)
         assert np.allclose([float(lines[0][f"reference.{kind}.{name}"]) for name in names], values, rtol=2e-3)
     data = read_dataset(study.data)
-    for name, split in (("discs", study.discs), ("sectors", leave_sectors_out(study.pushed, study.patch))):
+    for name, split in (("discs", study.discs), ("sectors", hold_out_sectors(study.pushed, study.patch))):
         test = split.test
         model = train(data, ["linear"], split=split).models["linear"]
         truth = data.read_displacement(study_box.tumour_nodes)[test]

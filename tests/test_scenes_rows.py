@@ -24,10 +24,10 @@ from sim.accuracy import TRAIN
 from sim.loads import Pushed
 from sim.runtime.threads import limit_to_one_thread
 from surrogate.data.dataset import read_dataset
-from surrogate.data.encode import compute_tool_features, reduce, split_forces
-from surrogate.data.splits import leave_sectors_out
+from surrogate.data.encode import compute_tool_features, fit_basis, split_forces
+from surrogate.data.splits import hold_out_sectors
 from surrogate.training.expansion import COARSE_BASIS, SERIES_MODELS
-from surrogate.training.learners import SVR_CANDIDATES, Tuned
+from surrogate.training.learners import SVR_CANDIDATES, TunedRegressor
 from surrogate.training.train import train
 
 
@@ -42,8 +42,8 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
         row = measure_learner(replace(study, data=path), LearnerSpec("svr"))
     lesson = Pushed(pushed.point[training], pushed.force[training], pushed.footprint[training])
     size, (every, direction) = split_forces(lesson)[0], split_forces(pushed)
-    basis = reduce(nodes, truth[training] / size[:, None, None], *COARSE_BASIS)
-    machine = Tuned(SVR_CANDIDATES).fit(
+    basis = fit_basis(nodes, truth[training] / size[:, None, None], *COARSE_BASIS)
+    machine = TunedRegressor(SVR_CANDIDATES).fit(
         compute_tool_features(study.patch, lesson), basis.encode(truth[training] / size[:, None, None])
     )
     within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
@@ -57,7 +57,7 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
     assert row.loads == training.sum()
     # Of loads that point into the sectors, by a model of those that do not.
-    data, sectors = read_dataset(path), leave_sectors_out(pushed, study.patch)
+    data, sectors = read_dataset(path), hold_out_sectors(pushed, study.patch)
     asked = data.loads.select(np.flatnonzero(data.good)[sectors.test])
     guess = train(data, ["svr"], split=sectors).models["svr"].deform(asked, at=nodes).displacement
     wanted = 1e3 * np.linalg.norm(guess - data.read_displacement(nodes)[data.good][sectors.test], axis=2)

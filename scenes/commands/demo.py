@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitStack) -> int:
     """Open the page, and play once `kernels` has loaded the first image's kernels; `closing` closes the page."""
-    from ar.page.access_guard import UnguardedError
+    from ar.page.access_guard import ViserError
 
     from ..page.demo import Demo
 
@@ -90,7 +90,7 @@ def play(args: argparse.Namespace, kernels: ThreadPoolExecutor, closing: ExitSta
             theatre, scene, name, args.host, args.port,
             anatomy=anatomy, find=asked, style=args.style, origins=list_addresses(args),
         )  # fmt: skip
-    except UnguardedError as error:
+    except ViserError as error:
         raise InputError(str(error)) from error
     closing.callback(demo.close)
     print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ar.overlay.hud import bound_words, format_millimetres
+from ar.overlay.hud import format_bound, format_millimetres
 from sim.geometry.closest_point import find_closest_points
 from sim.geometry.locate import Located, locate
 
@@ -166,7 +166,7 @@ class Outgoing:
         known, gauge = result.known, result.gauge
         if gauge is None:
             return f"not known: {known.words}"
-        inside = "inside the tumour, its edge " if gauge.inside else ""
+        inside = "inside the tumour, its edge " if gauge.is_inside else ""
         return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._source}){_format_doubt(known)}"
 
     def _format_motion(self, known: TrackingResult) -> str:
@@ -174,7 +174,9 @@ class Outgoing:
         if known.band is None:
             return f"not known: {known.words}"
         moved = format_millimetres(known.motion.moved, known.motion.error)
-        return f"moved {moved}, placed within {bound_words(known.band, 1)} (95 %; {self._source}){_format_doubt(known)}"
+        return (
+            f"moved {moved}, placed within {format_bound(known.band, 1)} (95 %; {self._source}){_format_doubt(known)}"
+        )
 
     @property
     def _source(self) -> str:

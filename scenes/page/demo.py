@@ -396,4 +396,4 @@ class Demo:
 
     def _get_user(self) -> int | None:
         """Return the user whose change is processed now."""
-        return None if self.browser.deed is None else self.browser.deed.visitor
+        return None if self.browser.deed is None else self.browser.deed.client

@@ -171,7 +171,7 @@ def format_trust(deformation: Deformation, name: str) -> str:
     if not np.isfinite(bound):
         return f"<p>{source}: {state}.</p>"
     return (
-        f"<p>{source}: {state}. Surrogate error (95 %): at most {hud.bound_words(bound, 2)} at any point of the "
+        f"<p>{source}: {state}. Surrogate error (95 %): at most {hud.format_bound(bound, 2)} at any point of the "
         "tumour, relative to FEM.</p>"
     )
 
@@ -189,7 +189,7 @@ def format_tumour_trust(error: TumourError) -> str:
             "<p>Tumour position error: not known. <code>sulcus uncertainty SCENE</code> estimates it for a scripted "
             "scene.</p>"
         )
-    bound = hud.bound_words(error.bound, 1)
+    bound = hud.format_bound(error.bound, 1)
     text = f"Tumour position error (95 %): at most {bound} at any point of its surface"
     caveat = ": rough estimate (few samples, load outside the tissue model, or by the size of the motion)"
     caveat = caveat if error.guess else ""
@@ -197,7 +197,7 @@ def format_tumour_trust(error: TumourError) -> str:
         text += f" ({error.registration_words})"
     if error.observed is None:
         return f"<p>{text}{caveat or f'; the largest part is {escape(error.largest)}'}.</p>"
-    prior = "" if error.prior is None else f"; without cortex observation {hud.bound_words(error.prior, 1)}{caveat}"
+    prior = "" if error.prior is None else f"; without cortex observation {hud.format_bound(error.prior, 1)}{caveat}"
     return f"<p>{text}{prior}.</p>"
 
 
@@ -214,7 +214,7 @@ def report(
     remaining = stage.select_stage(frame.loads).left
     facts = [f"frame {frame.number} of {frames - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
     if frame.distance_error is not None and frame.distance_error < np.inf:
-        facts += [f"error of the distance <= {hud.bound_words(frame.distance_error, 1)} (95 %, relative to FEM)"]
+        facts += [f"error of the distance <= {hud.format_bound(frame.distance_error, 1)} (95 %, relative to FEM)"]
     error = None if frame.doubt else frame.tumour_error.bound
     parts = [] if frame.distance is None else [format_tip_distance(frame.distance, error, frame.inside)]
     headline, *estimate_texts = [""] if frame.estimate is None else describe_estimate(frame.estimate)
@@ -239,11 +239,11 @@ def format_motion(frame: Frame) -> str:
     """Describe the tumour's displacement with its errors: of the model, and of the tumour in the patient."""
     motion = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' (estimate)'}"
     if frame.moved_error is not None:
-        error = f"motion error {hud.bound_words(frame.moved_error, 1)}"
+        error = f"motion error {hud.format_bound(frame.moved_error, 1)}"
     else:
         error = f"{'error' if frame.doubt else 'motion error'} not known"
     if frame.model_error is not None and frame.estimate is None:
-        error = f"surrogate error {hud.bound_words(frame.model_error, 2)}, {error}"
+        error = f"surrogate error {hud.format_bound(frame.model_error, 2)}, {error}"
     return f"{motion} ({error})"
 
 

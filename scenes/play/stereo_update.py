@@ -8,8 +8,15 @@ import numpy as np
 
 from ar.optics.camera import Camera
 from ar.overlay.outlines import compute_silhouette
-from ar.stereo.disparity import Cloud, StereoView, compute_stereo_view, find_supported, follow_pixels, triangulate_cloud
-from ar.stereo.rectified import rectify
+from ar.stereo.disparity import (
+    StereoCloud,
+    StereoView,
+    compute_stereo_view,
+    find_consistent_motions,
+    track_pixels,
+    triangulate_cloud,
+)
+from ar.stereo.rectified import build_rectification
 from sim.errors import InputError
 from sim.geometry.closest_point import find_closest_points
 from surrogate.locating.evidence import NOISE, SIGMA
@@ -75,7 +82,7 @@ class StereoPair:
         masks = None if self.tool is None else tuple(compute_silhouette(camera, *self.tool) for camera in self.cameras)
         target = cast(tuple[float, float, float], tuple(site.origin.tolist()))
         try:
-            geometry = rectify(*self.cameras, target, STEREO.half_width * site.radius, STEREO.resolution)
+            geometry = build_rectification(*self.cameras, target, STEREO.half_width * site.radius, STEREO.resolution)
             return compute_stereo_view(geometry, *self.pictures, cast(tuple[np.ndarray, np.ndarray] | None, masks))
         except ValueError as error:
             raise InputError(str(error)) from error
@@ -121,10 +128,10 @@ def observe_first(site: CraniotomyFrame, shot: StereoPair, count: int, rigid: Ri
             f"the first image pair shows a cortex {1e3 * np.median(off):.1f} mm from the scan's: check that eyes "
             "are not swapped, or calibrate them again."
         )
-    good = find_supported(rest, points - rest)
+    good = find_consistent_motions(rest, points - rest)
     require_points(int(good.sum()), len(pixels))
     around, still = find_surroundings(site, view)
-    return FirstView(view, pixels[found.which[good]], rest[good], len(pixels), around, rigid(still))
+    return FirstView(view, pixels[found.indices[good]], rest[good], len(pixels), around, rigid(still))
 
 
 def observe_points(
@@ -139,10 +146,10 @@ def observe_points(
     """
     view = shot.rectify(site)
     check_no_motion(first, view, rigid)
-    which, there = follow_pixels(first.view, view, first.pixels)
+    which, there = track_pixels(first.view, view, first.pixels)
     found = triangulate_seen_points(site, view, there)
-    now, rest = rigid(found.points), first.rest[which[found.which]]
-    good = find_supported(rest, now - rest)
+    now, rest = rigid(found.points), first.rest[which[found.indices]]
+    good = find_consistent_motions(rest, now - rest)
     require_points(int(good.sum()), first.asked, LARGE_MOTION_HINT)
     motion = float(np.median(np.linalg.norm(now - rest, axis=1)))
     if motion > STEREO.max_motion:
@@ -165,7 +172,7 @@ def observe_point_cloud(
     found = triangulate_seen_points(site, view, pixels)
     points = rigid(found.points)
     rest, _ = find_on_cortex(site, points)
-    good = find_supported(rest, points - rest)
+    good = find_consistent_motions(rest, points - rest)
     require_points(int(good.sum()), len(pixels))
     return Observation(points[good], None, compute_deviations(found.sigma[good]), rigid(tips))
 
@@ -178,10 +185,10 @@ def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.
     x, y = (each.ravel() for each in np.meshgrid(ticks, ticks))
     inside = np.hypot(x, y) < reach
     places = site.origin + x[inside, None] * site.right + y[inside, None] * site.up
-    return view.geometry.place(places)[0]
+    return view.geometry.project_points(places)[0]
 
 
-def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> Cloud:
+def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> StereoCloud:
     """Triangulate pixels (n, 2), and keep the points inside the drape's hole.
 
     Raises
@@ -194,7 +201,7 @@ def triangulate_seen_points(site: CraniotomyFrame, view: StereoView, pixels: np.
     except ValueError as error:
         raise InputError(str(error)) from error
     inside = site.compute_axis_distance(found.points) < HOLE_RATIO * site.clearance - STEREO.min_drape_distance
-    return Cloud(found.which[inside], found.points[inside], found.sigma[inside])
+    return StereoCloud(found.indices[inside], found.points[inside], found.sigma[inside])
 
 
 def find_surroundings(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
@@ -204,19 +211,19 @@ def find_surroundings(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarr
     found = triangulate_cloud(view, pixels)
     outside = np.flatnonzero(site.compute_axis_distance(found.points) > HOLE_RATIO * site.clearance)
     some = outside[np.linspace(0, len(outside) - 1, min(STEREO.max_static_points, len(outside))).astype(int)]
-    return pixels[found.which[some]], found.points[some]
+    return pixels[found.indices[some]], found.points[some]
 
 
 def check_no_motion(first: FirstView, view: StereoView, rigid: Rigid) -> None:
     """Raise InputError if the surroundings of the opening seem to have moved since the first pair."""
-    which, there = follow_pixels(first.view, view, first.around)
+    which, there = track_pixels(first.view, view, first.around)
     try:
         found = triangulate_cloud(view, there)
     except ValueError as error:
         raise InputError(str(error)) from error
-    if len(found.which) < STEREO.min_static_points:
+    if len(found.indices) < STEREO.min_static_points:
         return
-    motion = np.linalg.norm(rigid(found.points) - first.still[which[found.which]], axis=1)
+    motion = np.linalg.norm(rigid(found.points) - first.still[which[found.indices]], axis=1)
     moved = float(np.quantile(motion, 0.25))
     if moved > STEREO.static_tolerance:
         raise InputError(

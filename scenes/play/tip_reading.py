@@ -53,7 +53,7 @@ def read_tip_distance(
     found = model.predict_distance(loads, answer, np.array([apart]))
     promised = float(found.bound[0, 0])
     kept = answer.outcome[0].good and promised < float("inf")
-    return TipDistance(float(found.value[0]), promised if kept else None)
+    return TipDistance(float(found.distance[0]), promised if kept else None)
 
 
 def measure_tip_distance(

@@ -2,26 +2,28 @@
 
 import numpy as np
 
-from ar.overlay.gauge import Gauge
-from ar.page.history import Line, Sample
-from ar.page.slices import Cut
+from ar.overlay.gauge import DistanceGauge
+from ar.page.history import Sample, Trace
+from ar.page.slices import SlicedSurfaces
 
 from ..page.side_panels import draw_slices_through
 from .follower import TrackingResult
 from .overlay_painter import Painter
 
 # Chart of the distance from tip to tumour.
-DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion (95 %); dotted: not to be relied on")
+DISTANCE = Trace("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion (95 %); dotted: not to be relied on")
 # Chart of the overlay's error.
-OVERLAY_ERROR = Line("error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation")
+OVERLAY_ERROR = Trace(
+    "error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation"
+)
 
 
-def list_lines(tooled: bool) -> tuple[Line, ...]:
+def list_lines(tooled: bool) -> tuple[Trace, ...]:
     """Return the plotted quantities of each image."""
     return (DISTANCE, OVERLAY_ERROR) if tooled else (OVERLAY_ERROR,)
 
 
-def build_history_sample(known: TrackingResult, gauge: Gauge | None, tooled: bool, now: float) -> Sample:
+def build_history_sample(known: TrackingResult, gauge: DistanceGauge | None, tooled: bool, now: float) -> Sample:
     """Build the readings of an image that is shown at a time [s], in the order of `list_lines`."""
     within = 1e3 * known.band if known.relied and known.band is not None else None
     if not tooled:
@@ -42,5 +44,5 @@ def render_slices(known: TrackingResult, painter: Painter, through: str) -> np.n
     error = known.motion.error if known.relied and known.motion.known else None
     now = stage.build_tumour(known.motion.positions)
     return draw_slices_through(
-        stage, Cut(now, stage.tumour_at_rest, error, not known.relied, others, tip, "motion"), through
+        stage, SlicedSurfaces(now, stage.tumour_at_rest, error, not known.relied, others, tip, "motion"), through
     )

@@ -3,8 +3,8 @@
 from html import escape
 
 from ar.overlay.composite import DOUBTFUL_COLOUR
-from ar.overlay.gauge import Gauge
-from ar.overlay.hud import bound_words
+from ar.overlay.gauge import DistanceGauge
+from ar.overlay.hud import format_bound
 
 from ..page.text import RESEARCH_ONLY, format_legend, format_tip_distance, format_unbroken, to_stroke
 from ..play.stage import TUMOUR_COLOUR
@@ -39,7 +39,7 @@ def describe_overlay(name: str, who: str, tooled: bool) -> str:
     )
 
 
-def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
+def report(shown: Shown, gauge: DistanceGauge | None, tooled: bool, place: str) -> str:
     """Build the report of an image: distance first, then state, both errors, and processing time.
 
     `place` names the image.
@@ -62,21 +62,21 @@ def report(shown: Shown, gauge: Gauge | None, tooled: bool, place: str) -> str:
     return "".join([*parts, f"<p>{'; '.join(facts)}</p>", f'<p class="dim">{took}</p>'])
 
 
-def format_distance(gauge: Gauge | None, relied: bool) -> str:
+def format_distance(gauge: DistanceGauge | None, relied: bool) -> str:
     """Return the distance from tip to tumour with its error, where there is one that may be relied on."""
     if gauge is None:
         return '<p class="number">tip to tumour: not known</p>'
-    return format_tip_distance(gauge.distance, gauge.error if relied else None, gauge.inside)
+    return format_tip_distance(gauge.distance, gauge.error if relied else None, gauge.is_inside)
 
 
 def overlay_error(known: TrackingResult) -> str:
     """Describe the error of the outline across the view, by source."""
     if not known.relied or known.band is None:
         return "<p>Overlay error: not known.</p>"
-    stated = [f"{name} {bound_words(length, 2)}" for name, length in known.parts.items() if length > 0.0]
+    stated = [f"{name} {format_bound(length, 2)}" for name, length in known.parts.items() if length > 0.0]
     none = ", ".join(name for name, length in known.parts.items() if not length > 0.0 and name != "camera")
     off = known.parts.get("camera")
     camera = " What the camera's calibration adds is not known." if off is None else ""
     camera = " The camera is reported to be exactly known." if off == 0.0 else camera
     parts = ", ".join([*stated, *([f"not given: {none}"] if none else [])])
-    return f"<p>Overlay error (95 %): at most {bound_words(known.band, 1)} across the view ({parts}).{camera}</p>"
+    return f"<p>Overlay error (95 %): at most {format_bound(known.band, 1)} across the view ({parts}).{camera}</p>"
