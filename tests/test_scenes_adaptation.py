@@ -37,10 +37,10 @@ class TestAdapting:
         assert sum(reported) == 2 * rows_in_all
         row = measure_row(study, LearnerSpec("linear"))
         after = build_debulked_study(study)
-        model = train(after.dataset, ["linear"], split=after.discs).models["linear"]
-        test = np.flatnonzero(after.discs.test_mask)
+        model = train(after.dataset, ["linear"], split=after.disc_split).models["linear"]
+        test = np.flatnonzero(after.disc_split.test_mask)
         guess = model.deform(after.converged.select(test), at=after.anatomy.tumour_nodes).displacement
-        wanted = 1e3 * np.linalg.norm(guess - after.answers[test], axis=2).mean()
+        wanted = 1e3 * np.linalg.norm(guess - after.data_displacement[test], axis=2).mean()
         assert row.adapted.mm.mean == pytest.approx(wanted, rel=1e-6)
         assert row.adapt > read_simulation_seconds(study) > 0.0
         assert study_rows[0].adapt > 0.0 and study_rows[0].adapted is None

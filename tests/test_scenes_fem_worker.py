@@ -1,6 +1,7 @@
 """FEM solutions of the page: newest request and displayed frame."""
 
 import threading
+import time
 
 import numpy as np
 from visitor import run_until, wait_for
@@ -11,7 +12,7 @@ from scenes.page.fem_worker import FemWorker
 def test_paused_page_shows_fem_solution_that_arrives_later(demo, monkeypatch):
     """The frame is drawn before its FEM solution exists, and no further frame updates the tumour."""
     asked = []
-    monkeypatch.setattr(demo.referee, "ask", lambda number, touch: asked.append((number, touch)))
+    monkeypatch.setattr(demo.referee, "ask", lambda number, touch, rest: asked.append((number, touch)))
     demo.wish.set(plays=False, number=90)
     fem = demo.browser.meshes["finite elements"]
     rest = np.array(fem.vertices)
@@ -38,3 +39,22 @@ def test_fem_worker_solves_the_newest_request(theatre, scene):
     assert truth.deformation.outcome[0].good and truth.seconds > 0.0
     referee.close()
     assert not referee.thread.is_alive()
+
+
+def test_fem_worker_rests_between_comparisons(theatre, scene):
+    """The worker waits in proportion to the last solve, unless a request asks for no rest; closing ends the wait."""
+    referee = FemWorker(theatre, scene, threading.Lock())
+    referee.ask(20, None)
+    assert wait_for(lambda: referee.truth is not None)
+    begun, duration = time.perf_counter(), referee.solve_time
+    referee.ask(21, None, rest=1.0 + 1.0 / duration)
+    assert wait_for(lambda: referee.truth.number == 21)
+    assert time.perf_counter() - begun > 0.9
+    referee.ask(22, None, rest=1e6)
+    time.sleep(0.5)
+    assert referee.truth.number == 21
+    referee.ask(23, None)
+    assert wait_for(lambda: referee.truth.number == 23)
+    referee.ask(24, None, rest=1e6)
+    referee.close()
+    assert referee.truth.number == 23 and not referee.thread.is_alive()

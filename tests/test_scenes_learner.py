@@ -24,7 +24,7 @@ def test_held_out_solutions_do_not_influence_training(study, tmp_path, name, mon
     """Bitwise equal after a new tabulation: wrong held-out solutions change only the error figures."""
     monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})
-    path, _ = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
+    path, _ = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.disc_split.test_mask])
     found = []
     for data, folder in ((study.data, "as-it-is"), (path, "wild")):
         here = replace(study, data=data)
@@ -33,6 +33,6 @@ def test_held_out_solutions_do_not_influence_training(study, tmp_path, name, mon
         with limit_to_one_thread():
             found.append(measure_learner(here, LearnerSpec(name)))
     row, wild = found
-    assert row.load_mm == wild.load_mm and len(row.load_mm) == len(study.played)
+    assert row.load_mm == wild.load_mm and len(row.load_mm) == len(study.test_loads)
     assert wild.own_fem["discs"].mm.mean > 1.0 > row.own_fem["discs"].mm.mean
     assert replace(wild.own_fem["beyond"], percent=None) == replace(row.own_fem["beyond"], percent=None)

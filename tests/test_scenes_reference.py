@@ -23,7 +23,7 @@ from surrogate.model.training_range import compute_training_range
 
 
 def test_comparison_uses_only_loads_converged_in_both(study, study_box, monkeypatch):
-    truth = ReferenceSolutions(np.full((2, len(study.drawn), 3), 1e-3), np.array([True, False]), np.ones(2))
+    truth = ReferenceSolutions(np.full((2, len(study.read_nodes), 3), 1e-3), np.array([True, False]), np.ones(2))
     monkeypatch.setattr("scenes.report.row.get_reference", lambda study: truth)
     answer = np.full((2, len(study_box.tumour_nodes), 3), [[[1e-3, 1e-3, 3e-3]], [[np.nan] * 3]])
     for good, loads in (([True, True], 1), ([True, False], 1)):
@@ -68,8 +68,8 @@ def test_finer_reference_is_evaluated_at_the_same_points(study, tmp_path):
 
 
 def test_outside_loads_lie_beyond_the_training_range(study):
-    training = study.converged.select(np.flatnonzero(study.discs.train)).get(Pushed)
-    outside = study.outside.get(Pushed)
+    training = study.converged.select(np.flatnonzero(study.disc_split.train)).get(Pushed)
+    outside = study.loads_beyond.get(Pushed)
     assert not compute_training_range(study.patch, training).is_inside(study.patch, outside).any()
     size = np.linalg.norm(outside.force, axis=1)
     assert (size[::3] > 1.19 * np.linalg.norm(training.force, axis=1).max()).all()

@@ -44,13 +44,13 @@ def test_report_figures_match_independent_recomputation(study, page, study_box):
     effects = build_push_effects(study_box, TISSUE)
     truth = (
         Fem(study_box, effects, REFERENCE, "cpu", element="p2")
-        .deform(study.played)
+        .deform(study.test_loads)
         .restrict(study_box.tumour_nodes)
         .displacement
     )
     answer = (
         Fem(study_box, effects, TRAIN, "cpu", element="p1")
-        .deform(study.played)
+        .deform(study.test_loads)
         .restrict(study_box.tumour_nodes)
         .displacement
     )
@@ -61,8 +61,8 @@ def test_report_figures_match_independent_recomputation(study, page, study_box):
         assert np.allclose([stored[0]["reference"][kind][name] for name in names], values, rtol=2e-3)
         assert np.allclose([float(lines[0][f"reference.{kind}.{name}"]) for name in names], values, rtol=2e-3)
     data = read_dataset(study.data)
-    for name, split in (("discs", study.discs), ("sectors", hold_out_sectors(study.pushed, study.patch))):
-        test = split.test
+    for name, split in (("discs", study.disc_split), ("sectors", hold_out_sectors(study.pushed, study.patch))):
+        test = split.test_mask
         model = train(data, ["linear"], split=split).models["linear"]
         truth = data.read_displacement(study_box.tumour_nodes)[test]
         guess = model.deform(data.loads.select(np.flatnonzero(test)), at=study_box.tumour_nodes).displacement
@@ -73,7 +73,10 @@ def test_report_figures_match_independent_recomputation(study, page, study_box):
         worst = [miss.mean(), np.percentile(miss, 95.0), miss.max()]
         assert np.allclose([held["worst"][each] for each in names], worst, rtol=1e-5)
         assert held["loads"] == test.sum() and held["values"] == test.sum() * len(study_box.tumour_nodes)
-    assert stored[2]["loads"] == study.discs.train.sum() and stored[2]["units"] == 3 * study_box.craniotomy.sum()
+    assert (
+        stored[2]["loads"] == study.disc_split.training_mask.sum()
+        and stored[2]["units"] == 3 * study_box.craniotomy.sum()
+    )
 
 
 def test_report_page_loads_no_external_resources(page, study_rows):
@@ -91,17 +94,17 @@ def test_family_rows_have_error_and_outcome_of_each_load(study, study_rows, stud
     fem, _, learner, condensed, plate = study_rows
     nodes = np.union1d(study.patch.nodes, study_box.tumour_nodes)
     effects = build_push_effects(study_box, TISSUE)
-    truth = Fem(study_box, effects, REFERENCE, "cpu", element="p2").deform(study.played, at=nodes).displacement
-    found = build_family("condensed", study_box, effects, "cpu").deform(study.played, at=nodes).displacement
+    truth = Fem(study_box, effects, REFERENCE, "cpu", element="p2").deform(study.test_loads, at=nodes).displacement
+    found = build_family("condensed", study_box, effects, "cpu").deform(study.test_loads, at=nodes).displacement
     distance = 1e3 * np.linalg.norm(found - truth, axis=2)
     for name, part in (("load_mm", study_box.tumour_nodes), ("cortex_mm", study.patch.nodes)):
         wanted = distance[:, np.isin(nodes, part)].mean(axis=1)
         assert np.allclose(getattr(condensed, name), wanted, rtol=1e-3)
     assert condensed.reference.mm.mean == pytest.approx(np.mean(condensed.load_mm))
     assert fem.reference.mm.mean < plate.reference.mm.mean
-    assert sum(condensed.outcomes.values()) == sum(fem.outcomes.values()) == len(study.played)
+    assert sum(condensed.outcomes.values()) == sum(fem.outcomes.values()) == len(study.test_loads)
     assert set(plate.outcomes) <= {"GUESSED", "INVERTED", "OVERSTRAINED"}
-    assert learner.cortex_mm == () and len(learner.load_mm) == len(study.played)
+    assert learner.cortex_mm == () and len(learner.load_mm) == len(study.test_loads)
     assert condensed.preparation == condensed.set_up > 0.0 and condensed.adapt > 0.0
     assert condensed.central_ms[0] <= condensed.median <= condensed.central_ms[1]
 

@@ -1,26 +1,33 @@
 """Rows of a report: measured once, or with a reason."""
 
-import json
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from distributed import Scheduler, SpecCluster
 from poison import poisoned
 from studies import SPECS, TISSUE, read_back
 
 from scenes.analysis.measurement import measure_peak_memory
-from scenes.report.finite_elements import OWN_MESH, FemVariant
+from scenes.report.finite_elements import OWN_MESH, FamilySpec, FemVariant
 from scenes.report.learner import LearnerSpec, list_counts, measure_learner
 from scenes.report.reference import get_reference
 from scenes.report.rows import (
     list_all_combinations,
     list_learner_specs,
     list_one_factor_variants,
+    measure_on_workers,
     measure_row,
     measure_rows,
 )
 from scenes.report.study import measure_series_seconds, tabulate_series
 from sim.accuracy import TRAIN
+from sim.errors import InputError
 from sim.loads import Pushed
 from sim.runtime.threads import limit_to_one_thread
 from surrogate.data.dataset import read_dataset
@@ -33,9 +40,11 @@ from surrogate.training.train import train
 
 def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path, monkeypatch):
     """Trained here on the training rows; the report's file has wrong solutions of the held-out loads."""
-    training, pushed, nodes = study.discs.train, study.pushed, study_box.tumour_nodes
+    training, pushed, nodes = study.disc_split.training_mask, study.pushed, study_box.tumour_nodes
     truth = study.dataset.read_displacement(nodes)[study.dataset.good]
-    path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.discs.test])
+    path, wild = poisoned(
+        study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.disc_split.test_mask]
+    )
     monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})
     with limit_to_one_thread():
@@ -48,11 +57,11 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
     )
     within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
     guess = every[:, None, None] * basis.decode(machine.predict(compute_tool_features(study.patch, within)))
-    played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.played.get(Pushed).point]
-    exact = get_reference(study).displacement[:, np.isin(study.drawn, nodes)]
+    played = [np.flatnonzero((pushed.point == point).all(axis=1))[0] for point in study.test_loads.get(Pushed).point]
+    exact = get_reference(study).displacement[:, np.isin(study.read_nodes, nodes)]
     mean = 1e3 * np.linalg.norm(guess[played] - exact, axis=2).mean(axis=1)
     np.testing.assert_allclose(row.load_mm, mean, rtol=1e-3)
-    wanted = 1e3 * np.linalg.norm(guess[study.discs.test] - wild[nodes], axis=2)
+    wanted = 1e3 * np.linalg.norm(guess[study.disc_split.test_mask] - wild[nodes], axis=2)
     mm = row.own_fem["discs"].mm
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
     assert row.loads == training.sum()
@@ -66,14 +75,14 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
 
 
 def test_played_loads_lie_in_the_held_out_discs(study):
-    every = replace(study, loads=10_000).played.get(Pushed)
-    some, split = study.played.get(Pushed), study.discs
-    assert len(every.point) == split.test.sum() and len(some.point) == 2
+    every = replace(study, loads=10_000).test_loads.get(Pushed)
+    some, split = study.test_loads.get(Pushed), study.disc_split
+    assert len(every.point) == split.test_mask.sum() and len(some.point) == 2
     for pushed in (every, some):
         into = np.linalg.norm(pushed.point[:, None] - split.centres, axis=2).min(axis=1)
         assert into.max() <= split.radius
-        assert not np.isin(pushed.point[:, 0], study.pushed.point[split.train, 0]).any()
-    training = np.linalg.norm(study.pushed.point[split.train][:, None] - split.centres, axis=2).min(axis=1)
+        assert not np.isin(pushed.point[:, 0], study.pushed.point[split.training_mask, 0]).any()
+    training = np.linalg.norm(study.pushed.point[split.training_mask][:, None] - split.centres, axis=2).min(axis=1)
     assert training.min() > split.radius
     force, size = (np.linalg.norm(each.force, axis=1) for each in (some, every))
     assert list(force) == [size.min(), size.max()]
@@ -127,16 +136,9 @@ def test_only_missing_rows_are_measured_again(study, study_rows, tmp_path):
     list(measure_rows(replace(here, timed=31), SPECS[:1], run))
     assert asked[6:] == ["FEM"]
     kept = tmp_path / "rows" / "data-linear.json"
-    stored = json.loads(kept.read_text())
-    former = {"own_fem": "teacher", "loads": "taught"}
-    row = {former.get(name, name): value for name, value in stored["row"].items()}
-    kept.write_text(json.dumps({**stored, "row": row}))
-    assert tuple(measure_rows(here, SPECS[2:3], run)) == study_rows[2:3] and "teacher" in row and len(asked) == 7
     kept.write_text(kept.read_text()[:-9])
     list(measure_rows(here, SPECS, run))
-    assert asked[7:] == ["FEM", "linear"], (
-        "the first file held other inputs, the last was not whole; names from before are read"
-    )
+    assert asked[7:] == ["FEM", "linear"], "the first file held other inputs, the last was not whole"
 
 
 def test_report_plans_list_unique_variants(study):
@@ -157,3 +159,27 @@ def test_report_plans_list_unique_variants(study):
 def test_row_of_unknown_element_states_the_reason(study):
     row = measure_row(study, FemVariant("odd", element="cube"))
     assert "no element is called 'cube'" in row.state and row.reference is None and row.family == "finite elements"
+
+
+def test_rows_are_measured_by_workers_of_a_scheduler(study, tmp_path):
+    """One worker, in another process; its rows are stored, and read instead of measured by the next call."""
+    here = replace(study, folder=tmp_path)
+    shutil.copytree(study.folder / "answers", tmp_path / "answers")
+    specs = (FamilySpec("thin-plate"), LearnerSpec("linear"))
+    command = [sys.executable, "-m", "dask", "worker", "--nthreads", "1", "--host", "127.0.0.1", "--no-dashboard"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with ExitStack() as closing:
+        own = closing.enter_context(SpecCluster({}, {"cls": Scheduler, "options": {"host": "127.0.0.1", "port": 0}}))
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        address = own.scheduler_address
+        worker = subprocess.Popen([*command, address], env=environment, cwd=tmp_path, **quiet)
+        closing.enter_context(worker)
+        closing.callback(worker.terminate)
+        rows = list(measure_on_workers(here, specs, address))
+        stored = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "rows").iterdir()}
+        again = list(measure_on_workers(here, specs, address))
+        with pytest.raises(InputError, match="a worker does not see"):
+            list(measure_on_workers(replace(here, data=tmp_path / "elsewhere.h5"), specs, address))
+    assert [row.name for row in rows] == ["thin-plate", "linear"] and all(row.state == "measured" for row in rows)
+    assert again == rows and len(stored) == 2
+    assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "rows").iterdir()} == stored

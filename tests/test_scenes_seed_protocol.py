@@ -121,4 +121,4 @@ def test_options_that_do_not_belong_are_rejected(seed_file, tmp_path, capsys):
     assert main(["report", "--seed-mesh", str(seed_file), *out]) == 2
     assert "--seed-mesh belongs to --seed-protocol" in capsys.readouterr().err
     assert main(["report", "--seed-protocol", "--anatomy", "brain.vtu", *out]) == 2
-    assert "leave out --data and --anatomy" in capsys.readouterr().err
+    assert "leave out --data, --anatomy and --scheduler" in capsys.readouterr().err

@@ -195,7 +195,7 @@ def test_gp_correction_halves_series_error_on_trained_cortex(tmp_path):
 def test_series_training_ignores_held_out_discs(trained, data, expansion, tmp_path):
     """Bit-identical with random displacements of untrained loads and random series in held-out discs."""
     split = trained.split
-    rows = np.flatnonzero(data.good)[~split.train]
+    rows = np.flatnonzero(data.good)[~split.training_mask]
     wild = read_dataset(poisoned(data.path, tmp_path / "wild.h5", rows)[0])
     again = Expansion(wild, "cpu")
     inside = split.is_covered(again.positions)
@@ -217,7 +217,7 @@ def test_training_solve_counts_match_hand_count(trained, data):
     Unit forces on nodes inside the discs are counted once more.
     """
     linear, series, learnt = (row.solves for row in trained.scores)
-    loads_given, units = int(trained.split.train.sum()), len(data.unit_good)
+    loads_given, units = int(trained.split.training_mask.sum()), len(data.unit_good)
     outside = int((~trained.split.is_covered(add_edge_midpoints(open_patch(data.anatomy))[1])).sum())
     inside = 3 * int(trained.split.is_covered(open_patch(data.anatomy).points).sum())
     assert (linear.loads, linear.units, linear.series, linear.inside) == (loads_given, units, 0, inside) and inside

@@ -119,13 +119,15 @@ def test_held_out_distance_coverage_is_reported(trained, data, gauge):
 
     near, held = seen(beside), []
     for disc in range(len(split.centres)):
-        here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
+        here, others = (
+            np.flatnonzero(split.test_mask & ((split.disc_index == disc) == inside)) for inside in (True, False)
+        )
         bound = calibrate_bound(near, TIP_FIT, compute_growth(near, seen(others), TIP_FIT))
         bounded = replace(scored, tip=replace(scored.tip, bound=bound))
         held.append(seen(here).error <= bounded.predict_distance(good.select(here)).bound)
     found = trained.held_out_distance_coverage["linear"]
     held = np.concatenate(held, axis=1)
-    assert found.loads == held.shape[1] == split.test.sum() and found.shares == (held[0].mean(), None)
+    assert found.loads == held.shape[1] == split.test_mask.sum() and found.shares == (held[0].mean(), None)
 
 
 def test_correction_halves_the_distance_error(model, fresh):

@@ -154,7 +154,7 @@ class Silent:
     def __init__(self, theatre, scene, turn):
         pass
 
-    def ask(self, number, touch):
+    def ask(self, number, touch, rest=0.0):
         pass
 
     def close(self):

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # Numbers of loads of a short and of a full report: simulated where no data are given; compared with the reference;
 # beyond the training range.
 QUICK_COUNTS, FULL_COUNTS = (256, 8, 24), (3000, 64, 120)
+NO_SERIES = "Models of the power series: not measured with --quick on a CPU, where their table takes minutes."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,6 +56,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help=f"number of loads compared with the reference (default: {FULL_COUNTS[1]}; with --quick {QUICK_COUNTS[1]})",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="measure rows by the workers of a running Dask scheduler, tcp://HOST:PORT, that share the output folder",
     )
     parser.add_argument(
         "--seed-protocol",
@@ -96,6 +102,7 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
         list_family_specs,
         list_learner_specs,
         list_one_factor_variants,
+        measure_on_workers,
         measure_rows,
     )
     from ..report.study import ReportStudy
@@ -113,29 +120,36 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
     if not paths:
         paths = [args.out / "palpation.h5"]
         _simulate_data(paths[0], args, count)
-    studies = [ReportStudy(path, args.out, device, args.loads or loads, beyond, fine=not args.quick) for path in paths]
+    full = not args.quick
+    studies = [
+        ReportStudy(path, args.out, device, args.loads or loads, beyond, fine=full, poses=full) for path in paths
+    ]
     sections = []
     for study in studies:
+        series = full or study.on_card
         specs = (
-            *(list_all_combinations(study) if args.full else list_one_factor_variants(study, not args.quick)),
+            *(list_all_combinations(study) if args.full else list_one_factor_variants(study, full)),
             *list_family_specs(),
-            *list_learner_specs(),
+            *list_learner_specs(series),
         )
-        after = 0 if args.quick else len(study.dataset.loads) + len(study.dataset.unit_good)
-        total = len(study.played) + len(study.outside) + after + len(specs)
+        after = 0 if not full else len(study.dataset.loads) + len(study.dataset.unit_good)
+        total = len(study.test_loads) + len(study.loads_beyond) + after + len(specs)
         found = []
         with tqdm(total=total, desc=study.data.stem, unit="step", file=sys.stderr) as bar:
             solve_reference(study, bar.update)
             solve_beyond(study, bar.update)
-            _tabulate(study, bar)
-            if not args.quick:
+            if series:
+                _tabulate(study, bar)
+            if full:
                 simulate_debulked(study, bar.update)
                 _tabulate(build_debulked_study(study), bar)
-            for row in measure_rows(study, specs):
+            for row in (
+                measure_on_workers(study, specs, args.scheduler) if args.scheduler else measure_rows(study, specs)
+            ):
                 found.append(row)
                 bar.update()
         effects = read_effect_records(get_template_path().with_suffix(SUFFIX)) if study.is_shipped else {}
-        about = (*_describe_study(study), describe_reference_error(study.fine, found))
+        about = (*_describe_study(study), describe_reference_error(study.fine, found), *([] if series else [NO_SERIES]))
         body = study.anatomy.digest, str(study.tissue)
         sections.append(Section(study.data.stem, about, tuple(found), *body, tuple(effects.values())))
         write_report(args.out, describe_machine(device), sections)
@@ -162,8 +176,8 @@ def _measure_seed_sections(args: argparse.Namespace) -> list[Section]:
     from .simulate import show_progress
 
     device = _check_options(args)
-    if args.data or args.anatomy:
-        raise InputError("--seed-protocol makes its own data: leave out --data and --anatomy.")
+    if args.data or args.anatomy or args.scheduler:
+        raise InputError("--seed-protocol makes its own data: leave out --data, --anatomy and --scheduler.")
     count, loads = (
         seed_protocol.SEED_COUNTS[not args.quick],
         args.loads or (QUICK_COUNTS if args.quick else FULL_COUNTS)[1],
@@ -211,7 +225,7 @@ def _describe_study(study: ReportStudy) -> tuple[str, ...]:
     good = int(truth.good.sum())
     return (
         f"Data: {len(study.converged)} {preset} loads on {len(study.anatomy.mesh.nodes)} vertices, "
-        f"{study.element} elements, {study.tissue}; {study.discs.summarise()}.",
+        f"{study.element} elements, {study.tissue}; {study.disc_split.summarise()}.",
         f"Reference: quadratic tetrahedra (p2) on {mesh}, the data's tissue, to 1e-8 in double precision, read at the "
         f"same material points. {good} of {len(truth.good)} loads of the left-out discs converged, "
         f"{truth.seconds.mean():.2g} s each. Beyond the training range, in equal parts: {', '.join(KINDS)}.",

@@ -148,7 +148,7 @@ class Workers:
     tend: Callable[[], None] = lambda: None
 
     @property
-    def needs(self) -> Mapping[str, int] | None:
+    def needs(self) -> dict[str, int] | None:
         """Resources that a task requires of a worker."""
         return {GPU_RESOURCE: 1} if self.device == "cuda" else None
 

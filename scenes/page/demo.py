@@ -1,5 +1,6 @@
 """Main loop of the page: a scripted or manual tool, any deformer, and comparison with FEM in the background."""
 
+import os
 import sys
 import threading
 import time as clock
@@ -55,6 +56,8 @@ from .view import (
 WAITING_TEXT = "The finite elements are working on this load."  # Text while FEM solves.
 UNDEFORMED_TEXT = '<p class="stale">The undeformed body, as in the scan. The first result is being computed.</p>'
 MIN_REST = 0.007  # Shortest pause after an image, for FEM in the background [s].
+# Pause between comparisons with FEM while playing, relative to the duration of one: leaves few CPU cores to the images.
+COMPARISON_REST = 2.0 if (os.cpu_count() or 1) < 4 else 0.0
 MESSAGE_TIME = 2.0  # Time for which a playing page shows why a frame is skipped [s].
 
 
@@ -264,7 +267,7 @@ class Demo:
         if name == "fem" and not disabled:
             state.shown_fem = solution
         elif solution.number == number:
-            self.referee.ask(number, touch)
+            self.referee.ask(number, touch, COMPARISON_REST if self.wish.plays else 0.0)
         if not disabled:
             self.tally.record_time(name, state.load, solution.deformation.cost.total)
         state.picture = render_page_image(frame)

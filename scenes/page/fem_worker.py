@@ -36,7 +36,7 @@ class FemResult:
 class FemWorker:
     """Thread that solves the newest frame by FEM; older pending requests are dropped.
 
-    The thread pauses while an image is drawn.
+    The thread pauses while an image is drawn, and after a solve if a request asks for that.
     It is prepared at the first request. Frames on the way to the requested one are solved too. If FEM fails, `failure`
     is the reason, and no further frames are solved; if loads are rejected, only that frame is skipped, and `refused` is
     its request. After the setup, `player` has the solver, and `plan` lists its solvers as sentences.
@@ -51,18 +51,21 @@ class FemWorker:
         self.player: Player | None = None
         self.plan: tuple[str, ...] = ()
         self.build_lock = build_lock
+        self.solved_at = self.solve_time = self.rest = 0.0
         self.closed = threading.Event()
         self.wake = threading.Condition()
         self.thread = threading.Thread(target=self._serve, args=(theatre, scene), name="fem", daemon=True)
         self.thread.start()
 
-    def ask(self, number: int, touch: Touch | None) -> None:
+    def ask(self, number: int, touch: Touch | None, rest: float = 0.0) -> None:
         """Replace the pending request; `touch` is the manual one, if the user has the tool.
 
-        Nothing is solved twice: the request may be the one in progress, or the last one that was solved.
+        Nothing is solved twice: the request may be the one in progress, or the last one that was solved. `rest` is the
+        pause before the next solve, relative to the duration of the last.
         """
         result, request = self.truth, (number, touch)
         with self.wake:
+            self.rest = rest
             if result is not None and result.asked == request and result.number == number:
                 self.newest = None
             elif self.newest != request:
@@ -119,15 +122,21 @@ class FemWorker:
             except InputError as error:
                 number, self.failure, self.refused = requested, error, request
             with self.wake:
+                self.solved_at = clock.perf_counter()
+                self.solve_time = self.solved_at - start
                 if self.newest == request and number == requested:
                     self.newest = None
                 self.wake.notify_all()
 
     def _wait_for_request(self) -> FrameRequest | None:
-        """Return the newest request, once there is one; None at the end."""
+        """Return the newest request, once there is one and the pause is over; None at the end."""
         with self.wake:
-            self.wake.wait_for(lambda: self.closed.is_set() or self.newest is not None)
-            return None if self.closed.is_set() else self.newest
+            while not self.closed.is_set():
+                left = self.solved_at + self.rest * self.solve_time - clock.perf_counter()
+                if self.newest is not None and left <= 0.0:
+                    return self.newest
+                self.wake.wait(None if self.newest is None else left)
+            return None
 
     def _prepare_session(self, theatre: PatientSetup, scene: Scene) -> ReplaySession | None:
         """Build the FEM session; None if the request was withdrawn while this thread waited for the lock."""

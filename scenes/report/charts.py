@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -82,8 +83,15 @@ def build_cortex_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
         mean = float(np.mean(row.cortex_mm)) if row.cortex_mm else 0.0
         return (row.median, mean) if row.median and mean > 0.0 else None
 
-    chart = _scatter(rows, "And at the open cortex, that the camera sees?", "milliseconds a load", place)
+    title = "And at the open cortex, that the camera sees?"
+    chart = _scatter(rows, title, "milliseconds a load", place, attrgetter("cortex_mm"))
     return chart and replace(chart, y="mean distance from the reference at the open cortex [mm]")
+
+
+def build_pose_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
+    """Build the chart of the error where the tool's motion is given, not its force; None without rows."""
+    title = "And if the motion of the tool is known, not its force?"
+    return _scatter(rows, title, "milliseconds a load", lambda row: _place(row.median, row.pose), lambda row: ())
 
 
 def build_force_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
@@ -110,9 +118,16 @@ def build_learning_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
 
 
 def _scatter(
-    rows: Sequence[ReportRow], title: str, x: str, find: Callable[[ReportRow], Place | None]
+    rows: Sequence[ReportRow],
+    title: str,
+    x: str,
+    find: Callable[[ReportRow], Place | None],
+    get_errors: Callable[[ReportRow], Sequence[float]] = attrgetter("load_mm"),
 ) -> ChartPanel | None:
-    """Build a chart of rows at the places found; rows off the Pareto front are pale, and the front is drawn."""
+    """Build a chart of rows at the places found; rows off the Pareto front are pale, and the front is drawn.
+
+    Bars are the central range of `get_errors`, the errors of each load [mm].
+    """
     places = {row.name: place for row in rows if row.against != TOLERANCE_ALONE and (place := find(row))}
     best = find_pareto_front(
         {row.name: places[row.name] for row in rows if row.name in places and row.against == ERROR}
@@ -123,7 +138,7 @@ def _scatter(
             row.family if row.against == ERROR else DIFFERENT_LAW,
             *places[row.name],
             pale=row.name not in best,
-            y_range=_find_central_range(row.load_mm),
+            y_range=_find_central_range(get_errors(row)),
             hint=_describe(row),
         )
         for row in rows
@@ -159,6 +174,7 @@ CHARTS = {
     "adaptation": build_adaptation_chart,
     "force": build_force_chart,
     "cortex": build_cortex_chart,
+    "pose": build_pose_chart,
     "learning": build_learning_chart,
 }
 

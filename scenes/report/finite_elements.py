@@ -12,7 +12,7 @@ from sim.bodies.meshfile import read_anatomy, write_anatomy
 from sim.bodies.refine import refine
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, build_template_subject
-from sim.deformation import Deformer, Outcome
+from sim.deformation import Deformation, Deformer, Outcome
 from sim.discretisation.footprint import find_nearest_on
 from sim.effects import Elasticity, build_push_effects
 from sim.errors import InputError
@@ -24,6 +24,7 @@ from sim.material import Material, Tissue
 
 from ..analysis.measurement import time_work
 from .adaptation import debulk_tumour
+from .pose import measure_pose_error
 from .row import (
     DIFFERENCE,
     ERROR,
@@ -86,7 +87,7 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> ReportRow:
     """
     body = find_body(study, spec.mesh)
     fem, set_up = time_work(_build_fem, study, spec, body)
-    loads = study.played if spec.mesh == OWN_MESH else move_pushes_onto(body, study.played)
+    loads = study.test_loads if spec.mesh == OWN_MESH else move_pushes_onto(body, study.test_loads)
     law, element = spec.law or get_law_name(study.tissue) or "default", spec.element or study.element
     row = ReportRow(
         spec.name,
@@ -117,22 +118,31 @@ def measure_family(study: ReportStudy, spec: FamilySpec) -> ReportRow:
     model, set_up = time_work(build, study.anatomy)
     command = f"sulcus render press --deformer {spec.name}"
     row = ReportRow(spec.name, KINDS[spec.name], set_up=set_up, command=command)
-    row = _measure_loads(study, row, model, study.played)
-    debulked, first = debulk_tumour(study.anatomy), study.played.select(np.array([0]))
+    row = _measure_loads(study, row, model, study.test_loads)
+    debulked, first = debulk_tumour(study.anatomy), study.test_loads.select(np.array([0]))
     return replace(row, adapt=time_work(lambda: build(debulked).deform(first, at=debulked.tumour_nodes))[1])
 
 
 def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: Loads) -> ReportRow:
     """Return the row with errors and times of the loads, one by one."""
-    own, drawn = study.anatomy, study.drawn
+    own, drawn = study.anatomy, study.read_nodes
     same = model.anatomy is own
     located = None if same else locate(model.anatomy.mesh, own.mesh.nodes[drawn])
     model.deform(loads.select(np.array([0])), at=drawn if same else None)  # kernels are compiled at their first launch
     fields, outcomes, seconds = [], [], []
+    (pushed,) = loads.get_all(Pushed)
+
+    def read(result: Deformation) -> np.ndarray:
+        return result.displacement if located is None else located.read(result.displacement)
+
+    def solve(rows: np.ndarray, force: np.ndarray) -> np.ndarray:
+        pushes = Pushed(pushed.point[rows], force, pushed.footprint[rows])
+        return read(model.deform(replace(loads.select(rows), causes=(pushes,)), at=drawn if same else None))
+
     for number in range(len(loads)):
         result, spent = time_work(model.deform, loads.select(np.array([number])), None, drawn if same else None)
         seconds.append(spent)
-        fields.append(result.displacement[0] if located is None else located.read(result.displacement)[0])
+        fields.append(read(result)[0])
         outcomes.append(result.outcome[0])
     together = time_work(model.deform, loads, None, drawn if same else None)[1]
     field, tumour = np.array(fields), np.isin(drawn, own.tumour_nodes)
@@ -143,6 +153,7 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
         failed=int((~good).sum()),
         outcomes=dict(Counter(outcome.name for outcome in outcomes)),
         batch_ms=1e3 * together / len(loads),
+        pose=measure_pose_error(study, solve) if study.poses else None,
         **compute_load_errors(study, field, good, drawn),
         **summarise_times(seconds),
     )

@@ -35,14 +35,14 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
     InputError
         Input that `train` rejects.
     """
-    nodes, truth = study.anatomy.tumour_nodes, study.answers
+    nodes, truth = study.anatomy.tumour_nodes, study.data_displacement
 
     def judged(model: Deformer, split: DiscSplit) -> tuple[ErrorFigures | None, float]:
         """Return the errors relative to the data's own solutions of held-out loads."""
         rows = np.flatnonzero(split.test_mask)
         return _compute_errors(model, study.converged.select(rows), truth[rows], nodes)
 
-    discs, sectors = study.discs, hold_out_sectors(study.pushed, study.patch)
+    discs, sectors = study.disc_split, hold_out_sectors(study.pushed, study.patch)
     (model, solves), learning = time_work(_train_model, study, spec, discs)
     order = np.flatnonzero(discs.training_mask)
     curve = []
@@ -52,13 +52,13 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
         curve.append((count, judged(_train_model(study, spec, fewer)[0], discs)[0]))
     of_discs, of_sectors = judged(model, discs), judged(_train_model(study, spec, sectors)[0], sectors)
     beyond = get_solutions_beyond(study)
-    outside = study.outside.select(np.flatnonzero(beyond.good))
+    outside = study.loads_beyond.select(np.flatnonzero(beyond.good))
     sets = {
         "discs": of_discs,
         "sectors": of_sectors,
         "beyond": _compute_errors(model, outside, beyond.displacement[beyond.good], nodes),
     }
-    field, together = time_work(lambda: model.deform(study.played, at=nodes).displacement)
+    field, together = time_work(lambda: model.deform(study.test_loads, at=nodes).displacement)
     covered = compute_coverage_beyond(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _measure_adaptation(study, spec)
     held_out = study.converged.select(np.flatnonzero(discs.test_mask))
@@ -87,20 +87,20 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
     )
 
 
-def list_counts(most: int) -> list[int]:
-    """List the counts 64, 128, 256, ... below `most`."""
-    return [MIN_LOADS << k for k in range(20) if MIN_LOADS << k < most]
+def list_counts(max_loads: int) -> list[int]:
+    """List the counts 64, 128, 256, ... below `max_loads`."""
+    return [MIN_LOADS << k for k in range(20) if MIN_LOADS << k < max_loads]
 
 
 def compute_coverage_beyond(
-    study: ReportStudy, spec: LearnerSpec, outside: Loads, truth: np.ndarray
+    study: ReportStudy, spec: LearnerSpec, outside: Loads, reference: np.ndarray
 ) -> dict[str, float]:
-    """Return the coverage of the 95 % bounds outside their guarantee; `truth` (B, n, 3) [m] of the loads `outside`."""
+    """Return the coverage of the 95 % bounds outside their guarantee, from FEM solutions (B, n, 3) [m] of `outside`."""
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
     model, found = trained.models[spec.name], trained.held_out_coverage.get(spec.name)
     shares = {} if found is None else {"discs": found.shares[0]}
     if model.bounds is not None and len(outside) >= FORCE_CLASSES:
-        shares["beyond"] = compute_coverage(model, outside, truth).shares[0]
+        shares["beyond"] = compute_coverage(model, outside, reference).shares[0]
     return {name: share for name, share in shares.items() if share is not None}
 
 
@@ -110,11 +110,11 @@ def _measure_adaptation(study: ReportStudy, spec: LearnerSpec) -> tuple[float | 
     if seconds is None:
         return None, None
     after = build_debulked_study(study)
-    (model, _), learning = time_work(_train_model, after, spec, after.discs)
-    rows = np.flatnonzero(after.discs.test_mask)
+    (model, _), learning = time_work(_train_model, after, spec, after.disc_split)
+    rows = np.flatnonzero(after.disc_split.test_mask)
     seconds += learning + measure_series_seconds(after, spec.name)
     return seconds, _compute_errors(
-        model, after.converged.select(rows), after.answers[rows], after.anatomy.tumour_nodes
+        model, after.converged.select(rows), after.data_displacement[rows], after.anatomy.tumour_nodes
     )[0]
 
 

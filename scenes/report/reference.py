@@ -35,7 +35,7 @@ class ReferenceSolutions:
 
 
 def solve_reference(study: ReportStudy, progress: Callable[[int], object], accuracy: Accuracy = REFERENCE) -> None:
-    """Solve the compared loads with the reference's element, and store each at `study.drawn`.
+    """Solve the compared loads with the reference's element, and store each at `study.read_nodes`.
 
     `progress` receives the number of newly solved loads. Stored solutions are not solved again.
     """
@@ -50,9 +50,9 @@ def solve_reference(study: ReportStudy, progress: Callable[[int], object], accur
             None,
             study.reference_element,
         )
-        return fem, locate(body.mesh, study.anatomy.mesh.nodes[study.drawn])
+        return fem, locate(body.mesh, study.anatomy.mesh.nodes[study.read_nodes])
 
-    _solve(study, "reference", study.played, made, progress)
+    _solve(study, "reference", study.test_loads, made, progress)
 
 
 def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
@@ -63,17 +63,17 @@ def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
         fem = Fem(body, build_push_effects(body, study.get_tissue_on(body)), TRAIN, study.device, None, study.element)
         return fem, locate(body.mesh, body.mesh.nodes[body.tumour_nodes])
 
-    _solve(study, "beyond", study.outside, made, progress)
+    _solve(study, "beyond", study.loads_beyond, made, progress)
 
 
 def get_reference(study: ReportStudy) -> ReferenceSolutions:
     """Read the solutions of `solve_reference`."""
-    return _read(study, "reference", len(study.played))
+    return _read(study, "reference", len(study.test_loads))
 
 
 def get_solutions_beyond(study: ReportStudy) -> ReferenceSolutions:
     """Read the solutions of `solve_beyond`."""
-    return _read(study, "beyond", len(study.outside))
+    return _read(study, "beyond", len(study.loads_beyond))
 
 
 def _solve(

@@ -30,7 +30,7 @@ class ErrorSpread:
 
 
 @dataclass(frozen=True)
-class Tenth:
+class ForceDecile:
     """A tenth of the loads by force [N]: mean and largest distance [mm], and the mean in % of the motion."""
 
     least: float
@@ -53,21 +53,21 @@ class ErrorFigures:
     mm: ErrorSpread
     worst: ErrorSpread
     percent: ErrorSpread
-    tenths: tuple[Tenth, ...]
+    tenths: tuple[ForceDecile, ...]
 
 
-def compute_distance_figures(distance: np.ndarray, truth: np.ndarray, force: np.ndarray) -> ErrorFigures | None:
-    """Compute the errors from distances (B, n) [m] to `truth` (B, n, 3) [m] under forces (B,) [N]; None without loads.
+def compute_distance_figures(distance: np.ndarray, reference: np.ndarray, force: np.ndarray) -> ErrorFigures | None:
+    """Compute errors from distances (B, n) [m] to a `reference` (B, n, 3) [m] and forces (B,) [N]; None without loads.
 
-    A load's motion is the mean displacement of its n vertices in `truth`.
+    A load's motion is the mean displacement of its n vertices in `reference`.
     """
     if not len(distance):
         return None
-    motion = np.linalg.norm(truth, axis=2).mean(axis=1)
+    motion = np.linalg.norm(reference, axis=2).mean(axis=1)
     mm, percent = 1e3 * distance, 100.0 * distance / motion[:, None]
     parts = [rows for rows in np.array_split(np.argsort(force, kind="stable"), FORCE_CLASSES) if len(rows)]
     tenths = (
-        Tenth(*(float(v) for v in (force[r].min(), force[r].max(), mm[r].mean(), mm[r].max(), percent[r].mean())))
+        ForceDecile(*(float(v) for v in (force[r].min(), force[r].max(), mm[r].mean(), mm[r].max(), percent[r].mean())))
         for r in parts
     )
     return ErrorFigures(
@@ -81,10 +81,10 @@ def compute_distance_figures(distance: np.ndarray, truth: np.ndarray, force: np.
     )
 
 
-def compute_figures(result: np.ndarray, truth: np.ndarray, loads: Loads) -> ErrorFigures | None:
-    """Compute the errors of `result` (B, n, 3) [m] against `truth` (B, n, 3) [m] under pushes."""
+def compute_figures(result: np.ndarray, reference: np.ndarray, loads: Loads) -> ErrorFigures | None:
+    """Compute the errors of `result` (B, n, 3) [m] against `reference` (B, n, 3) [m] under pushes."""
     (pushed,) = loads.get_all(Pushed)
-    return compute_distance_figures(np.linalg.norm(result - truth, axis=2), truth, split_forces(pushed)[0])
+    return compute_distance_figures(np.linalg.norm(result - reference, axis=2), reference, split_forces(pushed)[0])
 
 
 def compare_with_reference(
@@ -93,8 +93,8 @@ def compare_with_reference(
     """Compute the errors of solutions (n, k, 3) [m] at vertices (k,) of the test loads where both are `good` (n,)."""
     truth = get_reference(study)
     rows = np.flatnonzero(good & truth.good)
-    known = np.isin(study.drawn, nodes)
-    return compute_figures(result[rows], truth.displacement[rows][:, known], study.played.select(rows))
+    known = np.isin(study.read_nodes, nodes)
+    return compute_figures(result[rows], truth.displacement[rows][:, known], study.test_loads.select(rows))
 
 
 def compute_load_errors(study: ReportStudy, result: np.ndarray, good: np.ndarray, nodes: np.ndarray) -> dict[str, Any]:
@@ -105,8 +105,10 @@ def compute_load_errors(study: ReportStudy, result: np.ndarray, good: np.ndarray
     truth = get_reference(study)
     rows = np.flatnonzero(good & truth.good)
     parts = {"load_mm": study.anatomy.tumour_nodes, "cortex_mm": study.patch.nodes}
-    distance = 1e3 * np.linalg.norm(result[rows] - truth.displacement[rows][:, np.isin(study.drawn, nodes)], axis=2)
-    known = np.intersect1d(study.drawn, nodes)
+    distance = 1e3 * np.linalg.norm(
+        result[rows] - truth.displacement[rows][:, np.isin(study.read_nodes, nodes)], axis=2
+    )
+    known = np.intersect1d(study.read_nodes, nodes)
     return {
         name: tuple(distance[:, np.isin(known, part)].mean(axis=1).tolist()) if np.isin(part, known).all() else ()
         for name, part in parts.items()
@@ -143,6 +145,8 @@ class ReportRow:
         Share of the loads of "discs" and "beyond" whose largest error is within the bound at 0.95.
     load_mm, cortex_mm
         Mean distance from the reference of each compared load [mm], at the tumour and at the open cortex.
+    pose
+        Distances from the reference where the tool is moved as there, instead of pushed with the same force.
     failed
         Test loads without a solution; they are excluded from all figures.
     outcomes
@@ -189,6 +193,7 @@ class ReportRow:
     covered: Mapping[str, float] = field(default_factory=dict)
     load_mm: tuple[float, ...] = ()
     cortex_mm: tuple[float, ...] = ()
+    pose: ErrorFigures | None = None
     failed: int = 0
     outcomes: Mapping[str, int] = field(default_factory=dict)
     median: float | None = None

@@ -4,7 +4,7 @@ import json
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from functools import partial
@@ -25,6 +25,7 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
 from sim.runtime.processes import LostError, process_pool, run_on_each
 from sim.runtime.threads import limit_to_one_thread
+from surrogate.training.expansion import SERIES_MODELS
 from surrogate.training.train import LEARNERS
 
 from ..analysis.measurement import measure_peak_memory, watch_gpu_memory
@@ -126,19 +127,56 @@ def list_family_specs() -> tuple[FamilySpec, ...]:
     return tuple(FamilySpec(name) for name in FAMILIES)
 
 
-def list_learner_specs() -> tuple[LearnerSpec, ...]:
-    """List a specification for each learner of `surrogate`."""
-    return tuple(LearnerSpec(name) for name in LEARNERS)
+def list_learner_specs(series: bool = True) -> tuple[LearnerSpec, ...]:
+    """List a specification for each learner of `surrogate`, those of the power series only if `series`."""
+    return tuple(LearnerSpec(name) for name in LEARNERS if series or name not in SERIES_MODELS)
 
 
-def measure_in_process(turn: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
-    """Measure a row in its own process, which starts immediately and measures once it enters `turn`."""
+def measure_in_process(slot: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
+    """Measure a row in its own process, which starts immediately and measures once it enters `slot`."""
     try:
         # Data that the study has already read are not copied to the process.
-        with process_pool(["cpu"], prepare_rows, replace(study)) as children, turn:
+        with process_pool(["cpu"], prepare_rows, replace(study)) as children, slot:
             return run_on_each(children, measure_row, [spec])[0]
     except LostError:
         return ReportRow(spec.name, FAMILY_NAMES[type(spec)], state="its process was killed, probably out of memory")
+
+
+def measure_on_worker(study: ReportStudy, spec: Spec) -> ReportRow:
+    """Measure a row on a Dask worker, or read its file; without peak memory, which is of all rows of the worker.
+
+    Raises
+    ------
+    InputError
+        A worker that does not see the study's files.
+    """
+    if not study.data.is_file():
+        raise InputError(f"a worker does not see {study.data}: put it in a folder that all machines share.")
+    return _get_row(study, lambda study, spec: replace(measure_row(study, spec), memory=None), spec)
+
+
+def measure_on_workers(study: ReportStudy, specs: Sequence[Spec], address: str) -> Iterator[ReportRow]:
+    """Yield a row for each of the `specs` as `measure_rows`, measured by the workers of a Dask scheduler.
+
+    Raises
+    ------
+    InputError
+        A scheduler that cannot be reached, or that ends; see `measure_on_worker`.
+    """
+    from distributed.scheduler import KilledWorker
+
+    from ..episodes.workers import connect_workers, describe_scheduler_end
+
+    here = replace(study, data=study.data.resolve(), folder=study.folder.resolve())
+    with connect_workers(address, "cuda" if study.on_card else "cpu") as workers:
+        rows = workers.client.map(partial(measure_on_worker, here), specs, pure=False, resources=workers.needs)
+        for spec, row in zip(specs, rows, strict=True):
+            try:
+                yield row.result()
+            except KilledWorker:
+                yield ReportRow(spec.name, FAMILY_NAMES[type(spec)], state="its workers were killed: out of memory?")
+            except CancelledError as error:
+                raise describe_scheduler_end(workers.where) from error
 
 
 def measure_rows(
@@ -215,15 +253,10 @@ def _compute_row_digest(study: ReportStudy, spec: Spec) -> str:
     return compute_digest(np.frombuffer(stated.encode(), np.uint8))
 
 
-FORMER_NAMES = {"teacher": "own_fem", "taught": "loads"}
-"""Former names of fields in files of rows."""
-
-
 def _read_kept_row(path: Path, digest: str) -> ReportRow | None:
     """Read the row in a file; None if it is missing, incomplete, or of other inputs."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
-        row = {FORMER_NAMES.get(name, name): value for name, value in stored["row"].items()}
-        return msgspec.convert(row, ReportRow) if stored["digest"] == digest else None
+        return msgspec.convert(stored["row"], ReportRow) if stored["digest"] == digest else None
     except (OSError, ValueError, LookupError, TypeError):
         return None

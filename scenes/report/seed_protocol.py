@@ -59,7 +59,7 @@ class SeedStudy(ReportStudy):
     reference_element: str = "p1"
 
     @cached_property
-    def played(self) -> Loads:
+    def test_loads(self) -> Loads:
         """The first of the converged loads, which are in random order."""
         return self.converged.select(slice(0, self.loads))
 
@@ -76,12 +76,12 @@ class SeedStudy(ReportStudy):
     @cached_property
     def solutions(self) -> np.ndarray:
         """Displacements (B, m, 3) [m] of the converged loads at `drawn`."""
-        return self.dataset.read_displacement(self.drawn)[self.dataset.good]
+        return self.dataset.read_displacement(self.read_nodes)[self.dataset.good]
 
     @cached_property
     def truth(self) -> np.ndarray:
         """Displacements (B, k, 3) [m] of the converged loads at `select_vertices`."""
-        return self.solutions[:, np.searchsorted(self.drawn, select_vertices(self.anatomy))].astype(np.float64)
+        return self.solutions[:, np.searchsorted(self.read_nodes, select_vertices(self.anatomy))].astype(np.float64)
 
     def load_rows(self, rows: np.ndarray) -> LoadedRows:
         """Return a data set of some converged loads (n,)."""
@@ -95,7 +95,7 @@ class SeedStudy(ReportStudy):
             residual=data.residual[numbers],
             unit_good=data.unit_good,
             provenance=data.provenance,
-            nodes=self.drawn,
+            nodes=self.read_nodes,
             displacement=self.solutions[rows],
         )
 
@@ -194,7 +194,7 @@ def describe_seed_study(study: SeedStudy, rows: tuple[ReportRow, ...]) -> tuple[
         f"{len(study.dataset.loads)} at {len(study.positions)} positions{motion}; {len(study.anatomy.mesh.nodes)} "
         "vertices, linear tetrahedra (p1), the authors' two-term Ogden tissue.",
         "Learners: trained once for each position, on at most "
-        f"{MAX_TRAINING} loads at the others, and tested on all loads there. Other models: on {len(study.played)} "
+        f"{MAX_TRAINING} loads at the others, and tested on all loads there. Other models: on {len(study.test_loads)} "
         "loads. The reference is p1 as the authors had; rows of p2 and smoothed elements show how far it is from a "
         "finer discretisation.",
         f"Published mean errors, and here: {'; '.join(verdicts) or 'not measured'}.",

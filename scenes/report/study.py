@@ -45,6 +45,8 @@ class ReportStudy:
         timed.
     fine
         True if the reference mesh is refined by halving every edge.
+    poses
+        True if models are compared with tools moved as in the reference, too.
     reference_element
         Element of the reference.
     """
@@ -56,6 +58,7 @@ class ReportStudy:
     beyond: int = 120
     timed: int = 1000
     fine: bool = False
+    poses: bool = False
     reference_element: str = "p2"
 
     @cached_property
@@ -104,7 +107,7 @@ class ReportStudy:
         return open_patch(self.anatomy)
 
     @cached_property
-    def drawn(self) -> np.ndarray:
+    def read_nodes(self) -> np.ndarray:
         """Sorted vertices (m,) of tumour and open cortex: where the reference is read."""
         return np.union1d(self.patch.nodes, self.anatomy.tumour_nodes)
 
@@ -128,28 +131,28 @@ class ReportStudy:
         return pushed
 
     @cached_property
-    def answers(self) -> np.ndarray:
+    def data_displacement(self) -> np.ndarray:
         """The data's own solutions (B, k, 3) [m] of `converged`, at the tumour's vertices."""
         return self.dataset.read_displacement(self.anatomy.tumour_nodes)[self.dataset.good]
 
     @cached_property
-    def discs(self) -> DiscSplit:
+    def disc_split(self) -> DiscSplit:
         """Discs of cortex left out."""
         return hold_out_discs(self.pushed.point, self.patch)
 
     @cached_property
-    def played(self) -> Loads:
+    def test_loads(self) -> Loads:
         """Loads of the left-out discs, spread evenly over their forces."""
-        rows = np.flatnonzero(self.discs.test_mask)
+        rows = np.flatnonzero(self.disc_split.test_mask)
         rows = rows[np.argsort(split_forces(self.pushed)[0][rows], kind="stable")]
         chosen = np.unique(np.linspace(0, len(rows) - 1, min(self.loads, len(rows))).round().astype(int))
         return self.converged.select(rows[chosen])
 
     @cached_property
-    def outside(self) -> Loads:
+    def loads_beyond(self) -> Loads:
         """Loads beyond the training range: stronger, more oblique, nearer to the rim, in equal parts."""
-        pushed = self.converged.select(np.flatnonzero(self.discs.test_mask)).get(Pushed)
-        training = self.converged.select(np.flatnonzero(self.discs.training_mask)).get(Pushed)
+        pushed = self.converged.select(np.flatnonzero(self.disc_split.test_mask)).get(Pushed)
+        training = self.converged.select(np.flatnonzero(self.disc_split.training_mask)).get(Pushed)
         assert pushed is not None and training is not None
         return draw_loads_beyond(self.patch, training, pushed, self.beyond)
 
@@ -168,13 +171,13 @@ EDGE_DISTANCES = (0.5, 0.9)  # Range of distances of a centre from the edge, rel
 KINDS = ("stronger", "more oblique", "nearer to the rim")  # Kinds of loads beyond the training range.
 
 
-def draw_loads_beyond(patch: Patch, training: Pushed, like: Pushed, count: int) -> Loads:
-    """Draw `count` loads, a third of each of `KINDS`, otherwise distributed as `like`; deterministic."""
+def draw_loads_beyond(patch: Patch, training: Pushed, pattern: Pushed, count: int) -> Loads:
+    """Draw `count` loads, a third of each of `KINDS`, otherwise distributed as `pattern`; deterministic."""
     random = np.random.default_rng(0)
-    rows = random.integers(len(like.point), size=count)
+    rows = random.integers(len(pattern.point), size=count)
     kind = np.arange(count) % len(KINDS)
-    size, direction = split_forces(replace(like, force=like.force[rows]))
-    point, footprint = like.point[rows], like.footprint[rows]
+    size, direction = split_forces(replace(pattern, force=pattern.force[rows]))
+    point, footprint = pattern.point[rows], pattern.footprint[rows]
     size = np.where(kind == 0, split_forces(training)[0].max() * random.uniform(*FORCE_RATIOS, count), size)
     oblique = _turn_from_normal(
         direction, patch.find_normals(point), _compute_max_angle(patch, training), random.uniform(*EXTRA_ANGLES, count)
@@ -208,16 +211,16 @@ def _sample_near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Gene
     return points[np.abs(ratio - wanted).argmin(axis=1)]
 
 
-def note_seconds(made: Path, seconds: float) -> None:
+def note_seconds(path: Path, seconds: float) -> None:
     """Keep the seconds that a file took to make, in a JSON file of its name."""
-    with write_atomically(_to_json_path(made), ".json") as partial:
+    with write_atomically(_to_json_path(path), ".json") as partial:
         partial.write_text(json.dumps({"seconds": seconds}))
 
 
-def read_noted_seconds(made: Path) -> float | None:
+def read_noted_seconds(path: Path) -> float | None:
     """Read the stored value; None if missing or incomplete."""
     try:
-        return float(json.loads(_to_json_path(made).read_text())["seconds"])
+        return float(json.loads(_to_json_path(path).read_text())["seconds"])
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
 

@@ -145,7 +145,7 @@ def fit_tissue(
 ) -> FittedTissue:  # fmt: skip
     """Estimate the tissue of a locator's anatomy from some frames.
 
-    Points that no others support are removed: `left_out`, or by `find_unsupported_points`. Results in `folder` are read.
+    Points that no others support are removed: `left_out`, or by `find_unsupported_points`. Those in `folder` are read.
     `progress` receives a stage, the number of its parts done, and their total.
 
     Raises

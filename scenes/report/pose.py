@@ -1,0 +1,71 @@
+"""Error of a model whose tool is moved as in the reference, with whatever force its tissue requires for that."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sim.discretisation.footprint import compute_footprint_weights
+from sim.loads import Pushed
+
+from .reference import get_reference
+from .row import ErrorFigures, compute_figures
+from .study import ReportStudy
+
+Solve = Callable[[np.ndarray, np.ndarray], np.ndarray]
+TOLERANCE = 1e-3  # Tolerance of a footprint's motion, relative to it.
+MAX_SOLVES = 10  # Maximum number of solves of a load.
+MAX_STEP_RATIO = 0.5  # Maximum change of a force in an iteration, relative to the force.
+
+
+def measure_pose_error(study: ReportStudy, solve: Solve) -> ErrorFigures | None:
+    """Compute errors at the tumour where every footprint's mean motion is that of the reference.
+
+    None without a converged load. `solve` returns displacements (n, m, 3) [m] at `study.read_nodes` of test loads (n,)
+    by number, under forces (n, 3) [N].
+    """
+    truth, mesh, (pushed,) = get_reference(study), study.anatomy.mesh, study.test_loads.get_all(Pushed)
+    weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint)[:, study.read_nodes]
+    weights = weights.toarray() / weights.sum(axis=1)[:, None]
+    good = truth.good.copy()
+    field = find_field_of_motion(solve, pushed.force, compute_motion(weights, truth.displacement), weights, good)
+    rows, tumour = np.flatnonzero(good), np.isin(study.read_nodes, study.anatomy.tumour_nodes)
+    return compute_figures(field[rows][:, tumour], truth.displacement[rows][:, tumour], study.test_loads.select(rows))
+
+
+def compute_motion(weights: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Compute the mean motion (n, 3) [m] of footprints with weights (n, m) in displacements (n, m, 3) [m]."""
+    return np.einsum("nm,nmi->ni", weights, field)
+
+
+def find_field_of_motion(
+    solve: Solve, force: np.ndarray, target: np.ndarray, weights: np.ndarray, good: np.ndarray
+) -> np.ndarray:
+    """Find displacements (n, m, 3) [m] in which footprints move by `target` (n, 3) [m], starting from `force` (n, 3).
+
+    Broyden's "good" method (Broyden 1965) for each load's force. `good` (n,) becomes False where it does not converge.
+    """
+    force, rows = force.copy(), np.flatnonzero(good)
+    field = np.zeros((*weights.shape, 3))
+    field[rows] = solve(rows, force[rows])
+    motion = compute_motion(weights, field)
+    ratio = np.linalg.norm(force, axis=1) / np.maximum(np.linalg.norm(motion, axis=1), 1e-12)
+    inverse = ratio[:, None, None] * np.eye(3)
+    for solves in range(1, MAX_SOLVES + 1):
+        good &= np.isfinite(field).all(axis=(1, 2))
+        reached = np.linalg.norm(target - motion, axis=1) <= TOLERANCE * np.linalg.norm(target, axis=1)
+        rows = np.flatnonzero(good & ~reached)
+        if not len(rows) or solves == MAX_SOLVES:
+            break
+        step = np.einsum("nij,nj->ni", inverse[rows], (target - motion)[rows])
+        limit = MAX_STEP_RATIO * np.linalg.norm(force[rows], axis=1)
+        step *= np.minimum(1.0, limit / np.linalg.norm(step, axis=1))[:, None]
+        force[rows] += step
+        field[rows] = solve(rows, force[rows])
+        change = compute_motion(weights[rows], field[rows]) - motion[rows]
+        motion[rows] += change
+        image = np.einsum("nij,nj->ni", inverse[rows], change)
+        row = np.einsum("ni,nij->nj", step, inverse[rows])
+        scale = np.einsum("ni,ni->n", step, image)[:, None, None]
+        inverse[rows] += (step - image)[:, :, None] * row[:, None, :] / np.where(scale == 0.0, np.inf, scale)
+    good[rows] = False
+    return field
