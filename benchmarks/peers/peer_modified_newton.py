@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from symmetric import Factor
 
-from benchmarks.peers.engine_process import EngineCase, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve_loads
 
 STEPS, TRIALS = 500, 8
 SLOPE_LEFT = 0.5
@@ -18,7 +18,7 @@ WORTH = 20
 class NeoHookeanBody:
     """Forces and stiffness of linear tetrahedra at the free components of the displacement."""
 
-    def __init__(self, case: EngineCase):
+    def __init__(self, case: Case):
         self.case = case
         edges = np.swapaxes(case.nodes[case.tets[:, 1:]] - case.nodes[case.tets[:, :1]], 1, 2)
         inner = np.linalg.inv(edges)  # (T, 3, 3): shape gradients of nodes 1 to 3, as rows
@@ -71,7 +71,7 @@ def _steps_left(kept: list[float], tolerance: float) -> float:
     return float(np.log(tolerance / kept[-1]) / np.log(rate)) if rate < 1.0 else np.inf
 
 
-def set_up_solver(case: EngineCase) -> Solve:
+def set_up_solver(case: Case) -> Solve:
     """Factorise the undeformed stiffness for all loads, and allocate a factor of a deformed body."""
     body, at_rest, later = NeoHookeanBody(case), Factor(), Factor()
     at_rest.factorise(body.assemble_stiffness(np.zeros(3 * len(case.nodes))))
@@ -119,4 +119,4 @@ def set_up_solver(case: EngineCase) -> Solve:
 
 
 if __name__ == "__main__":
-    serve(set_up_solver)
+    serve_loads(set_up_solver)

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from benchmarks.peers.engine_process import EngineCase, Solve, serve_loads
+from benchmarks.peers.engine_process import Case, Solve, serve_loads
 
 wp.config.enable_backward = False
 wp.config.log_level = wp.LOG_ERROR
@@ -92,7 +92,7 @@ def sum_squares(
         last_force[v] = force
 
 
-def set_up_solver(case: EngineCase, device: str = "cpu") -> Solve:
+def set_up_solver(case: Case, device: str = "cpu") -> Solve:
     """Compute undeformed gradients, masses and the tetrahedra around each node, for all loads."""
     count, size = len(case.tets), len(case.nodes)
     edges = np.swapaxes(case.nodes[case.tets[:, 1:]] - case.nodes[case.tets[:, :1]], 1, 2)

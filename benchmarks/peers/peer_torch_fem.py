@@ -5,7 +5,7 @@ import torch
 from torchfem import Solid
 from torchfem.materials import Hyperelastic3D
 
-from benchmarks.peers.engine_process import EngineCase, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve_loads
 
 
 def compute_energy_density(F: torch.Tensor, lame: torch.Tensor) -> torch.Tensor:
@@ -15,7 +15,7 @@ def compute_energy_density(F: torch.Tensor, lame: torch.Tensor) -> torch.Tensor:
     return lame[0] / 2 * (torch.trace(C) - 3.0) - lame[0] * log_J + lame[1] / 2 * log_J**2
 
 
-def set_up_solver(case: EngineCase) -> Solve:
+def set_up_solver(case: Case) -> Solve:
     """Build a solid with its assembly maps, for all loads."""
     torch.set_default_dtype(torch.float64)
     law = Hyperelastic3D(compute_energy_density, [case.mu, case.lam])
@@ -33,4 +33,4 @@ def set_up_solver(case: EngineCase) -> Solve:
 
 
 if __name__ == "__main__":
-    serve(set_up_solver)
+    serve_loads(set_up_solver)
