@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 
-class Film:
+class FrameFolder:
     """Folder of `frame_0000.png`, `frame_0001.png`, ...; each file is written atomically."""
 
     def __init__(self, folder: Path) -> None:
@@ -37,9 +37,9 @@ def write_png(path: Path, colour: np.ndarray) -> None:
         part.unlink(missing_ok=True)
 
 
-def shrink_image(colour: np.ndarray, width: int, height: int) -> np.ndarray:
+def shrink_image(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """Downsample an image (H, W, 3) uint8 to (height, width, 3): means of the pixels covered."""
-    return cv2.resize(colour, (width, height), interpolation=cv2.INTER_AREA)
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def read_png(path: Path) -> np.ndarray:
@@ -50,10 +50,10 @@ def read_png(path: Path) -> np.ndarray:
     return np.ascontiguousarray(bgr[..., ::-1])
 
 
-def write_film(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float = 25.0) -> None:
+def write_movie(path: Path, images: Iterable[np.ndarray], frames_per_second: float = 25.0) -> None:
     """Write images (H, W, 3) uint8 sRGB of one size as a video: `.mp4`, or `.gif` or `.webp` that loops.
 
-    The file is written atomically, or not at all if `pictures` or the writing fails.
+    The file is written atomically, or not at all if `images` or the writing fails.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def write_film(path: Path, pictures: Iterable[np.ndarray], frames_per_second: fl
         raise ValueError(f"{frames_per_second} frames per second: give a positive rate.")
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
-        writers[path.suffix](part, pictures, frames_per_second)
+        writers[path.suffix](part, images, frames_per_second)
         part.rename(path)
     finally:
         part.unlink(missing_ok=True)
@@ -93,9 +93,9 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], frames_per_second: f
     writer.release()
 
 
-def write_animation(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float) -> None:
+def write_animation(path: Path, images: Iterable[np.ndarray], frames_per_second: float) -> None:
     """Write a GIF or WebP that loops for ever; all images are in memory at once."""
-    frames = [np.ascontiguousarray(colour[..., ::-1]) for colour in pictures]
+    frames = [np.ascontiguousarray(colour[..., ::-1]) for colour in images]
     if not frames:
         raise ValueError("a video needs at least one image.")
     for frame in frames:
@@ -108,10 +108,10 @@ def write_animation(path: Path, pictures: Iterable[np.ndarray], frames_per_secon
         raise OSError(f"{path.parent} cannot hold the video: check that the folder exists and is writable.")
 
 
-def check_size(colour: np.ndarray, size: tuple[int, ...] | None) -> None:
+def check_size(image: np.ndarray, size: tuple[int, ...] | None) -> None:
     """Raise ValueError unless an image has the size of the first."""
-    if colour.shape != size:
-        raise ValueError(f"images of {size} and {colour.shape}: all images of a video must have one size.")
+    if image.shape != size:
+        raise ValueError(f"images of {size} and {image.shape}: all images of a video must have one size.")
 
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"  # First bytes of a PNG and of a JPEG.
@@ -122,7 +122,7 @@ IGNORE_ORIENTATION = cv2.IMREAD_IGNORE_ORIENTATION
 """Flag to ignore EXIF orientation: the camera matrix is for unrotated images."""
 
 
-def read_image_size(code: bytes) -> tuple[int, int]:
+def read_image_size(data: bytes) -> tuple[int, int]:
     """Read width and height [pixel] from the header of a JPEG or a PNG, without decoding.
 
     Raises
@@ -130,29 +130,29 @@ def read_image_size(code: bytes) -> tuple[int, int]:
     ValueError
         Bytes that are neither, or that end too early.
     """
-    ending = PNG_END if code.startswith(PNG) else JPEG_END if code.startswith(JPEG) else None
+    ending = PNG_END if data.startswith(PNG) else JPEG_END if data.startswith(JPEG) else None
     if ending is None:
         raise ValueError("it is neither a JPEG nor a PNG")
-    if not code.endswith(ending):
+    if not data.endswith(ending):
         raise ValueError("it ends too early")
     try:
         if ending is PNG_END:
-            width, height = struct.unpack_from(">II", code, 16)
+            width, height = struct.unpack_from(">II", data, 16)
             return width, height
         place = 2
         while True:
-            mark, kind, length = struct.unpack_from(">BBH", code, place)
+            mark, kind, length = struct.unpack_from(">BBH", data, place)
             if mark != 0xFF or length < 2:
                 raise ValueError("its header is damaged")
             if kind in SIZE_MARKERS:
-                height, width = struct.unpack_from(">HH", code, place + 5)
+                height, width = struct.unpack_from(">HH", data, place + 5)
                 return width, height
             place += 2 + length
     except struct.error as error:
         raise ValueError("its header is damaged") from error
 
 
-def decode_colour(code: bytes, width: int, height: int) -> np.ndarray:
+def decode_colour(data: bytes, width: int, height: int) -> np.ndarray:
     """Decode an image (height, width, 3) uint8 sRGB.
 
     Raises
@@ -160,10 +160,10 @@ def decode_colour(code: bytes, width: int, height: int) -> np.ndarray:
     ValueError
         Bytes that are not such an image, or one of another size.
     """
-    return _decode_image(code, (height, width, 3), cv2.IMREAD_COLOR_RGB | IGNORE_ORIENTATION, np.uint8)
+    return _decode_image(data, (height, width, 3), cv2.IMREAD_COLOR_RGB | IGNORE_ORIENTATION, np.uint8)
 
 
-def decode_depth(code: bytes, width: int, height: int, scale: float) -> np.ndarray:
+def decode_depth(data: bytes, width: int, height: int, scale: float) -> np.ndarray:
     """Decode depth (height, width) float32 [m] from a PNG of 16 bits with unit `scale` [m]; 0 without a surface.
 
     Raises
@@ -171,11 +171,11 @@ def decode_depth(code: bytes, width: int, height: int, scale: float) -> np.ndarr
     ValueError
         See `decode_colour`.
     """
-    steps = _decode_image(code, (height, width), cv2.IMREAD_UNCHANGED | IGNORE_ORIENTATION, np.uint16)
+    steps = _decode_image(data, (height, width), cv2.IMREAD_UNCHANGED | IGNORE_ORIENTATION, np.uint16)
     return steps * np.float32(scale)
 
 
-def decode_labels(code: bytes, width: int, height: int) -> np.ndarray:
+def decode_labels(data: bytes, width: int, height: int) -> np.ndarray:
     """Decode labels (height, width) uint8 from a PNG of 8 bits.
 
     Raises
@@ -183,7 +183,7 @@ def decode_labels(code: bytes, width: int, height: int) -> np.ndarray:
     ValueError
         See `decode_colour`.
     """
-    return _decode_image(code, (height, width), cv2.IMREAD_UNCHANGED | IGNORE_ORIENTATION, np.uint8)
+    return _decode_image(data, (height, width), cv2.IMREAD_UNCHANGED | IGNORE_ORIENTATION, np.uint8)
 
 
 def _decode_image(code: bytes, shape: tuple[int, ...], flag: int, kind: type) -> np.ndarray:

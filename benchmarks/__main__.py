@@ -39,14 +39,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command(args, "benchmarks")
 
 
-def make_parser(*asked: str) -> argparse.ArgumentParser:
-    """Build the parser of all measurements; only those in `asked` get their arguments."""
+def make_parser(*selected: str) -> argparse.ArgumentParser:
+    """Build the parser of all measurements; only those in `selected` get their arguments."""
     parser = CommandParser(prog="python -m benchmarks", description=__doc__)
     names = parser.add_subparsers(dest="command", required=True, metavar="NAME")
     for name, text in BENCHMARKS.items():
         one = names.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         one.set_defaults(program=f"benchmarks {name}")
-        if name in asked:
+        if name in selected:
             importlib.import_module(f"benchmarks.commands.{name}").add_arguments(one)
     return parser
 

@@ -25,7 +25,7 @@ from sim.errors import InputError
 FORCE, FOOTPRINT = 0.3, 7e-3  # [N], [m]
 
 
-def heads(mask: Path | None) -> dict[str, Callable[[Tumour], Subject]]:
+def list_heads(mask: Path | None) -> dict[str, Callable[[Tumour], Subject]]:
     """Return the functions that build a subject with a tumour, by the name of the head."""
     volume = HeadScaling().volume
     found = {"template": build_template_subject, "fsaverage": partial(_drawn, read_fsaverage_head(volume))}
@@ -41,7 +41,7 @@ def _drawn(healthy: HealthyHead, tumour: Tumour) -> Subject:
     return build_synthetic_subject(tumour, healthy)
 
 
-def motions(subject: Subject, nodes: int) -> list[float]:
+def compute_motions(subject: Subject, nodes: int) -> list[float]:
     """Compute the mean motion [mm] of the tumour under the force, with a bonded and with a sliding skull."""
     anatomy = make_anatomy(subject, MeshPlan(nodes))
     place = open_cortex(anatomy).place(right_mm=0, up_mm=0)
@@ -63,11 +63,11 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, default=5300)
     args = parser.parse_args()
     print("head,cover_mm,site,bonded_mm,sliding_mm")
-    found = heads(args.mask)
+    found = list_heads(args.mask)
     for cover, site, (name, draw) in product(args.cover, args.sites, found.items()):
         try:
             moved = ",".join(
-                f"{value:.3f}" for value in motions(draw(Tumour(cover=1e-3 * cover, site=site)), args.nodes)
+                f"{value:.3f}" for value in compute_motions(draw(Tumour(cover=1e-3 * cover, site=site)), args.nodes)
             )
         except InputError as error:
             moved = f'"{error}",'

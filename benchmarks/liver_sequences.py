@@ -98,7 +98,7 @@ class Hyperparameters:
     size: float
     error: float
 
-    def covariance(self, liver: Liver) -> np.ndarray:
+    def compute_covariance(self, liver: Liver) -> np.ndarray:
         """Compute the prior covariance of the patch's forces (3 f, 3 f) [N^2]."""
         at = liver.mesh.nodes[liver.patch]
         return np.kron(self.size**2 * compute_correlation(compute_squared_distances(at, at), self.length), np.eye(3))
@@ -120,15 +120,15 @@ def linearise_observation(liver: Liver, cloud: np.ndarray, force: np.ndarray) ->
 
 
 def condition_prior(
-    settings: Hyperparameters, prior: np.ndarray, rows: np.ndarray, value: np.ndarray
+    settings: Hyperparameters, prior: np.ndarray, rows: np.ndarray, observed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return mean (3 f,) [N] and covariance of forces, and the log evidence (Rasmussen, Williams 2006, 2.30)."""
     gain = prior @ rows.T
     whole = rows @ gain
     whole[np.diag_indices(len(whole))] += settings.error**2
     factor = cholesky(whole, lower=True)
-    weight = cho_solve((factor, True), value)
-    log = -0.5 * float(value @ weight) - float(np.log(np.diag(factor)).sum())
+    weight = cho_solve((factor, True), observed)
+    log = -0.5 * float(observed @ weight) - float(np.log(np.diag(factor)).sum())
     return gain @ weight, prior - gain @ cho_solve((factor, True), gain.T), log
 
 
@@ -136,13 +136,15 @@ def choose_hyperparameters(liver: Liver, cloud: np.ndarray) -> Hyperparameters:
     """Choose the hyperparameters of greatest evidence on a cloud."""
     rows, value = linearise_observation(liver, cloud, np.zeros(3 * len(liver.patch)))
     candidates = [Hyperparameters(*each) for each in product(LENGTHS, SIZES, ERRORS)]
-    return max(candidates, key=lambda settings: condition_prior(settings, settings.covariance(liver), rows, value)[2])
+    return max(
+        candidates, key=lambda settings: condition_prior(settings, settings.compute_covariance(liver), rows, value)[2]
+    )
 
 
 def estimate_forces(liver: Liver, clouds: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray, float]]:
     """Estimate forces (3 f,) [N], their covariance, and the computing time [s], cloud by cloud."""
     settings, force, found = choose_hyperparameters(liver, clouds[0]), np.zeros(3 * len(liver.patch)), []
-    prior = settings.covariance(liver)
+    prior = settings.compute_covariance(liver)
     for cloud in clouds:
         begun = time.perf_counter()
         for _ in range(ROUNDS):
@@ -185,13 +187,13 @@ def list_sequences(folder: Path) -> list[str]:
     return sorted(path.parent.relative_to(base).as_posix() for path in base.rglob("true-forces.npy"))
 
 
-def main(words: list[str] | None = None) -> int:
+def main(argv: list[str] | None = None) -> int:
     """Print a table; return 2 if the folder does not contain the data."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, help="data/liver of the repository")
     parser.add_argument("--mesh", choices=("remeshed", "default"), default="remeshed", help="mesh of the estimate")
     parser.add_argument("--sequences", nargs="+", help="names such as linear/s1 (default: all)")
-    args = parser.parse_args(words)
+    args = parser.parse_args(argv)
     try:
         names = args.sequences or list_sequences(args.folder)
         if not names:

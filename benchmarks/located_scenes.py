@@ -27,26 +27,26 @@ ERRORS = {"none": PointObservation(white=2e-5, smooth=2e-5, shift=0.0, turn=0.0)
 """Errors of points: 0.02 mm stands for no error, as an observation requires a positive error."""
 
 
-def estimates(theatre: PatientSetup, name: str, sights: int) -> dict[str, list[TumourEstimate]]:
+def compute_estimates(patient: PatientSetup, name: str, observation_count: int) -> dict[str, list[TumourEstimate]]:
     """Compute the estimates of a scene, by the errors of its observations."""
     scene = find_scene(name)
-    player, last, found = theatre.build_player("fem", scene), None, {error: [] for error in ERRORS}
+    player, last, found = patient.build_player("fem", scene), None, {error: [] for error in ERRORS}
     for number in np.linspace(0, len(scene.times), MOMENTS + 1, dtype=int)[1:] - 1:
         last = player.compute_deformation(player.build_loads(number), last)
         positions = player.compute_positions(last)
-        for seed in range(sights):
+        for seed in range(observation_count):
             for error, sight in ERRORS.items():
                 seen = replace(sight, seed=seed, points=COUNTS[seed % len(COUNTS)])
-                found[error].append(PointObserver(theatre.site, theatre.locator, seen).estimate(number, positions))
+                found[error].append(PointObserver(patient.site, patient.locator, seen).estimate(number, positions))
     return found
 
 
-def row(answers: list[TumourEstimate]) -> list[str]:
+def summarise_estimates(estimates: list[TumourEstimate]) -> list[str]:
     """Summarise the estimates of one scene."""
-    given = [answer for answer in answers if answer.location is not None]
-    moved = 1e3 * np.mean([answer.true_distance for answer in answers])
+    given = [answer for answer in estimates if answer.location is not None]
+    moved = 1e3 * np.mean([answer.true_distance for answer in estimates])
     doubted = sum(answer.location.slipped for answer in given if answer.location)
-    refused = len(answers) - len(given)
+    refused = len(estimates) - len(given)
     if not given:
         return [f"{moved:.2f}", "", "", "", "0", str(refused)]
     off = 1e3 * np.mean([answer.error for answer in given])
@@ -66,8 +66,8 @@ def main() -> None:
     table = csv.writer(sys.stdout)
     table.writerow(["scene", "errors", "moved_mm", "off_mm", "p95_mm", "held_percent", "in_doubt", "refused"])
     for name in args.scenes:
-        for error, answers in estimates(theatre, name, args.sights).items():
-            table.writerow([name, error, *row(answers)])
+        for error, answers in compute_estimates(theatre, name, args.sights).items():
+            table.writerow([name, error, *summarise_estimates(answers)])
             sys.stdout.flush()
 
 

@@ -1,4 +1,4 @@
-"""Array functions that NumPy lacks. Other array types, such as `Wire` of ONNX graphs, register their own versions."""
+"""Array functions that NumPy lacks. Other array types, such as `Tensor` of ONNX graphs, register their own versions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,22 +17,22 @@ def compute_squared_distances(points: np.ndarray, sites: np.ndarray) -> np.ndarr
 
 
 @dataclass(frozen=True, eq=False)
-class Rounded:
+class QuantisedTable:
     """Table (n, r) of whole numbers of steps, which takes a fraction of a file's bytes.
 
     Parameters
     ----------
-    whole
+    integers
         Numbers of steps (n, r) int16, column by column: similar numbers next to each other compress better.
     step
         Step sizes (r,) float32, in the table's unit.
     """
 
-    whole: np.ndarray
+    integers: np.ndarray
     step: np.ndarray
 
     @classmethod
-    def round_table(cls, table: np.ndarray, step: np.ndarray | float) -> Self:
+    def quantise(cls, table: np.ndarray, step: np.ndarray | float) -> Self:
         """Round a table (n, r) to a step, or steps (r,); larger ones if the numbers exceed int16."""
         largest = np.abs(table).max(axis=0, initial=0.0) / np.iinfo(np.int16).max
         step = np.maximum(np.broadcast_to(step, largest.shape), largest).astype(np.float32)
@@ -41,7 +41,7 @@ class Rounded:
     @cached_property
     def values(self) -> np.ndarray:
         """Table (n, r) float32."""
-        return np.multiply(self.whole, self.step, order="C", dtype=np.float32)
+        return np.multiply(self.integers, self.step, order="C", dtype=np.float32)
 
 
 def round_to_half(table: np.ndarray) -> np.ndarray:
@@ -54,25 +54,25 @@ def round_to_half(table: np.ndarray) -> np.ndarray:
 
 
 @singledispatch
-def take_rows_of(index: np.ndarray, table: np.ndarray | Rounded) -> np.ndarray:
+def take_rows(index: np.ndarray, table: np.ndarray | QuantisedTable) -> np.ndarray:
     """Return rows of a table (n, ...) at whole numbers of any shape: `table[index]`."""
-    return (table.values if isinstance(table, Rounded) else table)[index]
+    return (table.values if isinstance(table, QuantisedTable) else table)[index]
 
 
 @singledispatch
-def multiply_rows(rows: np.ndarray, table: Rounded, index: np.ndarray) -> np.ndarray:
+def multiply_rows(rows: np.ndarray, table: QuantisedTable, index: np.ndarray) -> np.ndarray:
     """Multiply rows (B, k) by the rows of a table (n, r) at an index (k,)."""
     return rows @ table.values[index]
 
 
 @singledispatch
-def find_columns_in_use(rows: np.ndarray) -> np.ndarray:
+def find_nonzero_columns(rows: np.ndarray) -> np.ndarray:
     """Return the columns of rows (B, n) that are not all zero, ascending."""
     return np.flatnonzero(rows.any(axis=0))
 
 
-def predict_in_chunks(predicted: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, most: int = 64) -> np.ndarray:
-    """Predict rows (B, f) in chunks of at most `most` rows, to limit memory."""
-    if len(rows) <= most:
-        return predicted(rows)
-    return np.concatenate([predicted(rows[first : first + most]) for first in range(0, len(rows), most)])
+def predict_in_chunks(predict: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, max_rows: int = 64) -> np.ndarray:
+    """Predict rows (B, f) in chunks of at most `max_rows` rows, to limit memory."""
+    if len(rows) <= max_rows:
+        return predict(rows)
+    return np.concatenate([predict(rows[first : first + max_rows]) for first in range(0, len(rows), max_rows)])

@@ -177,7 +177,9 @@ def short_fits():
     """Networks are fitted in 120 steps, not in 1000: they are less exact, and nothing else."""
     fit = Ann.fit
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Ann, "fit", lambda ann, X, Y: fit(replace(ann, steps=min(ann.steps, 120)), X, Y))
+        patched.setattr(
+            Ann, "fit", lambda ann, X, Y: fit(replace(ann, max_iterations=min(ann.max_iterations, 120)), X, Y)
+        )
         yield
 
 

@@ -53,7 +53,7 @@ class Plugged:
 
     def __init__(self, count):
         self.frames = [
-            each.colour[..., ::-1] for each in islice(read_video(FILM / "film.mp4", 30.0, colour=True), count)
+            each.colour[..., ::-1] for each in islice(read_video(FILM / "film.mp4", 30.0, with_colour=True), count)
         ]
         self.released = False
 

@@ -9,7 +9,7 @@ from sim.anatomy import Anatomy
 from sim.bodies.open_cortex import open_cortex
 from sim.runtime.threads import limit_to_one_thread
 from surrogate.locating.calibration import run_trials
-from surrogate.locating.causes import Presses, solve_presses
+from surrogate.locating.causes import PressResponses, solve_presses
 from surrogate.locating.ensemble import Ensemble
 from surrogate.locating.locator import Locator
 from surrogate.locating.prior import build_prior
@@ -45,7 +45,7 @@ def locator_of(body: Anatomy, solved: bool = False) -> Locator:
     ensemble = Ensemble(body, members, count % 5, count // 5 % 3, count // 15)
     points = body.mesh.nodes[np.unique(body.open_surface)]
     dents = np.array([[dent(body, random) for _ in range(3)] for _ in points], np.float32)[None]
-    presses = Presses(points, {"bonded": dents, "slide": dents})
+    presses = PressResponses(points, {"bonded": dents, "slide": dents})
     if solved:
         found = solve_presses(body, ("bonded",), "cpu")
         presses = replace(found, motion=dict.fromkeys(presses.motion, found.motion["bonded"]))

@@ -161,7 +161,7 @@ class TestDoor:
 
     def test_connection_above_visitor_limit_is_rejected_with_503(self):
         with (
-            closing(Page(visitors=1)) as page,
+            closing(Page(max_clients=1)) as page,
             connect(f"ws://127.0.0.1:{page.port}", subprotocols=PROTOCOL, max_size=None),
         ):
             assert knock(page) == 503
@@ -189,10 +189,10 @@ class TestDoor:
         before = set(threading.enumerate())
         with monkeypatch.context() as patch:
             patch.setattr(viser, "__version__", "2.0.0")
-            with pytest.raises(access_guard.UnguardedError, match=r"viser 2\.0\.0 cannot be guarded: install viser"):
+            with pytest.raises(access_guard.ViserError, match=r"viser 2\.0\.0 cannot be guarded: install viser"):
                 Page()
         monkeypatch.setattr(access_guard, "guard_server", lambda *words: nullcontext([]))
-        with pytest.raises(access_guard.UnguardedError, match="cannot be guarded"):
+        with pytest.raises(access_guard.ViserError, match="cannot be guarded"):
             Page()
         assert wait_for(lambda: set(threading.enumerate()) <= before)
 

@@ -11,8 +11,8 @@ from visitor import Visitor, free_port, wait_for
 
 from ar.page.access_guard import DEFAULT_LIMITS, ConnectionLimits
 from ar.page.browser import Browser
-from ar.page.elements import PICTURE, SAID, SLICES, STYLE_KEY, keep_together, to_data_url
-from ar.page.parts import Dropdown, Fold, Note, Playback, SceneSurface, SceneViewpoint, Sign, Slider, Toggle
+from ar.page.elements import PICTURE, SAID, SLICES, STYLE_KEY, keep_numbers_together, to_data_url
+from ar.page.parts import Dropdown, Folder, Note, Playback, SceneLabel, SceneSurface, SceneViewpoint, Slider, Toggle
 from ar.page.recording import RECORD_LABEL, STOP_LABEL
 from ar.page.style import NOTE, PAGE, STATUS, build_style
 
@@ -40,7 +40,7 @@ def open_page(heard, port, host="127.0.0.1", limits=DEFAULT_LIMITS) -> Browser:
         host=host,
         port=port,
         size=(64, 48),
-        signs=[Sign("R", np.array([0.1, 0.0, 0.0]))],
+        signs=[SceneLabel("R", np.array([0.1, 0.0, 0.0]))],
         limits=limits,
     )
 
@@ -243,13 +243,13 @@ def test_slices_and_history_are_sent_together_at_limited_rate(page):
         page.show_beside(lambda number=number: draw(number))
         time.sleep(0.02)
     assert wait_for(lambda: "seconds of 39" in page.beside.content)
-    assert drawn[-1] == 39 and len(drawn) <= 2 + DEFAULT_LIMITS.asides * (time.monotonic() - begun)
+    assert drawn[-1] == 39 and len(drawn) <= 2 + DEFAULT_LIMITS.slice_updates_per_second * (time.monotonic() - begun)
     assert to_data_url(np.full((20, 60, 3), 39, np.uint8)) in page.beside.content and SLICES in page.beside.content
     visitor.wire.close()
 
 
 def test_user_input_has_priority_over_page_updates(heard):
-    page = open_page(heard, free_port(), limits=ConnectionLimits(sendings=2000.0))
+    page = open_page(heard, free_port(), limits=ConnectionLimits(updates_per_second=2000.0))
     visitor = Visitor(page, 1200)
     assert wait_for(lambda: page.visitors == 1)
     sought = list(range(50, 100)) * 4
@@ -286,7 +286,7 @@ def test_fill_replaces_bodies_and_controls(page, heard):
     old = page.inputs["force [N]"]
     page.put("force [N]", 0.9)
     hidden: list[bool] = []
-    fold = Fold("more", (Toggle("Gravity", True, hidden.append, "gravity and fluid", "off?"),))
+    fold = Folder("more", (Toggle("Gravity", True, hidden.append, "gravity and fluid", "off?"),))
     body = SceneSurface("blade", TRIANGLE, np.array([[0, 1, 2]]))
     page.fill(
         [body], Playback(30, heard["play"].append, heard["frame"].append), [fold], "sulcus: retract", "<p>seen</p>"
@@ -339,7 +339,7 @@ def test_phone_layout_puts_distance_and_playback_first(page):
 
 
 def test_number_and_unit_are_joined_by_nonbreaking_space():
-    kept = keep_together('<p style="top: 3 px">in 4.72 mm (95 %)')
+    kept = keep_numbers_together('<p style="top: 3 px">in 4.72 mm (95 %)')
     assert kept == '<p style="top: 3 px">in&nbsp;4.72&nbsp;mm (95&nbsp;%)'
 
 

@@ -90,9 +90,9 @@ def test_image_scaling_requires_option_and_same_aspect_ratio():
     with pytest.raises(ValueError, match=r"640 x 480, not 320 x 240: calibrate with that size, or ask"):
         SOME.resize_calibration(320, 240)
     with pytest.raises(ValueError, match=r"not 640 x 360, which have another shape"):
-        SOME.resize_calibration(640, 360, scale=True)
+        SOME.resize_calibration(640, 360, allow_scaling=True)
     assert SOME.resize_calibration(640, 480) is SOME
-    half, points = SOME.resize_calibration(320, 240, scale=True), np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0]])
+    half, points = SOME.resize_calibration(320, 240, allow_scaling=True), np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.0]])
     pixels = [one.build_camera(np.eye(4)).project(points)[0] + 0.5 for one in (half, SOME)]
     assert np.allclose(2.0 * pixels[0], pixels[1]) and half.lens == SOME.lens and half.name == SOME.name
 

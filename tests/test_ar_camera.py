@@ -276,13 +276,13 @@ def test_calibration_files_store_the_readout_time():
             parse_calibration(text(USUAL_CALIBRATION) + 'readout_time: "fast"\n')
         with pytest.raises(ValueError, match="read in 0 to 1 s"):
             parse_calibration(text(USUAL_CALIBRATION) + "readout_time: -1\n")
-    assert replace(USUAL_CALIBRATION, readout=0.02).resize_calibration(640, 480, scale=True).readout == 0.02
+    assert replace(USUAL_CALIBRATION, readout=0.02).resize_calibration(640, 480, allow_scaling=True).readout == 0.02
 
 
 @pytest.fixture(scope="module")
 def player():
     theatre = template_theatre()
-    small = replace(USUAL_CALIBRATION.resize_calibration(800, 600, scale=True), readout=READOUT)
+    small = replace(USUAL_CALIBRATION.resize_calibration(800, 600, allow_scaling=True), readout=READOUT)
     view = replace(VIEW.calibrate(small), path=HandHeld(0))
     return Player(
         theatre.build_stage(replace(find_scene("palpate"), viewpoint=view, duration=0.1)), Still(theatre.anatomy)

@@ -10,7 +10,7 @@ import warp as wp
 
 import ar
 from ar.overlay.composite import load_kernels
-from ar.rendering.parallel import load
+from ar.rendering.parallel import load_modules
 
 
 @pytest.fixture
@@ -51,6 +51,6 @@ def test_kernel_load_waits_for_running_load(loading):
     ahead.start()
     while not most:
         time.sleep(0.001)
-    load("cpu", "ar.overlay.window")
+    load_modules("cpu", "ar.overlay.window")
     assert loaded[-1] == "ar.overlay.window" and len(loaded) == 8 and max(most) == 1
     ahead.join()

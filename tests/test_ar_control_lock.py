@@ -6,25 +6,25 @@ from ar.page.control_lock import MAX_IDLE_TIME, ControlLock
 class TestLead:
     def test_control_passes_to_first_request_then_oldest_visitor(self):
         lead = ControlLock()
-        lead.see({2, 3, 4}, 0.0)
-        assert lead.leader == 2 and lead.record_change(2, 1.0) and not lead.record_change(3, 1.0)
+        lead.update_clients({2, 3, 4}, 0.0)
+        assert lead.holder == 2 and lead.record_change(2, 1.0) and not lead.record_change(3, 1.0)
         for visitor in (4, 3):
-            lead.ask(visitor, 2.0)
+            lead.request_control(visitor, 2.0)
         assert (
-            lead.leader == 2
+            lead.holder == 2
             and "Visitor 4 asks" in lead.describe_control(2, {2, 3, 4})
             and "asked" in lead.describe_control(3, {2, 3, 4})
         )
-        lead.see({3, 4}, 3.0)
-        assert lead.leader == 4 and lead.asking == (3,)
-        lead.give(4.0)
-        assert lead.leader == 3
-        lead.see({4, 5}, 5.0)
-        assert lead.leader == 4 and not lead.describe_control(4, {4})
+        lead.update_clients({3, 4}, 3.0)
+        assert lead.holder == 4 and lead.queue == (3,)
+        lead.give_control(4.0)
+        assert lead.holder == 3
+        lead.update_clients({4, 5}, 5.0)
+        assert lead.holder == 4 and not lead.describe_control(4, {4})
 
     def test_idle_leader_loses_control_on_request(self):
         lead = ControlLock()
-        lead.see({1, 2}, 0.0)
+        lead.update_clients({1, 2}, 0.0)
         lead.record_change(1, 10.0)
-        lead.ask(2, 10.0 + MAX_IDLE_TIME)
-        assert lead.leader == 2 and lead.asking == ()
+        lead.request_control(2, 10.0 + MAX_IDLE_TIME)
+        assert lead.holder == 2 and lead.queue == ()

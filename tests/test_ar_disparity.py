@@ -10,8 +10,14 @@ from test_ar_lens import SOME
 from ar.optics.camera import Camera, build_stereo_pair, look_at
 from ar.rendering.layer import Layer, Solid
 from ar.rendering.renderer import Lamp, Picture, Renderer
-from ar.stereo.disparity import Cloud, compute_stereo_view, find_supported, follow_pixels, triangulate_cloud
-from ar.stereo.rectified import Rectified, rectify
+from ar.stereo.disparity import (
+    StereoCloud,
+    compute_stereo_view,
+    find_consistent_motions,
+    track_pixels,
+    triangulate_cloud,
+)
+from ar.stereo.rectified import RectifiedPair, build_rectification
 
 TARGET, REACH, FINE = np.array([0.04, 0.03, 0.02]), 15e-3, 6000.0
 LAMP = Lamp(TARGET + [0.05, 0.05, 0.3], TARGET, radius=0.06)
@@ -54,8 +60,8 @@ def taken(picture: Picture, seed: int, darker: float = 1.0) -> np.ndarray:
     return np.clip(noisy.round(), 0.0, 255.0).astype(np.uint8)
 
 
-def window_of(pair: tuple[Camera, Camera]) -> Rectified:
-    return rectify(*pair, tuple(TARGET.tolist()), REACH, FINE)
+def window_of(pair: tuple[Camera, Camera]) -> RectifiedPair:
+    return build_rectification(*pair, tuple(TARGET.tolist()), REACH, FINE)
 
 
 def grid(size: int) -> np.ndarray:
@@ -63,9 +69,9 @@ def grid(size: int) -> np.ndarray:
     return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
 
 
-def off(found: Cloud, pixels: np.ndarray, geometry: Rectified, left: Camera, picture: Picture) -> np.ndarray:
+def off(found: StereoCloud, pixels: np.ndarray, geometry: RectifiedPair, left: Camera, picture: Picture) -> np.ndarray:
     """How far off depths are (k,) [m], by the depth that was drawn."""
-    here = geometry.compute_points(pixels[found.which], np.zeros(len(found.which)))
+    here = geometry.compute_points(pixels[found.indices], np.zeros(len(found.indices)))
     at = left.project(here)[0].round().astype(int)
     true = left.unproject(left.project(here)[0], picture.depth[at[:, 1], at[:, 0]].astype(float))
     return (found.points - true) @ geometry.T_window_world[2, :3]
@@ -94,11 +100,14 @@ def view(geometry, pictures):
 def test_rectified_windows_match_distorted_projection(pair, geometry):
     columns, rows = np.meshgrid(np.arange(320, dtype=np.float32), np.arange(240, dtype=np.float32))
     points = TARGET + 5e-3 * np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3))
-    pixels, disparity = geometry.place(points)
+    pixels, disparity = geometry.project_points(points)
     there = pixels - np.stack([disparity, np.zeros_like(disparity)], axis=1)
     assert np.allclose(geometry.compute_points(pixels, disparity), points, atol=1e-9)
     assert np.abs(disparity).max() > 2.0 and geometry.size == 180
-    assert np.allclose(geometry.place(TARGET[None])[0], 89.5) and abs(geometry.place(TARGET[None])[1][0]) < 1e-9
+    assert (
+        np.allclose(geometry.project_points(TARGET[None])[0], 89.5)
+        and abs(geometry.project_points(TARGET[None])[1][0]) < 1e-9
+    )
     for eye, where, number in zip(pair, (pixels, there), (0, 1), strict=True):
         shown = [geometry.rectify(each, each)[number] for each in (columns, rows)]
         near = np.round(where).astype(int)
@@ -113,7 +122,7 @@ def test_depth_errors_match_their_standard_deviation(pair, geometry, pictures, d
     view = compute_stereo_view(geometry, taken(pictures[0], 0), taken(pictures[1], 1, darker))
     found = triangulate_cloud(view, pixels)
     error = off(found, pixels, geometry, pair[0], pictures[0])
-    assert len(found.which) > 0.9 * len(pixels)
+    assert len(found.indices) > 0.9 * len(pixels)
     assert np.sqrt((error**2).mean()) < 0.35e-3 and abs(error.mean()) < 0.1e-3
     assert 0.4 < np.sqrt(((error / found.sigma) ** 2).mean()) < 1.6
 
@@ -137,9 +146,9 @@ def test_saturated_pixels_are_excluded_from_the_cloud(pair, geometry, pictures):
             picture[row - 1 : row + 2, column - 1 : column + 2] = 255
     pixels, view = grid(geometry.size), compute_stereo_view(geometry, *lit)
     white = [window.min(axis=2) > 250 for window in geometry.rectify(*lit)]
-    assert white[0].any() and view.hidden[white[0]].all() and view.hidden_right[white[1]].all()
+    assert white[0].any() and view.invalid[white[0]].all() and view.invalid_right[white[1]].all()
     found = triangulate_cloud(view, pixels)
-    assert 0.3 * len(pixels) < len(found.which) < 0.9 * len(pixels)
+    assert 0.3 * len(pixels) < len(found.indices) < 0.9 * len(pixels)
     error = off(found, pixels, geometry, pair[0], pictures[0])
     assert np.sqrt((error**2).mean()) < 0.6e-3 and np.median(np.abs(error)) < 0.25e-3
 
@@ -150,9 +159,9 @@ def test_pixels_hidden_in_either_image_give_no_point(geometry, pictures, view):
     left[:, :140], right[:, 180:] = True, True
     colours = [taken(picture, seed) for seed, picture in enumerate(pictures)]
     found = triangulate_cloud(compute_stereo_view(geometry, *colours, (left, right)), pixels)
-    disparity = geometry.place(found.points)[1]
-    at = [pixels[found.which], pixels[found.which] - np.stack([disparity, np.zeros_like(disparity)], axis=1)]
-    assert len(found.which) > 20 and len(found.which) < 0.6 * len(triangulate_cloud(view, pixels).which)
+    disparity = geometry.project_points(found.points)[1]
+    at = [pixels[found.indices], pixels[found.indices] - np.stack([disparity, np.zeros_like(disparity)], axis=1)]
+    assert len(found.indices) > 20 and len(found.indices) < 0.6 * len(triangulate_cloud(view, pixels).indices)
     for mask, place in zip(geometry.rectify(left.astype(np.uint8), right.astype(np.uint8)), at, strict=True):
         column, row = place.round().astype(int).T
         assert mask.any() and not mask[row, column].any()
@@ -163,7 +172,7 @@ def test_textureless_surface_gives_no_points(pair, geometry):
     view = compute_stereo_view(
         geometry, *(taken(picture, seed) for seed, picture in enumerate(shot(pair, renderer=plain)))
     )
-    assert not len(triangulate_cloud(view, grid(geometry.size)).which)
+    assert not len(triangulate_cloud(view, grid(geometry.size)).indices)
 
 
 def test_invalid_stereo_inputs_are_rejected(pair, geometry, pictures):
@@ -173,7 +182,7 @@ def test_invalid_stereo_inputs_are_rejected(pair, geometry, pictures):
     with pytest.raises(ValueError, match="which is which"):
         window_of(pair[::-1])
     with pytest.raises(ValueError, match="ahead of the eyes"):
-        rectify(*pair, tuple(2.0 * pair[0].centre - TARGET), REACH, FINE)
+        build_rectification(*pair, tuple(2.0 * pair[0].centre - TARGET), REACH, FINE)
     turned = pair[0], pair[1].perturb(0.06, (1.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="pixels apart: calibrate the pair again"):
         triangulate_cloud(compute_stereo_view(window_of(turned), left, right), grid(geometry.size))
@@ -185,11 +194,11 @@ def test_points_are_tracked_over_30_pixels(pair, geometry, view):
     known = triangulate_cloud(view, pixels)
     for seed, motion in enumerate(np.array([[5e-3, 0.0, 0.0], [-2e-3, 4e-3, -2e-3]]), start=5):
         later = compute_stereo_view(geometry, *(taken(picture, seed) for picture in shot(pair, motion)))
-        which, there = follow_pixels(view, later, pixels[known.which])
+        which, there = track_pixels(view, later, pixels[known.indices])
         found = triangulate_cloud(later, there)
-        moved = found.points - known.points[which[found.which]]
-        good = find_supported(found.points, moved)
-        assert good.sum() > 0.5 * len(known.which) and good.mean() > 0.9
+        moved = found.points - known.points[which[found.indices]]
+        good = find_consistent_motions(found.points, moved)
+        assert good.sum() > 0.5 * len(known.indices) and good.mean() > 0.9
         error = np.linalg.norm(moved - motion, axis=1)[good]
         assert np.median(error) < 0.25e-3 and np.quantile(error, 0.95) < 0.8e-3
 
@@ -197,7 +206,7 @@ def test_points_are_tracked_over_30_pixels(pair, geometry, view):
 def test_points_are_not_tracked_into_unrelated_image(geometry, view):
     random = np.random.default_rng(0)
     other = replace(view, left=random.integers(0, 255, view.left.shape, dtype=np.uint8))
-    which, there = follow_pixels(view, other, grid(geometry.size))
+    which, there = track_pixels(view, other, grid(geometry.size))
     assert len(which) == len(there) < 3
 
 
@@ -215,7 +224,7 @@ def test_point_with_inconsistent_backward_flow_is_dropped(geometry, view, monkey
         )
 
     monkeypatch.setattr("cv2.calcOpticalFlowPyrLK", matched)
-    which, _ = follow_pixels(view, replace(view, hidden=np.zeros_like(view.hidden)), pixels)
+    which, _ = track_pixels(view, replace(view, invalid=np.zeros_like(view.invalid)), pixels)
     assert len(ends) == 2 and len(which) == len(ends[0]) // 2
 
 
@@ -223,5 +232,5 @@ def test_motion_unlike_its_neighbours_is_unsupported():
     random = np.random.default_rng(0)
     places, motions = random.uniform(0.0, 0.02, (60, 3)), 1e-4 * random.standard_normal((60, 3)) + 3e-3
     motions[[4, 30]] += [2e-3, 0.0, 0.0]
-    assert np.flatnonzero(~find_supported(places, motions)).tolist() == [4, 30]
-    assert find_supported(places[:8], motions[:8]).all()  # too few to judge
+    assert np.flatnonzero(~find_consistent_motions(places, motions)).tolist() == [4, 30]
+    assert find_consistent_motions(places[:8], motions[:8]).all()  # too few to judge

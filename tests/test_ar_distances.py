@@ -8,10 +8,10 @@ from ar.overlay.composite import composite
 from ar.overlay.distances import (
     RING_COLOUR,
     RING_DISTANCES,
-    build_tree,
-    compute_seen_distance,
+    build_bvh,
+    compute_visible_distance,
     draw_rings,
-    separate_rings,
+    remove_labels,
 )
 from ar.overlay.hud import FONT, TEXT_SCALE
 from ar.overlay.window import BORDER_COLOUR
@@ -20,8 +20,8 @@ from ar.overlay.window import BORDER_COLOUR
 def test_distance_rings_lie_at_their_distances():
     picture, at = seen(), tumour((0.0, 0.0, -0.014))
     whole, free = np.s_[0:480, 0:640], np.ones((480, 640), bool)
-    far = compute_seen_distance(
-        build_tree(at.vertices, at.triangles), CAMERA, whole, picture.drawn.depth[0], free, 18e-3
+    far = compute_visible_distance(
+        build_bvh(at.vertices, at.triangles), CAMERA, whole, picture.drawn.depth[0], free, 18e-3
     )
     sheet = np.zeros((480, 640, 4), np.uint8)
     assert draw_rings(sheet, far, free) == ["5", "10", "15"]
@@ -57,5 +57,5 @@ def test_ring_mask_excludes_the_pixels_of_ring_labels():
     distance = np.repeat(np.linspace(0.0, 8e-3, 120, dtype=np.float32)[None], 80, axis=0)
     assert draw_rings(drawn, distance, np.ones((80, 120), bool), [5e-3]) == ["5"]
     number = cv2.erode((drawn[..., 3] > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    there = separate_rings(drawn[..., 3] > 0)
+    there = remove_labels(drawn[..., 3] > 0)
     assert number.any() and not there[number].any() and there[8:20].any() and there[60:72].any()

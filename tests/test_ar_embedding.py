@@ -34,8 +34,8 @@ def test_subdivided_edges_are_short_and_shared_by_two_triangles(fine):
 
 def test_rigid_motion_carries_the_fine_surface_exactly(fine):
     turn = Rotation.from_rotvec([0.3, -0.5, 0.8])
-    found = fine.place(turn.apply(POINTS) + [1.0, 2.0, 3.0])
-    assert np.allclose(found, turn.apply(fine.place(POINTS)) + [1.0, 2.0, 3.0], atol=1e-12)
+    found = fine.compute_vertices(turn.apply(POINTS) + [1.0, 2.0, 3.0])
+    assert np.allclose(found, turn.apply(fine.compute_vertices(POINTS)) + [1.0, 2.0, 3.0], atol=1e-12)
 
 
 def test_linear_field_is_interpolated_exactly(fine):
@@ -46,7 +46,7 @@ def test_linear_field_is_interpolated_exactly(fine):
 def test_fine_vertices_stay_inside_the_coarse_facets(fine):
     random = np.random.default_rng(2)
     for at in (POINTS, POINTS + 0.05 * random.standard_normal(POINTS.shape)):
-        normals = fine.interpolate(at) - fine.place(at)
+        normals = fine.interpolate(at) - fine.compute_vertices(at)
         a, b, c = np.moveaxis(at[fine.corners], 1, 0)
         outward = np.cross(b - a, c - a)
         inside = fine.weights.min(axis=1) > 0.0
@@ -55,6 +55,6 @@ def test_fine_vertices_stay_inside_the_coarse_facets(fine):
 
 
 def test_rounding_reduces_radius_error_of_coarse_sphere(fine):
-    free = replace(fine, depth=np.zeros(len(fine.depth)), highest=np.inf, rounding=0.5)
-    flat, found = (np.linalg.norm(at, axis=1) for at in (fine.interpolate(POINTS), free.place(POINTS)))
+    free = replace(fine, depth=np.zeros(len(fine.depth)), max_height=np.inf, rounding=0.5)
+    flat, found = (np.linalg.norm(at, axis=1) for at in (fine.interpolate(POINTS), free.compute_vertices(POINTS)))
     assert np.abs(found - 1.0).max() < 0.25 * np.abs(flat - 1.0).max()

@@ -5,7 +5,7 @@ import pytest
 from test_ar_styles import CAMERA, seen, tumour
 
 from ar.overlay.composite import composite
-from ar.overlay.gauge import NUMBER_SCALE, Gauge, format_gauge
+from ar.overlay.gauge import NUMBER_SCALE, DistanceGauge, format_tip_distance
 from ar.overlay.marks import Marks
 from ar.overlay.outlines import find_text, has_text
 
@@ -13,7 +13,7 @@ from ar.overlay.outlines import find_text, has_text
 @pytest.mark.parametrize("tip", [(0.0, 0.0), (0.052, 0.03), (-0.07, 0.0), (0.0, -0.09), (0.3, 0.3)])
 def test_distance_label_is_near_the_tip_inside_the_image(tip):
     picture = seen()
-    gauge = Gauge(np.array([*tip, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
+    gauge = DistanceGauge(np.array([*tip, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
     shown = composite(picture, CAMERA, tumour(), marks=Marks(gauge=gauge)).colour
     found = find_text(shown, str(gauge), NUMBER_SCALE)
     assert found is not None
@@ -24,9 +24,9 @@ def test_distance_label_is_near_the_tip_inside_the_image(tip):
 
 
 def test_tip_inside_tumour_is_labelled_inside():
-    assert format_gauge(2.1e-3, None, True) == "inside, 2.1 mm from its edge"
-    assert format_gauge(2.1e-3, 1e-3, False) == "2.1 +- 1.0 mm"
-    gauge = Gauge(np.array([0.0, 0.0, -0.02]), np.array([0.0, 0.0, -0.008]), inside=True)
+    assert format_tip_distance(2.1e-3, None, True) == "inside, 2.1 mm from its edge"
+    assert format_tip_distance(2.1e-3, 1e-3, False) == "2.1 +- 1.0 mm"
+    gauge = DistanceGauge(np.array([0.0, 0.0, -0.02]), np.array([0.0, 0.0, -0.008]), is_inside=True)
     assert has_text(
         composite(seen(), CAMERA, tumour(), marks=Marks(gauge=gauge)).colour,
         "inside, 12.0 mm from its edge",

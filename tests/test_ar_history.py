@@ -5,12 +5,12 @@ import re
 import numpy as np
 import pytest
 
-from ar.page.history import TIME_SPAN, History, Line, Sample, round_up_scale
+from ar.page.history import TIME_SPAN, History, Sample, Trace, round_up_scale
 
 
 class TestHistory:
     def test_chart_shows_last_seconds_with_error_band(self):
-        history = History((Line("distance", "mm", "#fff"), Line("force", "N", "#f00")))
+        history = History((Trace("distance", "mm", "#fff"), Trace("force", "N", "#f00")))
         for time in np.arange(0.0, 60.0, 0.1):
             history.add(Sample(float(time), (10.0, None), (2.0 if time < 50.0 else None, None)))
         assert history.samples[0].time >= 59.9 - TIME_SPAN - 1e-9
@@ -23,14 +23,14 @@ class TestHistory:
         assert "force: not known" in chart and "distance [mm]" in chart and 'role="img"' in chart
 
     def test_chart_without_samples_is_empty(self):
-        chart = History((Line("a<b", "mm", "#fff"),)).draw_chart()
+        chart = History((Trace("a<b", "mm", "#fff"),)).draw_chart()
         assert "<polyline" not in chart and "nothing yet" in chart
 
     def test_chart_draws_single_samples_and_keeps_gaps(self):
-        history = History((Line("distance", "mm", "#fff"),))
+        history = History((Trace("distance", "mm", "#fff"),))
         for time, value in ((0.0, 3.0), (5.0, 4.0), (6.0, 4.0), (7.0, None), (8.0, 5.0)):
             history.add(Sample(time, (value,), (None,)))
-        history.break_off(8.5)
+        history.interrupt_lines(8.5)
         history.add(Sample(9.0, (6.0,), (None,)))
         lines = [line.split() for line in re.findall(r'<polyline points="([^"]*)"', history.draw_chart())]
         assert [len(line) for line in lines] == [2] * 4

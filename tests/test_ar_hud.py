@@ -10,13 +10,13 @@ from ar.overlay.hud import (
     FONT,
     MAX_TEXT_SHIFT,
     TEXT_SCALE,
-    Below,
+    Hideable,
     draw_orientation_labels,
     draw_text_panel,
     format_millimetres,
-    lay,
-    name_bearings,
     name_direction,
+    name_edge_directions,
+    place_text,
     wrap_line,
 )
 from ar.overlay.outlines import find_text
@@ -43,12 +43,12 @@ def test_direction_is_named_by_its_largest_components(direction, letters):
 def test_edge_labels_follow_the_camera_orientation():
     """Seen from the patient's right with the crown up, the face is on the right."""
     aside = look_at(np.array([0.3, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    assert name_bearings(aside.T_camera_world[:3, :3]) == {"left": "P", "right": "A", "top": "S", "bottom": "I"}
+    assert name_edge_directions(aside.T_camera_world[:3, :3]) == {"left": "P", "right": "A", "top": "S", "bottom": "I"}
     # From above, face upwards in the picture: the patient's right is on the right; from below it is on the left.
     above = look_at(np.array([0.0, 0.0, 0.3]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
     below = look_at(np.array([0.0, 0.0, -0.3]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
-    assert name_bearings(above.T_camera_world[:3, :3]) == {"left": "L", "right": "R", "top": "A", "bottom": "P"}
-    assert name_bearings(below.T_camera_world[:3, :3]) == {"left": "R", "right": "L", "top": "A", "bottom": "P"}
+    assert name_edge_directions(above.T_camera_world[:3, :3]) == {"left": "L", "right": "R", "top": "A", "bottom": "P"}
+    assert name_edge_directions(below.T_camera_world[:3, :3]) == {"left": "R", "right": "L", "top": "A", "bottom": "P"}
 
 
 def test_orientation_labels_are_drawn_at_image_edges():
@@ -64,8 +64,10 @@ def test_orientation_labels_are_drawn_at_image_edges():
 def test_text_panel_drops_lines_that_do_not_fit():
     plain = np.full((100, 320, 3), 90, np.uint8)
     lines = ["first", "second", "third", "fourth", "fifth"]
-    few = draw_text_panel(plain, lines, below=30)
-    kept = next(count for count in range(1, 6) if np.array_equal(few, draw_text_panel(plain, lines[:count], below=30)))
+    few = draw_text_panel(plain, lines, first_row=30)
+    kept = next(
+        count for count in range(1, 6) if np.array_equal(few, draw_text_panel(plain, lines[:count], first_row=30))
+    )
     assert 1 < kept < 4 and (few[:30] == 90).all() and (few[-BORDER_DISTANCE:] == 90).all()
 
 
@@ -102,17 +104,17 @@ def test_orientation_label_shifts_along_its_edge():
 
 def test_optional_labels_without_room_are_dropped():
     colour, taken = np.zeros((100, 200, 3), np.uint8), np.zeros((100, 200), np.uint8)
-    lay(colour, taken, ["first"], (0, 100))
+    place_text(colour, taken, ["first"], (0, 100))
     (low,) = np.nonzero(taken.any(axis=1))[0][[-1]]
-    lay(colour, taken, ["second", "and its next line"], (0, 100))
+    place_text(colour, taken, ["second", "and its next line"], (0, 100))
     assert low == 100 - BORDER_DISTANCE - 1 and np.nonzero(taken.any(axis=1))[0][0] < low - 40 and colour.any()
     # What is written is inside what is taken, but for the halo.
     assert not colour[cv2.dilate(taken, np.ones((9, 9), np.uint8)) == 0].any()
     full, blank = np.ones((100, 200), np.uint8), np.zeros((100, 200, 3), np.uint8)
-    lay(blank, full, ["dropped"], (0, 100))
-    lay(blank, full, [], (0, 100), needed=True)
+    place_text(blank, full, ["dropped"], (0, 100))
+    place_text(blank, full, [], (0, 100), force=True)
     assert not blank.any()
-    lay(blank, full, ["needed"], (0, 100), needed=True)
+    place_text(blank, full, ["needed"], (0, 100), force=True)
     assert blank[70:, :80].any() and not blank[:60].any()
 
 
@@ -155,9 +157,9 @@ def test_text_panel_drops_lines_instead_of_covering_marks():
     hidden[40:120, 200:] = 0
     lines = ["the first line", "the second", "the third", "the fourth", "the fifth", "the sixth"]
     for sights in ([np.ones_like(hidden), hidden], [hidden, np.zeros_like(hidden)]):
-        changed = (draw_text_panel(colour, lines, sights=sights) != colour).any(axis=2)
+        changed = (draw_text_panel(colour, lines, obstacles=sights) != colour).any(axis=2)
         assert changed.sum() > 1000 and not changed[hidden > 0].any()
-    assert (draw_text_panel(colour, lines[:2], sights=[hidden]) != colour).any(axis=2).sum() < changed.sum()
+    assert (draw_text_panel(colour, lines[:2], obstacles=[hidden]) != colour).any(axis=2).sum() < changed.sum()
 
 
 def test_text_labels_may_cover_thin_lines():
@@ -166,6 +168,8 @@ def test_text_labels_may_cover_thin_lines():
     for name, thin in (("far", None), ("near", True)):
         colour, taken = np.zeros((300, 400, 3), np.uint8), np.zeros((300, 400), np.uint8)
         taken[:200, ::20] = 1
-        lay(colour, taken, ["8.7 +- 8.0 mm"], (150, 60), below=Below(thin=None if thin is None else taken > 0))
+        place_text(
+            colour, taken, ["8.7 +- 8.0 mm"], (150, 60), parts=Hideable(ring_lines=None if thin is None else taken > 0)
+        )
         _, rows[name], _, _ = find_text(colour, "8.7 +- 8.0 mm", TEXT_SCALE)
     assert rows["near"] < 60 + MAX_TEXT_SHIFT < 200 < rows["far"]

@@ -28,9 +28,9 @@ def test_intrinsics_are_recovered_from_board_images():
     found = [find_board(BOARD, str(number), picture(T)) for number, T in enumerate(places)]
     assert all(found) and min(len(view.pixels) for view in found) > 20
     camera = calibrate_intrinsics(found, WIDTH, HEIGHT, "mine")
-    assert camera.rms < 0.12 and not camera.excluded and camera.used == tuple(map(str, range(12)))
-    np.testing.assert_allclose(camera.values[:4], TRUTH[:4], rtol=3e-3)
-    assert (np.abs(camera.values - TRUTH) < 5.0 * camera.deviations).all()
+    assert camera.rms < 0.12 and not camera.excluded_views and camera.used_views == tuple(map(str, range(12)))
+    np.testing.assert_allclose(camera.parameters[:4], TRUTH[:4], rtol=3e-3)
+    assert (np.abs(camera.parameters - TRUTH) < 5.0 * camera.deviations).all()
     # Between the corners rays go where they should.
     rng = np.random.default_rng(3)
     rays = np.column_stack([rng.uniform(-0.4, 0.4, 200), rng.uniform(-0.3, 0.3, 200), np.ones(200)])
@@ -47,7 +47,7 @@ def repeated():
 
 
 def test_covariance_matches_repeated_calibrations(repeated):
-    values = np.array([each.values for each in repeated])
+    values = np.array([each.parameters for each in repeated])
     stated = np.mean([each.covariance for each in repeated], axis=0)
     ratio = values.std(axis=0, ddof=1) / np.sqrt(np.diag(stated))
     assert (ratio > 1.0 / 1.5).all() and (ratio < 1.5).all(), ratio
@@ -71,9 +71,9 @@ def test_calibration_excludes_and_names_distorted_view():
     some = views(poses(14), 0.1)
     bent = replace(some[5], pixels=some[5].pixels + 3.0 * np.sin(some[5].pixels[:, ::-1] / 20.0))
     camera = calibrate_intrinsics([*some[:5], bent, *some[6:]], WIDTH, HEIGHT)
-    assert camera.excluded == ("view 5",) and len(camera.used) == 13
+    assert camera.excluded_views == ("view 5",) and len(camera.used_views) == 13
     alone = calibrate_intrinsics([*some[:5], *some[6:]], WIDTH, HEIGHT)
-    np.testing.assert_allclose(camera.values, alone.values, rtol=1e-6)
+    np.testing.assert_allclose(camera.parameters, alone.parameters, rtol=1e-6)
 
 
 def test_calibration_rejects_insufficient_views():

@@ -11,9 +11,9 @@ from test_ar_renderer import BALL, FLOOR, LAMP, ball, floor, scene
 from ar.optics.camera import Camera, look_at, project_cv2
 from ar.optics.lens import Lens
 from ar.overlay.composite import composite
-from ar.overlay.gauge import Gauge
+from ar.overlay.gauge import DistanceGauge
 from ar.overlay.marks import Marks
-from ar.overlay.outlines import compute_silhouette, find_ink, measure_outline_gap
+from ar.overlay.outlines import compute_silhouette, find_colour, measure_outline_distance
 from ar.rendering.layer import Layer
 from ar.rendering.raycast import raycast
 from ar.rendering.renderer import Renderer, render
@@ -172,14 +172,14 @@ def test_overlay_outline_is_registered_through_lens(lens):
     hidden = replace(ball((0.04, 0.02, -0.03)), colour=(0.3, 0.95, 0.55))
     picture = render(camera, ground, LAMP)
     before = replace(hidden, vertices=hidden.vertices - [0.01, 0.0, 0.0])
-    gauge = Gauge(np.array([-0.03, -0.03, 0.0]), hidden.vertices[0])
-    shown = composite(picture, camera, hidden, marks=Marks(gauge=gauge, before=before)).colour
+    gauge = DistanceGauge(np.array([-0.03, -0.03, 0.0]), hidden.vertices[0])
+    shown = composite(picture, camera, hidden, marks=Marks(gauge=gauge, initial=before)).colour
     mask = raycast(camera, hidden.vertices, hidden.triangles).mask
     ink = tuple(np.rint(255.0 * np.array([0.3, 0.95, 0.55])))
     clear = np.zeros(mask.shape, bool)
-    assert find_ink(shown, ink).sum() > 200 and measure_outline_gap(shown, ink, mask, clear) < 1.5
+    assert find_colour(shown, ink).sum() > 200 and measure_outline_distance(shown, ink, mask, clear) < 1.5
     off = raycast(replace(camera, lens=None), hidden.vertices, hidden.triangles).mask
-    assert measure_outline_gap(shown, ink, off, clear) > 2.0
+    assert measure_outline_distance(shown, ink, off, clear) > 2.0
 
 
 def test_objects_beyond_the_distortion_limit_are_not_drawn():
@@ -190,7 +190,9 @@ def test_objects_beyond_the_distortion_limit_are_not_drawn():
     assert np.abs(project_cv2(camera, aside.vertices) - camera.K[:2, 2]).max() < 0.5 * camera.K[0, 0]
     picture = render(camera, [aside], LAMP)
     assert not picture.segmentation.any() and np.isnan(camera.project(aside.vertices)[0]).all()
-    assert np.array_equal(composite(picture, camera, aside, marks=Marks(before=aside)).colour, picture.colour)
-    gauge = Gauge(np.array([0.0, 0.0, 1.0]), aside.vertices[0])  # its tip is in sight: the number alone stands there
-    rows, columns = np.nonzero(composite(picture, camera, aside, marks=Marks(gauge=gauge, before=aside)).taken)
+    assert np.array_equal(composite(picture, camera, aside, marks=Marks(initial=aside)).colour, picture.colour)
+    gauge = DistanceGauge(
+        np.array([0.0, 0.0, 1.0]), aside.vertices[0]
+    )  # its tip is in sight: the number alone stands there
+    rows, columns = np.nonzero(composite(picture, camera, aside, marks=Marks(gauge=gauge, initial=aside)).taken)
     assert np.ptp(rows) < 30 and np.ptp(columns) < 140

@@ -6,7 +6,7 @@ from itertools import islice
 import pytest
 from films import Plugged
 
-from ar.tracking.live_camera import read_camera_images, read_newest
+from ar.tracking.live_camera import read_camera_images, read_newest_images
 
 
 def test_unplugged_camera_is_reopened_until_it_returns():
@@ -33,7 +33,7 @@ def test_latest_image_is_returned_and_timeout_yields_none():
         yield "d"
         raise ValueError("unplugged")
 
-    found = read_newest(slow(), 0.05)
+    found = read_newest_images(slow(), 0.05)
     time.sleep(0.02)
     assert next(found) == "c"  # a and b are lost
     assert next(found) is None

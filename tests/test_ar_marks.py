@@ -9,8 +9,8 @@ import trimesh
 from ar.optics.camera import Camera, look_at
 from ar.overlay.composite import POINT_COLOUR, composite, draw_points
 from ar.overlay.hud import TEXT_SCALE
-from ar.overlay.marks import Marks, Trace, Words
-from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text, measure_outline_gap
+from ar.overlay.marks import ImageText, MarkOutline, Marks
+from ar.overlay.outlines import average_colour, compute_silhouette, find_colour, has_text, measure_outline_distance
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, Picture, render
 
@@ -35,20 +35,27 @@ def test_displacement_trace_is_drawn_below_the_outline():
     here, at = camera(640, 480), tumour()
     picture = ground(here)
     blue = replace(tumour((0.004, 0.0, -0.02)), colour=np.array((0.2, 0.4, 1.0)))
-    trace = Trace(blue, (12, 4), np.array([0.004, 0.0, -0.02]))
-    ink = compute_ink(blue.colour)
-    plain = composite(picture, here, at, style="contour", marks=Marks(before=at)).colour
+    trace = MarkOutline(blue, (12, 4), np.array([0.004, 0.0, -0.02]))
+    ink = average_colour(blue.colour)
+    plain = composite(picture, here, at, style="contour", marks=Marks(initial=at)).colour
     shown = composite(
-        picture, here, at, style="contour", marks=Marks(before=at, traces=[trace]), words=Words(moved=(2e-3, 1.24e-3))
+        picture,
+        here,
+        at,
+        style="contour",
+        marks=Marks(initial=at, outlines=[trace]),
+        words=ImageText(motion=(2e-3, 1.24e-3)),
     ).colour
-    assert not find_ink(plain, ink).any() and find_ink(shown, ink).sum() > 100
-    own = find_ink(plain, compute_ink(at.colour))
-    assert own.sum() > 100 and find_ink(shown, compute_ink(at.colour))[own].all()
+    assert not find_colour(plain, ink).any() and find_colour(shown, ink).sum() > 100
+    own = find_colour(plain, average_colour(at.colour))
+    assert own.sum() > 100 and find_colour(shown, average_colour(at.colour))[own].all()
     mask = compute_silhouette(here, blue.vertices, blue.triangles)
-    assert measure_outline_gap(shown, ink, mask, own, 32) < 2.5 < measure_outline_gap(plain, ink, mask, own, 32)
+    assert (
+        measure_outline_distance(shown, ink, mask, own, 32) < 2.5 < measure_outline_distance(plain, ink, mask, own, 32)
+    )
     wrong = compute_silhouette(here, at.vertices + [0.0, 0.003, 0.0], at.triangles)
-    assert measure_outline_gap(shown, ink, wrong, own, 32) > 5.0
-    column, row = here.project(trace.dot[None])[0][0].round().astype(int)
+    assert measure_outline_distance(shown, ink, wrong, own, 32) > 5.0
+    column, row = here.project(trace.dot_position[None])[0][0].round().astype(int)
     assert shown[row, column] == pytest.approx([153, 178, 255], abs=1)  # paler than the ink
     assert has_text(shown, "moved 2.0 +- 1.3 mm", TEXT_SCALE) and has_text(plain, "moved 0.0 mm", TEXT_SCALE)
 
@@ -58,8 +65,8 @@ def test_outline_gap_ignores_outlines_below_minimum_pixels():
     mask[20:40, 20:40] = True
     covered = np.ones((60, 60), bool)
     covered[:, 15:18] = False
-    assert measure_outline_gap(picture, (9, 9, 9), mask, covered, 32) == 0.0
-    assert measure_outline_gap(picture, (9, 9, 9), mask, np.zeros_like(mask), 32) == np.inf
+    assert measure_outline_distance(picture, (9, 9, 9), mask, covered, 32) == 0.0
+    assert measure_outline_distance(picture, (9, 9, 9), mask, np.zeros_like(mask), 32) == np.inf
 
 
 def test_points_are_drawn_only_on_visible_free_pixels():

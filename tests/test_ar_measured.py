@@ -4,16 +4,16 @@ import cv2
 import numpy as np
 from test_ar_styles import CAMERA, TOOL, seen, tumour
 
-from ar.overlay.measured import Measure
-from ar.overlay.window import BORDER_COLOUR, Roles
+from ar.overlay.measured import Measurement
+from ar.overlay.window import BORDER_COLOUR, LayerRoles
 
 
 def test_ring_numbers_avoid_the_line_from_the_tip():
     at = tumour((0.0, 0.0, -0.014))
-    roles = Roles((TOOL,), None, None)
+    roles = LayerRoles((TOOL,), None, None)
     plain, crossed = (np.zeros((480, 640, 4), np.uint8) for _ in range(2))
     box = np.s_[0:480, 0:640]
-    measure = Measure("rings", seen(), CAMERA, at, roles)
+    measure = Measurement("rings", seen(), CAMERA, at, roles)
     measure.draw(plain, np.zeros_like(plain), box)
     line = np.zeros_like(plain)
     number = (plain[..., :3] == np.array(BORDER_COLOUR, np.uint8)).all(axis=2) & (plain[..., 3] > 0)

@@ -8,10 +8,10 @@ import pytest
 
 from ar.optics.camera import look_at
 from ar.overlay.composite import DOUBTFUL_COLOUR, WARNING_COLOUR, composite, format_warning
-from ar.overlay.gauge import NUMBER_SCALE, Gauge
-from ar.overlay.hud import HEAD_ROW, LINE_SPACING, TEXT_SCALE, draw_text_panel, write
-from ar.overlay.marks import BEFORE_COLOUR, Cover, Marks, Words
-from ar.overlay.outlines import compute_ink, compute_iou, compute_silhouette, has_text, measure_outline_gap
+from ar.overlay.gauge import NUMBER_SCALE, DistanceGauge
+from ar.overlay.hud import HEAD_ROW, LINE_SPACING, TEXT_SCALE, draw_text_panel, write_text
+from ar.overlay.marks import BEFORE_COLOUR, ImageText, Marks, Occluders
+from ar.overlay.outlines import average_colour, compute_iou, compute_silhouette, has_text, measure_outline_distance
 from ar.rendering.layer import Layer, Solid
 from ar.rendering.renderer import Lamp, build_lamp, render
 
@@ -143,8 +143,8 @@ def test_overlay_is_drawn_at_the_tumour_position(style):
 def test_tool_occludes_the_overlay(style):
     here = camera()
     picture = render(here, [cortex(), tool((0.0, 0.0, 0.012))], LAMP)
-    gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
-    shown = composite(picture, here, tumour(), style=style, cover=Cover([TOOL]), marks=Marks(0.002, gauge=gauge))
+    gauge = DistanceGauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
+    shown = composite(picture, here, tumour(), style=style, cover=Occluders([TOOL]), marks=Marks(0.002, gauge=gauge))
     covered = picture.segmentation == TOOL
     text_free = covered & (np.arange(150) < 100)[:, None]
     assert np.array_equal(shown.colour[text_free], picture.colour[text_free])
@@ -186,8 +186,8 @@ def test_header_lines_are_drawn_at_the_top_in_every_style():
             here,
             tumour(),
             style=style,
-            marks=Marks(before=tumour((0.01, 0.0, -0.02))),
-            words=Words(head=["one", "two"]),
+            marks=Marks(initial=tumour((0.01, 0.0, -0.02))),
+            words=ImageText(header=["one", "two"]),
         )
         assert has_text(said.colour[HEAD_ROW : HEAD_ROW + 2 * LINE_SPACING], "one", TEXT_SCALE)
         assert has_text(said.colour[HEAD_ROW + LINE_SPACING - 4 : HEAD_ROW + 3 * LINE_SPACING], "two", TEXT_SCALE)
@@ -204,7 +204,7 @@ def test_deeper_tumour_is_drawn_darker():
 
 
 def test_gauge_distance_is_euclidean_distance():
-    assert Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.003, 0.004, 0.0])).distance == pytest.approx(0.005)
+    assert DistanceGauge(np.array([0.0, 0.0, 0.0]), np.array([0.003, 0.004, 0.0])).distance == pytest.approx(0.005)
 
 
 def test_image_label_shows_mean_tumour_displacement():
@@ -215,16 +215,16 @@ def test_image_label_shows_mean_tumour_displacement():
     margin = np.linspace(0.0005, 0.0015, len(now.vertices))
     before = replace(now, vertices=now.vertices - far)
     assert has_text(
-        composite(picture, here, now, marks=Marks(margin, before=before)).colour, "moved 3.0 mm", TEXT_SCALE
+        composite(picture, here, now, marks=Marks(margin, initial=before)).colour, "moved 3.0 mm", TEXT_SCALE
     )
-    assert has_text(composite(picture, here, now, marks=Marks(before=before)).colour, "moved 3.0 mm", TEXT_SCALE)
+    assert has_text(composite(picture, here, now, marks=Marks(initial=before)).colour, "moved 3.0 mm", TEXT_SCALE)
 
 
 def test_motion_arrow_points_to_the_current_tumour_position():
     here, before, now = camera(400, 300), tumour((-0.012, 0.0, -0.02), 0.006), tumour((0.012, 0.0, -0.02), 0.006)
     picture = render(here, [cortex()], LAMP)
-    shown = composite(picture, here, now, style="contour", marks=Marks(before=before)).colour
-    grey = np.argwhere((np.abs(shown.astype(int) - compute_ink(BEFORE_COLOUR)) <= 2).all(axis=2))[:, ::-1]
+    shown = composite(picture, here, now, style="contour", marks=Marks(initial=before)).colour
+    grey = np.argwhere((np.abs(shown.astype(int) - average_colour(BEFORE_COLOUR)) <= 2).all(axis=2))[:, ::-1]
     near = [
         np.count_nonzero(np.linalg.norm(grey - here.project(np.array([x, 0.0, -0.02]))[0], axis=1) < 8)
         for x in (-0.012, 0.012)
@@ -238,11 +238,11 @@ def test_motion_and_warning_are_on_separate_lines():
     picture = render(here, [cortex()], LAMP)
     before, now = tumour((0.0, 0.0, -0.02)), tumour((0.003, 0.0, -0.02))
     doubt = "outside the training range: do not rely on it"
-    shown = composite(picture, here, now, marks=Marks(np.nan, before=before), words=Words(doubt)).colour
+    shown = composite(picture, here, now, marks=Marks(np.nan, initial=before), words=ImageText(doubt)).colour
     assert has_text(shown, "moved 3.0 mm", TEXT_SCALE)
-    assert all(has_text(shown, line, TEXT_SCALE, compute_ink(WARNING_COLOUR)) for line in format_warning(doubt, 400))
+    assert all(has_text(shown, line, TEXT_SCALE, average_colour(WARNING_COLOUR)) for line in format_warning(doubt, 400))
     assert has_text(
-        composite(picture, here, now, marks=Marks(np.nan, before=before)).colour, "moved 3.0 mm", TEXT_SCALE
+        composite(picture, here, now, marks=Marks(np.nan, initial=before)).colour, "moved 3.0 mm", TEXT_SCALE
     )
 
 
@@ -250,22 +250,24 @@ def test_unreliable_overlay_is_amber_without_error_margin():
     """The image shows the reason and an amber outline, with neither margin nor +-."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
-    gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
+    gauge = DistanceGauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]), error=1.2e-3)
     sure = composite(picture, here, tumour(), marks=Marks(0.004, gauge=gauge)).colour
     assert has_text(sure, "8.0 +- 1.2 mm", NUMBER_SCALE) and not has_text(
-        sure, "do not rely on it", TEXT_SCALE, compute_ink(WARNING_COLOUR)
+        sure, "do not rely on it", TEXT_SCALE, average_colour(WARNING_COLOUR)
     )
     unsure, plain = (
-        composite(picture, here, tumour(), marks=Marks(margin, gauge=gauge), words=Words("do not rely on it")).colour
+        composite(
+            picture, here, tumour(), marks=Marks(margin, gauge=gauge), words=ImageText("do not rely on it")
+        ).colour
         for margin in (0.004, 0.0)
     )
     assert has_text(unsure, "8.0 mm", NUMBER_SCALE) and has_text(
-        unsure, "do not rely on it", TEXT_SCALE, compute_ink(WARNING_COLOUR)
+        unsure, "do not rely on it", TEXT_SCALE, average_colour(WARNING_COLOUR)
     )
     assert np.array_equal(unsure, plain)
     amber, green = (
         (np.abs(unsure.astype(int) - ink) <= 2).all(axis=2).sum()
-        for ink in map(compute_ink, (DOUBTFUL_COLOUR, (0.2, 0.9, 0.3)))
+        for ink in map(average_colour, (DOUBTFUL_COLOUR, (0.2, 0.9, 0.3)))
     )
     assert amber > 20 and green == 0
 
@@ -280,15 +282,15 @@ def test_tumour_outside_the_image_changes_no_pixel():
 def test_without_overlay_only_the_warning_is_drawn():
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
-    gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
+    gauge = DistanceGauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
     bare, unsure = (
         composite(
-            picture, here, tumour(), style="none", marks=Marks(gauge=gauge, before=tumour()), words=Words(doubt)
+            picture, here, tumour(), style="none", marks=Marks(gauge=gauge, initial=tumour()), words=ImageText(doubt)
         ).colour
         for doubt in ("", "do not rely on it")
     )
     assert np.array_equal(bare, picture.colour) and has_text(
-        unsure, "do not rely on it", TEXT_SCALE, compute_ink(WARNING_COLOUR)
+        unsure, "do not rely on it", TEXT_SCALE, average_colour(WARNING_COLOUR)
     )
     rows, columns = np.nonzero((unsure != picture.colour).any(axis=2))
     assert rows.min() > 270 and columns.max() < 120
@@ -298,9 +300,9 @@ def test_taken_mask_covers_lines_and_text():
     """All pixels of outline, arrow and number, and no others except a margin around letters."""
     here = camera(400, 300)
     picture = render(here, [cortex()], LAMP)
-    gauge = Gauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
+    gauge = DistanceGauge(np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.008]))
     drawn = composite(
-        picture, here, tumour(), style="contour", marks=Marks(gauge=gauge, before=tumour((0.01, 0.0, -0.02)))
+        picture, here, tumour(), style="contour", marks=Marks(gauge=gauge, initial=tumour((0.01, 0.0, -0.02)))
     )
     changed = (drawn.colour != picture.colour).any(axis=2)
     taken = drawn.taken > 0
@@ -313,7 +315,7 @@ def test_taken_mask_covers_lines_and_text():
 def test_text_is_drawn_inside_the_image():
     for at in ((-50, -50), (1000, 1000), (100, 60)):
         colour = np.full((80, 200, 3), 90, np.uint8)
-        write(colour, "12.3 mm", at)
+        write_text(colour, "12.3 mm", at)
         assert np.count_nonzero(colour[2:-2, 2:-2].max(axis=-1) > 200) > 20
 
 
@@ -354,7 +356,7 @@ def test_outline_error_counts_misplaced_and_missing_pixels():
         for mask in masks:
             colour[mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3))).astype(bool)] = ink
         colour[:, left:] = 0
-        return measure_outline_gap(colour, ink, true, nothing)
+        return measure_outline_distance(colour, ink, true, nothing)
 
     middle = int(np.nonzero(true)[1].mean())
     assert gap(true) <= 1.0
@@ -365,6 +367,6 @@ def test_outline_error_counts_misplaced_and_missing_pixels():
 
 def test_text_search_matches_only_whole_lines():
     colour = np.full((80, 200, 3), 90, np.uint8)
-    write(colour, "11.5 mm", (60, 40))
+    write_text(colour, "11.5 mm", (60, 40))
     found = {text for text in ("11.5 mm", "1.5 mm", "11.6 mm", "5 mm") if has_text(colour, text, 0.5)}
     assert found == {"11.5 mm"} and not has_text(colour, "11.5 mm", 0.45)

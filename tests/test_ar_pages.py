@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ar.tracking.pages import Page, build_printed_pages, describe_targets, to_face_name, to_pdf, to_png
+from ar.tracking.pages import PrintedPage, build_printed_pages, describe_targets, to_face_name, to_pdf, to_png
 from ar.tracking.targets import BORDER_WIDTH, build_calibration_board, build_patient_reference, build_tool_cube
 
 
@@ -59,7 +59,7 @@ def test_squares_and_markers_have_nominal_printed_size(pages, number):
     page = pages[number]
     with Image.open(io.BytesIO(to_png(page))) as picture:
         pixels, per_mm = np.asarray(picture.convert("L")), picture.info["dpi"][0] / 25.4
-    for each in page.placed:
+    for each in page.faces:
         face = each.face
         left, top = (round(at * per_mm) for at in (each.left, each.top))
         wide, high = (round(1e3 * size * per_mm) for size in face.size)
@@ -87,7 +87,7 @@ def test_printed_rulers_are_100_mm_long(pages):
 def test_opencv_detects_corners_at_their_page_positions(pages, number):
     page = pages[number]
     small = cv2.resize(page.pixels, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    for each in page.placed:
+    for each in page.faces:
         corners, ids, _, markers = cv2.aruco.CharucoDetector(each.face.board).detectBoard(small)
         assert set(each.face.ids) <= set(np.asarray(markers).ravel())
         own = np.asarray(each.face.board.getChessboardCorners())[np.asarray(ids).ravel(), :2]
@@ -108,7 +108,7 @@ def on_paper(each, places):
 def test_adjacent_faces_on_paper_are_adjacent_on_the_cube(pages):
     """Border corners at one place of the net coincide in space; a tab joins the remaining edge."""
     spots = []
-    for each in pages[0].placed:
+    for each in pages[0].faces:
         T, size, border = each.face.T_target_face, each.face.size, BORDER_WIDTH
         square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (size + 2.0 * border) - border
         space = 1e3 * (square @ T[:3, :2].T + T[:3, 3])
@@ -131,7 +131,7 @@ def test_adjacent_faces_on_paper_are_adjacent_on_the_cube(pages):
 def test_cut_lines_surround_the_face_borders(pages):
     """Most of each outer side of net and plate is drawn, and nothing in the white area between."""
     for page, names in ((pages[0], "+z"), (pages[1], "-z")):
-        (each,) = [each for each in page.placed if to_face_name(each.face) == names]
+        (each,) = [each for each in page.faces if to_face_name(each.face) == names]
         left, top = (round(20.0 * (at - 1e3 * BORDER_WIDTH)) for at in (each.left, each.top))
         wide = round(2e4 * (each.face.size[0] + 2.0 * BORDER_WIDTH))
         side = page.pixels[top : top + wide, left - 2 : left + 3] == 0
@@ -156,4 +156,4 @@ def test_target_list_describes_the_printed_targets():
 
 
 def test_page_pixels_are_black_or_white(pages):
-    assert all(isinstance(page, Page) and set(np.unique(page.pixels)) == {0, 255} for page in pages)
+    assert all(isinstance(page, PrintedPage) and set(np.unique(page.pixels)) == {0, 255} for page in pages)

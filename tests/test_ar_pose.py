@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.pose import Tracker, Verdict, find_pose
+from ar.tracking.pose import PoseStatus, Tracker, find_pose
 from ar.tracking.synthetic_images import render_targets
 from ar.tracking.targets import (
     TIP_DISTANCE,
@@ -105,8 +105,8 @@ def test_corners_are_detected_at_distorted_positions(scene):
 def test_tip_error_lies_within_its_covariance(scene):
     picture, poses = scene
     tracked = Tracker(CAMERA, (CUBE, PLATE)).track(picture)
-    assert set(tracked.verdicts.values()) == {Verdict.GOOD}
-    tip, covariance = tracked.poses["tool"].point(TIP_AT)
+    assert set(tracked.statuses.values()) == {PoseStatus.GOOD}
+    tip, covariance = tracked.poses["tool"].transform_point(TIP_AT)
     off = tip - (poses["tool"][:3, :3] @ TIP_AT + poses["tool"][:3, 3])
     assert np.linalg.norm(off) < 1.5e-3
     assert off @ np.linalg.solve(covariance, off) < 16.3  # 99.9 %
@@ -119,7 +119,7 @@ def test_pose_covariance_matches_repeated_noise():
     found = []
     for _ in range(150):
         verdict, pose = find_pose(CAMERA, CUBE, is_seen_from_front(T, 0.25, rng, CUBE))
-        assert verdict is Verdict.GOOD and pose is not None
+        assert verdict is PoseStatus.GOOD and pose is not None
         turn = Rotation.from_matrix(pose.T_camera_target[:3, :3] @ T[:3, :3].T).as_rotvec()
         error = np.append(pose.T_camera_target[:3, 3] - T[:3, 3], turn)
         found.append(error @ np.linalg.solve(pose.covariance, error))
@@ -137,7 +137,7 @@ def test_relative_pose_covariance_includes_both_poses():
         tool = find_pose(CAMERA, CUBE, is_seen_from_front(T, 0.2, rng, CUBE))[1]
         patient = find_pose(CAMERA, PLATE, is_seen_from_front(plate, 0.2, rng))[1]
         assert tool is not None and patient is not None
-        place, covariance = tool.transform_to(patient).point(TIP_AT)
+        place, covariance = tool.transform_to(patient).transform_point(TIP_AT)
         found.append((place - true) @ np.linalg.solve(covariance, place - true))
     assert np.mean(found) == pytest.approx(3.0, rel=0.25)
 
@@ -154,28 +154,28 @@ def test_mirrored_pose_is_never_rated_good():
                 angle(pose.T_camera_target, T)
                 < 6.0 * np.degrees(np.sqrt(np.linalg.eigvalsh(pose.covariance)[-1])) + 1.0
             )
-    assert verdicts.count(Verdict.GOOD) > 40 and verdicts.count(Verdict.AMBIGUOUS) > 60
+    assert verdicts.count(PoseStatus.GOOD) > 40 and verdicts.count(PoseStatus.AMBIGUOUS) > 60
 
 
 def test_previous_pose_resolves_the_mirror_ambiguity():
     rng, T = np.random.default_rng(3), flat((12.0, -10.0, 0.0), (0.0, 0.0, 1.0))
     corners = is_seen_from_front(T, 0.1, rng)
-    assert find_pose(CAMERA, PLATE, corners)[0] is Verdict.AMBIGUOUS
+    assert find_pose(CAMERA, PLATE, corners)[0] is PoseStatus.AMBIGUOUS
     near = T.copy()
     near[:3, :3] = Rotation.from_euler("x", 2.0, degrees=True).as_matrix() @ T[:3, :3]
     for _ in range(10):  # in some the mirrored pose fits better
         verdict, pose = find_pose(CAMERA, PLATE, is_seen_from_front(T, 0.2, rng), near)
-        assert verdict is Verdict.GOOD and pose is not None and angle(pose.T_camera_target, T) < 5.0
+        assert verdict is PoseStatus.GOOD and pose is not None and angle(pose.T_camera_target, T) < 5.0
     far = flat((0.0, 0.0, 90.0), (0.0, 0.0, 1.0))
-    assert find_pose(CAMERA, PLATE, corners, far) == (Verdict.AMBIGUOUS, None)
+    assert find_pose(CAMERA, PLATE, corners, far) == (PoseStatus.AMBIGUOUS, None)
 
 
 def test_inconsistent_corners_give_no_pose():
     corners = is_seen_from_front(flat((20.0, 15.0, 5.0), (-0.05, 0.0, 0.3)), 0.1, np.random.default_rng(4))
     few = DetectedCorners(corners.points[:5], corners.pixels[:5], corners.face[:5])
-    assert find_pose(CAMERA, PLATE, few) == find_pose(CAMERA, PLATE, None) == (Verdict.LOST, None)
+    assert find_pose(CAMERA, PLATE, few) == find_pose(CAMERA, PLATE, None) == (PoseStatus.LOST, None)
     strewn = replace(corners, pixels=corners.pixels[::-1] + np.random.default_rng(5).normal(0.0, 20.0, (16, 2)))
-    assert find_pose(CAMERA, PLATE, strewn) == (Verdict.POOR, None)
+    assert find_pose(CAMERA, PLATE, strewn) == (PoseStatus.POOR, None)
     mirrored = replace(corners, pixels=corners.pixels * [-1.0, 1.0] + [800.0, 0.0])
     assert find_pose(CAMERA, PLATE, mirrored)[1] is None
 
@@ -185,19 +185,19 @@ def test_target_is_tracked_lost_and_detected_again(scene):
     tracker = Tracker(CAMERA, (CUBE,))
     first = tracker.track(picture)
     again = tracker.track(picture, first)  # in a window
-    assert again.number == 1 and again.verdicts["tool"] is Verdict.GOOD
+    assert again.number == 1 and again.statuses["tool"] is PoseStatus.GOOD
     assert angle(again.poses["tool"].T_camera_target, first.poses["tool"].T_camera_target) < 1.0
     jumped = taken((CUBE, looking((0.0, 0.0, 0.0), (-0.05, 0.03, 0.24))))
     there = tracker.track(jumped, again)
-    assert there.verdicts["tool"] is Verdict.GOOD  # out of its window, so it was looked for everywhere
+    assert there.statuses["tool"] is PoseStatus.GOOD  # out of its window, so it was looked for everywhere
     nothing, state, lost = np.full((600, 800), 120, np.uint8), there, []
     for _ in range(7):
         state = tracker.track(nothing, state)
-        lost.append(state.verdicts["tool"])
+        lost.append(state.statuses["tool"])
         assert not state.poses
-    assert set(lost) == {Verdict.LOST} and not state.last
-    seen = [(state := tracker.track(picture, state)).verdicts["tool"] for _ in range(3)]
-    assert seen[-1] is Verdict.GOOD
+    assert set(lost) == {PoseStatus.LOST} and not state.last_poses
+    seen = [(state := tracker.track(picture, state)).statuses["tool"] for _ in range(3)]
+    assert seen[-1] is PoseStatus.GOOD
     assert angle(state.poses["tool"].T_camera_target, poses["tool"]) < 1.0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ar.optics.camera import Camera, look_at
-from ar.rendering.rasteriser import find_rows_reached, rasterise
+from ar.rendering.rasteriser import find_covered_rows, rasterise
 from ar.rendering.raycast import raycast
 
 NO_TRIANGLES = np.zeros((0, 3), int)
@@ -54,7 +54,7 @@ def test_triangle_crossing_near_plane_reaches_all_rows(depth):
     """The projected row of a corner nearer than the near plane is no bound."""
     here = camera(height=41)
     corners = np.array([[-0.1, 0.02, 0.3], [0.1, 0.02, 0.3], [0.0, 0.02, depth]])
-    assert find_rows_reached(corners @ here.K.T, 1e-3, here.height) == (0, here.height)
+    assert find_covered_rows(corners @ here.K.T, 1e-3, here.height) == (0, here.height)
     behind = corners @ here.T_camera_world[:3, :3] + here.centre
     drawn = rasterise(here, behind, np.array([[0, 1, 2]]))
     assert drawn.mask[-1].any() and not drawn.mask[: here.height // 2].any()

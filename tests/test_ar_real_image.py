@@ -5,7 +5,7 @@ import pytest
 from test_scenes_stage import seen
 from theatres import template_theatre
 
-from ar.rendering.real_image import add_vignette, scale_picture
+from ar.rendering.real_image import add_vignette, scale_image
 from scenes.script.viewpoint import Viewpoint
 from sim.errors import InputError
 
@@ -29,7 +29,7 @@ def test_vignette_darkens_only_pixels_beyond_its_edge():
 
 def test_enlarged_image_keeps_ids_and_colours():
     sharp = seen(template_theatre().intensity.values)
-    large = scale_picture(sharp, 640, 480)
+    large = scale_image(sharp, 640, 480)
     assert large.drawn.colour.shape == (1, 480, 640) and large.colour.dtype == np.uint8
     for name in ("depth", "segmentation"):  # no new values, and each pixel where it was
         np.testing.assert_array_equal(getattr(large, name)[::2, ::2], getattr(sharp, name))

@@ -17,9 +17,9 @@ class TestRecording:
     def test_recording_is_readable_mp4_of_bounded_length(self, tmp_path):
         recording = PageRecording(0.0)
         for number in range(20):
-            recording.take(to_data_url(np.full((48, 64, 3), 10 * number, np.uint8)), 0.1 * number)
-        recording.take(to_data_url(np.zeros((48, 64, 3), np.uint8)), MAX_DURATION + 1.0)
-        assert len(recording.taken) == 20 and recording.is_full(MAX_DURATION)
+            recording.add_image(to_data_url(np.full((48, 64, 3), 10 * number, np.uint8)), 0.1 * number)
+        recording.add_image(to_data_url(np.zeros((48, 64, 3), np.uint8)), MAX_DURATION + 1.0)
+        assert len(recording.images) == 20 and recording.is_full(MAX_DURATION)
         (tmp_path / "film.mp4").write_bytes(recording.encode_video(2.0))
         film = cv2.VideoCapture(str(tmp_path / "film.mp4"))
         assert film.get(cv2.CAP_PROP_FRAME_COUNT) == 2 * FRAME_RATE

@@ -29,7 +29,7 @@ def on_ellipsoid(points):
 
 
 def held(found):
-    at, covariance = found.point(TUMOUR)
+    at, covariance = found.transform_point(TUMOUR)
     away = at - moved(TUMOUR)
     return away @ np.linalg.solve(covariance, away) <= chi2.ppf(0.95, 3)
 
@@ -37,7 +37,7 @@ def held(found):
 def test_registration_is_exact_without_noise():
     found = register_points(SCAN, moved(SCAN))
     np.testing.assert_allclose(found.T_patient_scan, TRUE, atol=1e-12)
-    assert found.rms < 1e-12 and found.pairs == 7
+    assert found.rms < 1e-12 and found.pair_count == 7
 
 
 @pytest.mark.parametrize("count", [3, 4, 7])
@@ -56,7 +56,7 @@ def test_traced_surface_improves_registration_accuracy():
         seen = surface + 3e-4 * rng.normal(size=surface.shape)
         alone.append(register_points(SCAN[:4], patient))
         both.append(refine_registration(SCAN[:4], patient, seen, on_ellipsoid))
-    off = [[np.linalg.norm(each.point(TUMOUR)[0] - moved(TUMOUR)) for each in some] for some in (alone, both)]
+    off = [[np.linalg.norm(each.transform_point(TUMOUR)[0] - moved(TUMOUR)) for each in some] for some in (alone, both)]
     assert np.median(off[1]) < 0.8 * np.median(off[0])
     assert np.mean([held(each) for each in both]) > 0.88
 
@@ -96,11 +96,11 @@ def test_held_out_residual_uses_registration_of_other_pairs():
     fits = compute_pair_residuals(SCAN, patient)
     for row in range(len(SCAN)):
         others = register_points(np.delete(SCAN, row, axis=0), np.delete(patient, row, axis=0))
-        left = np.linalg.norm(others.point(SCAN[row])[0] - patient[row])
-        assert fits.held_out[row] == pytest.approx(left, rel=0.02) and fits.off[row] < left
+        left = np.linalg.norm(others.transform_point(SCAN[row])[0] - patient[row])
+        assert fits.held_out[row] == pytest.approx(left, rel=0.02) and fits.residuals[row] < left
     assert (
-        np.isnan(compute_pair_residuals(SCAN[:3], patient[:3]).chance)
-        and not compute_pair_residuals(SCAN[:3], patient[:3]).suspect
+        np.isnan(compute_pair_residuals(SCAN[:3], patient[:3]).p_value)
+        and not compute_pair_residuals(SCAN[:3], patient[:3]).has_outlier
     )
 
 
@@ -108,9 +108,9 @@ def test_wrong_pair_detection_rate_matches_docs():
     rng, sound, wrong = np.random.default_rng(0), [], []
     for number in range(300):
         patient = moved(SCAN[:6]) + 5e-4 * rng.normal(size=(6, 3))
-        sound.append(compute_pair_residuals(SCAN[:6], patient).suspect)
+        sound.append(compute_pair_residuals(SCAN[:6], patient).has_outlier)
         off = rng.normal(size=3)
         patient[number % 6] += 4e-3 * off / np.linalg.norm(off)
         fits = compute_pair_residuals(SCAN[:6], patient)
-        wrong.append(fits.suspect and fits.worst == number % 6)
+        wrong.append(fits.has_outlier and fits.worst_pair == number % 6)
     assert 0.02 < np.mean(sound) < 0.08 and 0.8 < np.mean(wrong) < 0.97

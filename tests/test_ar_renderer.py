@@ -10,11 +10,11 @@ from test_ar_rasteriser import build_sphere
 
 from ar.optics.camera import Camera, look_at
 from ar.overlay.composite import composite
-from ar.overlay.marks import Cover
+from ar.overlay.marks import Occluders
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
 from ar.rendering.rasteriser import EMPTY_PIXEL, allocate_z_buffer, keep_nearest, rasterise_surface
 from ar.rendering.raycast import raycast
-from ar.rendering.renderer import Lamp, Picture, Pictures, Renderer, as_light, build_tone_curve, render
+from ar.rendering.renderer import Lamp, Picture, Pictures, Renderer, build_tone_curve, render, to_light
 from ar.rendering.shade import WHITE_LEVEL
 
 FLOOR, BALL, EGG = 1, 2, 3
@@ -70,7 +70,7 @@ def test_depth_and_segmentation_match_ray_casting():
 
 def test_colours_follow_the_shading_formulas():
     """NumPy formula without texture and shadow: base (ambient + wrapped Lambert) + Fresnel x lobe."""
-    here, layer, light = camera(0.0, 320, 240), ball(gloss=0.4, shininess=30.0), as_light(LAMP)
+    here, layer, light = camera(0.0, 320, 240), ball(gloss=0.4, shininess=30.0), to_light(LAMP)
     picture, cast = render(here, [layer], LAMP), raycast(here, layer.vertices, layer.triangles)
     normals, on = compute_vertex_normals(layer.vertices, layer.triangles), cast.mask
 
@@ -148,9 +148,9 @@ def test_triangles_split_over_threads_render_equal_depth():
     for parts, begin, end in ((3, 0, 120), (8, 0, 120), (7, 31, 90)):
         shared = allocate_z_buffer(1, 120, 160, "cpu")
         size = 1, -(-len(layer.triangles) // 64), parts
-        inputs = [whole.points, whole.triangles, 0, wp.float64(1e-3), begin, end, parts, 64, whole.unbent]
+        inputs = [whole.points, whole.triangles, 0, wp.float64(1e-3), begin, end, parts, 64, whole.undistortion]
         wp.launch(keep_nearest, size, inputs, [shared], device="cpu")
-        assert np.array_equal(shared.numpy()[0, begin:end], whole.nearest.numpy()[0, begin:end])
+        assert np.array_equal(shared.numpy()[0, begin:end], whole.z_buffer.numpy()[0, begin:end])
         assert (shared.numpy()[0, :begin] == np.uint64(EMPTY_PIXEL)).all()
 
 
@@ -178,7 +178,7 @@ def drawn_on(device: str) -> tuple[Pictures, Picture, np.ndarray]:
     together = renderer.render_batch(moved, [camera(0.1 * row, 640, 480) for row in range(4)])
     alone = renderer.render(camera(0.0, 640, 480), [moved[0]])
     hidden = replace(ball((0.02, 0.0, -0.03)), id=EGG, colour=(0.2, 0.9, 0.3))
-    return together, alone, composite(alone, camera(0.0, 640, 480), hidden, cover=Cover((BALL,))).colour
+    return together, alone, composite(alone, camera(0.0, 640, 480), hidden, cover=Occluders((BALL,))).colour
 
 
 @pytest.mark.gpu

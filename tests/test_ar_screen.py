@@ -6,7 +6,7 @@ import pytest
 from limits import files_below
 from tiny_episodes import SCALE, packed
 
-from ar.screen import Film, decode_colour, decode_depth, decode_labels, read_image_size, read_png, write_film
+from ar.screen import FrameFolder, decode_colour, decode_depth, decode_labels, read_image_size, read_png, write_movie
 
 
 def picture(number: int = 0) -> np.ndarray:
@@ -17,7 +17,7 @@ def picture(number: int = 0) -> np.ndarray:
 
 
 def test_frames_are_written_to_the_folder_unchanged(tmp_path):
-    screen = Film(tmp_path / "deep" / "frames")
+    screen = FrameFolder(tmp_path / "deep" / "frames")
     for number in (0, 1, 12):
         screen.show(number, picture(number))
     files = sorted(path.name for path in (tmp_path / "deep" / "frames").iterdir())
@@ -26,7 +26,7 @@ def test_frames_are_written_to_the_folder_unchanged(tmp_path):
 
 
 def test_video_contains_every_frame_with_its_colours(tmp_path):
-    write_film(tmp_path / "film.mp4", (picture(number) for number in range(7)), 20.0)
+    write_movie(tmp_path / "film.mp4", (picture(number) for number in range(7)), 20.0)
     video = cv2.VideoCapture(str(tmp_path / "film.mp4"))
     frames = [frame for good, frame in iter(video.read, (False, None)) if good]
     assert len(frames) == 7
@@ -36,7 +36,7 @@ def test_video_contains_every_frame_with_its_colours(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp"])
 def test_animation_contains_every_frame_and_loops(tmp_path, suffix):
-    write_film(tmp_path / f"film{suffix}", (picture(number) for number in range(5)), 10.0)
+    write_movie(tmp_path / f"film{suffix}", (picture(number) for number in range(5)), 10.0)
     good, animation = cv2.imreadanimation(str(tmp_path / f"film{suffix}"))
     assert good and len(animation.frames) == 5 and animation.loop_count == 0
     assert list(animation.durations) == [100] * 5
@@ -50,28 +50,28 @@ def test_failed_video_leaves_no_file(tmp_path, suffix):
         raise RuntimeError("the camera is gone")
 
     with pytest.raises(RuntimeError, match="camera"):
-        write_film(tmp_path / f"film{suffix}", broken())
+        write_movie(tmp_path / f"film{suffix}", broken())
     with pytest.raises(ValueError, match="at least one"):
-        write_film(tmp_path / f"film{suffix}", [])
+        write_movie(tmp_path / f"film{suffix}", [])
     with pytest.raises(ValueError, match="one size"):
-        write_film(tmp_path / f"film{suffix}", [picture(), picture()[:20]])
+        write_movie(tmp_path / f"film{suffix}", [picture(), picture()[:20]])
     assert not list(tmp_path.iterdir())
 
 
 def test_full_disk_leaves_no_partial_frame(tmp_path):
     with files_below(100), pytest.raises(OSError, match="large"):
-        Film(tmp_path).show(0, picture())
+        FrameFolder(tmp_path).show(0, picture())
     assert not list(tmp_path.iterdir())
 
 
 def test_invalid_output_paths_are_rejected(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="folder"):
-        Film(tmp_path / "file")
+        FrameFolder(tmp_path / "file")
     with pytest.raises(ValueError, match="mp4"):
-        write_film(tmp_path / "film.avi", [picture()])
+        write_movie(tmp_path / "film.avi", [picture()])
     with pytest.raises(ValueError, match="positive"):
-        write_film(tmp_path / "film.mp4", [picture()], 0.0)
+        write_movie(tmp_path / "film.mp4", [picture()], 0.0)
     with pytest.raises(ValueError, match="not a readable image"):
         read_png(tmp_path / "file")
 

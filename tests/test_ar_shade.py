@@ -5,7 +5,7 @@ import pytest
 
 from ar.optics.camera import look_at
 from ar.rendering.layer import Layer
-from ar.rendering.renderer import Lamp, as_light, render
+from ar.rendering.renderer import Lamp, render, to_light
 
 PLAIN, LID = 1, 2
 
@@ -22,7 +22,7 @@ def test_shadow_requires_distance_above_the_bias(more, dark):
     camera = look_at(np.array([0.3, 0.0, 0.03]), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.radians(8.0), 320, 200)
     lamp = Lamp(np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.06)
     floor = Layer("floor", PLAIN, *square(0.05, 0.0), colour=(0.8, 0.8, 0.8))
-    lid = Layer("lid", LID, *square(0.012, as_light(lamp).offset + more), colour=(0.8, 0.8, 0.8), casts_shadow=True)
+    lid = Layer("lid", LID, *square(0.012, to_light(lamp).offset + more), colour=(0.8, 0.8, 0.8), casts_shadow=True)
     picture = render(camera, [floor, lid], lamp)
     column, row = np.rint(camera.project(np.array([0.008, 0.0, 0.0]))[0]).astype(int)
     beside = np.rint(camera.project(np.array([0.03, 0.0, 0.0]))[0]).astype(int)[1]

@@ -7,12 +7,12 @@ from ar.page.slices import (
     HALF_VIEW,
     PLANES,
     VIEW_SIDE,
-    Cut,
+    SlicedSurfaces,
     cut_surface,
     draw_slices,
+    draw_view,
     find_pixels_within,
     resample_view,
-    view,
 )
 from ar.rendering.layer import Layer, Solid
 from scenes.script.tool import build_sphere
@@ -68,17 +68,17 @@ class TestViews:
         assert widths == pytest.approx([10e-3, 10e-3], abs=1e-3)
 
     def test_unknown_error_or_unreliable_position_has_no_band(self):
-        known = Cut(ball(12e-3), ball(12e-3, (2e-3, 0.0, 0.0)), 4e-3)
-        green = [np.count_nonzero(tinted(view(PLANES[0], None, np.zeros(3), cut))) for cut in (
-            known, Cut(known.now, known.before), Cut(known.now, known.before, 4e-3, True)
+        known = SlicedSurfaces(ball(12e-3), ball(12e-3, (2e-3, 0.0, 0.0)), 4e-3)
+        green = [np.count_nonzero(tinted(draw_view(PLANES[0], None, np.zeros(3), cut))) for cut in (
+            known, SlicedSurfaces(known.current, known.before), SlicedSurfaces(known.current, known.before, 4e-3, True)
         )]  # fmt: skip
         assert green[0] > 2 * green[1] > 0 and green[2] == 0
 
     def test_slices_have_three_views_for_empty_surface_too(self):
         none = Layer("tumour", 4, np.zeros((0, 3)), np.zeros((0, 3), int))
         for cut in (
-            Cut(ball(12e-3), ball(12e-3), 1e-3, tip=np.zeros(3), others=[ball(3e-3)]),
-            Cut(none, ball(1e-2), 1e-3),
+            SlicedSurfaces(ball(12e-3), ball(12e-3), 1e-3, tip=np.zeros(3), others=[ball(3e-3)]),
+            SlicedSurfaces(none, ball(1e-2), 1e-3),
         ):
             assert draw_slices(None, np.zeros(3), cut).shape == (VIEW_SIDE, 3 * VIEW_SIDE, 3)
 

@@ -8,13 +8,20 @@ import pytest
 import trimesh
 
 from ar.optics.camera import look_at
-from ar.overlay.composite import composite, format_head_lines
-from ar.overlay.distances import RING_COLOUR, build_tree, compute_signed_distance
-from ar.overlay.gauge import NUMBER_SCALE, Gauge
+from ar.overlay.composite import composite, wrap_header
+from ar.overlay.distances import RING_COLOUR, build_bvh, compute_signed_distance
+from ar.overlay.gauge import NUMBER_SCALE, DistanceGauge
 from ar.overlay.hud import FONT, LINE_SPACING, TEXT_SCALE, WHITE, draw_text_panel, wrap_line
 from ar.overlay.legend import SHEET_VALUE
-from ar.overlay.marks import Cover, Marks, Words
-from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, find_text, has_text, measure_outline_gap
+from ar.overlay.marks import ImageText, Marks, Occluders
+from ar.overlay.outlines import (
+    average_colour,
+    compute_silhouette,
+    find_colour,
+    find_text,
+    has_text,
+    measure_outline_distance,
+)
 from ar.overlay.styles import STYLES, Opening
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Lamp, render
@@ -50,30 +57,30 @@ def seen(edge=0.09, *more):
 @pytest.mark.parametrize("style", DRAWN)
 def test_every_style_draws_registered_outline_and_error_band(style):
     picture, at = seen(), tumour()
-    shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
+    shown = composite(picture, CAMERA, at, style=style, cover=Occluders(opening=OPENING)).colour
     mask = compute_silhouette(CAMERA, at.vertices, at.triangles)
     words = (shown == np.asarray(WHITE, np.uint8)).all(axis=2)
-    others = words | find_ink(shown, RING_COLOUR)
-    assert measure_outline_gap(shown, compute_ink(GREEN), mask, others) < 1.5
-    assert measure_outline_gap(shown, compute_ink(GREEN), np.roll(mask, 5, axis=1), others) > 3.0
-    wide = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING), marks=Marks(0.004)).colour
+    others = words | find_colour(shown, RING_COLOUR)
+    assert measure_outline_distance(shown, average_colour(GREEN), mask, others) < 1.5
+    assert measure_outline_distance(shown, average_colour(GREEN), np.roll(mask, 5, axis=1), others) > 3.0
+    wide = composite(picture, CAMERA, at, style=style, cover=Occluders(opening=OPENING), marks=Marks(0.004)).colour
     outside = cv2.dilate(mask.astype(np.uint8), np.ones((15, 15))) == 0
     assert 100 < (outside & (wide != shown).any(axis=2)).sum() < 2000
     doubtful = composite(
-        picture, CAMERA, at, style=style, cover=Cover(opening=OPENING), words=Words("do not rely on it")
+        picture, CAMERA, at, style=style, cover=Occluders(opening=OPENING), words=ImageText("do not rely on it")
     ).colour
-    assert not find_ink(doubtful, compute_ink(GREEN)).any()
+    assert not find_colour(doubtful, average_colour(GREEN)).any()
 
 
 @pytest.mark.parametrize("style", DRAWN)
 def test_only_outlines_are_drawn_over_tools(style):
     probe = ball("tool", TOOL, (0.0, 0.0, 0.012), 0.01, (0.7, 0.7, 0.7))
     picture = seen(0.09, probe)
-    gauge = Gauge(np.array([0.0, 0.0, 0.001]), np.array([0.0, 0.0, -0.008]))
+    gauge = DistanceGauge(np.array([0.0, 0.0, 0.001]), np.array([0.0, 0.0, -0.008]))
     hand = np.zeros(picture.segmentation.shape, bool)
     hand[230:420, 250:300] = True
     marks = Marks(0.002, gauge)
-    shown = composite(picture, CAMERA, tumour(), style, Cover((TOOL,), OPENING, hand), marks).colour
+    shown = composite(picture, CAMERA, tumour(), style, Occluders((TOOL,), OPENING, hand), marks).colour
     tool = picture.segmentation == TOOL
     within = compute_silhouette(CAMERA, tumour().vertices, tumour().triangles).astype(np.uint8)
     outline = (cv2.dilate(within, np.ones((49, 49))) - cv2.erode(within, np.ones((9, 9)))) > 0
@@ -81,18 +88,18 @@ def test_only_outlines_are_drawn_over_tools(style):
     assert kept.sum() > 2000 and np.array_equal(shown[kept], picture.colour[kept])
     crossed = (shown != picture.colour).any(axis=2) & tool
     assert crossed.any() and crossed.sum() < 0.2 * tool.sum()  # broken lines alone
-    bare = composite(picture, CAMERA, tumour(), style, Cover(opening=OPENING), marks).colour
+    bare = composite(picture, CAMERA, tumour(), style, Occluders(opening=OPENING), marks).colour
     assert (bare[tool] != picture.colour[tool]).any() and (bare[hand] != picture.colour[hand]).any()
 
 
 @pytest.mark.parametrize("style", DRAWN)
 def test_outline_under_drape_is_dashed(style):
     picture, at = seen(0.0), tumour()
-    shown = composite(picture, CAMERA, at, style=style, cover=Cover(opening=OPENING)).colour
+    shown = composite(picture, CAMERA, at, style=style, cover=Occluders(opening=OPENING)).colour
     mask, shut = compute_silhouette(CAMERA, at.vertices, at.triangles), picture.segmentation == DRAPE
     outline = np.zeros(mask.shape, np.uint8)
     cv2.drawContours(outline, cv2.findContours(mask.astype(np.uint8), 0, 1)[0], -1, (1,))
-    inked = find_ink(shown, compute_ink(GREEN)) & (outline > 0)
+    inked = find_colour(shown, average_colour(GREEN)) & (outline > 0)
     far = cv2.dilate(shut.astype(np.uint8), np.ones((9, 9))) == 0
     assert 0.4 < inked[(outline > 0) & shut].mean() < 0.85 and inked[(outline > 0) & far].mean() > 0.95
     within = cv2.erode((mask & shut).astype(np.uint8), np.ones((13, 13))) > 0
@@ -100,7 +107,7 @@ def test_outline_under_drape_is_dashed(style):
     assert unchanged[within].mean() > 0.6  # all but words
     assert all(has_text(shown, line, TEXT_SCALE) for line in ("partly under", "the drape"))
     open_to_all = composite(picture, CAMERA, at, style=style).colour
-    assert (find_ink(open_to_all, compute_ink(GREEN)) & (outline > 0))[(outline > 0) & shut].mean() > 0.95
+    assert (find_colour(open_to_all, average_colour(GREEN)) & (outline > 0))[(outline > 0) & shut].mean() > 0.95
 
 
 def test_opening_describes_tissue_above_the_tumour():
@@ -120,15 +127,15 @@ def test_depth_style_is_stronger_when_nearer_and_has_a_scale():
             CAMERA,
             tumour((0.0, 0.0, -depth), 0.01),
             style="depth",
-            cover=Cover(opening=OPENING),
-            words=Words(error=2e-3),
+            cover=Occluders(opening=OPENING),
+            words=ImageText(error=2e-3),
         )
         red.append(int(shown.colour[row, column, 0]))
     assert red[0] < red[1] - 10 < red[2] - 20  # less of the cortex's red under more of the tint
     changed = (
         shown.colour
         != composite(
-            picture, CAMERA, tumour((0.0, 0.0, -0.04), 0.01), style="contour", cover=Cover(opening=OPENING)
+            picture, CAMERA, tumour((0.0, 0.0, -0.04), 0.01), style="contour", cover=Occluders(opening=OPENING)
         ).colour
     ).any(axis=2)
     assert changed[:, 480:].sum() > 1000  # the scale, on the drape
@@ -139,7 +146,7 @@ def test_signed_distance_is_nan_beyond_its_limit():
     turned = replace(surface, triangles=surface.triangles[:, ::-1])
     points = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.0, 0.005, 0.0], [0.5, 0.0, 0.0]])
     for each in (surface, turned):
-        found = compute_signed_distance(build_tree(each.vertices, each.triangles), points, 0.1)
+        found = compute_signed_distance(build_bvh(each.vertices, each.triangles), points, 0.1)
         assert found[:3] == pytest.approx([-0.01, 0.01, -0.005], abs=2e-4) and np.isnan(found[3])
 
 
@@ -147,15 +154,17 @@ def test_text_panel_is_placed_outside_hidden_regions():
     colour, hidden = np.full((360, 640, 3), 90, np.uint8), np.zeros((360, 640), np.uint8)
     hidden[:, :400] = 1
     lines = ["a line that is as wide as more than half of the picture, or wider", "another"]
-    shown = draw_text_panel(colour, lines, below=40, sights=[np.ones_like(hidden), hidden])
+    shown = draw_text_panel(colour, lines, first_row=40, obstacles=[np.ones_like(hidden), hidden])
     changed = (shown != colour).any(axis=2)
     assert changed.any() and not changed[:, :400].any()
-    assert np.array_equal(draw_text_panel(colour, lines, sights=[np.ones_like(hidden)]), draw_text_panel(colour, lines))
+    assert np.array_equal(
+        draw_text_panel(colour, lines, obstacles=[np.ones_like(hidden)]), draw_text_panel(colour, lines)
+    )
 
 
 def test_occlusion_mask_of_other_size_is_rejected():
     with pytest.raises(ValueError, match="covered"):
-        composite(seen(), CAMERA, tumour(), cover=Cover(covered=np.zeros((4, 4), bool)))
+        composite(seen(), CAMERA, tumour(), cover=Occluders(occluder_mask=np.zeros((4, 4), bool)))
 
 
 def test_section_has_letters_at_both_ends_next_to_a_tool():
@@ -164,8 +173,8 @@ def test_section_has_letters_at_both_ends_next_to_a_tool():
         picture = seen()
         roles = np.zeros((480, 640), bool)
         roles[:, 360:] = tool
-        shown = composite(picture, CAMERA, at, style="cut", cover=Cover(covered=roles)).colour
-        plain = composite(picture, CAMERA, at, style="contour", cover=Cover(covered=roles)).colour
+        shown = composite(picture, CAMERA, at, style="cut", cover=Occluders(occluder_mask=roles)).colour
+        plain = composite(picture, CAMERA, at, style="contour", cover=Occluders(occluder_mask=roles)).colour
         # The line lies level through the middle, and letters stand above it.
         (middle,), _ = CAMERA.project(at.vertices.mean(axis=0)[None])
         reach = np.ptp(CAMERA.project(at.vertices)[0][:, 0]) / 2.0
@@ -180,13 +189,13 @@ def test_section_has_letters_at_both_ends_next_to_a_tool():
 def test_header_lines_wrap_next_to_a_tool():
     tool = np.zeros((480, 640), bool)
     texts = ["FEM reference (no surrogate)", "tumour position error <= 5.7 mm (95 %), above all registration"]
-    assert format_head_lines(texts, tool) == texts
+    assert wrap_header(texts, tool) == texts
     tool[:200, 330:390] = True
-    lines = format_head_lines(texts, tool)
+    lines = wrap_header(texts, tool)
     assert len(lines) > 2 and " ".join(lines) == " ".join(texts)
     assert max(cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines) < 330
     tool[:, 40:] = True
-    assert format_head_lines(texts, tool) == texts  # there is no room beside it
+    assert wrap_header(texts, tool) == texts  # there is no room beside it
 
 
 def test_ring_caption_is_separated_from_the_tip_distance():
@@ -198,10 +207,10 @@ def test_ring_caption_is_separated_from_the_tip_distance():
         CAMERA,
         at,
         style="rings",
-        cover=Cover(opening=OPENING),
-        marks=Marks(gauge=Gauge(tip, at.vertices[0])),
+        cover=Occluders(opening=OPENING),
+        marks=Marks(gauge=DistanceGauge(tip, at.vertices[0])),
     ).colour
-    number = find_text(shown, str(Gauge(tip, at.vertices[0])), NUMBER_SCALE)
+    number = find_text(shown, str(DistanceGauge(tip, at.vertices[0])), NUMBER_SCALE)
     caption = find_text(shown, wrap_line(said, 0.3 * 640)[0], TEXT_SCALE)
     assert number is not None and caption is not None
     left, top, right, foot = number
@@ -219,5 +228,5 @@ def test_section_inset_is_drawn_unless_the_image_is_covered(covered, middle):
     hand = np.zeros((480, 640), bool)
     hand[:, :covered] = True
     at = tumour((0.0, 0.0, middle))
-    over = composite(seen(0.01), CAMERA, at, style="cut", cover=Cover(opening=OPENING, covered=hand))
+    over = composite(seen(0.01), CAMERA, at, style="cut", cover=Occluders(opening=OPENING, occluder_mask=hand))
     assert (over.taken == SHEET_VALUE).any() == (covered < 640)

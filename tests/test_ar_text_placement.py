@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ar.overlay.text_placement import BORDER_DISTANCE, GRID_SPACING, SIDEWAYS_WEIGHT, TEXT_DISTANCE, find_free_place
+from ar.overlay.text_placement import BORDER_DISTANCE, GRID_SPACING, SIDEWAYS_WEIGHT, TEXT_DISTANCE, find_free_position
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -33,14 +33,14 @@ def test_free_place_is_nearest_to_the_requested_position(seed):
         for c in range(BORDER_DISTANCE, 160 - BORDER_DISTANCE - 30 + 1, GRID_SPACING)
     ]
     places = [place for place in grid if free(*place)]
-    found = find_free_place(taken, size, wish)
+    found = find_free_position(taken, size, wish)
     assert places and found is not None and free(*found)
     assert far(*found) == (0 if free(*there) else min(far(*place) for place in places))
 
 
 def test_full_image_has_no_free_place_for_text():
     taken = np.zeros((100, 200), np.uint8)
-    assert find_free_place(taken, (184, 84), (0, 0)) == (BORDER_DISTANCE, BORDER_DISTANCE)
-    assert find_free_place(taken, (185, 84), (0, 0)) is None and find_free_place(taken, (20, 85), (0, 0)) is None
+    assert find_free_position(taken, (184, 84), (0, 0)) == (BORDER_DISTANCE, BORDER_DISTANCE)
+    assert find_free_position(taken, (185, 84), (0, 0)) is None and find_free_position(taken, (20, 85), (0, 0)) is None
     taken[::10] = 1
-    assert find_free_place(taken, (20, 12), (50, 50)) is None
+    assert find_free_position(taken, (20, 12), (50, 50)) is None

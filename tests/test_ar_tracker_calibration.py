@@ -39,7 +39,7 @@ def test_hand_eye_is_exact_without_noise(turn, shift):
     X = rigid(turn, shift)
     found = solve_hand_eye(*bodies(X))
     np.testing.assert_allclose(found.X, X, atol=1e-12)
-    assert found.turn < 1e-6 and found.shift < 1e-12 and found.motions > 300
+    assert found.rotation_error < 1e-6 and found.translation_error < 1e-12 and found.motion_count > 300
 
 
 def test_hand_eye_error_with_noise_matches_published_error():
@@ -51,7 +51,7 @@ def test_hand_eye_error_with_noise_matches_published_error():
         found = solve_hand_eye(*(noisy(poses, 0.3, 5e-4, rng) for poses in bodies(X, seed=seed)))
         turns.append(np.degrees(Rotation.from_matrix(X[:3, :3].T @ found.X[:3, :3]).magnitude()))
         shifts.append(1e3 * np.linalg.norm(found.X[:3, 3] - X[:3, 3]))
-        assert 0.3 < np.degrees(found.turn) < 1.0 and 5e-4 < found.shift < 4e-3
+        assert 0.3 < np.degrees(found.rotation_error) < 1.0 and 5e-4 < found.translation_error < 4e-3
         np.testing.assert_allclose(found.X[:3, :3] @ found.X[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.mean(turns) < 0.25 and np.mean(shifts) < 0.6
 
@@ -90,7 +90,7 @@ def test_hand_eye_rotation_axes_within_8_degrees_are_rejected(tilt, is_parallel)
 def test_hand_eye_limits_the_number_of_motions():
     X = rigid([0.3, -2.0, 0.5], [0.05, -0.02, 0.12])
     found = solve_hand_eye(*bodies(X, count=1000))
-    assert found.motions == 2000
+    assert found.motion_count == 2000
     np.testing.assert_allclose(found.X, X, atol=1e-12)
 
 

@@ -8,7 +8,14 @@ import warp as wp
 from test_ar_renderer import EGG, LAMP, agree, ball, camera, floor
 
 from ar.overlay.outlines import find_pixel_box
-from ar.overlay.window import FADE_DEPTH, SOFT_EDGE_WIDTH, Lines, Roles, compute_chamfer_distance, draw_overlay
+from ar.overlay.window import (
+    FADE_DEPTH,
+    SOFT_EDGE_WIDTH,
+    LayerRoles,
+    OverlayLines,
+    compute_chamfer_distance,
+    draw_overlay,
+)
 from ar.rendering.layer import compute_vertex_normals
 from ar.rendering.rasteriser import rasterise_surface
 from ar.rendering.raycast import raycast
@@ -39,7 +46,7 @@ def test_window_overlay_matches_its_numpy_formula():
     part = here.crop_to(*box)
     found = rasterise_surface(part, hidden.vertices, hidden.triangles)
     shown, taken = draw_overlay(
-        picture.drawn, box, part, hidden, found, Roles(), "window", Lines((0.0, 0.0, 0.0), solid=False)
+        picture.drawn, box, part, hidden, found, LayerRoles(), "window", OverlayLines((0.0, 0.0, 0.0), is_solid=False)
     )
     away = cv2.distanceTransform((~cast.mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3) / float(SOFT_EDGE_WIDTH)
     window = np.clip(1.25 - 1.25 * away, 0.0, 1.0)[..., None]
@@ -65,13 +72,15 @@ def test_overlay_outline_follows_the_silhouette_edge():
     mask = found.mask.astype(np.uint8)
     edge = (mask - cv2.erode(mask, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3)))).astype(bool)
     near = cv2.dilate(edge.astype(np.uint8), np.ones((9, 9))).astype(bool)
-    shown, taken = draw_overlay(picture.drawn, box, part, hidden, found, Roles(), "contour", Lines(ink))
+    shown, taken = draw_overlay(picture.drawn, box, part, hidden, found, LayerRoles(), "contour", OverlayLines(ink))
     inked = np.abs(shown[box].astype(int) - np.array(ink)).max(axis=-1) <= 2
     assert inked[edge].mean() > 0.99 and not taken[~near].any()
     np.testing.assert_array_equal(shown[box][taken == 0], picture.colour[box][taken == 0])
     rim = (taken > 0) & ~inked
     assert (rim & ~found.mask).sum() > 30 and (rim & found.mask).sum() > 30
     assert (shown[box][rim].max(axis=-1) <= picture.colour[box][rim].max(axis=-1) + 2).mean() > 0.6
-    same, free = draw_overlay(picture.drawn, box, part, hidden, found, Roles((floor().id,)), "contour", Lines(ink))
+    same, free = draw_overlay(
+        picture.drawn, box, part, hidden, found, LayerRoles((floor().id,)), "contour", OverlayLines(ink)
+    )
     np.testing.assert_array_equal(same, picture.colour)
     assert not free.any()

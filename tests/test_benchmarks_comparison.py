@@ -11,8 +11,17 @@ from conftest import make_box
 
 from benchmarks.__main__ import main
 from benchmarks.commands.solver import NAMES
-from benchmarks.peers.comparison import HOUSE, OWN, PEERS, TOLERANCE, Engine, build_judge, case_of, compare
-from benchmarks.peers.engine_sulcus import fem_of
+from benchmarks.peers.comparison import (
+    HOUSE,
+    OWN,
+    PEERS,
+    TOLERANCE,
+    Engine,
+    build_case,
+    build_reference_solver,
+    compare_engines,
+)
+from benchmarks.peers.engine_sulcus import build_fem
 from sim.bodies.meshfile import write_anatomy
 
 WRONG = """
@@ -43,17 +52,17 @@ def box():
 
 @pytest.fixture(scope="module")
 def case(box):
-    return case_of(box, 3, 0)
+    return build_case(box, 3, 0)
 
 
 @pytest.fixture(scope="module")
 def judge(case):
-    return build_judge(case)
+    return build_reference_solver(case)
 
 
 def compared(case, judge, *engines):
     """In one process each: how long a first answer takes is of no interest."""
-    return compare(case, judge, engines, starts=0, threads=1, done=lambda: None)
+    return compare_engines(case, judge, engines, start_count=0, threads=1, on_result=lambda: None)
 
 
 def engine(folder, name, code):
@@ -64,7 +73,7 @@ def engine(folder, name, code):
 
 def test_peer_list_matches_the_command_choices():
     assert tuple(peer.name for peer in PEERS) == NAMES
-    assert all(peer.words[0].endswith(".py") and Path(peer.words[0]).exists() for peer in PEERS)
+    assert all(peer.arguments[0].endswith(".py") and Path(peer.arguments[0]).exists() for peer in PEERS)
 
 
 def test_comparison_case_fixes_sliding_nodes_and_keeps_force(box, case):
@@ -84,7 +93,7 @@ def test_invalid_and_failed_engines_get_no_good_result(case, judge, tmp_path):
         Engine("absent", "", ("no_module_of_this_name",), ("-m", "absent")),
     )
     calls = []
-    rows = compare(case, judge, engines, starts=1, threads=1, done=lambda: calls.append(1))
+    rows = compare_engines(case, judge, engines, start_count=1, threads=1, on_result=lambda: calls.append(1))
     ours, wrong, failing, dying, absent = rows
     assert len(calls) == 4 * (1 + len(case.force))
     assert all(answer.good and answer.apart < 1e-4 for answer in ours.answers)
@@ -130,8 +139,8 @@ def test_each_row_states_its_requested_tolerance(box, tmp_path, capsys):
 def test_peer_engine_finds_the_same_displacement(case, judge, name, tolerance):
     """Each engine stops at the requested tolerance, near the reference solution."""
     peer = next(peer for peer in PEERS if peer.name == name)
-    if peer.missing:
-        pytest.skip(peer.missing)
+    if peer.missing_reason:
+        pytest.skip(peer.missing_reason)
     ours, theirs = compared(replace(case, tolerance=tolerance), judge, OWN, peer)
     for row in (ours, theirs):
         assert row.tolerance == tolerance
@@ -145,17 +154,19 @@ def test_peer_engine_finds_the_same_displacement(case, judge, name, tolerance):
 
 
 def test_only_sulcus_and_tled_run_on_the_gpu():
-    moved = {engine.name for engine in (OWN, *PEERS) if engine.on("cuda").words == (*engine.words, "cuda")}
+    moved = {
+        engine.name for engine in (OWN, *PEERS) if engine.select_device("cuda").words == (*engine.arguments, "cuda")
+    }
     assert moved == {"sulcus", "tled"}
-    assert all(engine.on("cpu") == engine for engine in (OWN, *PEERS))
-    assert all(engine.on("cuda") == engine for engine in PEERS if engine.name not in moved)
+    assert all(engine.select_device("cpu") == engine for engine in (OWN, *PEERS))
+    assert all(engine.select_device("cuda") == engine for engine in PEERS if engine.name not in moved)
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device here")
 def test_tled_on_gpu_finds_the_same_displacement(case, judge):
     tled = next(peer for peer in PEERS if peer.name == "tled")
-    for row in compared(case, judge, OWN.on("cuda"), tled.on("cuda")):
+    for row in compared(case, judge, OWN.select_device("cuda"), tled.select_device("cuda")):
         assert [answer.reason for answer in row.answers] == [""] * len(case.force)
         assert all(answer.good and answer.apart < 1e-4 for answer in row.answers)
 
@@ -188,4 +199,4 @@ def test_solver_bench_rejects_invalid_input(words, capsys):
 
 
 def test_comparison_case_uses_linear_tetrahedra(case):
-    assert fem_of(case).space.element == "p1"
+    assert build_fem(case).space.element == "p1"

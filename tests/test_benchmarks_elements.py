@@ -11,8 +11,8 @@ from theatres import coarse_brain
 
 from benchmarks.__main__ import main
 from benchmarks.studies import contact_mesh, stages
-from benchmarks.studies.elements import Press, Row, limits, rows
-from benchmarks.studies.robustness import SETS, Record, Trial, records, shares, tallies
+from benchmarks.studies.elements import ElementRow, PressCase, extrapolate_motions, measure_motions
+from benchmarks.studies.robustness import SETS, LoadRecord, SolverTrial, divide_loads, solve_loads, summarise_sets
 from scenes.analysis import measurement
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.refine import refine
@@ -36,7 +36,7 @@ def test_timing_statistics_exclude_warm_up(monkeypatch):
         now[0] += 100.0 if len(calls) < stages.WARM_UP else run + 1.0
         calls.append(run)
 
-    row = stages.figure("it", "ms", 1e3, 20, "how", work)
+    row = stages.time_runs("it", "ms", 1e3, 20, "how", work)
     assert calls[stages.WARM_UP :] == list(range(20)) and set(calls) == set(range(20))
     assert (row.median, row.p95, row.runs) == (pytest.approx(10.5e3), pytest.approx(19.05e3), 20)
 
@@ -44,11 +44,11 @@ def test_timing_statistics_exclude_warm_up(monkeypatch):
 def test_nearly_incompressible_tissue_locks_only_p1_elements():
     """Nearly incompressible tissue: P1 elements lose half of the motion, the others little."""
     anatomy = make_box(cells=(6, 6, 4), spacing=12e-3, tumour=12e-3, opening=45e-3)
-    press = Press(law="linear", force=0.02, footprint=12e-3)
-    found = list(rows([anatomy], ["p1", "smoothed"], [0.495], press, "cpu"))
-    found += rows([anatomy, refine(anatomy)], ["p2"], [0.495], press, "cpu")
+    press = PressCase(law="linear", force=0.02, footprint=12e-3)
+    found = list(measure_motions([anatomy], ["p1", "smoothed"], [0.495], press, "cpu"))
+    found += measure_motions([anatomy, refine(anatomy)], ["p2"], [0.495], press, "cpu")
     assert all(row.good for row in found)
-    limit = limits(found)[0.495]
+    limit = extrapolate_motions(found)[0.495]
     share = {row.element: row.motion / limit for row in reversed(found)}
     assert share["p1"] < 0.5
     assert 0.8 < share["p2"] < 1.0
@@ -57,7 +57,9 @@ def test_nearly_incompressible_tissue_locks_only_p1_elements():
 
 def test_p2_contact_force_depends_less_on_mesh_than_p1():
     anatomy = make_box(cells=(5, 5, 3), spacing=8e-3, tumour=12e-3, opening=34e-3)
-    stiff, exact = contact_mesh.rows(anatomy, ["p1", "p2"], [2e-3], 8e-3, Material("neo-hookean", 3000.0, 0.45), "cpu")
+    stiff, exact = contact_mesh.measure_forces(
+        anatomy, ["p1", "p2"], [2e-3], 8e-3, Material("neo-hookean", 3000.0, 0.45), "cpu"
+    )
     assert stiff.along.shape == stiff.fine.shape == (5,) and stiff.depth == 2e-3
     assert 0.0 < exact.share < stiff.share and exact.along.mean() < stiff.fine.mean() < stiff.along.mean()
     assert 0.0 < exact.sideways.max() < stiff.sideways.max() < stiff.along.min() and stiff.scatter > exact.scatter
@@ -66,25 +68,25 @@ def test_p2_contact_force_depends_less_on_mesh_than_p1():
 
 
 def test_limit_is_extrapolated_with_second_order_error():
-    row = Row(
+    row = ElementRow(
         poisson=0.45, element="p2", vertices=1000, nodes=7000, motion=0.0, set_up=1.0, solve=1.0, outer=4, good=True
     )
     series = [replace(row, vertices=n, motion=2.0 - 3.0 * n ** (-2.0 / 3.0)) for n in (1000, 8000, 27000)]
-    assert limits(series) == {0.45: pytest.approx(2.0)}
-    assert limits(series[:1]) == {}
-    assert limits([replace(one, element="p1") for one in series]) == {}
-    assert limits([series[0], replace(series[1], good=False)]) == {}
+    assert extrapolate_motions(series) == {0.45: pytest.approx(2.0)}
+    assert extrapolate_motions(series[:1]) == {}
+    assert extrapolate_motions([replace(one, element="p1") for one in series]) == {}
+    assert extrapolate_motions([series[0], replace(series[1], good=False)]) == {}
 
 
 def test_load_shares_are_half_brutal_and_sum_to_count():
     for count in (2, 7, 60, 10_000):
-        assert sum(shares(count).values()) == count
-        assert shares(count)["brutal"] == count // 2
-    assert list(shares(100)) == list(SETS)
+        assert sum(divide_loads(count).values()) == count
+        assert divide_loads(count)["brutal"] == count // 2
+    assert list(divide_loads(100)) == list(SETS)
 
 
 def test_tally_counts_recorded_outcomes():
-    one = Record(
+    one = LoadRecord(
         preset="brutal",
         number=0,
         force=1.0,
@@ -102,11 +104,11 @@ def test_tally_counts_recorded_outcomes():
         replace(one, outcome="BUDGET", outer=60, residual=0.3, force=0.7),
         replace(one, outcome="STALLED", outer=80, residual=0.1),
     ]
-    (tally,) = tallies(found)
+    (tally,) = summarise_sets(found)
     assert (tally.loads, tally.converged, tally.rescued) == (5, 3, 1)
     assert (tally.checked, tally.double) == (2, 8e-5)
     assert tally.hardest == found[3]
-    assert tallies(found[:3])[0].hardest == found[2]
+    assert summarise_sets(found[:3])[0].hardest == found[2]
     assert all(Outcome[record.outcome] for record in found)
 
 
@@ -154,7 +156,9 @@ def test_element_benches_reject_invalid_input(words, reason, capsys, tmp_path, m
 def test_random_surgical_and_brutal_loads_converge(anatomy):
     """Half of the loads are far above surgical ones; template to 1e-4 in single precision."""
     effects = (Elasticity(), Held(), Slide(), ToolForce())
-    found = [record for some in records(Trial(anatomy, effects, "p1", "cpu", 30), 60, 1, ()) for record in some]
+    found = [
+        record for some in solve_loads(SolverTrial(anatomy, effects, "p1", "cpu", 30), 60, 1, ()) for record in some
+    ]
     assert len(found) == 60
     assert [record for record in found if not Outcome[record.outcome].good] == []
     assert max(record.residual for record in found) <= 1e-4

@@ -15,12 +15,12 @@ from conftest import make_box
 
 from benchmarks.__main__ import main
 from benchmarks.figures import figure_runs
-from benchmarks.figures.figure_comparison import compared
-from benchmarks.figures.figure_readings import LIVE, number_at
-from benchmarks.figures.figure_record import Entry, Origin, Value, read_record, record_of, write_record
-from benchmarks.figures.figure_runs import Run, entry_of
-from benchmarks.figures.figures import NAMED, Figure, command_of
-from benchmarks.peers.child_process import Ended, run_to_end
+from benchmarks.figures.figure_comparison import compare_records
+from benchmarks.figures.figure_readings import LIVE, read_number
+from benchmarks.figures.figure_record import Entry, Origin, Value, build_record, read_record, write_record
+from benchmarks.figures.figure_runs import Run, measure_figure
+from benchmarks.figures.figures import NAMED, Figure, format_command
+from benchmarks.peers.child_process import ProcessResult, run_command
 from sim.bodies.meshfile import write_anatomy
 
 HOUSE = Path(__file__).parents[1]
@@ -29,11 +29,13 @@ HERE = Origin("0.1.0 (code 1)", "a machine", "a body", "2026-11-23")
 
 def entry(name="live-cpu", state="measured", origin=HERE, **numbers):
     values = tuple(Value(key.replace("_", " "), number, "ms", "smaller") for key, number in numbers.items())
-    return Entry(name, command_of(NAMED[name]), state, values, "" if state == "measured" else "it broke", 1.0, origin)
+    return Entry(
+        name, format_command(NAMED[name]), state, values, "" if state == "measured" else "it broke", 1.0, origin
+    )
 
 
 def put(path, *entries):
-    write_record(path, record_of(HERE, entries))
+    write_record(path, build_record(HERE, entries))
     return str(path)
 
 
@@ -49,7 +51,7 @@ def test_failed_and_skipped_figures_are_measured_on_resume(brain, tmp_path, caps
     out = tmp_path / "new.json"
     names = ("elements-limit-cpu", "live-cuda", "throughput-cpu")
     for name in names:  # small counts, as nobody waits for more
-        small = replace(NAMED[name], command=f"{NAMED[name].command} {NAMED[name].quick}")
+        small = replace(NAMED[name], command=f"{NAMED[name].command} {NAMED[name].quick_options}")
         monkeypatch.setitem(NAMED, name, small)
     words = ["all", "--json", str(out), "--anatomy", str(brain), "--only", *names]
     assert main(words) == 1
@@ -114,9 +116,9 @@ def test_stopped_run_keeps_its_measurements(number, tmp_path, capsys, monkeypatc
         asked.append(command[3])
         if len(asked) == 2:
             signal.raise_signal(number)
-        return Ended(0, spoken(NAMED["live-cpu"]), "", 2.0)
+        return ProcessResult(0, spoken(NAMED["live-cpu"]), "", 2.0)
 
-    monkeypatch.setattr(figure_runs, "run_to_end", run)
+    monkeypatch.setattr(figure_runs, "run_command", run)
     monkeypatch.chdir(tmp_path)
     out = tmp_path / "new.json"
     words = ["all", "--json", str(out), "--only", "live-cpu", "live-linear-cpu"]
@@ -141,7 +143,7 @@ def test_interrupted_run_ends_its_child_process(tmp_path):
 
     script = "import os, sys, time; print(os.getpid(), file=sys.stderr, flush=True); time.sleep(99)"
     with pytest.raises(KeyboardInterrupt):
-        run_to_end((sys.executable, "-c", script), tmp_path, heard)
+        run_command((sys.executable, "-c", script), tmp_path, heard)
     assert gone(int(said[0]))
 
 
@@ -157,7 +159,9 @@ def gone(process):
 def said_by(script, figure=NAMED["live-cpu"], before=None, **more):
     """The entry that a process makes which runs a script in place of a bench."""
     code = f"import json, os, signal, sys\n{script}"
-    return entry_of(figure, Run("1", "body", bench=(sys.executable, "-c", code), **more), before, lambda line: None)
+    return measure_figure(
+        figure, Run("1", "body", command=(sys.executable, "-c", code), **more), before, lambda line: None
+    )
 
 
 @pytest.mark.parametrize(
@@ -196,7 +200,7 @@ def test_background_children_end_with_their_process(tmp_path):
     script = (
         "import subprocess, sys; print(subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(99)']).pid)"
     )
-    ended = run_to_end((sys.executable, "-c", script), tmp_path, lambda line: None)
+    ended = run_command((sys.executable, "-c", script), tmp_path, lambda line: None)
     assert ended.code == 0 and ended.seconds < 60.0
     assert gone(int(ended.output))
 
@@ -211,12 +215,12 @@ def test_recorded_entry_is_kept_when_modules_are_missing():
 
 def test_figure_number_is_selected_by_the_names_of_its_row():
     said = {"rows": [{"engine": "tled", "x": 1.0}, {"engine": "felupe 11.3", "x": True}, {"engine": "b", "x": -1.0}]}
-    assert number_at(said, ("rows", {"engine": "tled"}, "x")) == 1.0
-    assert number_at({"rows": [{"engine": "felupe 11.3", "x": 2}]}, ("rows", {"engine": "felupe"}, "x")) == 2.0
+    assert read_number(said, ("rows", {"engine": "tled"}, "x")) == 1.0
+    assert read_number({"rows": [{"engine": "felupe 11.3", "x": 2}]}, ("rows", {"engine": "felupe"}, "x")) == 2.0
     for engine in ("felupe", "b", "tl", "none"):
-        assert number_at(said, ("rows", {"engine": engine}, "x")) is None
-    assert number_at(said, ("rows", {"engine": "tled"}, "y")) is None and number_at(said, ("rows", 3, "x")) is None
-    assert number_at({"rows": 2 * said["rows"]}, ("rows", {"engine": "tled"}, "x")) is None
+        assert read_number(said, ("rows", {"engine": engine}, "x")) is None
+    assert read_number(said, ("rows", {"engine": "tled"}, "y")) is None and read_number(said, ("rows", 3, "x")) is None
+    assert read_number({"rows": 2 * said["rows"]}, ("rows", {"engine": "tled"}, "x")) is None
 
 
 def test_slower_numbers_are_reported_with_exit_code_1(tmp_path, capsys):
@@ -250,7 +254,7 @@ def test_slower_numbers_are_reported_with_exit_code_1(tmp_path, capsys):
 )
 def test_change_above_ten_percent_counts_as_worse(better, old, new, worse):
     before, after = (replace(entry(), values=(Value("x", number, "", better),)) for number in (old, new))
-    found = compared(record_of(HERE, [before]), record_of(HERE, [after]))
+    found = compare_records(build_record(HERE, [before]), build_record(HERE, [after]))
     assert bool(found.worse) is worse and len(found.changes) == 1
 
 
@@ -363,7 +367,7 @@ def test_page_with_invalid_markers_is_unchanged(text, reason, tmp_path, capsys):
 )
 def test_figure_command_rejects_invalid_input(words, reason, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(figure_runs, "run_to_end", lambda *asked: pytest.fail("it measures"))
+    monkeypatch.setattr(figure_runs, "run_command", lambda *asked: pytest.fail("it measures"))
     put(tmp_path / "new.json", entry(a=1.0))
     assert main(["all", *words]) == 2
     assert reason in capsys.readouterr().err

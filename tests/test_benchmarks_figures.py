@@ -9,7 +9,7 @@ from conftest import make_box
 
 from benchmarks.__main__ import BENCHMARKS, make_parser
 from benchmarks.figures.figure_readings import LIVE, STAGES
-from benchmarks.figures.figures import FIGURES, NAMED, SHORTCUTS, words_of
+from benchmarks.figures.figures import FIGURES, NAMED, SHORTCUTS, build_arguments
 from benchmarks.peers import comparison as peers
 from benchmarks.studies import elements, frame, live, robustness, scaling, shortcuts, skull_models, stages, throughput
 from scenes.script.craniotomy_frame import build_craniotomy_frame
@@ -17,16 +17,16 @@ from surrogate.data.tool_loads import PRESETS
 
 HOUSE = Path(__file__).parents[1]
 ROWS = {
-    "throughput": throughput.Row,
-    "live": live.Tally,
-    "stages": stages.Row,
-    "frame": frame.Spent,
-    "shortcuts": shortcuts.Row,
-    "growth": scaling.Row,
-    "solver": peers.Row,
-    "robust": robustness.Tally,
-    "skull": skull_models.Row,
-    "elements": elements.Row,
+    "throughput": throughput.ThroughputRow,
+    "live": live.RideStatistics,
+    "stages": stages.StageRow,
+    "frame": frame.StageTime,
+    "shortcuts": shortcuts.ShortcutRow,
+    "growth": scaling.ScalingRow,
+    "solver": peers.EngineRow,
+    "robust": robustness.SetStatistics,
+    "skull": skull_models.SkullRow,
+    "elements": elements.ElementRow,
 }
 """What each bench has in the lists of its JSON."""
 
@@ -37,10 +37,10 @@ def test_every_figure_command_parses(name):
     parser = make_parser(figure.command.split()[0])
     for quick in (False, True):
         for anatomy in (None, "brain.vtu"):
-            args = parser.parse_args([*words_of(figure, quick, anatomy), "--json"])
+            args = parser.parse_args([*build_arguments(figure, quick, anatomy), "--json"])
             given = next((getattr(args, key) for key in ("anatomy", "anatomies", "mesh") if hasattr(args, key)), None)
             assert args.device == figure.device and args.json
-            taken = anatomy is not None and figure.body is not None
+            taken = anatomy is not None and figure.anatomy_option is not None
             assert bool(given) == taken and (not taken or "brain.vtu" in str(given))
 
 
@@ -62,7 +62,7 @@ def test_every_figure_number_is_a_field_of_its_bench():
     stated = [step for it in FIGURES for r in it.readings for step in r.place if "shortcut" in str(step)]
     done = [
         {"shortcut": work.shortcut, "work": work.name}
-        for work in shortcuts.works(build_craniotomy_frame(make_box()), 1, False)
+        for work in shortcuts.list_cases(build_craniotomy_frame(make_box()), 1, False)
     ]
     assert len(stated) == 2 * len(SHORTCUTS) + 2 and not [pair for pair in stated if pair not in done]
 

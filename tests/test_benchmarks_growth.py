@@ -9,10 +9,18 @@ import pytest
 from ar.screen import read_png
 from benchmarks.__main__ import main
 from benchmarks.studies import scaling
-from benchmarks.studies.scaling import LOADS, Row, Trial, build_template_mesh, measured, panels, rows
+from benchmarks.studies.scaling import (
+    LOADS,
+    MeshTrial,
+    ScalingRow,
+    build_panels,
+    build_template_mesh,
+    measure_mesh,
+    measure_meshes,
+)
 from sim.errors import InputError
 
-ROW = Row(
+ROW = ScalingRow(
     size=2000,
     asked=1,
     nodes=1977,
@@ -39,7 +47,7 @@ def folder(tmp_path_factory):
 
 
 def test_growth_row_describes_the_solved_case(folder):
-    row = measured(Trial("p1", "cpu", folder), 2000, 2)
+    row = measure_mesh(MeshTrial("p1", "cpu", folder), 2000, 2)
     assert (row.preconditioner, row.batch, row.loads, row.converged) == ("sparse factor", 2, LOADS, LOADS)
     assert 1900 < row.nodes < 2100 and row.tets > 4 * row.nodes
     assert row.set_up > 0.0 and row.load > 0.0 and row.outer >= 1
@@ -56,7 +64,7 @@ def test_recorded_rows_are_not_measured_again(folder, tmp_path, monkeypatch, cap
         asked.append([row.asked for row in done])
         yield from (replace(ROW, asked=b, batch=b) for b in batches if b not in asked[-1])
 
-    monkeypatch.setattr(scaling, "rows", instead)
+    monkeypatch.setattr(scaling, "measure_meshes", instead)
     assert main([*words[:-3], "--device", "cpu", "--out", str(out)]) == 0
     assert main([*words, "--out", str(out), "--json"]) == 0
     assert asked == [[], [1]]
@@ -80,18 +88,18 @@ def test_child_process_error_is_raised_in_the_parent(folder):
     """An error in the process is raised unchanged in the parent."""
     said = []
     with pytest.raises(InputError, match="no element"):
-        list(rows(Trial("abacus", "cpu", folder), [2000], [1], [], said.append))
+        list(measure_meshes(MeshTrial("abacus", "cpu", folder), [2000], [1], [], said.append))
     assert said == ["2000 nodes, the mesh", "2000 nodes, batch of 1"]
 
 
 def test_plot_marks_the_change_of_preconditioner():
     large = replace(ROW, size=8000, nodes=8000, preconditioner="algebraic multigrid, 3 levels")
     larger = replace(large, nodes=32000, preconditioner="algebraic multigrid, 4 levels")
-    seconds, memory = panels([ROW, large, larger])
+    seconds, memory = build_panels([ROW, large, larger])
     assert seconds.marks == memory.marks == ((pytest.approx(np.sqrt(1977 * 8000)), "algebraic multigrid"),)
     assert [curve.name for curve in seconds.curves] == ["one load", "set-up"]
     assert [curve.name for curve in memory.curves] == ["host, batch of 1"]
-    assert "card, batch of 1" in [curve.name for curve in panels([replace(ROW, card=2.0)])[1].curves]
+    assert "card, batch of 1" in [curve.name for curve in build_panels([replace(ROW, card=2.0)])[1].curves]
 
 
 @pytest.mark.parametrize(

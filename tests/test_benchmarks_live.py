@@ -9,7 +9,16 @@ from conftest import make_box
 
 from benchmarks.__main__ import main
 from benchmarks.studies import live
-from benchmarks.studies.live import RIDES, WARM_UP, Frame, Ride, errors, frames_of, loads_of, tally
+from benchmarks.studies.live import (
+    RIDES,
+    WARM_UP,
+    LiveFrame,
+    ToolRide,
+    build_loads,
+    compute_errors,
+    solve_frames,
+    summarise_ride,
+)
 from scenes.analysis.budget import MAX_LIVE_ERROR
 from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.scene import find_scene
@@ -43,7 +52,7 @@ def test_tool_path_has_constant_speed_within_circle():
 
 
 def test_tool_presses_at_each_path_position(site):
-    found = loads_of(RIDES[0], SCENE, site, 20)
+    found = build_loads(RIDES[0], SCENE, site, 20)
     assert len(found) == WARM_UP + 20
     pushed = [load.get(Pushed) for load in found]
     assert all(np.linalg.norm(one.force) == pytest.approx(0.25) for one in pushed)
@@ -59,8 +68,8 @@ def test_frames_start_from_last_result_and_skip_warm_up(site, pretender):
             starts.append(start)
             return pretender.deform(loads)
 
-    loads = loads_of(RIDES[0], SCENE, build_craniotomy_frame(pretender.anatomy), 3)
-    frames = list(frames_of(Watched(), loads))
+    loads = build_loads(RIDES[0], SCENE, build_craniotomy_frame(pretender.anatomy), 3)
+    frames = list(solve_frames(Watched(), loads))
     assert [frame.loads for frame in frames] == loads[WARM_UP:]
     assert starts[0] is None and all(start is not None for start in starts[1:])
     np.testing.assert_array_equal(starts[-1].displacement, frames[-2].answer.displacement)
@@ -68,27 +77,29 @@ def test_frames_start_from_last_result_and_skip_warm_up(site, pretender):
 
 
 def test_errors_measure_a_known_displacement_error(site):
-    fem = live.live_fem(SCENE, site, "cpu", "p1")
-    load = loads_of(Ride("weak", 0.1, 10e-3), SCENE, site, 1)[-1]
+    fem = live.build_live_fem(SCENE, site, "cpu", "p1")
+    load = build_loads(ToolRide("weak", 0.1, 10e-3), SCENE, site, 1)[-1]
     answer = fem.deform(load)
     moved = answer.displacement.copy()
     moved[0, 5] += [0.0, 3e-4, 4e-4]
-    off = errors([Frame(load, answer, 0.1), Frame(load, replace(answer, displacement=moved), 0.1)], SCENE, site, "p1")
+    off = compute_errors(
+        [LiveFrame(load, answer, 0.1), LiveFrame(load, replace(answer, displacement=moved), 0.1)], SCENE, site, "p1"
+    )
     assert off[0] < MAX_LIVE_ERROR
     assert off[1] == pytest.approx(5e-4, abs=off[0])
 
 
 def test_tally_summarises_frame_times_and_outcomes(site, pretender):
-    load = loads_of(RIDES[0], SCENE, build_craniotomy_frame(pretender.anatomy), 1)[-1]
+    load = build_loads(RIDES[0], SCENE, build_craniotomy_frame(pretender.anatomy), 1)[-1]
     answer = pretender.deform(load)
-    frames = [Frame(load, answer, 1e-3 * number) for number in range(1, 101)]
-    item = tally(RIDES[0], frames, np.array([1e-5, 3e-5]))
+    frames = [LiveFrame(load, answer, 1e-3 * number) for number in range(1, 101)]
+    item = summarise_ride(RIDES[0], frames, np.array([1e-5, 3e-5]))
     assert (item.frames, item.median, item.worst) == (100, pytest.approx(50.5), pytest.approx(100.0))
     assert item.p95 < item.p99 < item.worst
     assert (item.steps, item.most_steps, item.outcomes, item.good) == (4.0, 4, {"CONVERGED": 100}, True)
     assert (item.checked, item.error) == (2, pytest.approx(0.03))
     lost = replace(answer, outcome=(Outcome.STALLED,))
-    assert not tally(RIDES[0], [*frames, Frame(load, lost, 1.0)], np.zeros(1)).good
+    assert not summarise_ride(RIDES[0], [*frames, LiveFrame(load, lost, 1.0)], np.zeros(1)).good
 
 
 def test_live_command_reports_every_tool(site, tmp_path, capsys, monkeypatch):
@@ -98,7 +109,7 @@ def test_live_command_reports_every_tool(site, tmp_path, capsys, monkeypatch):
     rides = json.loads(capsys.readouterr().out)["rides"]
     assert [item["ride"] for item in rides] == [ride.name for ride in RIDES]
     assert all(item["frames"] == 3 and item["checked"] == 2 and item["error"] <= 0.05 for item in rides)
-    monkeypatch.setattr(live, "errors", lambda frames, *rest: np.full(len(frames), 1e-3))
+    monkeypatch.setattr(live, "compute_errors", lambda frames, *rest: np.full(len(frames), 1e-3))
     assert main([*words, "--device", "cpu"]) == 1
     capsys.readouterr()
     assert main([*words[:-2], "--device", "cpu", "--json"]) == 1  # as many are checked as there are

@@ -9,22 +9,30 @@ from locators import in_a_skull
 from scipy.spatial.transform import Rotation
 
 from benchmarks.__main__ import main
+from benchmarks.studies import locate_rivals as baselines
 from benchmarks.studies import locate_twins
-from benchmarks.studies.locate_rivals import kelvin_forces, oracle, rigid, springs, thin_plates
 from benchmarks.studies.locate_study import (
     ORACLE,
     OURS,
     Estimate,
-    PointsSeen,
-    estimate,
-    observed,
-    ours,
-    row,
-    rows,
-    sights_of,
-    spoilt,
+    PointModel,
+    add_errors,
+    build_point_models,
+    compare_motion,
+    evaluate_locator,
+    measure_baselines,
+    sample_observation,
+    summarise_estimates,
 )
-from benchmarks.studies.locate_twins import CAUSES, Twin, drawn, effects_of, loads_of, solved, twins
+from benchmarks.studies.locate_twins import (
+    CAUSES,
+    SyntheticCase,
+    build_effects,
+    build_loads,
+    sample_parameters,
+    solve_case,
+    solve_cases,
+)
 from sim.accuracy import REFERENCE
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.open_cortex import open_cortex
@@ -37,7 +45,7 @@ from sim.loads import Loads, Nodal, Posture, Pushed
 from sim.material import Material
 from surrogate.locating import locator_store
 from surrogate.locating.locator import Locator
-from surrogate.locating.prior import NO_PLACE, MotionPrior, compute_middle
+from surrogate.locating.prior import NO_PLACE, MotionPrior, compute_centroid_motion
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +91,7 @@ def test_rigid_estimator_recovers_a_rigid_motion(tumour):
     def motion(at):
         return turn.apply(at) + [1e-3, 2e-3, -3e-3] - at
 
-    assert rigid(tumour)(rest, motion(rest)) == pytest.approx(motion(tumour), abs=1e-12)
+    assert baselines.fit_rigid_motion(tumour)(rest, motion(rest)) == pytest.approx(motion(tumour), abs=1e-12)
 
 
 def test_thin_plates_extrapolate_linearly_and_smooth_noise(tumour):
@@ -92,12 +100,12 @@ def test_thin_plates_extrapolate_linearly_and_smooth_noise(tumour):
     def motion(at):
         return at @ (0.05 * np.arange(9.0).reshape(3, 3) - 0.2) + [1e-3, 0.0, -2e-3]
 
-    assert thin_plates(tumour)(rest, motion(rest)) == pytest.approx(motion(tumour), abs=1e-9)
+    assert baselines.fit_thin_plates(tumour)(rest, motion(rest)) == pytest.approx(motion(tumour), abs=1e-9)
     noise = 1e-3 * np.random.default_rng(1).standard_normal(rest.shape)
-    smooth = thin_plates(rest)(rest, motion(rest) + noise)
+    smooth = baselines.fit_thin_plates(rest)(rest, motion(rest) + noise)
     assert np.linalg.norm(smooth - motion(rest)) < 0.6 * np.linalg.norm(noise)
     wavy = 5e-3 * np.sin(40.0 * rest)  # what is no noise is kept
-    assert thin_plates(rest)(rest, wavy) == pytest.approx(wavy, abs=1e-4)
+    assert baselines.fit_thin_plates(rest)(rest, wavy) == pytest.approx(wavy, abs=1e-4)
 
 
 def test_kelvinlets_equal_kelvin_solution_and_are_symmetric():
@@ -117,19 +125,23 @@ def test_kelvinlet_estimator_recovers_point_forces(tumour):
     rest = scatter_columns(12)
     force = np.random.default_rng(2).standard_normal((12, 3)) * [1e-5, 2e-5, 3e-5]
     seen, there = (np.einsum("nivj,ni->vj", compute_kelvinlets(at, rest, 10e-3, 0.49), force) for at in (rest, tumour))
-    found = kelvin_forces(tumour)(rest, seen)
+    found = baselines.fit_kelvinlets(tumour)(rest, seen)
     assert np.linalg.norm(found - there) < 0.05 * np.linalg.norm(there)
     twice, torn = np.concatenate([rest, rest[:1] + 1e-9]), np.zeros((13, 3))
     torn[[0, 12]] = [[1e-3, 0.0, 0.0], [-1e-3, 0.0, 0.0]]  # two points in one place that part
-    assert np.abs(kelvin_forces(tumour)(twice, torn)).max() < 1e-3
+    assert np.abs(baselines.fit_kelvinlets(tumour)(twice, torn)).max() < 1e-3
 
 
 def test_spring_estimator_depends_on_skull_stiffness(body):
     motion = np.cross([0.02, 0.01, -0.03], body.mesh.nodes - body.mesh.nodes.mean(axis=0)) + [1e-3, 2e-3, -3e-3]
-    seen, true = observed(body, motion, PointsSeen(40, 60, 0), (0,)), motion[body.tumour_nodes]
-    found = springs(body, skull=1.0, point=100.0)(seen.rest, seen.now - seen.rest)
+    seen, true = sample_observation(body, motion, PointModel(40, 60, 0), (0,)), motion[body.tumour_nodes]
+    found = baselines.build_spring_body(body, skull_stiffness=1.0, point_stiffness=100.0)(
+        seen.rest, seen.now - seen.rest
+    )
     assert found == pytest.approx(true, abs=1e-5)
-    held = springs(body, skull=1e9, point=100.0)(seen.rest, seen.now - seen.rest)
+    held = baselines.build_spring_body(body, skull_stiffness=1e9, point_stiffness=100.0)(
+        seen.rest, seen.now - seen.rest
+    )
     assert 0.05 < np.linalg.norm(held, axis=1).mean() / np.linalg.norm(true, axis=1).mean() < 0.9
 
 
@@ -141,65 +153,67 @@ def test_stiff_spring_compliance_matches_bonded_fem(body):
     stiff = [Material("linear", 3000.0 * times, 0.45) for times in (1.0, 2.0)]
     effects = (Elasticity(stiff[0], {2: stiff[1]}), Held(), Bonded(), NodalForce())
     true = Fem(body, effects, REFERENCE, "cpu", element="p1").deform(Loads((Nodal(force),)))
-    found = np.tensordot(force[0, cortex[7]], springs(body, skull=1e11).compliance[7], 1)
+    found = np.tensordot(force[0, cortex[7]], baselines.build_spring_body(body, skull_stiffness=1e11).compliance[7], 1)
     assert found == pytest.approx(true.displacement[0, np.append(cortex, body.tumour_nodes)], rel=1e-3, abs=1e-8)
 
 
 def test_oracle_reproduces_motions_of_its_shapes(locator, body):
     motion = some_motion(locator, 1)
-    assert oracle(locator.prior, motion) == pytest.approx(motion[body.tumour_nodes], abs=1e-7)
+    assert baselines.fit_oracle(locator.prior, motion) == pytest.approx(motion[body.tumour_nodes], abs=1e-7)
     other = np.where(np.arange(len(motion))[:, None] % 2, 1e-3, -1e-3) * np.ones(3)
-    off = oracle(locator.prior, other) - other[body.tumour_nodes]
+    off = baselines.fit_oracle(locator.prior, other) - other[body.tumour_nodes]
     assert 0.1e-3 < np.linalg.norm(off, axis=1).mean() < 2e-3
 
 
 def test_row_statistics_match_hand_calculation():
     zeros = np.zeros((3, 3))
     true = 1e-3 * np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [3.0, 0.0, 0.0]])
-    exact = estimate(true, true, 7.8, 0.010)
-    half = estimate(true - [0.0, 1e-3, 0.0], true, 7.9, 0.030)
-    refused = estimate(zeros, true, None, None, refused=True)
+    exact = compare_motion(true, true, 7.8, 0.010)
+    half = compare_motion(true - [0.0, 1e-3, 0.0], true, 7.9, 0.030)
+    refused = compare_motion(zeros, true, None, None, is_rejected=True)
     assert half.error == pytest.approx(np.full(3, 1e-3)) and half.motion == pytest.approx([5e-3, 2e-3, 3e-3])
-    found = row(PointsSeen(30, 20, 1), "it", [exact, half])
+    found = summarise_estimates(PointModel(30, 20, 1), "it", [exact, half])
     assert (found.points, found.cover, found.noise, found.estimator) == (30, 20, 1, "it")
     assert found.removed == pytest.approx(100.0 * (1.0 - 3.0 / 20.0)) and found.mean == pytest.approx(0.5)
     assert (found.held, found.milliseconds) == (50.0, pytest.approx(20.0)) and (found.twins, found.refused) == (2, 0)
-    with_refused = row(PointsSeen(30, 20, 1), "it", [exact, half, refused])
+    with_refused = summarise_estimates(PointModel(30, 20, 1), "it", [exact, half, refused])
     assert with_refused.removed == pytest.approx(100.0 * (1.0 - 13.0 / 30.0)) and with_refused.held == 50.0
-    warned = row(PointsSeen(30, 20, 1), "it", [replace(half, warned=True), half, replace(half, doubted=True)])
+    warned = summarise_estimates(
+        PointModel(30, 20, 1), "it", [replace(half, has_warning=True), half, replace(half, has_slip=True)]
+    )
     assert (warned.warned, warned.doubted) == (1, 1)
     assert with_refused.refused == 1 and with_refused.milliseconds == pytest.approx(20.0)
-    alone = row(PointsSeen(30, 20, 1), "it", [refused])
+    alone = summarise_estimates(PointModel(30, 20, 1), "it", [refused])
     assert (alone.held, alone.milliseconds, alone.removed) == (None, None, pytest.approx(0.0))
     hundred = Estimate(1e-3 * np.arange(101.0), np.ones(101), None, 0.0)
-    assert row(PointsSeen(30, 20, 1), "it", [hundred]).p95 == pytest.approx(95.0)
+    assert summarise_estimates(PointModel(30, 20, 1), "it", [hundred]).p95 == pytest.approx(95.0)
 
 
 def test_squared_error_uses_the_centroid_covariance(locator, body):
     motion = some_motion(locator, 0)
-    seen = observed(body, motion, PointsSeen(60, 60, 1), (0, 0))
-    found, answer = ours(locator, motion, seen), locator.locate(seen)
-    off = answer.centroid - compute_middle(body, motion[None])[0]
+    seen = sample_observation(body, motion, PointModel(60, 60, 1), (0, 0))
+    found, answer = evaluate_locator(locator, motion, seen), locator.locate(seen)
+    off = answer.centroid - compute_centroid_motion(body, motion[None])[0]
     assert found.square == pytest.approx(off @ np.linalg.inv(answer.centroid_covariance) @ off)
     wild = replace(seen, now=seen.rest + 0.01 * np.random.default_rng(0).standard_normal(seen.rest.shape))
-    refused = ours(locator, motion, wild)
+    refused = evaluate_locator(locator, motion, wild)
     assert refused.refused and refused.square is None and np.array_equal(refused.error, refused.motion)
 
 
 def test_observations_use_same_points_at_any_noise(locator, body):
     motion = some_motion(locator, 2)
-    exact, low, high = (observed(body, motion, PointsSeen(50, 36, noise), (3, 1)) for noise in (0, 1, 2))
+    exact, low, high = (sample_observation(body, motion, PointModel(50, 36, noise), (3, 1)) for noise in (0, 1, 2))
     assert np.array_equal(exact.rest, low.rest) and np.array_equal(exact.rest, high.rest)
     assert exact.sigma == pytest.approx(np.full(50, 0.05e-3)) and low.sigma is None and high.sigma is None
     assert np.sqrt(3.0) * np.array([each.rigid for each in (exact, low, high)]) == pytest.approx([0.0, 1e-3, 2e-3])
     at = np.linalg.norm(body.mesh.nodes[:, None] - exact.rest, axis=2)
     on_vertex = at.argmin(axis=0)
     assert np.linalg.norm(exact.now - exact.rest - motion[on_vertex], axis=1).max() < 1e-3
-    again = observed(body, motion, PointsSeen(50, 36, 1), (3, 1))
+    again = sample_observation(body, motion, PointModel(50, 36, 1), (3, 1))
     assert np.array_equal(again.now, low.now)
-    others = [observed(body, motion, PointsSeen(50, 36, 1), seed).rest for seed in ((3, 2), (4, 1))]
+    others = [sample_observation(body, motion, PointModel(50, 36, 1), seed).rest for seed in ((3, 2), (4, 1))]
     assert not any(np.array_equal(low.rest, other) for other in others)
-    wide = observed(body, motion, PointsSeen(50, 100, 0), (3, 1))
+    wide = sample_observation(body, motion, PointModel(50, 100, 0), (3, 1))
     assert np.ptp(exact.rest[:, :2], axis=0).max() < 0.8 * np.ptp(wide.rest[:, :2], axis=0).max()
 
 
@@ -207,36 +221,39 @@ def test_noise_levels_have_their_rigid_translations(locator, body):
     """Mean squares over many observations: white and smooth errors are equal at both levels."""
     still, square = np.zeros_like(body.mesh.nodes), []
     for noise in (1, 2):
-        seen = [observed(body, still, PointsSeen(60, 60, noise), (0, number)) for number in range(60)]
+        seen = [sample_observation(body, still, PointModel(60, 60, noise), (0, number)) for number in range(60)]
         square.append(np.mean([1e6 * ((one.now - one.rest).mean(axis=0) ** 2).sum() for one in seen]))
     assert 1.0 < square[0] < 1.5 and square[1] - square[0] == pytest.approx(3.0, abs=0.6)
 
 
 def test_every_twin_is_observed_at_its_own_points(locator, body):
-    some = [Twin(drawn(0, number), some_motion(locator, number)) for number in (0, 1)]
+    some = [SyntheticCase(sample_parameters(0, number), some_motion(locator, number)) for number in (0, 1)]
     given = []
     spy = {"spy": lambda rest, motion: given.append(rest) or np.zeros((len(body.tumour_nodes), 3))}
-    found = list(rows(some, sights_of([30], [50], [0, 1]), spy, locator))
+    found = list(measure_baselines(some, build_point_models([30], [50], [0, 1]), spy, locator))
     assert [(each.noise, each.estimator) for each in found[::3]] == [(0, "spy"), (1, "spy")] and len(found) == 6
     assert np.array_equal(given[0], given[2]) and not np.array_equal(given[0], given[1])
-    clouds = list(rows(some, sights_of([30], [50], [0], named=False), spy, locator))
+    clouds = list(measure_baselines(some, build_point_models([30], [50], [0], named=False), spy, locator))
     assert [each.estimator for each in clouds] == [OURS, ORACLE] and len(given) == 4
-    seen = [observed(body, some[0].motion, PointsSeen(30, 50, 0, named), (0, 0)) for named in (True, False)]
+    seen = [sample_observation(body, some[0].motion, PointModel(30, 50, 0, named), (0, 0)) for named in (True, False)]
     assert seen[1].rest is None and np.array_equal(seen[0].now, seen[1].now)
-    slipped = observed(body, some[0].motion, PointsSeen(30, 50, 0, slip=8e-3), (0, 0)).now - seen[0].now
+    slipped = sample_observation(body, some[0].motion, PointModel(30, 50, 0, slip=8e-3), (0, 0)).now - seen[0].now
     assert slipped == pytest.approx(np.tile(slipped[0], (30, 1))) and np.linalg.norm(slipped[0]) == pytest.approx(8e-3)
     assert slipped[0] @ open_cortex(body).axis == pytest.approx(0.0, abs=1e-9)
-    wrong = [observed(body, some[0].motion, PointsSeen(30, 50, 0, wrong=True), (0, seed)) for seed in range(8)]
-    right = [observed(body, some[0].motion, PointsSeen(30, 50, 0), (0, seed)) for seed in range(8)]
+    wrong = [
+        sample_observation(body, some[0].motion, PointModel(30, 50, 0, is_misregistered=True), (0, seed))
+        for seed in range(8)
+    ]
+    right = [sample_observation(body, some[0].motion, PointModel(30, 50, 0), (0, seed)) for seed in range(8)]
     moved = np.stack([one.now - other.now for one, other in zip(wrong, right, strict=True)])
     shifts = np.ptp(moved, axis=1).max(axis=1) < 1e-12
     assert 0 < shifts.sum() < 8
     assert all(2e-3 <= np.linalg.norm(each[0]) <= 5e-3 for each in moved[shifts])
     assert all(np.linalg.norm(each, axis=1).max() <= np.radians(4.0) * 0.1 for each in moved[~shifts])
     with pytest.raises(InputError, match="level 3"):
-        list(rows(some, sights_of([30], [50], [3]), spy, locator))
+        list(measure_baselines(some, build_point_models([30], [50], [3]), spy, locator))
     with pytest.raises(InputError, match="no twin"):
-        list(rows([], sights_of([30], [50], [0]), spy, locator))
+        list(measure_baselines([], build_point_models([30], [50], [0]), spy, locator))
 
 
 @pytest.mark.parametrize("translation", [1e-3, 2e-3])
@@ -249,7 +266,7 @@ def test_observation_errors_have_nominal_size(translation):
     for apart, expected in ((0.0, 2.0 * 0.3**2), (15e-3, 2.0 * 0.3**2 + 2.0 * 0.5**2 * (1.0 - np.exp(-0.5)))):
         rest = np.concatenate([site, site + apart * way])
         now = rest + [0.01, 0.0, 0.02]  # what has moved is turned about where it was
-        off = spoilt(rest, now, translation, np.random.default_rng(4)) - now
+        off = add_errors(rest, now, translation, np.random.default_rng(4)) - now
         turn = Rotation.align_vectors(now + off - (now + off).mean(axis=0), now - now.mean(axis=0))[0]
         assert np.degrees(turn.magnitude()) == pytest.approx(0.5, abs=0.01)
         left = off - (turn.apply(now - rest.mean(axis=0)) + rest.mean(axis=0) - now)
@@ -260,8 +277,11 @@ def test_observation_errors_have_nominal_size(translation):
 
 
 def test_twins_depend_only_on_seed_and_number():
-    many = [drawn(0, number) for number in range(200)]
-    assert drawn(0, 5) == many[5] != replace(drawn(0, 9), number=5) and drawn(1, 5) != many[5]
+    many = [sample_parameters(0, number) for number in range(200)]
+    assert (
+        sample_parameters(0, 5) == many[5] != replace(sample_parameters(0, 9), number=5)
+        and sample_parameters(1, 5) != many[5]
+    )
     assert [one.cause for one in many[:8]] == [*CAUSES, *CAUSES]
     assert {one.skull for one in many if one.cause == "drainage"} == {"contact"}
     assert {one.skull for one in many if one.cause != "drainage"} == {"contact", "bonded", "slide"}
@@ -275,13 +295,13 @@ def test_twins_depend_only_on_seed_and_number():
 
 def test_twins_have_drawn_tissue_and_single_cause(body):
     for number in range(4):
-        draw = drawn(3, number)
-        elasticity = effects_of(draw)[0]
+        draw = sample_parameters(3, number)
+        elasticity = build_effects(draw)[0]
         for law, times in ((elasticity.default, 1.0), (elasticity.regions[2], draw.ratio)):
             mu, lam = law.lame
             assert mu == pytest.approx(670.0 * draw.stiffness * times) and law.terms[0][1] == -19.0
             assert lam / (2.0 * (lam + mu)) == pytest.approx(0.49)
-        loads = loads_of(body, draw)
+        loads = build_loads(body, draw)
         pushed, posture = loads.get(Pushed), loads.get(Posture)
         assert pushed.force.any() == ("tool" in draw.cause)
         assert (loads.times[0] != 0.0) == (draw.cause == "swelling")
@@ -292,9 +312,9 @@ def test_twins_have_drawn_tissue_and_single_cause(body):
 
 def test_twin_motion_follows_the_push_of_its_tool(body):
     """The push moves the open cortex along its direction, and the tumour less."""
-    draw = replace(drawn(0, 0), skull="slide", stiffness=1.0)
-    motion = solved(body, draw, "cpu", "p1")
-    pushed = loads_of(body, draw).get(Pushed)
+    draw = replace(sample_parameters(0, 0), skull="slide", stiffness=1.0)
+    motion = solve_case(body, draw, "cpu", "p1")
+    pushed = build_loads(body, draw).get(Pushed)
     near = np.linalg.norm(body.mesh.nodes - pushed.point[0], axis=1).argmin()
     assert motion[near] @ pushed.force[0] > 0.7 * np.linalg.norm(motion[near]) * np.linalg.norm(pushed.force[0])
     deep = np.linalg.norm(motion[body.tumour_nodes], axis=1).mean()
@@ -310,32 +330,32 @@ def test_twins_are_stored_and_read_at_body_vertices(body, tmp_path, monkeypatch)
             raise KeyboardInterrupt
         return None if draw.number == 1 else 0.1 * draw.stiffness * anatomy.mesh.nodes
 
-    monkeypatch.setattr(locate_twins, "solved", linear)
+    monkeypatch.setattr(locate_twins, "solve_case", linear)
     with pytest.raises(KeyboardInterrupt):
-        list(twins(body, finer, 3, seed=7, folder=tmp_path))
+        list(solve_cases(body, finer, 3, seed=7, folder=tmp_path))
     heard = []
-    found = list(twins(body, finer, 3, seed=7, folder=tmp_path, progress=lambda *each: heard.append(each)))
+    found = list(solve_cases(body, finer, 3, seed=7, folder=tmp_path, progress=lambda *each: heard.append(each)))
     assert made == [0, 1, 2, 2] and heard == [(1, 3), (2, 3), (3, 3)] and found[1] is None
     for twin in (found[0], found[2]):
         assert twin.motion == pytest.approx(0.1 * twin.draw.stiffness * body.mesh.nodes, abs=1e-9)
-    list(twins(body, finer, 1, seed=8, folder=tmp_path))  # another draw, element or mesh is another twin
-    list(twins(body, finer, 1, seed=7, element="p1", folder=tmp_path))
-    list(twins(body, body, 1, seed=7, folder=tmp_path))
+    list(solve_cases(body, finer, 1, seed=8, folder=tmp_path))  # another draw, element or mesh is another twin
+    list(solve_cases(body, finer, 1, seed=7, element="p1", folder=tmp_path))
+    list(solve_cases(body, body, 1, seed=7, folder=tmp_path))
     assert made[4:] == [0, 0, 0]
     kept = sorted(tmp_path.glob("twin-0000-*.npz"))
     assert len(kept) == 4
     for path in kept:
         path.write_bytes(path.read_bytes()[:-300])
     with pytest.raises(InputError, match="computed again"):
-        list(twins(body, finer, 1, seed=7, folder=tmp_path))
+        list(solve_cases(body, finer, 1, seed=7, folder=tmp_path))
 
 
 def test_mesh_of_other_brain_or_without_tumour_is_rejected(body):
     moved = replace(body, mesh=replace(body.mesh, nodes=body.mesh.nodes + [0.0, 0.01, 0.0]))
     with pytest.raises(InputError, match="10 mm apart"):
-        list(twins(body, moved, 1))
+        list(solve_cases(body, moved, 1))
     with pytest.raises(InputError, match="no tumour"):
-        list(twins(body, replace(body, mesh=replace(body.mesh, region=np.ones_like(body.mesh.region))), 1))
+        list(solve_cases(body, replace(body, mesh=replace(body.mesh, region=np.ones_like(body.mesh.region))), 1))
 
 
 def test_locate_command_prints_estimator_rows_and_resumes(body, locator, tmp_path, monkeypatch, capsys):
@@ -345,7 +365,7 @@ def test_locate_command_prints_estimator_rows_and_resumes(body, locator, tmp_pat
         made.append(draw.number)
         return None if draw.number == 2 else some_motion(locator, draw.number)
 
-    monkeypatch.setattr(locate_twins, "solved", some)
+    monkeypatch.setattr(locate_twins, "solve_case", some)
     monkeypatch.setattr(locator_store, "make_locator", lambda *each, **named: made.append("locator") or locator)
     path, folder = tmp_path / "body.vtu", tmp_path / "kept"
     write_anatomy(path, body)

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.__main__ import main
 from benchmarks.studies import shortcuts
-from benchmarks.studies.shortcuts import Row, Work, measure, works
+from benchmarks.studies.shortcuts import ShortcutCase, ShortcutRow, list_cases, measure_case
 from scenes.script.craniotomy_frame import CraniotomyFrame, build_craniotomy_frame
 from sim.accuracy import LIVE, TRAIN
 from sim.anatomy import Anatomy
@@ -24,11 +24,11 @@ def site(box: Anatomy) -> CraniotomyFrame:
     return build_craniotomy_frame(box)
 
 
-def some(site: CraniotomyFrame, **more) -> Work:
+def some(site: CraniotomyFrame, **more) -> ShortcutCase:
     loads = draw("palpation", site.anatomy, 3, 0)
     single = [loads.select(np.array([row])) for row in range(3)]
     effects = build_push_effects(site.anatomy, BRAIN)
-    return replace(Work("a", "b", SolverStep.LBFGS, single, effects, TRAIN, "p1"), **more)
+    return replace(ShortcutCase("a", "b", SolverStep.LBFGS, single, effects, TRAIN, "p1"), **more)
 
 
 def test_runs_with_and_without_shortcut_alternate(site: CraniotomyFrame, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,7 +39,7 @@ def test_runs_with_and_without_shortcut_alternate(site: CraniotomyFrame, monkeyp
         return solve(fem, loads, start)
 
     monkeypatch.setattr(Fem, "deform", heard)
-    row = measure(some(site), site, "cpu")
+    row = measure_case(some(site), site, "cpu")
     assert row is not None and row.runs == 2  # the first only warms up
     assert [quick for quick, _, _ in asked] == 3 * [True, False]
     assert all(one is other for (_, one, _), (_, other, _) in zip(asked[::2], asked[1::2], strict=True))
@@ -55,18 +55,18 @@ def test_runs_without_shortcut_drop_the_warm_start(site: CraniotomyFrame, monkey
         return solve(fem, loads, start)
 
     monkeypatch.setattr(Fem, "deform", heard)
-    assert measure(some(site, step=None, accuracy=LIVE, live=True, follows=True), site, "cpu") is not None
+    assert measure_case(some(site, step=None, accuracy=LIVE, live=True, follows=True), site, "cpu") is not None
     assert starts[:2] == [None, None]
     assert all(len(start.warm) > 0 for start in starts[2::2]) and not any(start.warm for start in starts[3::2])
 
 
 @pytest.mark.parametrize("step", [SolverStep.FRAME, SolverStep.CONTACT, SolverStep.CLAMPED, SolverStep.STRAINED])
 def test_unused_shortcut_has_no_row(site: CraniotomyFrame, step: SolverStep) -> None:
-    assert measure(some(site, step=step), site, "cpu") is None
+    assert measure_case(some(site, step=step), site, "cpu") is None
 
 
 def test_every_solver_step_except_newton_is_measured(site: CraniotomyFrame) -> None:
-    found = list(works(site, 2, False))
+    found = list(list_cases(site, 2, False))
     assert {work.step for work in found} == {None, *SolverStep} - {SolverStep.NEWTON}
     assert all(len(work.loads) == 3 for work in found)
     assert {len(work.loads[0]) for work in found} == {1, shortcuts.BATCH, shortcuts.POSES}
@@ -75,7 +75,7 @@ def test_every_solver_step_except_newton_is_measured(site: CraniotomyFrame) -> N
 def test_shortcuts_command_prints_the_measured_row(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    row = Row(
+    row = ShortcutRow(
         shortcut="short",
         work="work",
         runs=4,
@@ -87,8 +87,8 @@ def test_shortcuts_command_prints_the_measured_row(
         total_without=15.0,
     )
     found = iter([row, None])
-    monkeypatch.setattr(shortcuts, "works", lambda *known: [1, 2])
-    monkeypatch.setattr(shortcuts, "measure", lambda *known: next(found))
+    monkeypatch.setattr(shortcuts, "list_cases", lambda *known: [1, 2])
+    monkeypatch.setattr(shortcuts, "measure_case", lambda *known: next(found))
     assert main(["shortcuts", "--device", "cpu", "--json"]) == 0
     captured = capsys.readouterr()
     (said,) = json.loads(captured.out)["rows"]

@@ -8,7 +8,7 @@ import pytest
 from programs import main
 from theatres import coarse_brain
 
-from benchmarks.studies.skull_models import rows
+from benchmarks.studies.skull_models import measure_skulls
 from sim.accuracy import TRAIN
 from sim.anatomy import TUMOUR_LABEL
 from sim.bodies.meshfile import write_anatomy
@@ -63,9 +63,11 @@ def test_pressing_skull_allows_more_motion_than_bonded(brain, capsys):
 
 def test_unconverged_tearing_is_excluded_from_the_mean(brain, capsys, monkeypatch):
     path, anatomy = brain
-    (row,) = rows([anatomy], ["pressing"], [0.45], draw("palpation", anatomy, 1, 0), "cpu", Debonding(max_solves=1))
+    (row,) = measure_skulls(
+        [anatomy], ["pressing"], [0.45], draw("palpation", anatomy, 1, 0), "cpu", Debonding(max_solves=1)
+    )
     assert row.failed == 1 and row.bond is None
-    monkeypatch.setattr("benchmarks.studies.skull_models.rows", lambda *words: iter([row]))
+    monkeypatch.setattr("benchmarks.studies.skull_models.measure_skulls", lambda *words: iter([row]))
     assert main(["benchmarks", "skull", path, "--loads", "1", "--device", "cpu", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["rows"] == [asdict(row) | {"motion": pytest.approx(np.nan, nan_ok=True)}]
 
@@ -76,7 +78,7 @@ def test_skull_rows_count_strained_loads(brain):
     tissue = Material("neo-hookean", 3000.0, 0.45)
     limited = Fem(anatomy, build_push_effects(anatomy, tissue), TRAIN, "cpu").deform(loads)
     assert limited.outcome[0] in (Outcome.OVERSTRAINED, Outcome.INVERTED)
-    (row,) = rows([anatomy], ["bonded"], [0.45], loads, "cpu")
+    (row,) = measure_skulls([anatomy], ["bonded"], [0.45], loads, "cpu")
     assert row.failed == 0 and row.bond == pytest.approx(limited.bond[0], rel=1e-3)
 
 

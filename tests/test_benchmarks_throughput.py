@@ -7,14 +7,14 @@ import pytest
 from conftest import make_box
 
 from benchmarks.__main__ import main
-from benchmarks.studies.robustness import Trial
-from benchmarks.studies.throughput import Row, checked, drawn, rows, together
+from benchmarks.studies.robustness import SolverTrial
+from benchmarks.studies.throughput import ThroughputRow, combine_rows, measure_rates, sample_loads, select_checked
 from sim.bodies.meshfile import write_anatomy
 from sim.deformation import Outcome
 from sim.fem import Fem
 from sim.material import BRAIN
 
-ROW = Row(
+ROW = ThroughputRow(
     law="linear",
     poisson=0.45,
     element="p1",
@@ -131,23 +131,27 @@ def test_only_tool_presets_are_summed():
     others = [replace(ROW, preset=preset, seconds=(1.0,)) for preset in ("mixed", "seed", "brutal")]
     stiff = replace(ROW, poisson=0.49, set_up=2.0)
     found = [ROW, replace(ROW, preset="spatula", loads=40, seconds=(17.0,)), *others, stiff]
-    soft, other = together(found)
+    soft, other = combine_rows(found)
     assert (soft.presets, soft.loads, soft.seconds, soft.rate) == (("bipolar", "spatula"), 100, 20.0, 5.0)
     assert (other.poisson, other.set_up, other.rate) == (0.49, 2.0, 20.0)
-    assert [one.rate for one in together(others)] == [None]
+    assert [one.rate for one in combine_rows(others)] == [None]
 
 
 def test_one_percent_of_loads_is_checked_in_double_precision(box):
-    assert [len(checked(count)) for count in (3, 11, 400, 1101)] == [3, 4, 4, 12] and checked(1101)[-1] == 1100
+    assert [len(select_checked(count)) for count in (3, 11, 400, 1101)] == [3, 4, 4, 12] and select_checked(1101)[
+        -1
+    ] == 1100
     reported = []
-    sets = drawn(box, ["bipolar"], 11)
-    (row,) = rows(Trial(box, (), "p1", "cpu", 11), BRAIN, sets, 1, lambda: reported.append(1))
+    sets = sample_loads(box, ["bipolar"], 11)
+    (row,) = measure_rates(SolverTrial(box, (), "p1", "cpu", 11), BRAIN, sets, 1, lambda: reported.append(1))
     assert (row.loads, row.checked, len(reported)) == (11, 4, 3)
 
 
 def test_strained_converged_loads_are_counted_as_converged(box):
     soft = replace(BRAIN, young=600.0)
-    (row,) = rows(Trial(box, (), "p1", "cpu", 12), soft, drawn(box, ["brutal"], 12), 1, lambda: None)
+    (row,) = measure_rates(
+        SolverTrial(box, (), "p1", "cpu", 12), soft, sample_loads(box, ["brutal"], 12), 1, lambda: None
+    )
     assert row.converged == row.loads == 12
 
 

@@ -11,25 +11,25 @@ from benchmarks.studies.track_study import (
     LEANING,
     TIP_DISTANCE,
     TURNED,
-    Shot,
-    between,
+    TrackedImage,
     build_pivot_poses,
     build_row,
-    spread,
-    trial_camera,
+    build_trial_camera,
+    compute_distance_errors,
+    sample_poses,
 )
 
 
 def shot(tip, off=None, deviation=1e-3, markers=30.0):
     """A picture whose tip was found off by (3,) [m]; None: it was not found."""
     found = None if off is None else np.array(tip) + off
-    return Shot(np.array(tip, float), markers, found, None if off is None else deviation**2 * np.eye(3), 0.01)
+    return TrackedImage(np.array(tip, float), markers, found, None if off is None else deviation**2 * np.eye(3), 0.01)
 
 
 def test_row_counts_detections_and_errors():
     shots = [shot([0, 0, 0], [1e-3, 0, 0]), shot([0, 0, 0], [0, 2e-3, 0]), shot([0, 0, 0]), shot([0, 0, 0], markers=10)]
     row = build_row(
-        "trial", shots, lambda certain: np.array([np.linalg.norm(each.found - each.tip) for each in certain])
+        "trial", shots, lambda certain: np.array([np.linalg.norm(each.estimate - each.true_tip) for each in certain])
     )
     assert (row.pictures, row.median, row.most) == (4, pytest.approx(1.5), pytest.approx(2.0))
     assert row.certain == pytest.approx(100.0 * 2 / 3) and row.wrong == 0 and row.held == 100.0
@@ -39,14 +39,14 @@ def test_row_counts_detections_and_errors():
 
 def test_relative_error_ignores_a_common_offset():
     shots = [shot([k * 0.01, 0.0, 0.0], [1e-3, 1e-3, 0.0]) for k in range(4)]
-    np.testing.assert_allclose(between(shots), 0.0, atol=1e-12)
+    np.testing.assert_allclose(compute_distance_errors(shots), 0.0, atol=1e-12)
     shots.append(shot([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
-    assert between(shots)[-1] > 0.9e-3
+    assert compute_distance_errors(shots)[-1] > 0.9e-3
 
 
 def test_generated_poses_satisfy_the_protocols():
     """All poses are in view and within the tilt limit; in pivot protocols the tip is the same in every pose."""
-    camera, evenly = trial_camera(), list(spread(40, 0))
+    camera, evenly = build_trial_camera(), list(sample_poses(40, 0))
     middle = np.mean([T[:3, 3] for T in evenly], axis=0)
     np.testing.assert_allclose(middle, [0.0, 0.0, AWAY], atol=0.01)
     pixels = camera.project(np.array([T[:3, 3] for T in evenly]))[0]
@@ -58,7 +58,7 @@ def test_generated_poses_satisfy_the_protocols():
     for poses, most in ((evenly, TURNED), (once, LEANING)):
         cosine = [0.5 * (np.trace(T[:3, :3] @ first_turn(poses).T) - 1.0) for T in poses]
         assert np.degrees(np.arccos(min(cosine))) <= 2.0 * most
-    assert not np.allclose(list(spread(5, 1)), evenly[:5])
+    assert not np.allclose(list(sample_poses(5, 1)), evenly[:5])
 
 
 def first_turn(poses):

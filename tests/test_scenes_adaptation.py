@@ -38,7 +38,7 @@ class TestAdapting:
         row = measure_row(study, LearnerSpec("linear"))
         after = build_debulked_study(study)
         model = train(after.dataset, ["linear"], split=after.disc_split).models["linear"]
-        test = np.flatnonzero(after.disc_split.test)
+        test = np.flatnonzero(after.disc_split.test_mask)
         guess = model.deform(after.converged.select(test), at=after.anatomy.tumour_nodes).displacement
         wanted = 1e3 * np.linalg.norm(guess - after.data_displacement[test], axis=2).mean()
         assert row.adapted.mm.mean == pytest.approx(wanted, rel=1e-6)

@@ -92,11 +92,11 @@ def test_reported_errors_above_the_limit_mark_a_weak_model():
         return ReportedErrors(1.0, HeldOutErrors(mean, 0.0, p999, 0.0))
 
     assert (
-        not ReportedErrors(MAX_VERTEX_ERROR, None).weak
-        and ReportedErrors(1.1 * MAX_VERTEX_ERROR, None).weak
-        and ReportedErrors(math.nan, None).weak
+        not ReportedErrors(MAX_VERTEX_ERROR, None).is_weak
+        and ReportedErrors(1.1 * MAX_VERTEX_ERROR, None).is_weak
+        and ReportedErrors(math.nan, None).is_weak
     )
-    assert not left_out(0.01).weak and left_out(0.02).weak and left_out(0.01, 3e-4).weak
+    assert not left_out(0.01).is_weak and left_out(0.02).is_weak and left_out(0.01, 3e-4).is_weak
     assert str(ReportedErrors(4e-4, None)) == "maximum error up to 0.4 mm in 95 % of loads (limit 0.2 mm)"
     assert str(left_out(0.042)) == "mean error 4.2 % of the motion (limit 1 %)"
     assert str(left_out(0.042, 3e-4)).endswith("); 99.9th percentile 0.3 mm (limit 0.2 mm)")

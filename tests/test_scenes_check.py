@@ -10,7 +10,7 @@ from theatres import PUSHING, SIGHTED, player, put, small, theatre_of
 
 from ar.overlay.composite import composite
 from ar.overlay.hud import format_millimetres
-from ar.overlay.marks import Cover, Marks
+from ar.overlay.marks import Marks, Occluders
 from ar.rendering.renderer import Picture
 from scenes.cli import main
 from scenes.play.checks import SceneFigures, measure_frames
@@ -112,13 +112,13 @@ def drawn(play, frame, positions, camera=None, tip=None, opening=OPENING):
     tumour, rest = (stage.build_tumour(each) for each in (positions, play.site.anatomy.mesh.nodes))
     gauge = measure_tip_gauge(at, tumour)
     if tip is None:
-        gauge = replace(gauge, read=frame.distance, error=frame.tumour_error.bound)
+        gauge = replace(gauge, reading=frame.distance, error=frame.tumour_error.bound)
     shown = composite(
         frame.picture,
         camera or play.camera,
         tumour,
-        cover=Cover((TOOL,), opening=opening),
-        marks=Marks(gauge=gauge, before=rest),
+        cover=Occluders((TOOL,), opening=opening),
+        marks=Marks(gauge=gauge, initial=rest),
     )
     annotate_image(shown, frame.number, frame.remark)
     return replace(frame, shown=shown.colour)

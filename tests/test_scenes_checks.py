@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from ar.overlay.composite import DOUBTFUL_COLOUR, composite
-from ar.overlay.gauge import NUMBER_SCALE, Gauge
+from ar.overlay.gauge import NUMBER_SCALE, DistanceGauge
 from ar.overlay.legend import SHEET_VALUE
-from ar.overlay.marks import BEFORE_COLOUR, Cover, Marks
-from ar.overlay.outlines import compute_ink, find_text
+from ar.overlay.marks import BEFORE_COLOUR, Marks, Occluders
+from ar.overlay.outlines import average_colour, find_text
 from ar.overlay.styles import STYLES
 from scenes.cli import main
 from scenes.play.checks import measure_frames
@@ -104,15 +104,15 @@ def again(frame, play, opening, gauge=None, style="window"):
         stage.build_tumour(at) for at in (play.compute_positions(frame.deformation), play.site.anatomy.mesh.nodes)
     )
     if gauge is None:
-        gauge = replace(measure_tip_gauge(frame.tip, tumour), read=frame.distance, error=frame.tumour_error.bound)
+        gauge = replace(measure_tip_gauge(frame.tip, tumour), reading=frame.distance, error=frame.tumour_error.bound)
     band = frame.tumour_error.bound or 0.0
     over = composite(
         frame.picture,
         play.camera,
         tumour,
         style=style,
-        cover=Cover((TOOL,), opening=opening),
-        marks=Marks(band, gauge=gauge, before=rest),
+        cover=Occluders((TOOL,), opening=opening),
+        marks=Marks(band, gauge=gauge, initial=rest),
     )
     annotate_image(over, frame.number, frame.remark)
     return replace(frame, shown=over.colour)
@@ -124,7 +124,7 @@ def test_overlay_below_the_drape_must_be_drawn_as_covered():
     assert broken(again(frame, play, OPENING), play) == []
     for opening in (None, replace(OPENING, ids=(*OPENING.ids, DRAPE))):  # all solid and shaded
         assert any(seen in sentence for sentence in broken(again(frame, play, opening), play))
-    speechless = replace(OPENING, under=((DRAPE, "over there"),))
+    speechless = replace(OPENING, labels=((DRAPE, "over there"),))
     assert any(seen in sentence for sentence in broken(again(frame, play, speechless), play))
     shaded = again(frame, play, OPENING)
     closed = frame.picture.segmentation == DRAPE
@@ -134,7 +134,7 @@ def test_overlay_below_the_drape_must_be_drawn_as_covered():
 
 def test_tip_distance_text_must_be_complete_and_near_the_tip():
     frame, play = build_tool_frame(), player((640, 360))
-    text = str(Gauge(frame.tip, frame.tip, frame.distance, frame.tumour_error.bound))
+    text = str(DistanceGauge(frame.tip, frame.tip, frame.distance, frame.tumour_error.bound))
     left, top, right, foot = find_text(frame.shown, text, NUMBER_SCALE)
     box, wide = np.s_[top - 3 : foot + 3, left - 3 : right + 3], right - left
     for to in (np.s_[-60 - (foot - top) - 6 : -60, 4 : wide + 10], None):
@@ -164,7 +164,9 @@ def test_gauge_reports_tip_inside_the_tumour():
     play = player((640, 360))
     rest = play.stage.tumour_at_rest
     middle, corners = rest.vertices.mean(axis=0), rest.vertices[rest.triangles]
-    assert measure_tip_gauge(middle, rest).inside and not measure_tip_gauge(middle + [0.03, 0.0, 0.0], rest).inside
+    assert (
+        measure_tip_gauge(middle, rest).is_inside and not measure_tip_gauge(middle + [0.03, 0.0, 0.0], rest).is_inside
+    )
     assert is_enclosing(corners[:, ::-1], middle) and not is_enclosing(corners, middle + [0.0, 0.0, 0.5])
     assert str(measure_tip_gauge(middle, rest)).startswith("inside, ")
 
@@ -197,4 +199,4 @@ def test_command_help_lists_all_overlay_styles(capsys):
     with pytest.raises(SystemExit):
         main(["check", "press", "--style", "none"])
     assert "invalid choice" in capsys.readouterr().err
-    assert compute_ink(TUMOUR_COLOUR) == (51.0, 240.0, 107.0)
+    assert average_colour(TUMOUR_COLOUR) == (51.0, 240.0, 107.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from theatres import short, sinking, small
 
-from ar.page.parts import Dropdown, Fold, Slider
+from ar.page.parts import Dropdown, Folder, Slider
 from scenes.page.controls import build_controls, is_animated
 from scenes.page.effect_costs import build_effect_switches
 from scenes.page.requests import Requests
@@ -14,7 +14,7 @@ from scenes.page.side_panels import TIP
 from scenes.script.scene import find_scene
 from scenes.script.tool_paths import Touch
 
-ACTIONS = print, print, Fold("physics effects", ()), print
+ACTIONS = print, print, Folder("physics effects", ()), print
 
 
 class TestControls:
@@ -24,16 +24,16 @@ class TestControls:
         found = build_controls(scene, site, ("svr", "fem"), Requests("svr", Touch()), *ACTIONS)
         places = [control for control in found if isinstance(control, Slider) and control.label.startswith("place")]
         room = site.clearance - scene.tool.radius
-        assert len(places) == 2 and all(0.5 <= control.high <= max(0.5, 1e3 * room) for control in places)
-        assert all(control.low == -control.high and control.hint for control in places)
-        assert all(any(f"to {letter}" in control.words for letter in "LRAPSI") for control in places)
+        assert len(places) == 2 and all(0.5 <= control.upper <= max(0.5, 1e3 * room) for control in places)
+        assert all(control.lower == -control.upper and control.hint for control in places)
+        assert all(any(f"to {letter}" in control.text for letter in "LRAPSI") for control in places)
 
     def test_effect_switches_have_readable_labels(self, theatre):
         for name in ("press", "palpate", "retract", "brain_shift", "pulsation"):
             found = build_controls(small(name), theatre.site, ("fem",), Requests("fem", Touch()), *ACTIONS)
             folds = *found, build_effect_switches(theatre, small(name), Requests("fem", Touch()), print)
-            switches = [inner for control in folds if isinstance(control, Fold) for inner in control.controls]
-            assert switches and all(inner.words and inner.words != inner.label for inner in switches)
+            switches = [inner for control in folds if isinstance(control, Folder) for inner in control.controls]
+            assert switches and all(inner.text and inner.text != inner.label for inner in switches)
 
     def test_overlay_control_comes_before_tool_sliders(self, theatre):
         labels = [
@@ -51,9 +51,9 @@ class TestControls:
         overlay = next(control for control in found if isinstance(control, Dropdown) and control.label == "overlay")
         seen = []
         for option in overlay.options:
-            overlay.changed(option)
+            overlay.on_change(option)
             seen.append(wish.style)
-        assert seen[:3] == ["window", "contour", "fill"] and overlay.start == overlay.options[0]
+        assert seen[:3] == ["window", "contour", "fill"] and overlay.initial == overlay.options[0]
 
     def test_camera_and_slice_choices_are_offered(self, theatre):
         asks = Requests("fem", Touch())
@@ -62,19 +62,19 @@ class TestControls:
         assert isinstance(camera, Dropdown) and isinstance(slices, Dropdown)
         seen = []
         for option in camera.options:
-            camera.changed(option)
+            camera.on_change(option)
             seen.append(asks.path)
         assert seen == ["", "stays", "hand-held", "microscope", "orbit"]
-        slices.changed(TIP)
-        tilt, distance = cast(Fold, found["camera position"]).controls
-        assert isinstance(tilt, Slider) and isinstance(distance, Slider) and distance.start == 300.0
-        tilt.changed(20.0)
-        distance.changed(200.0)
+        slices.on_change(TIP)
+        tilt, distance = cast(Folder, found["camera position"]).controls
+        assert isinstance(tilt, Slider) and isinstance(distance, Slider) and distance.initial == 300.0
+        tilt.on_change(20.0)
+        distance.on_change(200.0)
         assert asks.look == ("window", "orbit", TIP, pytest.approx(-np.radians(20.0)), pytest.approx(0.2), None)
         registration = cast(Dropdown, found["registration"])
         assert registration.options == ("perfect registration", "clinical registration, 1.6 mm per axis")
-        registration.changed(registration.options[1])
-        assert registration.start == registration.options[0] and asks.look.registration == "clinical"
+        registration.on_change(registration.options[1])
+        assert registration.initial == registration.options[0] and asks.look.registration == "clinical"
         assert "slices" not in {
             each.label for each in build_controls(sinking(), theatre.site, ("fem",), asks, *ACTIONS)
         }

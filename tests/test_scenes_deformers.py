@@ -124,7 +124,7 @@ def test_family_within_error_limit_is_timed_and_selected(theatre, tmp_path):
     put(theatre, tmp_path / "box.vtu")
     write_report(tmp_path / "box.report.json", theatre.anatomy.digest)
     here = open_theatre(tmp_path / "box.vtu", device="cpu")
-    offer = choose_within(here, scene, (1e-3, None), said.append).offer
+    offer = choose_within(here, scene, (1e-3, None), said.append).candidate
     assert offer.name == "condensed" and offer.median_ms > ROW["median"] and "64 recorded pushes" in str(offer)
     assert len(said) == 1 and "0.001 ms" in said[0] and "time of a card" in said[0]
     frame = here.build_player("condensed", scene).draw(0, 0.0, Touch(force=0.2))
@@ -144,7 +144,7 @@ def test_families_without_recorded_errors_are_not_offered(theatre, tmp_path):
         replace(short(), effects=(*short().effects, Gravity())),
         replace(short(), effects=(Elasticity(Material("neo-hookean", 900.0, 0.49)), Held(), ToolForce())),
     ):
-        assert choose_within(here, scene, (1.0, None), said.append).offer.name == "fem"
+        assert choose_within(here, scene, (1.0, None), said.append).candidate.name == "fem"
     assert len(said) == 2 and all("`sulcus report --anatomy MESH.vtu`" in words for words in said)
 
 

@@ -28,7 +28,7 @@ def template():
 
 def words_of(theatre, scene):
     fold = build_effect_switches(theatre, scene, Requests("fem", Touch()), print)
-    return {control.label: control.words for control in fold.controls}
+    return {control.label: control.text for control in fold.controls}
 
 
 def test_measure_costs_measures_each_switchable_effect(theatre):

@@ -26,7 +26,7 @@ from sim.effects import Held, ToolForce
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import push
-from surrogate.data.solution_rows import read_tissue_statement
+from surrogate.data.solution_rows import read_tissue_text
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ class TestEpisode:
         """Tissue, element, tool, load and solver are those in the file's attributes."""
         _, file, _, _ = episode
         said, number = file.attrs, 3
-        effects = (read_tissue_statement({name: str(text) for name, text in said.items()}), Held(), ToolForce())
+        effects = (read_tissue_text({name: str(text) for name, text in said.items()}), Held(), ToolForce())
         fem = Fem(box, effects, TRAIN, "cpu", element=said["element"])
         assert said["anatomy"] == box.digest and said["finite_elements"] == fem.description
         load = push(file["contact"][number], file["force"][number], float(said["footprint_m"]))

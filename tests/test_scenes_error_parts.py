@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from theatres import template_theatre
 
 from ar.tracking.pose_stream import build_pose_stream
-from ar.tracking.rigid import move_about
+from ar.tracking.rigid import move_rigidly
 from scenes.link.pose_responder import PoseResponder
 from scenes.link.received_transforms import ReceivedTransforms, TransformNames
 from scenes.script.scene import find_scene
@@ -58,7 +58,7 @@ def test_hand_eye_error_equals_shift_of_the_camera():
     )
     right, other = (
         ExternalTracker(far, far, mount=CameraMount(each, np.outer(step, step)))
-        for each in (T, move_about(T, np.zeros(3), step))
+        for each in (T, move_rigidly(T, np.zeros(3), step))
     )
     found, there = right.find_reference_pose(0.0), other.find_reference_pose(0.0).T_camera_target
     turn = Rotation.from_matrix(there[:3, :3] @ found.T_camera_target[:3, :3].T).as_rotvec()

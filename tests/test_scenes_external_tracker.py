@@ -14,9 +14,9 @@ from theatres import template_theatre
 from ar.optics.lens import Lens
 from ar.tracking import pose_stream
 from ar.tracking.image_sequences import read_video
-from ar.tracking.pose import Pose, Verdict
-from ar.tracking.pose_stream import Clock, build_pose_stream, estimate_clock_by_motion
-from ar.tracking.rigid import move_about
+from ar.tracking.pose import Pose, PoseStatus
+from ar.tracking.pose_stream import Clock, build_pose_stream, estimate_clock_offset
+from ar.tracking.rigid import move_rigidly
 from ar.tracking.targets import build_patient_reference
 from scenes.cli import main
 from scenes.script.scene import find_scene
@@ -41,7 +41,7 @@ from scenes.tracked.truth import read_truth
 from sim.errors import InputError
 
 FILM = Path(__file__).parent / "data" / "film"
-TRACKER = move_about(np.eye(4), np.zeros(3), np.array([0.3, -0.2, 1.1, 0.5, -0.7, 1.2]))
+TRACKER = move_rigidly(np.eye(4), np.zeros(3), np.array([0.3, -0.2, 1.1, 0.5, -0.7, 1.2]))
 """T_tracker_scan."""
 NOISE = np.diag(np.repeat([1e-4**2, 3e-4**2], 3))
 NONE = np.zeros((6, 6))
@@ -52,14 +52,14 @@ def swung(time):
     """A tool in a quick hand: 20 mm and 11 degrees to and fro, 1.2 times a second."""
     phase = 2.0 * np.pi * 1.2 * time
     step = [0.02 * np.sin(phase), 0.01 * np.sin(0.7 * phase), 0.0, 0.0, 0.2 * np.sin(phase + 1.0), 0.1 * np.cos(phase)]
-    return move_about(TRACKER, np.zeros(3), np.array(step))
+    return move_rigidly(TRACKER, np.zeros(3), np.array(step))
 
 
 def sampled(pose_at, times, rng=None, offset=0.0):
     """A stream of what happens at times, with noise; its stamps are those times and an offset."""
     poses = [pose_at(time) for time in times]
     if rng is not None:
-        poses = [move_about(T, np.zeros(3), rng.multivariate_normal(np.zeros(6), NOISE)) for T in poses]
+        poses = [move_rigidly(T, np.zeros(3), rng.multivariate_normal(np.zeros(6), NOISE)) for T in poses]
     return build_pose_stream(
         np.asarray(times) + offset, np.stack(poses), np.tile(NONE if rng is None else NOISE, (len(times), 1, 1))
     )
@@ -125,23 +125,23 @@ def test_clock_offset_from_motion_has_a_valid_error():
     for true in rng.uniform(-0.9, 0.9, 60):
         times = np.arange(1.0, 4.0, 0.1)
         places = np.stack([swung(time + true)[:3, 3] for time in times]) + 2e-4 * rng.normal(size=(30, 3)) + 0.05
-        clock = estimate_clock_by_motion(times, places, samples, others + 1e-4 * rng.normal(size=others.shape))
+        clock = estimate_clock_offset(times, places, samples, others + 1e-4 * rng.normal(size=others.shape))
         off.append((clock.offset - true) / clock.error)
         assert abs(clock.offset - true) < 2e-3
     assert 0.7 < np.std(off) < 1.5
     still = np.tile(others[:1], (len(samples), 1)) + 1e-5 * rng.normal(size=others.shape)
     with pytest.raises(ValueError, match="Move the tool"):
-        estimate_clock_by_motion(times, places[:1] + 1e-5 * rng.normal(size=places.shape), samples, still)
+        estimate_clock_offset(times, places[:1] + 1e-5 * rng.normal(size=places.shape), samples, still)
     turned = np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in samples])
     with pytest.raises(ValueError, match="more than one offset"):
-        estimate_clock_by_motion(times, np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in times]), samples, turned)
+        estimate_clock_offset(times, np.stack([[np.sin(6.0 * np.pi * t), 0.0, 0.0] for t in times]), samples, turned)
     with pytest.raises(ValueError, match="images show what the poses have"):
-        estimate_clock_by_motion(times[:3], places[:3], samples, others)
+        estimate_clock_offset(times[:3], places[:3], samples, others)
     with pytest.raises(ValueError, match="end before the images"):
-        estimate_clock_by_motion(3.0 * times, places, samples, others)
+        estimate_clock_offset(3.0 * times, places, samples, others)
     some = np.abs(samples - 2.5) > 0.06
     with pytest.raises(ValueError, match="gaps of more than"):
-        estimate_clock_by_motion(times, places, samples[some], others[some])
+        estimate_clock_offset(times, places, samples[some], others[some])
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def bodies(stage):
     scene = find_scene("palpate")
 
     def head(time):
-        return move_about(TRACKER, np.zeros(3), np.array([0.0, 2e-3 * np.sin(4.0 * time), 0.0, 0.0, 0.0, 0.0]))
+        return move_rigidly(TRACKER, np.zeros(3), np.array([0.0, 2e-3 * np.sin(4.0 * time), 0.0, 0.0, 0.0, 0.0]))
 
     return {
         "tool": lambda time: (
@@ -237,14 +237,16 @@ def test_external_poses_are_compared_with_visible_targets(follower, bodies, stag
     for each in followed(follower, right.swapped_tracker):
         assert each.state is TumourState.UNSURE and each.bound is None
         assert "mm from its poses: are the two files of --poses swapped?" in each.warning
-    aside = move_about(np.eye(4), np.zeros(3), np.array([0.05, 0.0, -0.03, 0.4, 0.0, 0.0]))  # bodies beside their cubes
+    aside = move_rigidly(
+        np.eye(4), np.zeros(3), np.array([0.05, 0.0, -0.03, 0.4, 0.0, 0.0])
+    )  # bodies beside their cubes
     mounted = replace(right, tool_poses=sampled(lambda time: bodies["tool"](time) @ aside, times))
     assert all(each.is_reliable for each in followed(follower, mounted))
     far = replace(
         right,
         tool_poses=sampled(
             lambda time: (
-                bodies["tool"](time) @ move_about(np.eye(4), np.zeros(3), np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0]))
+                bodies["tool"](time) @ move_rigidly(np.eye(4), np.zeros(3), np.array([0.4, 0.0, 0.0, 0.0, 0.0, 0.0]))
             ),
             times,
         ),
@@ -307,7 +309,7 @@ class Still:
 
 def written(path, stream):
     rows = [
-        TrackedPose(time % DAY, Verdict.GOOD, Pose(T, covariance, 0.0, 0), 0.0)
+        TrackedPose(time % DAY, PoseStatus.GOOD, Pose(T, covariance, 0.0, 0), 0.0)
         for time, T, covariance in zip(stream.times.tolist(), stream.poses, stream.covariances, strict=True)
     ]
     write_poses(path, rows, np.zeros(3))
@@ -319,7 +321,7 @@ def test_overlay_command_estimates_clock_of_pose_files(bodies, tmp_path, capsys)
     streams = ((name, sampled(bodies[name], times, rng, DAY - 1.0)) for name in ("tool", "patient"))
     files = [written(tmp_path / f"{name}.csv", stream) for name, stream in streams]
     again = read_pose_stream(files[0])
-    assert again.daily and again.times[-1] > DAY and again.covariances[0, 0, 0] == pytest.approx(1e-8)
+    assert again.has_daily_clock and again.times[-1] > DAY and again.covariances[0, 0, 0] == pytest.approx(1e-8)
     given = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]
     words = ["overlay", str(FILM / "film.mp4"), *given, "--tool", str(FILM / "tool.json"), "--poses", *files]
     quick = ["--deformer", "rest", "--device", "cpu", "--json"]

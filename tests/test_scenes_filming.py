@@ -8,7 +8,7 @@ import pytest
 from theatres import template_theatre
 
 from ar.tracking.pose import Tracker
-from ar.tracking.synthetic_images import read_stamp
+from ar.tracking.synthetic_images import read_time_stamp
 from ar.tracking.targets import Detector, build_patient_reference, build_tool_cube
 from scenes.play.deformers import RestDeformer
 from scenes.play.player import Player
@@ -24,7 +24,7 @@ from scenes.tracked.filming import (
 )
 from sim.errors import InputError
 
-SMALL = USUAL_CALIBRATION.resize_calibration(800, 600, scale=True)
+SMALL = USUAL_CALIBRATION.resize_calibration(800, 600, allow_scaling=True)
 
 
 TARGETS = (build_tool_cube(), build_patient_reference())
@@ -68,7 +68,7 @@ def test_disturbances_hide_only_the_named_targets(shots):
     assert found[0] == found[-1] == both  # before and after
     assert found[1:5] == [{"tool"}, {"patient"}, set(), set()]
     assert [shot.time for shot in shots] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.7])  # 0.5 is left out
-    assert [read_stamp(grey(shot)) for shot in shots] == pytest.approx([shot.time for shot in shots])
+    assert [read_time_stamp(grey(shot)) for shot in shots] == pytest.approx([shot.time for shot in shots])
 
 
 def test_invalid_disturbance_is_rejected():
@@ -83,7 +83,7 @@ def test_registration_error_has_the_reported_covariance(player):
     for seed in range(200):
         one = register_with_error(player.site, mounts, 0.5, 0.4, seed)
         off = one.T_patient_scan @ mounts.T_scan_patient
-        place, covariance = one.point(player.site.origin + [0.02, 0.0, 0.0])
+        place, covariance = one.transform_point(player.site.origin + [0.02, 0.0, 0.0])
         true = np.linalg.inv(mounts.T_scan_patient) @ [*(player.site.origin + [0.02, 0.0, 0.0]), 1.0]
         found.append((place - true[:3]) @ np.linalg.solve(covariance, place - true[:3]))
         assert not np.allclose(off, np.eye(4), atol=1e-6)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from locators import dent, locator_of
 
-from benchmarks.studies.fit_study import row
-from benchmarks.studies.fit_twins import loads_of, patient, places
+from benchmarks.studies.fit_study import summarise_fits
+from benchmarks.studies.fit_twins import build_loads, sample_patient, sample_positions
 from scenes.cli import main
 from scenes.commands.fit import find_fitted_tissue, format_fit
 from sim.bodies.meshfile import write_anatomy
@@ -92,10 +92,10 @@ def test_fitted_tissue_is_found_next_to_its_anatomy(tmp_path):
 
 
 def test_benchmark_row_counts_correct_estimates(body):
-    tools = places(body)
-    one = patient(tools, 0, 0, 2, 3)
-    assert one == patient(tools, 0, 0, 2, 3) != patient(tools, 0, 1, 2, 3)
-    loads = loads_of(body, tools, one)
+    tools = sample_positions(body)
+    one = sample_patient(tools, 0, 0, 2, 3)
+    assert one == sample_patient(tools, 0, 0, 2, 3) != sample_patient(tools, 0, 1, 2, 3)
+    loads = build_loads(body, tools, one)
     pushed = loads.get(Pushed)
     assert pushed is not None and (np.linalg.norm(pushed.force, axis=1) > 0.0).tolist() == [
         True,
@@ -107,8 +107,8 @@ def test_benchmark_row_counts_correct_estimates(body):
     sure = np.zeros((3, 13, 33))
     held = one.skull == "bonded"
     sure[0 if held else 1, 0 if one.poisson < 0.4725 else 12, :] = 1.0 / 33.0
-    right = row(1, [(one, FittedTissue("", 5, sure, np.array([1.0, 2.0])))])
+    right = summarise_fits(1, [(one, FittedTissue("", 5, sure, np.array([1.0, 2.0])))])
     assert right.sliding == right.poisson == right.held == 100.0 and right.young_within == 0.0 and right.forces == 1
     other = sure[[1, 0, 2]][:, ::-1]
-    wrong = row(1, [(one, FittedTissue("", 5, other, np.zeros(0)))])
+    wrong = summarise_fits(1, [(one, FittedTissue("", 5, other, np.zeros(0)))])
     assert wrong.poisson == wrong.sliding == 0.0 and wrong.young is None

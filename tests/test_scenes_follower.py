@@ -34,7 +34,7 @@ def test_uncertain_registration_is_in_band_up_to_limit(follower):
 
 def test_registration_without_anatomy_is_not_reliable(follower):
     first = next(iter(pictures())).source
-    other = replace(follower, registration=replace(follower.registration, scanned=None))
+    other = replace(follower, registration=replace(follower.registration, scan=None))
     known = other.step(first.grey, 0.0)
     assert known.state is TumourState.UNSURE and "not checked whose registration" in known.warning
     assert known.bound == follower.step(first.grey, 0.0).bound

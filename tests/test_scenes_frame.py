@@ -10,7 +10,14 @@ from ar.page.browser import Browser
 from ar.rendering.renderer import Renderer
 from benchmarks.__main__ import main
 from benchmarks.studies import frame
-from benchmarks.studies.frame import STAGES, WARM_UP, batch_rate, frames_of, measure_size, table
+from benchmarks.studies.frame import (
+    STAGES,
+    WARM_UP,
+    measure_batch_rate,
+    parse_image_size,
+    summarise_stages,
+    time_frames,
+)
 from scenes.play.player import Player
 
 
@@ -28,7 +35,7 @@ def test_benchmark_draws_and_sends_each_frame_once(box, monkeypatch):
     monkeypatch.setattr(Player, "draw_frame", seen)
     monkeypatch.setattr(Browser, "put_sight", heard)
     player = theatre_of(box).build_player("linear", short())
-    found = list(frames_of(player, 4))
+    found = list(time_frames(player, 4))
     assert len(found) == 4 and all(len(row) == len(STAGES) and min(row) > 0.0 for row in found)
     assert drawn == [number % len(player.scene.times) for number in range(WARM_UP + 4)]
     pictures = [code for code, _ in sent if code.startswith("data:image/jpeg")]
@@ -36,7 +43,7 @@ def test_benchmark_draws_and_sends_each_frame_once(box, monkeypatch):
 
 
 def test_frame_time_is_the_sum_of_its_stages():
-    rows = table([(1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (3.0, 2.0, 3.0, 4.0, 5.0, 6.0)])
+    rows = summarise_stages([(1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (3.0, 2.0, 3.0, 4.0, 5.0, 6.0)])
     assert [row.stage for row in rows] == [*STAGES, "frame"]
     assert (rows[0].median, rows[-1].median, rows[-1].mean) == (2000.0, 22000.0, 22000.0)
     assert rows[-1].p95 == pytest.approx(22900.0)
@@ -50,14 +57,14 @@ def test_batch_has_the_given_number_of_frames_and_cameras(box, monkeypatch):
         return pictures(renderer, vertices, cameras)
 
     monkeypatch.setattr(Renderer, "render_batch", heard)
-    assert batch_rate(theatre_of(box).build_player("linear", short()), 3, 0.01) > 0.0
+    assert measure_batch_rate(theatre_of(box).build_player("linear", short()), 3, 0.01) > 0.0
     vertices, cameras = asked[-1]
     assert len(asked) >= 2 and len({vertex.tobytes() for vertex in vertices}) > 1
     assert len({camera.T_camera_world.tobytes() for camera in cameras}) == len(cameras) == len(vertices) == 3
 
 
 def test_frame_benchmark_reports_size_and_each_stage(box, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(frame, "batch_rate", partial(frame.batch_rate, seconds=0.01))
+    monkeypatch.setattr(frame, "measure_batch_rate", partial(frame.measure_batch_rate, duration=0.01))
     words = ["frame", "--anatomy", str(put(theatre_of(box), tmp_path / "box.vtu")), "--device", "cpu"]
     words += ["--deformer", "linear", "--size", "160x120", "--frames", "2"]
     assert main([*words, "--json"]) == 0
@@ -72,4 +79,4 @@ def test_frame_benchmark_reports_size_and_each_stage(box, tmp_path, capsys, monk
 def test_invalid_image_size_is_rejected(text, capsys):
     assert main(["frame", "--size", text]) == 2
     assert "--size" in capsys.readouterr().err
-    assert measure_size("1280X720") == (1280, 720)
+    assert parse_image_size("1280X720") == (1280, 720)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from chromium import PROGRAM, SIZES, Chromium
 
-from ar.overlay.hud import bound_words as words
+from ar.overlay.hud import format_bound as words
 from ar.overlay.outlines import compute_silhouette, find_outlines
 from scenes.cli import main
 from scenes.html.document import MAX_BYTES, SCRIPTS, build_exported_model, build_html, choose_model

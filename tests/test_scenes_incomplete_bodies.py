@@ -81,7 +81,7 @@ def solved(monkeypatch):
             nonlocal rows
             rows = total
 
-        found.append((simulate(*given, progress=progress).rows, rows))
+        found.append((simulate(*given, progress=progress).total, rows))
 
     monkeypatch.setattr(bodies, "simulate", noted)
     return found
@@ -138,7 +138,7 @@ def test_tabulated_series_is_reused_after_an_error(plan, tmp_path, monkeypatch):
         with pytest.raises(InputError, match="just now"):
             make_body(tmp_path, again, 1, 0, "cpu")
     with monkeypatch.context() as held:
-        held.setattr("surrogate.training.expansion.tabulate", full)
+        held.setattr("surrogate.training.expansion.tabulate_series", full)
         assert make_body(tmp_path, again, 1, 0, "cpu").resumed
     assert not make_body(tmp_path / "other", again, 1, 0, "cpu").resumed
     assert files_of(tmp_path) == files_of(tmp_path / "other")

@@ -26,7 +26,7 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.material import BRAIN, MATERIALS, Material
 from surrogate.data.dataset import read_dataset
-from surrogate.data.solution_rows import describe_tissue_source, read_tissue_statement
+from surrogate.data.solution_rows import describe_tissue_source, read_tissue_text
 from surrogate.training.expansion import Expansion
 
 STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=500.0)
@@ -123,7 +123,7 @@ RUN = "--count", "2", "--device", "cpu", "--element", "p1", "--json"
 class TestData:
     def test_data_set_is_solved_with_and_states_region_tissue(self, data):
         found = read_dataset(data)
-        assert read_tissue_statement(found.provenance) == TISSUE
+        assert read_tissue_text(found.provenance) == TISSUE
         truth = Fem(found.anatomy, build_push_effects(found.anatomy, TISSUE), TRAIN, "cpu", element="p1").deform(
             found.loads
         )

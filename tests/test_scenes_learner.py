@@ -24,12 +24,12 @@ def test_held_out_solutions_do_not_influence_training(study, tmp_path, name, mon
     """Bitwise equal after a new tabulation: wrong held-out solutions change only the error figures."""
     monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})
-    path, _ = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.disc_split.test])
+    path, _ = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.disc_split.test_mask])
     found = []
     for data, folder in ((study.data, "as-it-is"), (path, "wild")):
         here = replace(study, data=data)
         kept = tmp_path / folder / "series.npz"
-        vars(here)["expansion"] = Expansion(here.dataset, "cpu", kept=kept)
+        vars(here)["expansion"] = Expansion(here.dataset, "cpu", table_path=kept)
         with limit_to_one_thread():
             found.append(measure_learner(here, LearnerSpec(name)))
     row, wild = found

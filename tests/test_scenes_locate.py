@@ -17,7 +17,7 @@ from sim.material import Material
 from surrogate.data.solution_rows import describe_tissue_source
 from surrogate.locating.causes import KINDS
 from surrogate.locating.locator_store import load_locator, save_locator
-from surrogate.locating.observation import MAX_POINTS, Observation, choose_points, to_evidence
+from surrogate.locating.observation import MAX_POINTS, Observation, choose_point_numbers, to_evidence
 from surrogate.locating.regions import Region
 from surrogate.model.store import save
 
@@ -186,7 +186,10 @@ def test_locate_uses_a_subset_of_many_points(files, body, named):
     folder, truth = files
     locator = load_locator(folder / "box.locator.npz", body)
     rest, motion = seen_dent(body, truth, 20_000)
-    some, now = choose_points(len(rest)), rest + motion  # one is off by half a kilometre, and makes no line of them
+    some, now = (
+        choose_point_numbers(len(rest)),
+        rest + motion,
+    )  # one is off by half a kilometre, and makes no line of them
     assert len(some) == MAX_POINTS and some[0] == 0 and some[-1] == len(rest) - 1
     rest[some[7]] = now[some[7]] = now[some[7]] + [0.0, 0.0, 500.0]
     alone = locator.locate(Observation(now[some], rest[some] if named else None))

@@ -8,8 +8,8 @@ import pytest
 from locators import locator_of
 from theatres import SIGHTED, short, small
 
-from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, bound_words, format_millimetres, wrap_line
-from ar.overlay.outlines import compute_ink, find_ink, has_text
+from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, format_bound, format_millimetres, wrap_line
+from ar.overlay.outlines import average_colour, find_colour, has_text
 from scenes.cli import main
 from scenes.page.text import describe_estimate, format_page_legend, format_report
 from scenes.play.checks import is_within_surface, list_warnings, measure_frames
@@ -29,7 +29,7 @@ from sim.anatomy import PART_LABELS
 from sim.bodies.meshfile import write_anatomy
 from sim.errors import InputError
 from surrogate.locating.locator_store import save_locator, to_locator_path
-from surrogate.locating.prior import compute_middle
+from surrogate.locating.prior import compute_centroid_motion
 from surrogate.locating.regions import Region
 
 # Small errors, as a tumour in a box moves little.
@@ -83,13 +83,13 @@ def test_image_shows_estimate_truth_and_ellipsoid(play, frames):
     assert found.location is not None and found.is_covered and found.error < 0.7 * np.linalg.norm(found.true_motion)
     assert frame.moved == found.motion_length == pytest.approx(np.linalg.norm(found.location.centroid))
     for ink, least in ((TUMOUR_COLOUR, 200), (ELLIPSOID_COLOUR, 10), (TRUTH_COLOUR, 10)):
-        assert np.count_nonzero(find_ink(frame.shown, compute_ink(ink))) >= least
+        assert np.count_nonzero(find_colour(frame.shown, average_colour(ink))) >= least
     nodes = play.site.anatomy.tumour_nodes
     believed, positions = play.estimate_positions(frame), play.compute_positions(frame.deformation)
     assert not np.allclose(believed[nodes], positions[nodes], atol=1e-5)
     others = np.setdiff1d(np.arange(len(positions)), nodes)
     assert np.array_equal(believed[others], positions[others])  # the camera sees the true cortex
-    moved = compute_middle(play.site.anatomy, (believed - play.site.anatomy.mesh.nodes)[None])[0]
+    moved = compute_centroid_motion(play.site.anatomy, (believed - play.site.anatomy.mesh.nodes)[None])[0]
     assert moved == pytest.approx(found.motion, abs=1e-6)
     assert "locate" in frame.seconds and frame.remark.endswith(f"estimate error {1e3 * found.error:.1f} mm")
 
@@ -174,8 +174,8 @@ def test_rejected_observation_shows_warning_and_no_ellipsoid(refused, monkeypatc
     assert not found.is_covered and frame.remark == ""
     nodes = play.site.anatomy.tumour_nodes
     assert np.array_equal(play.estimate_positions(frame)[nodes], play.site.anatomy.mesh.nodes[nodes])
-    assert not find_ink(frame.shown, compute_ink(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
-    assert np.count_nonzero(find_ink(frame.shown, compute_ink(TRUTH_COLOUR))) > 10
+    assert not find_colour(frame.shown, average_colour(ELLIPSOID_COLOUR)).any() and frame.moved == 0.0
+    assert np.count_nonzero(find_colour(frame.shown, average_colour(TRUTH_COLOUR))) > 10
     monkeypatch.setattr(
         "scenes.play.scene_costs.draw_text_panel", lambda colour, lines, **more: said.extend(lines) or colour
     )
@@ -207,7 +207,7 @@ def test_label_separates_simulated_and_estimated_motion(frames, monkeypatch):
     )
     draw_cost_panel(replace(frame, named=False), "fem")
     truth = 1e3 * np.linalg.norm(found.true_motion)
-    off = bound_words(found.location.p95, 1)
+    off = format_bound(found.location.p95, 1)
     assert said[0] == f"simulated tumour motion: {truth:.2f} mm"
     assert said[1] == f"estimate: tumour moved {1e3 * found.motion_length:.2f} +- {off}"
     assert f"simulation: {frame.deformation.source}" in said and f"estimate: {found.source}" in said

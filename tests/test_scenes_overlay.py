@@ -10,10 +10,16 @@ import numpy as np
 import pytest
 from films import FILM, Recorded
 
-from ar.overlay.outlines import compute_changed_share, compute_ink, compute_silhouette, find_ink, measure_outline_gap
+from ar.overlay.outlines import (
+    average_colour,
+    compute_changed_share,
+    compute_silhouette,
+    find_colour,
+    measure_outline_distance,
+)
 from ar.rendering.layer import Layer
 from ar.rendering.real_image import build_real_image
-from ar.tracking.image_sequences import Named, read_video
+from ar.tracking.image_sequences import NamedImage, read_video
 from scenes.cli import main
 from scenes.play.stage import CORTEX, DRAPE, TUMOUR_COLOUR
 from scenes.tracked.calibration_file import read_calibration
@@ -37,7 +43,7 @@ GOOD, REST, LOST, TOOL, STALE = (
 # Of a film of palpate that is over-exposed at 0.53 s, hides the cube from 0.93 to 1.07 s and the reference from
 # 1.33 to 1.73 s, and lacks a picture at 2 s. The ball lies on the cortex from 0.4 s on.
 STATES = [REST, REST, REST, GOOD, LOST, GOOD, GOOD, TOOL, TOOL, GOOD, LOST, LOST, LOST, LOST, GOOD, STALE, GOOD]
-INK = compute_ink(TUMOUR_COLOUR)
+INK = average_colour(TUMOUR_COLOUR)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +52,7 @@ def calibration():
 
 
 def pictures():
-    return read_timed_images(read_video(FILM / "film.mp4", 30.0, colour=True))
+    return read_timed_images(read_video(FILM / "film.mp4", 30.0, with_colour=True))
 
 
 @pytest.fixture(scope="module")
@@ -70,14 +76,14 @@ def test_drawn_outline_matches_the_true_tumour(shown, truth, calibration, stage,
     vertices, triangles = follower.tool.mesh
     for each in shown:
         if not each.result.is_reliable:
-            assert np.count_nonzero(find_ink(each.image, INK)) < 5  # nothing looks as if it were known
+            assert np.count_nonzero(find_colour(each.image, INK)) < 5  # nothing looks as if it were known
             continue
         row = truth.find_image(each.result.time)
         camera, pose = calibration.build_camera(truth.T_camera_scan[row]), truth.T_scan_tool[row]
         true = stage.tumour_at_rest.vertices + truth.displacement[row]
         mask = compute_silhouette(camera, true, stage.tumour_at_rest.triangles)
         covered = compute_silhouette(camera, vertices @ pose[:3, :3].T + pose[:3, 3], triangles)
-        assert measure_outline_gap(each.image, INK, mask, covered) < 2.5
+        assert measure_outline_distance(each.image, INK, mask, covered) < 2.5
 
 
 def test_overlay_is_not_drawn_over_the_drape(shown, truth, calibration, stage, follower):
@@ -115,7 +121,7 @@ def test_tool_error_enters_the_band_through_a_deeper_tool(follower, truth, stage
 
 def test_paced_video_drops_images_at_slow_processing():
     picture = np.zeros((8, 8), np.uint8)
-    film = (TimedImage(Named(str(n), picture, 0.02 * n), False) for n in range(20))
+    film = (TimedImage(NamedImage(str(n), picture, 0.02 * n), False) for n in range(20))
     seen, ages = [], []
     for taken, begun in pace_images(film):
         ages.append(time.perf_counter() - begun - taken.source.time)
@@ -161,7 +167,7 @@ def test_overlay_command_writes_video_table_and_report(tmp_path, capsys):
         and "tissue motion unknown" in rows[0]["words"]
         and rows[11]["tumour_x_mm"] == ""
     )
-    film = list(read_video(out, 30.0, colour=True))
+    film = list(read_video(out, 30.0, with_colour=True))
     assert len(film) == 17 and film[0].grey.shape == (720, 960)
 
 

@@ -122,7 +122,7 @@ def test_video_page_restarts_after_the_last_image(follower, stage):
 
 
 def test_camera_image_dims_when_stale_and_recovers(follower, stage):
-    first = next(read_video(FILM / "film.mp4", 30.0, colour=True))
+    first = next(read_video(FILM / "film.mp4", 30.0, with_colour=True))
 
     def pictures():
         yield replace(first, time=time.perf_counter())

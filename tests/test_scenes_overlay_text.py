@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ar.overlay.hud
-from ar.overlay.hud import name_bearings
+from ar.overlay.hud import name_edge_directions
 from ar.overlay.outlines import compute_silhouette, find_outlines
 from ar.overlay.styles import Style
 from scenes.page.demo import render_page_image
@@ -86,7 +86,7 @@ def lined(play, frame):
         mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles)
         cv2.polylines(lines, find_outlines(mask), True, (1,), 2)
     middles = np.stack([rest.vertices.mean(axis=0), now.vertices.mean(axis=0)])
-    for ends in (middles, np.stack([frame.tip, measure_tip_gauge(frame.tip, now).nearest])):
+    for ends in (middles, np.stack([frame.tip, measure_tip_gauge(frame.tip, now).nearest_point])):
         start, end = np.rint(frame.camera.project(ends)[0]).astype(int).tolist()
         if start != end:  # no arrow without motion
             cv2.line(lines, start, end, (1,), 2)
@@ -137,7 +137,7 @@ def test_direction_letters_and_motion_text_have_fixed_places(monkeypatch, size):
     for touch in (None, Touch(), Touch(-0.03), Touch(force=1.0)):
         _, frame, found = seen(monkeypatch, "press", size, touch)
         words = {word.text.split()[0]: word for word in found}
-        bearings = name_bearings(frame.camera.T_camera_world[:3, :3])
+        bearings = name_edge_directions(frame.camera.T_camera_world[:3, :3])
         top, foot, left, right = (words[bearings[edge]] for edge in ("top", "bottom", "left", "right"))
         assert [0.5 * (letter.left + letter.right) / width for letter in (top, foot)] == pytest.approx(
             [0.25, 0.75], abs=0.01

@@ -26,7 +26,7 @@ from surrogate.model.applicability import find_rejection
 from surrogate.model.guarded import find_first_model
 from surrogate.model.learned import Learned, ModelPart
 from surrogate.model.tool_contact import ForceModel
-from surrogate.model.training_range import Envelope
+from surrogate.model.training_range import TrainingRange
 from surrogate.training.fem_tables import condense_contact, join_bases
 
 NODES = np.zeros((1, 3))
@@ -50,7 +50,7 @@ def untrained(anatomy: Anatomy, scene: Scene) -> Learned:
     patch = open_patch(anatomy)
     fem = Fem(anatomy, (Elasticity(Material("linear", 5000.0, 0.49)), Held(), Slide()), REFERENCE, "cpu")
     contact, bases = condense_contact(fem, [anatomy.tumour_nodes, np.setdiff1d(patch.nodes, anatomy.tumour_nodes)])
-    envelope = Envelope(patch.points, 1.0, 1.0, np.pi, (1e-6, 1.0), (ball.radius, ball.radius), np.inf)
+    envelope = TrainingRange(patch.points, 1.0, 1.0, np.pi, (1e-6, 1.0), (ball.radius, ball.radius), np.inf)
     said = {"effects": repr(scene.effects)}
     parts = (ModelPart("tool", replace(contact, grip=np.array([1.0, 0.0])), join_bases(bases)),)
     return Learned(anatomy, parts, envelope, training=said, tool=ball, force=ForceModel())

@@ -20,7 +20,7 @@ from sim.errors import InputError
 from sim.material import BRAIN, Material
 from sim.runtime.device import find_device
 from sim.runtime.memory import check_fits
-from surrogate.data.solution_rows import describe_tissue_source, read_tissue_statement
+from surrogate.data.solution_rows import describe_tissue_source, read_tissue_text
 from surrogate.model.applicability import find_rejection
 
 TINY = """
@@ -175,7 +175,7 @@ def test_memory_shortage_is_raised_and_marks_no_failed_body(tmp_path, monkeypatc
 
 def test_model_states_the_tissue_of_its_regions():
     tissue = Elasticity(BRAIN, {TUMOUR_LABEL: Material("neo-hookean", 9000.0, 0.49)})
-    assert read_tissue_statement(describe_tissue_source(tissue)) == tissue and read_tissue_statement(
+    assert read_tissue_text(describe_tissue_source(tissue)) == tissue and read_tissue_text(
         describe_tissue_source(Elasticity(BRAIN))
     ) == Elasticity(BRAIN)
     theatre = open_theatre()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from test_scenes_overlay import INK, pictures
 
-from ar.overlay.outlines import find_ink
+from ar.overlay.outlines import find_colour
 from scenes.tracked.follower import TumourState
 from scenes.tracked.overlay_painter import Painter
 from scenes.tracked.plausible import describe_implausible_registration
@@ -19,7 +19,7 @@ def test_implausible_registration_and_tool_are_unreliable(follower, stage):
     known = other.step(first.grey, 0.0)
     assert known.state is TumourState.UNSURE and known.bound is None and "mm from the reference" in known.warning
     painted = Painter(stage, follower.tool).paint(first.colour, known).colour
-    assert np.count_nonzero(find_ink(painted, INK)) < 5
+    assert np.count_nonzero(find_colour(painted, INK)) < 5
     near = follower.step(first.grey, 0.0)
     behind = replace(near.camera, T_camera_world=np.diag([1.0, -1.0, -1.0, 1.0]) @ near.camera.T_camera_world)
     assert "behind the camera" in describe_implausible_registration(follower.registration, stage, behind)

@@ -11,7 +11,7 @@ from theatres import PUSHING, on_template, player, short, small
 from ar.optics.camera import project_cv2
 from ar.overlay.composite import WARNING_COLOUR
 from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, WHITE, wrap_line
-from ar.overlay.outlines import compute_ink, has_text
+from ar.overlay.outlines import average_colour, has_text
 from scenes.play.frame_text import shorten_source
 from scenes.play.player import BONE_WARNING, CARRIED_DEPTH, STAGES
 from scenes.play.stage import CORTEX, TOOL
@@ -67,7 +67,7 @@ def test_result_is_unreliable_with_tissue_pressed_into_bone(theatre):
     reach = play.site.compute_reach(play.scene.tool.radius)
     frame = play.draw(0, 0.0, Touch(reach, 0.0, force=0.4, tilt=(np.radians(40.0), 0.0)))
     assert frame.doubt == BONE_WARNING and all(
-        says(frame.shown, part, compute_ink(WARNING_COLOUR)) for part in BONE_WARNING.split(": ")
+        says(frame.shown, part, average_colour(WARNING_COLOUR)) for part in BONE_WARNING.split(": ")
     )
     assert play.site.compute_axis_distance(frame.tip[None])[0] <= reach + 1e-9 and frame.distance_error is None
 
@@ -198,7 +198,7 @@ def test_distance_equals_sampled_distance_from_tip_to_tumour(play):
     assert read <= least < read + 2e-4
     if bare is not play:  # what it is off by on average is added
         assert frame.distance == pytest.approx(
-            play.deformer.predict_distance(frame.loads, frame.deformation).value[0], rel=1e-12
+            play.deformer.predict_distance(frame.loads, frame.deformation).distance[0], rel=1e-12
         )
 
 

@@ -7,7 +7,7 @@ import pytest
 from links import NAMES, NOW, corners_of, in_mm, linked, peers, played
 from scipy.spatial.transform import Rotation
 
-from ar.overlay.gauge import Gauge
+from ar.overlay.gauge import DistanceGauge
 from scenes.commands.link import parse_address
 from scenes.link.console import format_address
 from scenes.link.frame import to_stamp
@@ -86,7 +86,7 @@ def test_unverified_registration_is_used_with_warning(follower, registration, be
     expected = 1e3 * (follower.motion.stage.tumour_at_rest.vertices + truth.displacement[10])
 
     async def scene():
-        own = None if sent else replace(registration, scanned=None)
+        own = None if sent else replace(registration, scan=None)
         async with linked(follower, own) as port, peers(port, 1) as (tracker,):
             if sent:
                 assert "no ReferenceToRas yet" in await tracker.said("Sulcus")
@@ -130,7 +130,7 @@ def test_distant_tool_is_marked_unreliable(follower, registration, beside):
 def test_old_result_is_marked_stale_without_band(stage, state):
     known = TrackingResult(0.0, state, "words", NO_TARGETS, BrainMotion(stage.anatomy.mesh.nodes), bound=1e-3)
     assert mark_late(PoseResult(NOW, known), 0.2, 0.3).tracking is known
-    old = mark_late(PoseResult(NOW, known, Gauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
+    old = mark_late(PoseResult(NOW, known, DistanceGauge(np.zeros(3), np.ones(3))), 0.4, 0.3)
     assert (
         old.tracking.state is TumourState.STALE
         and old.tracking.bound is old.gauge is None

@@ -20,7 +20,7 @@ def test_register_command_writes_file_and_error_at_tumour(tmp_path, capsys):
     said = json.loads(capsys.readouterr().out)
     assert 0.1 < said["tumour_p95_mm"] < 5.0 and said["rms_mm"] < 1.0
     np.testing.assert_allclose(read_registration(out).T_patient_scan, TRUE, atol=5e-3)
-    assert read_registration(out).scanned.digest == read_anatomy(get_template_path()).digest
+    assert read_registration(out).scan.digest == read_anatomy(get_template_path()).digest
     assert len(said["residuals_mm"]) == len(said["left_out_mm"]) == 7 and not said["suspect"]
     assert main(["register", str(pairs), "--out", str(out), "--surface", str(pairs)]) == 2
     assert "give it by --anatomy" in capsys.readouterr().err

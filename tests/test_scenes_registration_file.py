@@ -41,17 +41,17 @@ def test_registration_file_round_trips_and_rejects_damage(tmp_path):
 def test_registration_accepts_another_mesh_of_the_same_body(tmp_path):
     anatomy, path = read_anatomy(get_template_path()), tmp_path / "r.json"
     made = describe_scan(anatomy)
-    found = replace(register_points(SCAN, moved(SCAN)), scanned=made)
+    found = replace(register_points(SCAN, moved(SCAN)), scan=made)
     write_registration(path, found)
     again = read_registration(path)
-    assert again.scanned.digest == made.digest and again.scanned.compute_distance(made) < 1e-9
+    assert again.scan.digest == made.digest and again.scan.compute_distance(made) < 1e-9
     assert describe_other_mesh(again, anatomy, path) == ""
-    assert "does not say of which anatomy" in describe_other_mesh(replace(again, scanned=None), anatomy, path)
-    meshed = replace(again, scanned=replace(made, digest="other", bounds=made.bounds + 2e-3))
+    assert "does not say of which anatomy" in describe_other_mesh(replace(again, scan=None), anatomy, path)
+    meshed = replace(again, scan=replace(made, digest="other", bounds=made.bounds + 2e-3))
     assert "another mesh" in describe_other_mesh(meshed, anatomy, path)
     for other in (replace(made, bounds=made.bounds + 2e-2), replace(made, target=made.target + [0.0, 1e-2, 0.0])):
         with pytest.raises(InputError, match="made for another anatomy: bounds or tumour are"):
-            describe_other_mesh(replace(again, scanned=replace(other, digest="other")), anatomy, path)
+            describe_other_mesh(replace(again, scan=replace(other, digest="other")), anatomy, path)
     stored = json.loads(path.read_text())
     path.write_text(json.dumps(stored | {"scanned": stored["scanned"] | {"tumour_mm": [1, 2]}}))
     with pytest.raises(InputError, match="a tumour's middle of 3"):

@@ -19,7 +19,7 @@ from sim.effects import build_push_effects
 from sim.families.registry import build_family
 from sim.fem import Fem
 from surrogate.data.dataset import read_dataset
-from surrogate.data.splits import leave_sectors_out
+from surrogate.data.splits import hold_out_sectors
 from surrogate.training.train import train
 
 
@@ -61,8 +61,8 @@ def test_report_figures_match_independent_recomputation(study, page, study_box):
         assert np.allclose([stored[0]["reference"][kind][name] for name in names], values, rtol=2e-3)
         assert np.allclose([float(lines[0][f"reference.{kind}.{name}"]) for name in names], values, rtol=2e-3)
     data = read_dataset(study.data)
-    for name, split in (("discs", study.disc_split), ("sectors", leave_sectors_out(study.pushed, study.patch))):
-        test = split.test
+    for name, split in (("discs", study.disc_split), ("sectors", hold_out_sectors(study.pushed, study.patch))):
+        test = split.test_mask
         model = train(data, ["linear"], split=split).models["linear"]
         truth = data.read_displacement(study_box.tumour_nodes)[test]
         guess = model.deform(data.loads.select(np.flatnonzero(test)), at=study_box.tumour_nodes).displacement
@@ -73,7 +73,10 @@ def test_report_figures_match_independent_recomputation(study, page, study_box):
         worst = [miss.mean(), np.percentile(miss, 95.0), miss.max()]
         assert np.allclose([held["worst"][each] for each in names], worst, rtol=1e-5)
         assert held["loads"] == test.sum() and held["values"] == test.sum() * len(study_box.tumour_nodes)
-    assert stored[2]["loads"] == study.disc_split.train.sum() and stored[2]["units"] == 3 * study_box.craniotomy.sum()
+    assert (
+        stored[2]["loads"] == study.disc_split.training_mask.sum()
+        and stored[2]["units"] == 3 * study_box.craniotomy.sum()
+    )
 
 
 def test_report_page_loads_no_external_resources(page, study_rows):

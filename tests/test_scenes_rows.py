@@ -31,26 +31,28 @@ from sim.errors import InputError
 from sim.loads import Pushed
 from sim.runtime.threads import limit_to_one_thread
 from surrogate.data.dataset import read_dataset
-from surrogate.data.encode import compute_tool_features, reduce, split_forces
-from surrogate.data.splits import leave_sectors_out
+from surrogate.data.encode import compute_tool_features, fit_basis, split_forces
+from surrogate.data.splits import hold_out_sectors
 from surrogate.training.expansion import COARSE_BASIS, SERIES_MODELS
-from surrogate.training.learners import SVR_CANDIDATES, Tuned
+from surrogate.training.learners import SVR_CANDIDATES, TunedRegressor
 from surrogate.training.train import train
 
 
 def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path, monkeypatch):
     """Trained here on the training rows; the report's file has wrong solutions of the held-out loads."""
-    training, pushed, nodes = study.disc_split.train, study.pushed, study_box.tumour_nodes
+    training, pushed, nodes = study.disc_split.training_mask, study.pushed, study_box.tumour_nodes
     truth = study.dataset.read_displacement(nodes)[study.dataset.good]
-    path, wild = poisoned(study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.disc_split.test])
+    path, wild = poisoned(
+        study.data, tmp_path / "data.h5", np.flatnonzero(study.dataset.good)[study.disc_split.test_mask]
+    )
     monkeypatch.setattr("scenes.report.learner.list_counts", lambda most: [])
     monkeypatch.setattr("scenes.report.learner.compute_coverage_beyond", lambda *known: {})
     with limit_to_one_thread():
         row = measure_learner(replace(study, data=path), LearnerSpec("svr"))
     lesson = Pushed(pushed.point[training], pushed.force[training], pushed.footprint[training])
     size, (every, direction) = split_forces(lesson)[0], split_forces(pushed)
-    basis = reduce(nodes, truth[training] / size[:, None, None], *COARSE_BASIS)
-    machine = Tuned(SVR_CANDIDATES).fit(
+    basis = fit_basis(nodes, truth[training] / size[:, None, None], *COARSE_BASIS)
+    machine = TunedRegressor(SVR_CANDIDATES).fit(
         compute_tool_features(study.patch, lesson), basis.encode(truth[training] / size[:, None, None])
     )
     within = replace(pushed, force=np.clip(every, size.min(), size.max())[:, None] * direction)
@@ -59,12 +61,12 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
     exact = get_reference(study).displacement[:, np.isin(study.read_nodes, nodes)]
     mean = 1e3 * np.linalg.norm(guess[played] - exact, axis=2).mean(axis=1)
     np.testing.assert_allclose(row.load_mm, mean, rtol=1e-3)
-    wanted = 1e3 * np.linalg.norm(guess[study.disc_split.test] - wild[nodes], axis=2)
+    wanted = 1e3 * np.linalg.norm(guess[study.disc_split.test_mask] - wild[nodes], axis=2)
     mm = row.own_fem["discs"].mm
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
     assert row.loads == training.sum()
     # Of loads that point into the sectors, by a model of those that do not.
-    data, sectors = read_dataset(path), leave_sectors_out(pushed, study.patch)
+    data, sectors = read_dataset(path), hold_out_sectors(pushed, study.patch)
     asked = data.loads.select(np.flatnonzero(data.good)[sectors.test])
     guess = train(data, ["svr"], split=sectors).models["svr"].deform(asked, at=nodes).displacement
     wanted = 1e3 * np.linalg.norm(guess - data.read_displacement(nodes)[data.good][sectors.test], axis=2)
@@ -75,12 +77,12 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
 def test_played_loads_lie_in_the_held_out_discs(study):
     every = replace(study, loads=10_000).test_loads.get(Pushed)
     some, split = study.test_loads.get(Pushed), study.disc_split
-    assert len(every.point) == split.test.sum() and len(some.point) == 2
+    assert len(every.point) == split.test_mask.sum() and len(some.point) == 2
     for pushed in (every, some):
         into = np.linalg.norm(pushed.point[:, None] - split.centres, axis=2).min(axis=1)
         assert into.max() <= split.radius
-        assert not np.isin(pushed.point[:, 0], study.pushed.point[split.train, 0]).any()
-    training = np.linalg.norm(study.pushed.point[split.train][:, None] - split.centres, axis=2).min(axis=1)
+        assert not np.isin(pushed.point[:, 0], study.pushed.point[split.training_mask, 0]).any()
+    training = np.linalg.norm(study.pushed.point[split.training_mask][:, None] - split.centres, axis=2).min(axis=1)
     assert training.min() > split.radius
     force, size = (np.linalg.norm(each.force, axis=1) for each in (some, every))
     assert list(force) == [size.min(), size.max()]

@@ -9,9 +9,9 @@ import pytest
 from theatres import template_theatre
 
 from ar.overlay.hud import TEXT_SCALE
-from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text
-from ar.screen import write_film
-from ar.tracking.image_sequences import Named, read_video
+from ar.overlay.outlines import average_colour, compute_silhouette, find_colour, has_text
+from ar.screen import write_movie
+from ar.tracking.image_sequences import NamedImage, read_video
 from scenes.cli import main
 from scenes.script.scene import find_scene
 from scenes.tracked.calibration_file import read_calibration
@@ -32,7 +32,7 @@ def parts():
 
 
 def film(count):
-    return islice(read_video(FILM / "film.mp4", 30.0, colour=True), count)
+    return islice(read_video(FILM / "film.mp4", 30.0, with_colour=True), count)
 
 
 def test_masked_areas_have_no_overlay_and_report_their_share(parts):
@@ -43,8 +43,8 @@ def test_masked_areas_have_no_overlay_and_report_their_share(parts):
     columns = np.flatnonzero(mask.any(axis=0))
     covered = np.zeros(mask.shape, np.uint8)
     covered[150:, : int(columns.mean())] = 255  # below the words of the head
-    (hidden,) = draw_overlays(read_timed_images(film(1), iter([Named("0.png", covered)])), follower, painter)
-    amber = [find_ink(each.image, compute_ink((0.92, 0.50, 0.05))) for each in (whole, hidden)]
+    (hidden,) = draw_overlays(read_timed_images(film(1), iter([NamedImage("0.png", covered)])), follower, painter)
+    amber = [find_colour(each.image, average_colour((0.92, 0.50, 0.05))) for each in (whole, hidden)]
     assert amber[0][covered > 0].any() and not amber[1][covered > 0].any()
     np.testing.assert_array_equal(amber[0][covered == 0], amber[1][covered == 0])
     share = np.count_nonzero(mask & (covered > 0)) / np.count_nonzero(mask)
@@ -65,11 +65,11 @@ def test_frozen_overlay_is_hidden_by_the_mask(parts):
 
 
 def test_masks_match_images_by_number_and_size():
-    black = Named("a.png", np.zeros((720, 960), np.uint8))
+    black = NamedImage("a.png", np.zeros((720, 960), np.uint8))
     assert [each.occluded.any() for each in read_timed_images(film(2), iter([black, black]))] == [False, False]
     ones = black.grey.copy()
     ones[100:200] = 1  # a mask of 0 and 1
-    (shown,) = read_timed_images(film(1), iter([Named("a.PNG", ones)]))
+    (shown,) = read_timed_images(film(1), iter([NamedImage("a.PNG", ones)]))
     np.testing.assert_array_equal(shown.occluded, ones > 0)
     soft = replace(black, name="frame 0", grey=np.full_like(ones, 16))  # a video's black
     assert not next(read_timed_images(film(1), iter([soft]))).occluded.any()
@@ -78,12 +78,12 @@ def test_masks_match_images_by_number_and_size():
     with pytest.raises(ValueError, match="more masks than images"):
         list(read_timed_images(film(1), iter([black, black])))
     with pytest.raises(ValueError, match=r"the mask b\.png"):
-        list(read_timed_images(film(1), iter([Named("b.png", black.grey[1:])])))
+        list(read_timed_images(film(1), iter([NamedImage("b.png", black.grey[1:])])))
 
 
 def test_overlay_command_rejects_mask_video_with_missing_frames(tmp_path, capsys):
     masks = tmp_path / "masks.mp4"
-    write_film(masks, iter([np.zeros((720, 960, 3), np.uint8)] * 2), 30.0)
+    write_movie(masks, iter([np.zeros((720, 960, 3), np.uint8)] * 2), 30.0)
     given = ["--camera", str(FILM / "camera.yaml"), "--registration", str(FILM / "registration.json")]
     assert main(["overlay", str(FILM / "film.mp4"), *given, "--covered", str(masks)]) == 2
     assert "frame 2 has no mask: there are 2" in capsys.readouterr().err

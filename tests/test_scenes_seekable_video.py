@@ -8,7 +8,7 @@ from scenes.tracked.seekable_video import SeekableVideo
 
 
 def test_seekable_video_reads_frames_in_any_order(tmp_path):
-    film, pictures = SeekableVideo(FILM / "film.mp4", 30.0), list(read_video(FILM / "film.mp4", 30.0, colour=True))
+    film, pictures = SeekableVideo(FILM / "film.mp4", 30.0), list(read_video(FILM / "film.mp4", 30.0, with_colour=True))
     assert film.count == len(pictures) == 17
     for number in (3, 4, 16, 0):
         found = film.read_image(number)

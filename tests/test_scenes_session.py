@@ -14,7 +14,7 @@ import pytest
 from films import FILM
 from links import HOST, NAMES, in_mm, linked, peers, played
 
-from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, measure_outline_gap
+from ar.overlay.outlines import average_colour, compute_silhouette, find_colour, measure_outline_distance
 from ar.tracking.image_sequences import read_video
 from scenes.link.frame import to_stamp
 from scenes.link.messages import encode_image, encode_transform, read_image
@@ -161,7 +161,7 @@ def test_pyigtl_client_sends_pose_and_receives_tumour(follower, registration, be
 
 
 def test_camera_image_is_returned_with_tumour_overlay(follower, registration, truth, beside, stage):
-    picture = next(iter(read_video(FILM / "film.mp4", 30.0, colour=True))).colour
+    picture = next(iter(read_video(FILM / "film.mp4", 30.0, with_colour=True))).colour
     camera = follower.calibration.build_camera(truth.T_camera_scan[0])
     placed = in_mm(registration.T_patient_scan @ np.linalg.inv(truth.T_camera_scan[0]))
     mask = compute_silhouette(camera, stage.tumour_at_rest.vertices, stage.tumour_at_rest.triangles)
@@ -199,10 +199,11 @@ def test_camera_image_is_returned_with_tumour_overlay(follower, registration, tr
         "one": False, "drawn": True, "fast": False, "late": False
     }  # fmt: skip
     assert (
-        measure_outline_gap(shown["drawn"], compute_ink(TUMOUR_COLOUR), mask, compute_silhouette(camera, *tool)) < 2.5
+        measure_outline_distance(shown["drawn"], average_colour(TUMOUR_COLOUR), mask, compute_silhouette(camera, *tool))
+        < 2.5
     )
 
 
 def found(drawn):
     """Whether a tumour is drawn as known."""
-    return np.count_nonzero(find_ink(drawn, compute_ink(TUMOUR_COLOUR))) > 5
+    return np.count_nonzero(find_colour(drawn, average_colour(TUMOUR_COLOUR))) > 5

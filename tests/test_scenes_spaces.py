@@ -19,7 +19,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from theatres import short
 
-from ar.tracking.pose import Verdict
+from ar.tracking.pose import PoseStatus
 from ar.tracking.registration import Registration
 from scenes.cli import main
 from scenes.episodes.episode import EpisodeRecording, collect
@@ -184,7 +184,7 @@ def test_tables_and_headers_name_their_spaces(tmp_path):
     write_truth(tmp_path / "truth.npz", truth)
     assert json.loads(str(np.load(tmp_path / "truth.npz")["header"]))["spaces"]["scan"] == "RAS [m]"
     write_truth_table(tmp_path / "truth.csv", truth, 1e-3 * TUMOUR[None])
-    write_poses(tmp_path / "track.csv", [TrackedPose(0.0, Verdict.LOST, None, 0.01)], np.zeros(3))
+    write_poses(tmp_path / "track.csv", [TrackedPose(0.0, PoseStatus.LOST, None, 0.01)], np.zeros(3))
     write_tracking_table(tmp_path / "overlay.csv", [], [])
     (heads, *rows), (tracked, lost), (drawn,) = (
         list(csv.reader((tmp_path / name).read_text().splitlines()))

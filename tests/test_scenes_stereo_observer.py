@@ -8,7 +8,7 @@ from programs import main
 from theatres import template_theatre
 
 from ar.overlay.outlines import compute_silhouette
-from benchmarks.studies.stereo_study import row
+from benchmarks.studies.stereo_study import summarise_seed
 from scenes.play.deformers import RestDeformer
 from scenes.play.player import REJECTED_WARNING, Player
 from scenes.play.stereo_observer import StereoObserver
@@ -202,7 +202,7 @@ def test_study_summary_counts_rejected_frames(observer, moved):
         observer.estimate(30, moved),
         replace(observer, observation_model=replace(EXACT, darker=0.999)).estimate(3, moved),
     )
-    found = row(4, [good, good, none])
+    found = summarise_seed(4, [good, good, none])
     assert (found.seed, found.frames, found.refused) == (4, 3, 1) and found.covered == float(good.is_covered)
     length = float(np.linalg.norm(good.true_motion))
     assert found.most_mm == pytest.approx(1e3 * length) and found.off_mm == pytest.approx(1e3 * good.error)

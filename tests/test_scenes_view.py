@@ -8,7 +8,7 @@ from theatres import small
 from visitor import report, wait_for
 
 from ar.page.elements import build_tabs
-from ar.page.parts import ScenePicture
+from ar.page.parts import SceneImage
 from scenes.page.fem_worker import FemWorker
 from scenes.page.view import FEM_COLOUR, STALE_COLOUR, build_page_bodies, build_static_bodies
 from scenes.script.craniotomy_frame import HOLE_RATIO
@@ -58,13 +58,13 @@ def test_page_3d_view_has_craniotomy_scan_and_slice_planes(theatre):
     assert away.min() == pytest.approx(hole, rel=0.05) and away.max() < hole + 3e-3
     assert len(bodies["cortex"].triangles) > len(bodies["sulci"].triangles) > 0
     assert np.array_equal(bodies["scan"].vertices, stage.tumour_at_rest.vertices)
-    legend = build_tabs(bodies=list(bodies.values())).partition('<p class="key">')[2].partition("</p>")[0]
+    legend = build_tabs(surfaces=list(bodies.values())).partition('<p class="key">')[2].partition("</p>")[0]
     assert 'rgb(20% 94% 42%)">&#9632;</b> tumour now</span>' in legend and legend.count("<span>") == 3
-    planes = [part for part in build_static_bodies(stage) if isinstance(part, ScenePicture)]
+    planes = [part for part in build_static_bodies(stage) if isinstance(part, SceneImage)]
     assert [plane.name for plane in planes] == ["axial", "coronal", "sagittal"]
-    assert 0.05 < max((plane.colour[..., 3] > 0).mean() for plane in planes) < 0.55
+    assert 0.05 < max((plane.image[..., 3] > 0).mean() for plane in planes) < 0.55
     for intensity, count in ((stage.intensity, 3), (None, 0)):  # a texture of vessels is no scan
         drawn = replace(stage.scene, look=replace(stage.scene.look, vessels=3))
         found = build_static_bodies(replace(stage, scene=drawn, intensity=intensity))[-3:]
-        same = [np.array_equal(a.colour, b.colour) for a, b in zip(found, planes, strict=True) if hasattr(a, "colour")]
+        same = [np.array_equal(a.image, b.image) for a, b in zip(found, planes, strict=True) if hasattr(a, "colour")]
         assert same == [True] * count

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from surrogate.array_functions import Rounded, multiply_rows, round_to_half, take_rows_of
+from surrogate.array_functions import QuantisedTable, multiply_rows, round_to_half, take_rows
 from surrogate.regressors.force_series import ForcePairs, Series
 from surrogate.regressors.gp import Gp
 
@@ -12,21 +12,21 @@ TABLE = np.random.default_rng(0).normal(size=(50, 4)) * [1.0, 10.0, 1e-3, 0.0]
 
 @pytest.mark.parametrize("step", [0.01, np.array([0.01, 0.1, 1e-5, 1.0])])
 def test_rounded_table_error_is_at_most_half_a_step(step):
-    rounded = Rounded.round_table(TABLE, step)
-    assert rounded.whole.dtype == np.int16 and rounded.values.flags.c_contiguous
+    rounded = QuantisedTable.quantise(TABLE, step)
+    assert rounded.integers.dtype == np.int16 and rounded.values.flags.c_contiguous
     assert (np.abs(rounded.values - TABLE) <= 0.5001 * np.asarray(step)).all()
 
 
 def test_rounding_step_increases_to_avoid_integer_overflow():
-    rounded = Rounded.round_table(TABLE, 1e-6)
+    rounded = QuantisedTable.quantise(TABLE, 1e-6)
     largest = np.abs(TABLE).max(axis=0)
     assert rounded.step == pytest.approx(np.maximum(1e-6, largest / 32767))
     np.testing.assert_allclose(rounded.values, TABLE, atol=largest.max() / 32767)
 
 
 def test_rounded_rows_and_products_equal_those_of_values():
-    rounded, rows = Rounded.round_table(TABLE, 0.01), np.array([3, 1, 3])
-    np.testing.assert_array_equal(take_rows_of(rows, rounded), rounded.values[rows])
+    rounded, rows = QuantisedTable.quantise(TABLE, 0.01), np.array([3, 1, 3])
+    np.testing.assert_array_equal(take_rows(rows, rounded), rounded.values[rows])
     np.testing.assert_array_equal(multiply_rows(np.ones((1, 3)), rounded, rows)[0], rounded.values[rows].sum(axis=0))
 
 

@@ -11,7 +11,7 @@ def test_pcr_drops_components_of_small_variance():
     scores = np.random.default_rng(5).normal(size=(200, 3)) * [10.0, 3.0, 0.1]
     turned = np.linalg.qr(RANDOM.normal(size=(6, 3)))[0]
     X, Y = scores @ turned.T + 7.0, scores / [10.0, 3.0, 0.1] + 2.0
-    few, all_ = Pcr(share=0.999).fit(X, Y), Pcr(share=1.0).fit(X, Y)
+    few, all_ = Pcr(variance_share=0.999).fit(X, Y), Pcr(variance_share=1.0).fit(X, Y)
     assert np.allclose(all_.predict(X), Y, atol=1e-5)
     assert np.allclose(few.predict(X)[:, :2], Y[:, :2], atol=0.3) and few.predict(X)[:, 2].std() < 0.3
     assert np.linalg.matrix_rank(few.map_, tol=1e-9) == 2

@@ -12,7 +12,7 @@ from surrogate.data.indentation import get_only_pushes
 from surrogate.data.simulate import simulate
 from surrogate.data.splits import CALIBRATION_STRIDE
 from surrogate.data.tool_loads import draw
-from surrogate.training.bounds import MIN_SCALE_LOADS, TUMOUR_FIT, bound_by, collect_missed
+from surrogate.training.bounds import MIN_SCALE_LOADS, TUMOUR_FIT, calibrate_bound, collect_bound_examples
 from surrogate.training.train import train
 
 
@@ -39,8 +39,8 @@ def test_bound_scale_source_depends_on_calibration_count(pretender, tmp_path, co
     apart = np.arange(len(good))[-trained.calibrated :]
     answer = model.deform(good.select(apart), at=data.anatomy.tumour_nodes).displacement
     error = np.linalg.norm(answer - truth[apart], axis=2).max(axis=1)
-    near = collect_missed(model, open_patch(data.anatomy), get_only_pushes(good.select(apart)), error)
-    bounds = bound_by(near, TUMOUR_FIT, float(model.bounds.growth))
+    near = collect_bound_examples(model, open_patch(data.anatomy), get_only_pushes(good.select(apart)), error)
+    bounds = calibrate_bound(near, TUMOUR_FIT, float(model.bounds.growth))
     pairs = ((model.bounds.weights, bounds.weights), (model.bounds.quantile, bounds.quantile))
     assert [np.allclose(*pair) for pair in pairs] == 2 * [trained.calibrated >= MIN_SCALE_LOADS] == 2 * [count > 600]
 
@@ -53,4 +53,4 @@ def test_distance_correction_without_benefit_is_omitted(box, pretender, tmp_path
     loads = draw("palpation", box, 20, 5)
     answer, gauge = linear.deform(loads), build_tip_gauge(box)
     truth = gauge.compute_distances(loads, answer.displacement, answer.nodes)
-    assert np.abs(model.predict_distance(loads).value - truth).max() < 2e-5
+    assert np.abs(model.predict_distance(loads).distance - truth).max() < 2e-5

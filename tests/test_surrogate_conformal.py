@@ -14,12 +14,12 @@ from surrogate.model.conformal import (
     fit_bound,
     fit_growth,
 )
-from surrogate.model.training_range import Outside
+from surrogate.model.training_range import Excess
 
 
 def lying(count, away=0.0, beyond=0.0):
     """So many loads at a distance [m] from the nearest training load, and so far beyond their range otherwise."""
-    return Outside(np.full(count, away), np.full(count, beyond), np.full(count, beyond))
+    return Excess(np.full(count, away), np.full(count, beyond), np.full(count, beyond))
 
 
 def drawn(count, seed):
@@ -85,8 +85,8 @@ def test_growing_bounds_cover_near_and_far_loads():
     error = error * (1.0 + 800.0 * away)
     near = np.flatnonzero(away < 2e-3)
     known = features[near], force[near], error[near]
-    bound = fit_bound((features, error), *known, away=away[near], growth=800.0)
-    stated = bound.evaluate(features, force, Outside(away, 0.0 * away, 0.0 * away))[0]
+    bound = fit_bound((features, error), *known, distance=away[near], growth=800.0)
+    stated = bound.evaluate(features, force, Excess(away, 0.0 * away, 0.0 * away))[0]
     held = error <= stated
     assert abs(held[near].mean() - 0.95) < 0.02 and abs(held[away > 4e-3].mean() - 0.95) < 0.03
 
@@ -119,7 +119,7 @@ def placed(count, seed, discs=None):
 def test_bound_scale_from_few_discs_is_bounded_between_them(curved):
     discs = np.array([[-12.0, -9.0, 5.0], [2.0, 11.0, -8.0], [13.0, -4.0, 9.0]])
     features, _, error = placed(400, 5, discs)
-    bound = fit_bound((features, error), *placed(1000, 6), BoundSettings(curved=curved))
+    bound = fit_bound((features, error), *placed(1000, 6), BoundSettings(allow_quadratic=curved))
     features, force, error = placed(5000, 7)
     stated = bound.evaluate(features, force, lying(len(force)))
     assert abs(np.mean(error <= stated[0]) - 0.95) < 0.02
@@ -131,7 +131,7 @@ def test_bound_scale_from_few_discs_is_bounded_between_them(curved):
 @pytest.mark.parametrize("curved", [True, False])
 def test_bound_scale_is_independent_of_contact_position(curved):
     features, _, error = placed(400, 5)
-    bound = fit_bound((features, error), *placed(1000, 6), BoundSettings(curved=curved))
+    bound = fit_bound((features, error), *placed(1000, 6), BoundSettings(allow_quadratic=curved))
     elsewhere = features + [0.0, 0.0, 0.0, 0.0, 9.0, -9.0, 30.0]
     at = [bound.evaluate(some, np.full(400, 0.2), lying(400)) for some in (features, elsewhere)]
     np.testing.assert_array_equal(*at)

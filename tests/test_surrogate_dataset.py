@@ -13,7 +13,14 @@ from boxes import box as cube
 from sim.deformation import Outcome
 from sim.errors import InputError
 from sim.loads import Loads, Posture, Pushed, build_posture, push
-from surrogate.data.dataset import SEAL_ATTRIBUTE, read_dataset, read_embedded, read_loads, write_embedded, write_loads
+from surrogate.data.dataset import (
+    SEAL_ATTRIBUTE,
+    read_dataset,
+    read_embedded_anatomy,
+    read_loads,
+    write_embedded_anatomy,
+    write_loads,
+)
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 
@@ -31,8 +38,8 @@ def test_written_dataset_is_read_unchanged(tmp_path, box, pretender, loads):
     said = simulate(path, pretender, loads, SAID, 8, lambda done, total: seen.append((done, total)))
     data = read_dataset(path)
     units = 3 * int(box.craniotomy.sum())
-    solved = said.rows
-    assert (said.loads, said.units) == (len(loads), units) and min(said.unit_seconds, said.load_seconds) > 0.0
+    solved = said.total
+    assert (said.load_count, said.unit_count) == (len(loads), units) and min(said.unit_seconds, said.load_seconds) > 0.0
     assert solved == len(loads) + units and seen[-1] == (solved, solved) and not list(tmp_path.glob("*.partial"))
     assert data.anatomy.digest == box.digest and data.provenance["preset"] == "palpation"
     assert np.array_equal(data.loads.get(Pushed).force, loads.get(Pushed).force)
@@ -60,18 +67,18 @@ def test_posture_loads_round_trip_through_the_file(tmp_path):
 @pytest.mark.parametrize("mesh", [cube((2, 2, 2)), quadratic(cube((2, 2, 2)), curved=0.05)], ids=["p1", "p2"])
 def test_anatomy_is_embedded_in_the_dataset(tmp_path, mesh):
     with h5py.File(tmp_path / "data.h5", "w") as file:
-        write_embedded(file, base_held(mesh))
-        assert read_embedded(file).digest == base_held(mesh).digest
+        write_embedded_anatomy(file, base_held(mesh))
+        assert read_embedded_anatomy(file).digest == base_held(mesh).digest
 
 
 def test_unit_responses_superpose_to_small_loads(tmp_path, box, pretender, loads):
     from surrogate.data.cortex_patch import open_patch
-    from surrogate.data.encode import compute_nodal_shares
+    from surrogate.data.encode import compute_unit_nodal_forces
 
     simulate(tmp_path / "data.h5", pretender, loads, SAID)
     small = loads.scale(1e-4)
     table = read_dataset(tmp_path / "data.h5").compute_unit_response(box.tumour_nodes)
-    shares = compute_nodal_shares(open_patch(box), small.get(Pushed))
+    shares = compute_unit_nodal_forces(open_patch(box), small.get(Pushed))
     size = np.linalg.norm(small.get(Pushed).force, axis=1)
     predicted = size[:, None, None] * np.einsum("bf,fni->bni", shares, table)
     truth = pretender.deform(small, at=box.tumour_nodes).displacement
@@ -155,7 +162,7 @@ def test_killed_run_resumes_to_an_identical_file(tmp_path, pretender, loads):
     with pytest.raises(InputError, match="unfinished run"):
         read_dataset(killed)
     assert [path.name.startswith(".sulcus-") for path in sorted(tmp_path.iterdir())] == [True, False, False]
-    assert simulate(killed, pretender, loads, SAID, 8).rows == 0
+    assert simulate(killed, pretender, loads, SAID, 8).total == 0
     assert read_dataset(killed).estimate_seconds("unit response", 3) is None  # none was solved by the run that ended
     assert sorted(tmp_path.iterdir()) == [killed, whole] and undated(killed) == undated(whole)
 
@@ -164,9 +171,9 @@ def test_finished_dataset_is_unchanged_or_extended(tmp_path, box, pretender, loa
     path, direct = tmp_path / "data.h5", tmp_path / "direct.h5"
     simulate(path, pretender, loads, SAID, 8)
     before = path.read_bytes()
-    assert simulate(path, pretender, loads, SAID, 8).rows == 0 and path.read_bytes() == before
+    assert simulate(path, pretender, loads, SAID, 8).total == 0 and path.read_bytes() == before
     more = draw("palpation", box, 30, 0)
-    assert simulate(path, pretender, more, SAID, 8).rows == 30 - 16  # the last, short batch is solved again
+    assert simulate(path, pretender, more, SAID, 8).total == 30 - 16  # the last, short batch is solved again
     simulate(direct, pretender, more, SAID, 8)
     assert undated(path) == undated(direct)
     assert (
@@ -174,7 +181,7 @@ def test_finished_dataset_is_unchanged_or_extended(tmp_path, box, pretender, loa
         and read_dataset(path).estimate_seconds("unit response", 1) > 0.0
     )
     after = path.read_bytes()
-    assert simulate(path, pretender, loads, SAID, 8).rows == 0 and path.read_bytes() == after
+    assert simulate(path, pretender, loads, SAID, 8).total == 0 and path.read_bytes() == after
 
 
 def test_finished_dataset_rejects_other_parameters(tmp_path, box, pretender, loads):

@@ -14,7 +14,7 @@ from sim.fem import Fem
 from sim.loads import Loads, Pushed
 from sim.material import Material, to_tissue_json
 from sim.runtime.journal import open_journal
-from surrogate.array_functions import Rounded
+from surrogate.array_functions import QuantisedTable
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import ENCODERS, compute_tool_features, split_forces
@@ -24,7 +24,7 @@ from surrogate.model.store import load, save
 from surrogate.regressors.force_series import MAX_ORDER, ORDER_COLUMNS, Series
 from surrogate.training.examples import Examples
 from surrogate.training.expansion import ADDED_BASIS, COARSE_BASIS, SERIES_MODELS, Expansion
-from surrogate.training.fem_tables import add_edge_midpoints, tabulate
+from surrogate.training.fem_tables import add_edge_midpoints, tabulate_series
 from surrogate.training.train import list_learners, train
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
@@ -32,7 +32,7 @@ TISSUE = Material("neo-hookean", 3000.0, 0.45)
 
 def pushes(patch, count, seed, radius=(6e-3, 8e-3), most=0.15):
     random = np.random.default_rng(seed)
-    point, normal = patch.place(random.random((count, 3)))
+    point, normal = patch.place_points(random.random((count, 3)))
     force = random.uniform(0.02, most, (count, 1)) * (normal + 0.3 * random.normal(size=(count, 3)))
     return Pushed(point, force, random.uniform(*radius, count))
 
@@ -40,7 +40,7 @@ def pushes(patch, count, seed, radius=(6e-3, 8e-3), most=0.15):
 def unrounded(table):
     """A table (places, radii, 19, r) that is not rounded."""
     columns = table.reshape(-1, 19 * table.shape[-1]).astype(np.float32)
-    return Rounded(columns, np.ones(columns.shape[1], np.float32))
+    return QuantisedTable(columns, np.ones(columns.shape[1], np.float32))
 
 
 def every_motion(fem, nodes):
@@ -55,7 +55,7 @@ def test_tabulated_series_matches_finite_element_series(box, patch, tmp_path):
     exact = fem.compute_series(Loads((loads,)), MAX_ORDER, reading)
     (triangles, places), radii = add_edge_midpoints(patch), np.array([7e-3])
     heard = []
-    table = tabulate(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
+    table = tabulate_series(fem, places, radii, reading, lambda done, total: heard.append((done, total)))
     series = Series(patch.points, triangles, radii, unrounded(table))
     assert heard[-1] == (len(places), len(places))
 
@@ -66,9 +66,9 @@ def test_tabulated_series_matches_finite_element_series(box, patch, tmp_path):
 
     step, last = heard[0][0], []
     with pytest.raises(KeyboardInterrupt), open_journal(tmp_path / "rows", {}) as journal:
-        tabulate(fem, places, radii, reading, stop, journal)
+        tabulate_series(fem, places, radii, reading, stop, journal)
     with open_journal(tmp_path / "rows", {}) as journal:
-        again = tabulate(fem, places, radii, reading, lambda done, total: last.append(done), journal)
+        again = tabulate_series(fem, places, radii, reading, lambda done, total: last.append(done), journal)
     assert np.array_equal(again, table) and last == [done for done, _ in heard[2:]]
     size, _ = split_forces(loads)
     predicted = series.predict(compute_tool_features(patch, loads)) * size[:, None]
@@ -96,7 +96,7 @@ def data(box, tmp_path_factory):
 def expansion(data):
     """What all may read: nobody writes into its table."""
     found = Expansion(data, "cpu")
-    found.tabulated.table.setflags(write=False)
+    found.table.table.setflags(write=False)
     return found
 
 
@@ -152,16 +152,16 @@ def test_first_two_series_orders_are_exact_for_any_tool(expansion, box):
 def test_resumed_series_has_equal_table_and_no_solve_time(tmp_path):
     small = make_box(cells=(8, 8, 4), spacing=8e-3, tumour=12e-3, depth=20e-3, opening=22e-3)
     data = simulated(tmp_path / "data.h5", small, 100)
-    whole, later = (Expansion(data, "cpu", begun=tmp_path / "rows", most_pairs=0) for _ in range(2))
-    assert whole.tabulated.seconds > 0.0 and np.isnan(later.tabulated.seconds)
-    assert np.array_equal(whole.tabulated.table, later.tabulated.table)
+    whole, later = (Expansion(data, "cpu", journal_path=tmp_path / "rows", max_pairs=0) for _ in range(2))
+    assert whole.table.seconds > 0.0 and np.isnan(later.table.seconds)
+    assert np.array_equal(whole.table.table, later.table.table)
     took = [train(data, ["series"], expansion=each).scores[0].solves.seconds for each in (whole, later)]
     assert took[0] > 0.0 and took[1] is None
 
 
 def test_second_order_is_interpolated_above_pair_limit(data, trained):
-    known = Expansion(data, "cpu", most_pairs=100)
-    assert [len(parts) for parts in known.exact] == [1, 1]
+    known = Expansion(data, "cpu", max_pairs=100)
+    assert [len(parts) for parts in known.exact_parts] == [1, 1]
     again = train(data, ["series"], expansion=known)
     kinds = [type(part.regressor).__name__ for part in again.models["series"].parts]
     assert kinds == ["Linear", "Linear", "Series", "Series"]
@@ -195,12 +195,12 @@ def test_gp_correction_halves_series_error_on_trained_cortex(tmp_path):
 def test_series_training_ignores_held_out_discs(trained, data, expansion, tmp_path):
     """Bit-identical with random displacements of untrained loads and random series in held-out discs."""
     split = trained.split
-    rows = np.flatnonzero(data.good)[~split.train]
+    rows = np.flatnonzero(data.good)[~split.training_mask]
     wild = read_dataset(poisoned(data.path, tmp_path / "wild.h5", rows)[0])
     again = Expansion(wild, "cpu")
-    inside = split.is_covered(again.places)
+    inside = split.is_covered(again.positions)
     assert 0 < inside.sum() < len(inside)
-    again.tabulated.table[inside] = np.random.default_rng(0).normal(size=again.tabulated.table[inside].shape)
+    again.table.table[inside] = np.random.default_rng(0).normal(size=again.table.table[inside].shape)
     before, after = (train(each.data, SERIES_MODELS, split=split, expansion=each) for each in (expansion, again))
     for name in SERIES_MODELS:
         for one, other in zip(before.models[name].parts, after.models[name].parts, strict=True):
@@ -217,7 +217,7 @@ def test_training_solve_counts_match_hand_count(trained, data):
     Unit forces on nodes inside the discs are counted once more.
     """
     linear, series, learnt = (row.solves for row in trained.scores)
-    loads_given, units = int(trained.split.train.sum()), len(data.unit_good)
+    loads_given, units = int(trained.split.training_mask.sum()), len(data.unit_good)
     outside = int((~trained.split.is_covered(add_edge_midpoints(open_patch(data.anatomy))[1])).sum())
     inside = 3 * int(trained.split.is_covered(open_patch(data.anatomy).points).sum())
     assert (linear.loads, linear.units, linear.series, linear.inside) == (loads_given, units, 0, inside) and inside

@@ -53,7 +53,7 @@ def models(block, tmp_path_factory):
     data = read_dataset(path)
     fit = Ann.fit
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Ann, "fit", lambda ann, X, Y: fit(replace(ann, steps=30), X, Y))
+        patched.setattr(Ann, "fit", lambda ann, X, Y: fit(replace(ann, max_iterations=30), X, Y))
         return train(data, expansion=Expansion(data, "cpu")).models
 
 
@@ -164,8 +164,8 @@ def test_exported_series_supports_one_or_many_radii(models, block, loads, taken)
     model = models["series"]
     (number, part), radii = _series_of(model, block.tumour_nodes), np.linspace(5e-3, 8e-3, len(taken))
     series = part.regressor
-    of_radii = series.table.whole.reshape(-1, len(series.radii), len(series.table.step))[:, taken]
-    table = replace(series.table, whole=of_radii.reshape(-1, len(series.table.step)))
+    of_radii = series.table.integers.reshape(-1, len(series.radii), len(series.table.step))[:, taken]
+    table = replace(series.table, integers=of_radii.reshape(-1, len(series.table.step)))
     kept = replace(series, radii=radii, table=table)
     parts = [*model.parts]
     parts[number] = replace(part, regressor=kept)

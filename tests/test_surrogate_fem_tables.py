@@ -20,7 +20,7 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis, compute_tool_features
 from surrogate.data.indentation import get_poses, to_indentation
 from surrogate.data.simulate import simulate
-from surrogate.data.solution_rows import compute_row_checksums, get_row_type
+from surrogate.data.solution_rows import compute_row_checksums, get_row_dtype
 from surrogate.data.tool_poses import choose_ball, compute_poses, draw_poses
 from surrogate.evaluation.score import compare_forces, compute_point_errors
 from surrogate.model.store import load, save
@@ -238,7 +238,7 @@ def test_dataset_without_reactions_gives_no_force_model(tmp_path, data, box):
     older = tmp_path / "older.h5"
     shutil.copy(data.path, older)
     with h5py.File(older, "r+") as file:
-        rows = np.empty(len(data.loads), get_row_type(len(box.mesh.nodes)))
+        rows = np.empty(len(data.loads), get_row_dtype(len(box.mesh.nodes)))
         for name in rows.dtype.names or ():
             rows[name] = file[f"answers/{name}"][:]
         del file["answers/reaction"]

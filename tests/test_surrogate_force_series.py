@@ -7,7 +7,7 @@ from test_surrogate_expansion import pushes, unrounded
 from sim.errors import InputError
 from sim.loads import Pushed
 from surrogate.data.encode import compute_tool_features, split_forces
-from surrogate.regressors.force_series import Series, compute_forms, fill_table
+from surrogate.regressors.force_series import Series, compute_direction_monomials, interpolate_table
 from surrogate.training.fem_tables import add_edge_midpoints, choose_radii
 
 
@@ -48,8 +48,10 @@ def _row(loads, k):
 def test_force_forms_span_polynomials_of_their_degree():
     random = np.random.default_rng(0)
     direction = random.normal(size=(40, 3))
-    values = compute_forms(direction, np.ones(40))
-    assert np.allclose(compute_forms(2.0 * direction, np.ones(40)), values * np.repeat([2.0, 4.0, 8.0], [3, 6, 10]))
+    values = compute_direction_monomials(direction, np.ones(40))
+    assert np.allclose(
+        compute_direction_monomials(2.0 * direction, np.ones(40)), values * np.repeat([2.0, 4.0, 8.0], [3, 6, 10])
+    )
     for columns, degree in ((slice(0, 3), 1), (slice(3, 9), 2), (slice(9, 19), 3)):
         wanted = (direction @ random.normal(size=3)) ** degree
         found = np.linalg.lstsq(values[:, columns], wanted, rcond=None)[0]
@@ -63,6 +65,6 @@ def test_omitted_table_entries_are_interpolated(patch):
     wanted = (places @ np.random.default_rng(0).normal(size=(3, 4)) + 2.0).reshape(-1, 2, 2)
     wild = np.where(left_out[:, None, None], 1e9, wanted)
     assert 0 < left_out.sum() < len(places)
-    np.testing.assert_allclose(fill_table(places, wild, left_out), wanted, rtol=1e-9)
+    np.testing.assert_allclose(interpolate_table(places, wild, left_out), wanted, rtol=1e-9)
     with pytest.raises(InputError, match="hold all places"):
-        fill_table(places, wild, np.ones(len(places), bool))
+        interpolate_table(places, wild, np.ones(len(places), bool))

@@ -39,7 +39,7 @@ def test_irrelevant_feature_gets_a_long_length_scale():
 
 def test_gp_trains_on_subset_above_row_limit():
     X, Y = rows(300, 0)
-    few = Gp(rows=40, most=120).fit(X, Y)
+    few = Gp(likelihood_rows=40, max_rows=120).fit(X, Y)
     assert len({*map(tuple, few.seen_)}) == 120
     assert np.abs(few.predict(X) - Y)[:, 0].max() < 0.2 * Y[:, 0].std()
 

@@ -149,10 +149,10 @@ def test_held_out_errors_count_fem_solutions_as_exact():
         distance, np.full(3, 10e-3), 1e-3 * np.array([0.5, 0.1, 0.1]), np.array([False, False, True])
     )
     assert stated.mean == pytest.approx((0.02 + 0.002 + 0.04) / 3) and stated.guarded == pytest.approx(0.002 / 3)
-    assert stated.solved == pytest.approx(2 / 3) and stated.p999 is None and not stated.enough
+    assert stated.solved == pytest.approx(2 / 3) and stated.p999 is None and not stated.is_sufficient
     assert "2.07 % of the motion alone; with FEM for" in str(stated)
     many = measure_held_out(np.full((1000, 2), 0.3e-3), np.full(1000, 1.0), np.full(1000, 0.1e-3), np.zeros(1000, bool))
-    assert many.p999 == pytest.approx(0.3e-3) and many.mean < 0.01 and not many.enough
+    assert many.p999 == pytest.approx(0.3e-3) and many.mean < 0.01 and not many.is_sufficient
     assert measure_held_out(distance[1:2], np.full(1, 10e-3), np.full(1, np.nan), np.zeros(1, bool)).solved == 1.0
 
 

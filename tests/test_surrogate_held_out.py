@@ -33,7 +33,7 @@ def scored(data, trained):
 
 def test_envelope_is_independent_of_held_out_loads(trained, scored, data):
     """Bit-identical for other positions and forces of held-out loads."""
-    rows = np.flatnonzero(~trained.split.train)
+    rows = np.flatnonzero(~trained.split.training_mask)
     pushed = data.loads.get(Pushed)
     moved = Pushed(pushed.point.copy(), pushed.force.copy(), pushed.footprint.copy())
     moved.point[rows], moved.force[rows] = np.roll(pushed.point[rows], 1, axis=0), 2.0 * pushed.force[rows]

@@ -7,7 +7,7 @@ import pytest
 from locators import dent, in_a_skull, locator_of
 
 from surrogate.locating import iterated_conditioning
-from surrogate.locating.observation import Observation, to_moved_evidence
+from surrogate.locating.observation import Observation, to_deformed_evidence
 from surrogate.locating.posterior import condition_prior
 
 
@@ -36,11 +36,11 @@ def test_each_conditioning_round_starts_from_the_last_result(prior, monkeypatch,
 
     def place(body, observation, near, motion, bias):
         starts.append((near, motion.copy(), bias(rest)))
-        return to_moved_evidence(body, observation, near, motion, bias)
+        return to_deformed_evidence(body, observation, near, motion, bias)
 
     monkeypatch.setattr(iterated_conditioning, "condition_prior", condition)
-    monkeypatch.setattr(iterated_conditioning, "to_moved_evidence", place)
-    found, near = iterated_conditioning.match_and_update(prior, seen, free=True)
+    monkeypatch.setattr(iterated_conditioning, "to_deformed_evidence", place)
+    found, near = iterated_conditioning.match_and_update(prior, seen, allow_slip=True)
     assert found is results[-1] and 2 <= len(results) <= iterated_conditioning.MAX_ITERATIONS + 1
     np.testing.assert_array_equal(near, np.arange(count))  # without the one that is off the cortex
     every = prior.restrict_shapes(np.arange(len(body.mesh.nodes)))

@@ -3,18 +3,18 @@
 from types import SimpleNamespace
 
 from surrogate.model import kept_arrays
-from surrogate.model.kept_arrays import find_kept_path
+from surrogate.model.kept_arrays import get_cache_path
 
 
 def test_cache_path_depends_on_version_device_and_inputs(tmp_path, monkeypatch):
-    first = find_kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")
+    first = get_cache_path(tmp_path, "a-", "cpu", "digest", "smoothed")
     assert (
-        first == find_kept_path(tmp_path, "a-", "cpu", "digest", "smoothed")
-        and find_kept_path(None, "a-", "cpu") is None
+        first == get_cache_path(tmp_path, "a-", "cpu", "digest", "smoothed")
+        and get_cache_path(None, "a-", "cpu") is None
     )
-    others = [find_kept_path(tmp_path, "a-", "cpu", "digest", "p2")]
+    others = [get_cache_path(tmp_path, "a-", "cpu", "digest", "p2")]
     monkeypatch.setattr(kept_arrays, "get_version", lambda name: "9.9")
-    others.append(find_kept_path(tmp_path, "a-", "cpu", "digest", "smoothed"))
+    others.append(get_cache_path(tmp_path, "a-", "cpu", "digest", "smoothed"))
     monkeypatch.setattr(kept_arrays, "find_device", lambda name, precision: SimpleNamespace(on_cuda=True))
-    others.append(find_kept_path(tmp_path, "a-", "cuda", "digest", "smoothed"))
+    others.append(get_cache_path(tmp_path, "a-", "cuda", "digest", "smoothed"))
     assert len({first, *others}) == 4

@@ -19,12 +19,12 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.splits import CALIBRATION_STRIDE
 from surrogate.data.tool_loads import draw
-from surrogate.evaluation.coverage import compute_coverage, measure_covered, measure_shares
+from surrogate.evaluation.coverage import compute_coverage, measure_coverage, measure_coverage_shares
 from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
 from surrogate.model.store import load, save
-from surrogate.training.bounds import TUMOUR_FIT, bound_by, collect_missed, compute_growth
+from surrogate.training.bounds import TUMOUR_FIT, calibrate_bound, collect_bound_examples, compute_growth
 from surrogate.training.expansion import SERIES_MODELS
 from surrogate.training.train import LEARNERS, train
 
@@ -170,12 +170,12 @@ def test_held_out_coverage_is_reported(trained, scored, data):
             loads = good.select(rows)
             answer = model.deform(loads, at=data.anatomy.tumour_nodes).displacement
             error = np.linalg.norm(answer - truth[rows], axis=2).max(axis=1)
-            return collect_missed(model, open_patch(data.anatomy), loads.get(Pushed), error)
+            return collect_bound_examples(model, open_patch(data.anatomy), loads.get(Pushed), error)
 
         near, held, alone, stated = seen(beside), [], [], trained.models[name].held_out
         for disc in range(len(split.centres)):
             here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
-            bounds = bound_by(near, TUMOUR_FIT, compute_growth(near, seen(others), TUMOUR_FIT))
+            bounds = calibrate_bound(near, TUMOUR_FIT, compute_growth(near, seen(others), TUMOUR_FIT))
             bounded, asked = replace(model, bounds=bounds), good.select(here)
             answer = bounded.deform(asked, at=data.anatomy.tumour_nodes)
             held.append(seen(here).error <= answer.bound)
@@ -242,10 +242,10 @@ def test_coverage_of_each_level_uses_its_own_bound(trained, fresh, box):
     assert found.extrapolated == answer.outcome.count(Outcome.EXTRAPOLATED) and found.loads == len(fresh)
     weakest = np.argsort(np.linalg.norm(fresh.get(Pushed).force, axis=1))
     assert found.tenths == tuple((weakest[k : k + 6] % 4 == 0).mean() for k in range(0, 60, 6))
-    some = measure_covered(np.ones(20), np.full(20, 3e-3), np.array([np.full(20, 4e-3), np.full(20, np.inf)]), 0)
+    some = measure_coverage(np.ones(20), np.full(20, 3e-3), np.array([np.full(20, 4e-3), np.full(20, np.inf)]), 0)
     assert some.shares == (1.0, None) and "100.0 % at 95 %, no guarantee at 99 %;" in str(some)
     half = np.where(np.arange(20) < 10, 2e-3, np.inf)  # what promises nothing does not hold, either
-    assert measure_shares(np.full(20, 3e-3), half[None]) == (0.0,)
+    assert measure_coverage_shares(np.full(20, 3e-3), half[None]) == (0.0,)
 
 
 def test_predict_motion_equals_deform_displacement(model, box, fresh):

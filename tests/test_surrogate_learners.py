@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from surrogate.regressors.baselines import Svr
-from surrogate.training.learners import SVR_CANDIDATES, Tuned, find_inner_discs
+from surrogate.training.learners import SVR_CANDIDATES, TunedRegressor, find_inner_discs
 
 
 def nearby(count, seed):
@@ -17,10 +17,13 @@ def nearby(count, seed):
 
 def test_tuned_settings_reduce_the_published_svr_error():
     (X, Y), (asked, truth) = nearby(600, 0), nearby(200, 2)
-    miss = [np.abs(model.predict(asked) - truth).mean() for model in (Svr().fit(X, Y), Tuned(SVR_CANDIDATES).fit(X, Y))]
+    miss = [
+        np.abs(model.predict(asked) - truth).mean()
+        for model in (Svr().fit(X, Y), TunedRegressor(SVR_CANDIDATES).fit(X, Y))
+    ]
     assert miss[1] < 0.6 * miss[0]
-    again = Tuned(SVR_CANDIDATES).fit(X, Y)
-    assert np.array_equal(again.predict(asked), Tuned(SVR_CANDIDATES).fit(X, Y).predict(asked)) and isinstance(
+    again = TunedRegressor(SVR_CANDIDATES).fit(X, Y)
+    assert np.array_equal(again.predict(asked), TunedRegressor(SVR_CANDIDATES).fit(X, Y).predict(asked)) and isinstance(
         again, Svr
     )
 
@@ -44,7 +47,7 @@ def test_settings_are_chosen_on_inner_held_out_discs():
             order = np.sort(np.argsort(-Y.std(axis=0), kind="stable")[:8])
             return Y[left_out][:, order] + self.by
 
-    chosen = Tuned(tuple(partial(Off, by) for by in (2.0, 0.5, 1.0))).fit(X, Y)
+    chosen = TunedRegressor(tuple(partial(Off, by) for by in (2.0, 0.5, 1.0))).fit(X, Y)
     assert chosen.by == 0.5 and [by for by, _ in seen] == [2.0, 0.5, 1.0, 0.5]
     assert all(np.array_equal(rows, X[~left_out]) for _, rows in seen[:3]) and len(seen[3][1]) == 100
-    assert Tuned((partial(Off, 2.0), partial(Off, 0.5))).fit(X[:30], Y[:30]).by == 2.0
+    assert TunedRegressor((partial(Off, 2.0), partial(Off, 0.5))).fit(X[:30], Y[:30]).by == 2.0

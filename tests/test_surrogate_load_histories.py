@@ -11,17 +11,23 @@ from sim.fem import Fem
 from sim.loads import Loads
 from sim.tools import Capsule
 from surrogate.data.dataset import read_dataset
-from surrogate.data.load_histories import APPROACH_TIME, compute_unfaded, read_series, sample_times, solve_histories
+from surrogate.data.load_histories import (
+    APPROACH_TIME,
+    compute_decayed_coefficients,
+    read_prony_series,
+    sample_times,
+    solve_histories,
+)
 from surrogate.data.tool_poses import draw_poses
-from surrogate.model.relaxation import follow_relaxation
+from surrogate.model.relaxation import update_relaxation
 
 
 def test_single_step_history_equals_two_played_steps():
     for time in (0.0, 0.2, APPROACH_TIME, 3.0, 80.0):
-        alone = follow_relaxation(SERIES, pressed(2e-3), np.array([time]), None, 1e-4)
+        alone = update_relaxation(SERIES, pressed(2e-3), np.array([time]), None, 1e-4)
         steps = [t for t in (min(time, APPROACH_TIME), time) if t > 0.0]
         np.testing.assert_allclose(alone.share, played([2e-3] * len(steps), steps)[-1].share if steps else 0.0)
-        assert alone.share[0] == pytest.approx(0.7 - compute_unfaded(SERIES, np.array([time])).sum())
+        assert alone.share[0] == pytest.approx(0.7 - compute_decayed_coefficients(SERIES, np.array([time])).sum())
 
 
 def test_fem_response_depends_only_on_the_relaxed_share(box):
@@ -29,7 +35,7 @@ def test_fem_response_depends_only_on_the_relaxed_share(box):
     fem = Fem(box, list(EFFECTS), device="cpu", batch=1, element="p1")
     causes = draw_poses("palpation", box, 1, 5, BALL).causes
     slow = solve_histories(fem, Loads(causes, np.array([2.0])))
-    gone = compute_unfaded(SERIES, np.array([2.0])).sum()
+    gone = compute_decayed_coefficients(SERIES, np.array([2.0])).sum()
     low, high = APPROACH_TIME, 60.0
     for _ in range(60):  # one step of so long
         middle = 0.5 * (low + high)
@@ -50,7 +56,7 @@ def test_simulate_draws_times_for_relaxing_tissue(tmp_path, box, capsys):
     wanted += ["--preset", "dissector", "--capsule", "2", "26"]
     assert main([*wanted, "--element", "p1", "--prony", "0.45,0.5;0.365,50"]) == 0
     found = read_dataset(out)
-    assert read_series(found.provenance) == RELAXING_BRAIN.prony
+    assert read_prony_series(found.provenance) == RELAXING_BRAIN.prony
     np.testing.assert_array_equal(found.loads.times, sample_times(2, 0))
     assert found.good.all() and found.tool == Capsule(2e-3, 0.026)
     assert main([*wanted, "--prony", "0.45;50", "--force"]) == 2

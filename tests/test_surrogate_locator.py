@@ -12,7 +12,7 @@ from surrogate.locating.ensemble import compute_surface_motion, solve_groups, so
 from surrogate.locating.locator import Locator
 from surrogate.locating.locator_store import load_locator, make_locator, save_locator
 from surrogate.locating.observation import Observation, to_evidence
-from surrogate.locating.prior import NO_PLACE, PRESS, compute_middle
+from surrogate.locating.prior import NO_PLACE, PRESS, compute_centroid_motion
 
 FEW = Causes(
     poisson=(0.45, 0.485), tools=(8, 3), drainages=3, levels=(0.6, 0.3), swellings=(0.04, 0.02, -0.02),
@@ -170,7 +170,7 @@ def test_located_tumour_motion_is_within_error_ellipsoids(locator, body, truth):
     left, all_of_it, held = 0.0, 0.0, []
     for seed, (motion, _) in enumerate(truth):
         found = locator.locate(observed(body, motion, seed))
-        middle = compute_middle(body, motion[None])[0]
+        middle = compute_centroid_motion(body, motion[None])[0]
         off = found.centroid - middle
         left, all_of_it = left + np.linalg.norm(off), all_of_it + np.linalg.norm(middle)
         held.append(off @ np.linalg.solve(found.centroid_covariance, off) < 7.815)
@@ -215,7 +215,7 @@ def test_reported_rigid_error_is_estimated(locator, body, truth):
         tipped = replace(seen, tips=seen.now[:1], rigid=0.0)
         for exact in (found[0], locator.locate(cloud), locator.locate(tipped)):
             assert exact.slipped or np.abs([exact.bias, exact.rotation]).max() < 1e-6
-        off += [np.linalg.norm(each.centroid - compute_middle(body, motion[None])[0]) for each in found]
+        off += [np.linalg.norm(each.centroid - compute_centroid_motion(body, motion[None])[0]) for each in found]
     assert off[2] < off[1] < off[0]
 
 
@@ -224,7 +224,7 @@ def test_point_cloud_recovers_the_normal_displacement(locator, body, truth):
     for seed, (motion, _) in enumerate(truth):
         named = observed(body, motion, seed, count=150, noise=0.2)
         found = locator.locate(Observation(named.now, sigma=np.full(150, 0.15e-3)))
-        middle = compute_middle(body, motion[None])[0]
+        middle = compute_centroid_motion(body, motion[None])[0]
         left, all_of_it = left + abs((found.centroid - middle)[2]), all_of_it + abs(middle[2])
     assert left < 0.4 * all_of_it
 
@@ -233,7 +233,7 @@ def test_point_cloud_may_lie_14_mm_below_the_cortex(locator, body):
     """A cloud lies on the displaced surface; named points are searched at rest, within a smaller distance."""
     rest = observed(body, np.zeros_like(body.mesh.nodes)).rest
     sunk = rest - [0.0, 0.0, 14e-3]
-    assert to_evidence(body, Observation(sunk)).value == pytest.approx(-14e-3)
+    assert to_evidence(body, Observation(sunk)).motion == pytest.approx(-14e-3)
     for far in (Observation(rest - [0.0, 0.0, 19e-3]), Observation(rest, sunk)):
         with pytest.raises(InputError, match="from the open cortex"):
             to_evidence(body, far)

@@ -14,7 +14,7 @@ def test_arrays_above_the_size_limit_are_rejected(tmp_path):
     np.savez_compressed(tmp_path / "m.npz", few=np.zeros(10), many=np.zeros(1000))
     with (tmp_path / "m.npz").open("rb") as raw:
         for most, name, count in ((1000, "few", 10), (8200, "many", 1000)):  # less than both with their heads
-            archive = Archive(raw, largest=most)
+            archive = Archive(raw, max_bytes=most)
             assert len(archive.read_arrays([name])[name]) == count
             with pytest.raises(InputError, match="MB are the most"):
                 archive.read_arrays(["few", "many"])

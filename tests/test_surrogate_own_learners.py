@@ -21,7 +21,7 @@ from sim.runtime.user_script import run_script
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
-from surrogate.model.own_learners import OWN_LEARNERS, PLAYER_NAMES, RESERVED_NAMES, find_own, register_learner
+from surrogate.model.own_learners import OWN_LEARNERS, PLAYER_NAMES, RESERVED_NAMES, find_own_learner, register_learner
 from surrogate.model.store import FITTED, load, save
 from surrogate.training.train import LEARNERS, POSE_LEARNERS, train
 
@@ -57,7 +57,7 @@ def forget(name: str) -> None:
     OWN_LEARNERS.clear()
     for module in [module for module in sys.modules if module.startswith("own_")]:
         del sys.modules[module]
-    assert find_own(name) is None
+    assert find_own_learner(name) is None
 
 
 def test_plugin_learner_is_trained_stored_and_played(folder, box, monkeypatch, capsys, clean):
@@ -117,18 +117,18 @@ def test_package_learner_is_imported_only_when_selected(tmp_path, monkeypatch, c
     (made / "METADATA").write_text("Metadata-Version: 2.1\nName: labs-learners\nVersion: 1.0\n")
     (made / "entry_points.txt").write_text("[sulcus.learners]\nlabs = labs_learners\nbroken = no_such_module\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert find_own("other") is None and "labs_learners" not in sys.modules
-    found = find_own("labs")
+    assert find_own_learner("other") is None and "labs_learners" not in sys.modules
+    found = find_own_learner("labs")
     assert found is not None and found.regressor.__module__ == "labs_learners"
     with pytest.raises(InputError, match="learner broken of no_such_module cannot be loaded"):
-        find_own("broken")
+        find_own_learner("broken")
     del sys.modules["labs_learners"]
 
 
 def test_registered_learner_may_have_its_own_encoder(box, clean):
     own = run_script(NEAREST)
     register_learner("along", lambda patch, pushed: pushed.force)(type("Along", (own.Nearest,), {}))
-    assert find_own("along").encoder == "along"
+    assert find_own_learner("along").encoder == "along"
 
 
 def test_built_in_learner_names_are_reserved():

@@ -10,10 +10,10 @@ from scipy.stats import multivariate_normal
 from sim.geometry.locate import LocatedPoints
 from surrogate.locating.causes import SWELLING, TOOL
 from surrogate.locating.evidence import SHIFT_ERROR, SIGMA, SLIPPED_ERROR, TURN_PER_SHIFT, build_motion_evidence
-from surrogate.locating.observation import Observation, to_moved_evidence
+from surrogate.locating.observation import Observation, to_deformed_evidence
 from surrogate.locating.posterior import POSTERIOR, ObservedPrior, Posterior, build_observed_prior, condition_prior
 from surrogate.locating.prior import CAUSE_SETS, NO_PLACE, OTHER_CAUSES, PLACE_SETS, RIGID_RATIOS, MotionPrior
-from surrogate.locating.whitened import whiten
+from surrogate.locating.whitened import whiten_system
 
 POINTS = 30
 
@@ -47,31 +47,31 @@ def drawn(prior, random, number=0):
     """Weights and a rigid error (r + 6,) as a hypothesis with its first place has them, and what is seen."""
     hypothesis = prior.hypotheses[number]
     unknown = np.zeros(len(prior.kind) + 6)
-    unknown[hypothesis.rows] = 3.0 * hypothesis.size * random.standard_normal(len(hypothesis.rows))
-    unknown[hypothesis.places[:1]] = 3.0 * random.standard_normal(3)
-    unknown[-6:] = hypothesis.rigid * RIGID * random.standard_normal(6)
+    unknown[hypothesis.rows] = 3.0 * hypothesis.deviations * random.standard_normal(len(hypothesis.rows))
+    unknown[hypothesis.place_rows[:1]] = 3.0 * random.standard_normal(3)
+    unknown[-6:] = hypothesis.rigid_ratio * RIGID * random.standard_normal(6)
     evidence = seen(prior, np.tensordot(unknown[:-6], prior.shape, 1))
-    noise = np.linalg.cholesky(evidence.compute_noise()) @ random.standard_normal(len(evidence))
-    return unknown, replace(evidence, value=evidence.value + evidence.rigid @ unknown[-6:] + noise)
+    noise = np.linalg.cholesky(evidence.compute_covariance()) @ random.standard_normal(len(evidence))
+    return unknown, replace(evidence, motion=evidence.motion + evidence.rigid_jacobian @ unknown[-6:] + noise)
 
 
 def seen_unknowns(prior, evidence):
     """What unit weights, and a rigid error of one standard deviation, do at the points (m, r + 6)."""
-    moved = np.einsum("mc,rmci->rmi", evidence.place.weights, prior.shape[:, evidence.place.vertices])
+    moved = np.einsum("mc,rmci->rmi", evidence.location.weights, prior.shape[:, evidence.location.vertices])
     return np.hstack([np.einsum("rmi,mi->mr", moved, evidence.axis), evidence.rigid * evidence.rigid_scale])
 
 
 def test_projected_shapes_equal_their_motion_at_the_points(prior):
     evidence = seen(prior, np.zeros((len(prior.anatomy.mesh.nodes), 3)))
-    found = np.hstack([prior.project_shapes(*evidence.weights), evidence.rigid * evidence.rigid_scale])
+    found = np.hstack([prior.project_shapes(*evidence.weights), evidence.rigid_jacobian * evidence.rigid_scale])
     assert found == pytest.approx(seen_unknowns(prior, evidence), abs=1e-9)
 
 
 def test_rigid_bias_at_points_matches_evidence_rows(prior):
     evidence = drawn(prior, np.random.default_rng(3))[1]
     found = Posterior(evidence, [], np.arange(1.0, 7.0), 1.0, np.zeros(0, int), 0.0, 0.0)
-    own = np.einsum("mi,mi->m", found.compute_bias(evidence.at), evidence.axis)
-    assert own == pytest.approx(evidence.rigid @ found.rigid, abs=1e-12)
+    own = np.einsum("mi,mi->m", found.compute_bias(evidence.positions), evidence.axis)
+    assert own == pytest.approx(evidence.rigid_jacobian @ found.rigid_error, abs=1e-12)
 
 
 def test_point_cloud_is_placed_without_its_rigid_error(prior):
@@ -79,8 +79,10 @@ def test_point_cloud_is_placed_without_its_rigid_error(prior):
     open_nodes = body.mesh.nodes[np.unique(body.open_surface)]
     rest = open_nodes[np.linalg.norm(open_nodes - open_nodes.mean(axis=0), axis=1) < 10e-3]
     still, number = np.zeros_like(body.mesh.nodes), np.arange(len(rest))
-    found = to_moved_evidence(body, Observation(rest + shift), number, still, lambda at: np.tile(shift, (len(at), 1)))
-    assert len(rest) > 3 and found.at == pytest.approx(rest, abs=1e-9)
+    found = to_deformed_evidence(
+        body, Observation(rest + shift), number, still, lambda at: np.tile(shift, (len(at), 1))
+    )
+    assert len(rest) > 3 and found.positions == pytest.approx(rest, abs=1e-9)
 
 
 def test_hypotheses_cover_all_causes_skulls_and_tools(prior):
@@ -90,12 +92,12 @@ def test_hypotheses_cover_all_causes_skulls_and_tools(prior):
         kinds, skull = prior.kind[hypothesis.rows], number // (len(RIGID_RATIOS) * len(CAUSE_SETS))
         taking.add((skull, tuple(sorted(set(kinds.tolist())))))
         assert set(prior.skull[hypothesis.rows[kinds != TOOL]]) <= {skull}
-        pressed = set(prior.skull[hypothesis.rows[kinds == TOOL]]) | set(prior.skull[hypothesis.places.ravel()])
+        pressed = set(prior.skull[hypothesis.rows[kinds == TOOL]]) | set(prior.skull[hypothesis.place_rows.ravel()])
         assert pressed == {min(skull, 1)}, "a skull that lets go is pressed as one in which the brain slides"
         causes = tuple(sorted(set(kinds.tolist()) - {TOOL}))
-        assert len(hypothesis.places) == (2 if causes in PLACE_SETS else 0)
+        assert len(hypothesis.place_rows) == (2 if causes in PLACE_SETS else 0)
     assert taking == {(skull, tuple(sorted((*some, TOOL)))) for skull in range(3) for some in CAUSE_SETS}
-    assert {hypothesis.rigid for hypothesis in prior.hypotheses} == {0.1, 1.0, np.inf}
+    assert {hypothesis.rigid_ratio for hypothesis in prior.hypotheses} == {0.1, 1.0, np.inf}
 
 
 @pytest.mark.parametrize("single", [False, True])
@@ -110,23 +112,25 @@ def test_posterior_matches_normal_equations_and_evidence(prior, single):
     kept[np.flatnonzero((prior.kind == SWELLING) & (prior.skull == 1))[1:]] = False
     prior = replace(prior, **{name: getattr(prior, name)[kept] for name in ("shape", "kind", "skull", "place")})
     sight = build_observed_prior(prior, evidence)
-    noise = evidence.compute_noise(np.sqrt((evidence.value**2).sum() / POINTS))
+    noise = evidence.compute_covariance(np.sqrt((evidence.motion**2).sum() / POINTS))
     unknown = seen_unknowns(prior, evidence).T
     logs, density = [], []
-    for hypothesis, found in zip(prior.hypotheses, sight.logs, strict=True):
-        pressed, rigid = len(hypothesis.places), min(hypothesis.rigid, SLIPPED_ERROR / SHIFT_ERROR)
+    for hypothesis, found in zip(prior.hypotheses, sight.log_evidence, strict=True):
+        pressed, rigid = len(hypothesis.place_rows), min(hypothesis.rigid_ratio, SLIPPED_ERROR / SHIFT_ERROR)
         assert np.isfinite(found[: 1 + pressed]).all() and (found[1 + pressed :] == -np.inf).all()
         for number, log in enumerate(found[: 1 + pressed]):
-            place = hypothesis.places[number - 1] if number else np.zeros(0, int)
+            place = hypothesis.place_rows[number - 1] if number else np.zeros(0, int)
             answer = sight.compute_posterior(hypothesis, place, 1.0)
-            size = np.concatenate([sight.scale * hypothesis.size, np.full(6, rigid), np.full(len(place), sight.scale)])
+            size = np.concatenate(
+                [sight.motion_size * hypothesis.deviations, np.full(6, rigid), np.full(len(place), sight.motion_size)]
+            )
             some = unknown[answer.rows]
             spread = np.linalg.inv(some @ np.linalg.solve(noise, some.T) + np.diag(size**-2.0))
             assert answer.root.T @ answer.root == pytest.approx(spread, rel=1e-4, abs=1e-8)
-            mean = spread @ some @ np.linalg.solve(noise, evidence.value)
+            mean = spread @ some @ np.linalg.solve(noise, evidence.motion)
             assert answer.mean == pytest.approx(mean, rel=1e-4, abs=1e-6)
             logs.append(log)
-            density.append(multivariate_normal(cov=noise + (some.T * size**2) @ some).logpdf(evidence.value))
+            density.append(multivariate_normal(cov=noise + (some.T * size**2) @ some).logpdf(evidence.motion))
     assert POSTERIOR.evidence_divisor * np.diff(logs) == pytest.approx(np.diff(density), rel=1e-4, abs=1e-4)
 
 
@@ -136,9 +140,9 @@ def test_whitening_by_axis_equals_whitening_of_all_rows(prior):
     short = evidence.build_whitening(1e-3)
     turned = evidence.select(np.random.default_rng(0).permutation(len(evidence)))
     long = turned.build_whitening(1e-3)
-    assert (short.copies, long.copies) == (3, 1)
+    assert (short.axis_count, long.axis_count) == (3, 1)
     for one, other in ((short, evidence), (long, turned)):
-        inverse = np.linalg.inv(other.compute_noise(1e-3))
+        inverse = np.linalg.inv(other.compute_covariance(1e-3))
         rows = np.random.default_rng(1).standard_normal((len(other), 2))
         white = one.whiten(rows)
         assert white.T @ white == pytest.approx(rows.T @ inverse @ rows)
@@ -158,9 +162,9 @@ def test_block_rows_match_products_of_all_points(prior, count):
     at = np.einsum("nc,nci->ni", place.weights, box.mesh.nodes[place.vertices])
     whole = build_motion_evidence(place, at, 1e-3 * random.standard_normal((count, 3)), np.full(count, SIGMA))
     for evidence in (whole, whole.select(random.permutation(len(whole)))):
-        found, unknown = whiten(prior, evidence, 1e-3), seen_unknowns(prior, evidence)
-        rows = np.column_stack([unknown, evidence.value])
-        precise = np.linalg.solve(evidence.compute_noise(1e-3), rows)
+        found, unknown = whiten_system(prior, evidence, 1e-3), seen_unknowns(prior, evidence)
+        rows = np.column_stack([unknown, evidence.motion])
+        precise = np.linalg.solve(evidence.compute_covariance(1e-3), rows)
         assert found.products == pytest.approx(rows.T @ precise, abs=1e-9 * np.abs(rows.T @ precise).max())
         columns = random.permutation(rows.shape[1])[:9]
         for some in (columns, np.append(columns, rows.shape[1] - 1)):
@@ -172,8 +176,8 @@ def test_posterior_ellipsoids_have_chi_square_coverage(prior):
     for _ in range(200):
         truth, evidence = drawn(prior, random, 3)
         # What shapes lack is no part of these draws, and their size is known.
-        sight = ObservedPrior(prior, 3.0, whiten(prior, evidence, 0.0), np.zeros(3))
-        answer = sight.compute_posterior(hypothesis, hypothesis.places[0], 1.0)
+        sight = ObservedPrior(prior, 3.0, whiten_system(prior, evidence, 0.0), np.zeros(3))
+        answer = sight.compute_posterior(hypothesis, hypothesis.place_rows[0], 1.0)
         scale = np.append(np.ones(len(prior.kind)), RIGID)
         off = answer.mean - (truth / scale)[answer.rows]
         square.append(off @ np.linalg.solve(answer.root.T @ answer.root, off))
@@ -186,21 +190,23 @@ def test_mixture_moments_match_its_hypotheses(prior):
     found = condition_prior(prior, evidence)
     assert not len(found.outliers) and 0.2 < found.surprise < 1.6
     answers = build_observed_prior(prior, evidence).compute_posteriors()
-    assert len(answers) == POSTERIOR.max_hypotheses and sum(answer.share for answer in answers) == pytest.approx(1.0)
+    assert len(answers) == POSTERIOR.max_hypotheses and sum(answer.probability for answer in answers) == pytest.approx(
+        1.0
+    )
     means = np.zeros((len(answers), len(prior.kind) + 6))
     spreads = np.zeros((len(answers), *2 * means.shape[1:]))
     for mean, spread, answer in zip(means, spreads, answers, strict=True):
         mean[answer.rows] = answer.mean
         spread[np.ix_(answer.rows, answer.rows)] = answer.root.T @ answer.root
-    share = np.array([answer.share for answer in answers])
+    share = np.array([answer.probability for answer in answers])
     assert (np.diff(share) <= 0.0).all()
     mean = share @ means
-    assert np.append(found.weight, found.rigid / RIGID) == pytest.approx(mean)
+    assert np.append(found.shape_weights, found.rigid_error / RIGID) == pytest.approx(mean)
     spread = np.tensordot(share, spreads + (means - mean)[:, :, None] * (means - mean)[:, None], 1)[:-6, :-6]
     some = prior.shape[:, ::40].astype(float)
     covariance = np.einsum("rvi,rs,svj->vij", some, spread, some)
     assert found.compute_covariance(some) == pytest.approx(covariance, abs=1e-9 * covariance.max())
-    assert replace(found, factor=2.5).compute_covariance(some) == pytest.approx(
+    assert replace(found, covariance_factor=2.5).compute_covariance(some) == pytest.approx(
         2.5 * covariance, abs=1e-9 * covariance.max()
     )
 
@@ -208,10 +214,12 @@ def test_mixture_moments_match_its_hypotheses(prior):
 def test_gross_errors_are_excluded_and_reported(prior):
     truth, evidence = drawn(prior, np.random.default_rng(5))
     wrong = np.isin(evidence.point, [3, 11, 24])
-    spoilt = replace(evidence, value=evidence.value + np.where(wrong, 0.03, 0.0))
+    spoilt = replace(evidence, motion=evidence.motion + np.where(wrong, 0.03, 0.0))
     found, clean = condition_prior(prior, spoilt), condition_prior(prior, evidence)
     assert found.outliers.tolist() == [3, 11, 24] and not len(clean.outliers)
-    off, without = (np.linalg.norm((each.weight - truth[:-6]) @ prior.middle) for each in (found, clean))
+    off, without = (
+        np.linalg.norm((each.shape_weights - truth[:-6]) @ prior.centroid_motion) for each in (found, clean)
+    )
     assert off < 2.0 * without + 0.3e-3
 
 
@@ -220,7 +228,7 @@ def test_points_beyond_1e_4_probability_are_excluded(prior, deviations, left_out
     """The root of chi-square (3 degrees of freedom) is 4.6 at 1e-4, and 7.9 at 1e-12."""
     still = seen(prior, np.zeros(prior.anatomy.mesh.nodes.shape))
     far = np.where(still.point == 7, deviations * still.sigma / np.sqrt(3.0), 0.0)
-    found = condition_prior(prior, replace(still, value=still.value + far))
+    found = condition_prior(prior, replace(still, motion=still.motion + far))
     assert found.outliers.tolist() == left_out
 
 
@@ -230,8 +238,8 @@ def test_outlier_observed_along_one_axis_is_excluded(prior):
     single = replace(evidence.select(np.arange(0, len(evidence), 3)), point=np.arange(POINTS))
     assert not len(condition_prior(prior, single).outliers)
     wrong = np.arange(POINTS) == 7
-    found = condition_prior(prior, replace(single, value=single.value + np.where(wrong, 0.05, 0.0)))
-    assert found.outliers.tolist() == [7] and np.isfinite(found.weight).all()
+    found = condition_prior(prior, replace(single, motion=single.motion + np.where(wrong, 0.05, 0.0)))
+    assert found.outliers.tolist() == [7] and np.isfinite(found.shape_weights).all()
 
 
 def test_motion_outside_the_prior_gives_large_surprise(prior):
@@ -247,28 +255,30 @@ def test_tool_place_odds_decrease_with_tip_distance(prior):
         build_observed_prior(prior, evidence),
         build_observed_prior(prior, evidence, np.array([[0.02, 0.004, 0.0], [1.0, 1.0, 1.0]])),
     )
-    assert not without.odds.any()
-    assert near.odds == pytest.approx([np.log(0.05), -0.5 * (0.02**2 + 0.004**2) / 0.004**2, -0.5])
-    assert near.logs[0] - without.logs[0] == pytest.approx(near.odds)
-    assert near.logs[-1, 0] - without.logs[-1, 0] == pytest.approx(near.odds[0])  # with which no tool may press
+    assert not without.log_odds.any()
+    assert near.log_odds == pytest.approx([np.log(0.05), -0.5 * (0.02**2 + 0.004**2) / 0.004**2, -0.5])
+    assert near.log_evidence[0] - without.log_evidence[0] == pytest.approx(near.log_odds)
+    assert near.log_evidence[-1, 0] - without.log_evidence[-1, 0] == pytest.approx(
+        near.log_odds[0]
+    )  # with which no tool may press
 
 
 def test_prior_scale_includes_rigid_error(prior):
     """Motion may be as large as the rigid error, whose prior translation has a length of 1.4 mm."""
     little, much = (seen(prior, np.full_like(prior.anatomy.mesh.nodes, each)) for each in (1e-5, 3e-3))
-    assert build_observed_prior(prior, little).scale == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
-    assert build_observed_prior(prior, much).scale == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
-    exact = replace(much, shift=0.0)
-    assert build_observed_prior(prior, exact).scale == pytest.approx(np.sqrt(3.0) * 3.0, rel=1e-3)
+    assert build_observed_prior(prior, little).motion_size == pytest.approx(np.sqrt(3.0) * 0.8, rel=1e-3)
+    assert build_observed_prior(prior, much).motion_size == pytest.approx(np.sqrt(3.0 * (3.0**2 + 0.8**2)), rel=1e-3)
+    exact = replace(much, shift_sigma=0.0)
+    assert build_observed_prior(prior, exact).motion_size == pytest.approx(np.sqrt(3.0) * 3.0, rel=1e-3)
 
 
 def test_estimated_rigid_error_follows_reported_size(prior):
     """A shift above the reported error moves the tumour; with zero reported error none is estimated."""
     truth, evidence = drawn(prior, np.random.default_rng(10), 3)
-    shifted = replace(evidence, value=evidence.value + evidence.rigid[:, :3] @ [2e-3, -2e-3, 2e-3])
+    shifted = replace(evidence, motion=evidence.motion + evidence.rigid_jacobian[:, :3] @ [2e-3, -2e-3, 2e-3])
     off, bias = [], []
     for shift in (0.0, 0.2e-3, 2e-3):
-        found = condition_prior(prior, replace(shifted, shift=shift))
-        off.append(np.linalg.norm((found.weight - truth[:-6]) @ prior.middle))
-        bias.append(np.linalg.norm(found.rigid[:3]))
+        found = condition_prior(prior, replace(shifted, shift_sigma=shift))
+        off.append(np.linalg.norm((found.shape_weights - truth[:-6]) @ prior.centroid_motion))
+        bias.append(np.linalg.norm(found.rigid_error[:3]))
     assert bias[0] < 1e-5 and bias[1] < 0.5 * bias[2] and off[2] < 0.5 * off[0]

@@ -11,8 +11,8 @@ from surrogate.regressors.baselines import Ann, Pcr, Svr
 from surrogate.regressors.gp import Gp
 from surrogate.regressors.protocol import Linear
 
-MAKE = {"linear": Linear, "ann": lambda: Ann(hidden=12, steps=150), "svr": Svr, "gp": Gp}
-MAKE["pcr"] = lambda: Pcr(share=1.0)  # its features here have several units
+MAKE = {"linear": Linear, "ann": lambda: Ann(hidden_units=12, max_iterations=150), "svr": Svr, "gp": Gp}
+MAKE["pcr"] = lambda: Pcr(variance_share=1.0)  # its features here have several units
 LEARNT = {"linear": 0.25, "pcr": 0.25, "ann": 0.05, "svr": 0.25, "gp": 0.01}
 """Error in the largest output against its deviation."""
 RANDOM = np.random.default_rng(3)

@@ -21,13 +21,13 @@ from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import compute_tool_features
 from surrogate.data.indentation import Relaxing, add_relaxation, get_poses, get_relaxation, to_indentation
-from surrogate.data.load_histories import APPROACH_TIME, HISTORY, read_series, sample_times
+from surrogate.data.load_histories import APPROACH_TIME, HISTORY, read_prony_series, sample_times
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import draw_poses
 from surrogate.evaluation.score import compute_point_errors
 from surrogate.model.applicability import find_rejection
 from surrogate.model.guarded import Guarded, describe_error
-from surrogate.model.relaxation import MEMORY_KEY, Relaxed, follow_relaxation
+from surrogate.model.relaxation import MEMORY_KEY, RelaxationState, update_relaxation
 from surrogate.model.store import load, save
 from surrogate.model.tool_contact import compute_wrench
 from surrogate.onnx_export.export import build_onnx_model
@@ -51,16 +51,16 @@ def pressed(depth: float, x: float = 0.0) -> Pushed:
     return Pushed(np.array([[x, 0.0, 0.0]]), np.array([[0.0, 0.0, -depth]]), np.array([BALL.radius]))
 
 
-def start_of(past: Relaxed, time: float) -> Deformation:
+def start_of(past: RelaxationState, time: float) -> Deformation:
     return replace(build_start(np.zeros((1, 1, 3))), memory={MEMORY_KEY: past.memory}, time=np.array([time]))
 
 
-def played(depths: list[float], times: list[float], x: list[float] | None = None) -> list[Relaxed]:
+def played(depths: list[float], times: list[float], x: list[float] | None = None) -> list[RelaxationState]:
     """The frames of a tool that was in the air before."""
-    found = [follow_relaxation(SERIES, pressed(0.0), np.zeros(1), None, 1e-4)]
+    found = [update_relaxation(SERIES, pressed(0.0), np.zeros(1), None, 1e-4)]
     for depth, before, time, place in zip(depths, [0.0, *times], times, x or [0.0] * len(times), strict=False):
         start = start_of(found[-1], before)
-        found.append(follow_relaxation(SERIES, pressed(depth, place), np.array([time]), start, 1e-4))
+        found.append(update_relaxation(SERIES, pressed(depth, place), np.array([time]), start, 1e-4))
     return found[1:]
 
 
@@ -88,9 +88,9 @@ def test_histories_outside_training_are_marked():
 def test_start_without_matching_history_is_rejected():
     late = start_of(played([1e-3], [2.0])[0], 2.0)
     with pytest.raises(InputError, match=r"the start is 1 s later than the loads"):
-        follow_relaxation(SERIES, pressed(1e-3), np.ones(1), late, 1e-4)
+        update_relaxation(SERIES, pressed(1e-3), np.ones(1), late, 1e-4)
     with pytest.raises(InputError, match="does not say how far the tissue has relaxed"):
-        follow_relaxation(SERIES, pressed(1e-3), np.ones(1), replace(late, memory={}), 1e-4)
+        update_relaxation(SERIES, pressed(1e-3), np.ones(1), replace(late, memory={}), 1e-4)
 
 
 class Fading:
@@ -104,7 +104,7 @@ class Fading:
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         pushed = to_indentation(loads, BALL, self.patch)
-        share = follow_relaxation(SERIES, pushed, loads.times, start, 1e-4).share[:, None]
+        share = update_relaxation(SERIES, pushed, loads.times, start, 1e-4).share[:, None]
         X, count = compute_tool_features(self.patch, pushed), len(loads)
         answered = self.contact.compute_linear(X) * X[:, 6:7] * (1.0 - 0.3 * share)
         split, moved = len(self.bases[0].modes), np.zeros((count, len(self.anatomy.mesh.nodes), 3))
@@ -192,7 +192,7 @@ def test_model_rejects_other_prony_series(model, box):
     timeless = replace(model, training={name: said for name, said in model.training.items() if name != "history"})
     assert "from loads without time, and here the tissue relaxes" in str(find_rejection(timeless, EFFECTS))
     with pytest.raises(InputError, match="unsupported histories"):
-        read_series({**SAID, "history": "the tool fell"})
+        read_prony_series({**SAID, "history": "the tool fell"})
 
 
 def test_relaxation_model_plays_frame_by_frame_without_fem(model, box):

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from surrogate.data.tool_loads import draw
-from surrogate.evaluation.score import SolveCounts, compute_spread, find_best, format_scores, score, score_forces
+from surrogate.evaluation.score import (
+    SolveCounts,
+    compute_statistics,
+    find_best_score,
+    format_scores,
+    score,
+    score_forces,
+)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +31,7 @@ def test_score_measures_a_known_shift(pretender, box, fresh):
     bent[:, 3, 1] += 1e-3 * np.arange(60)
     one = score("one vertex", pretender, fresh, bent, box.tumour_nodes)
     assert (one.worst_mean_mm, one.worst_p95_mm) == pytest.approx((29.5, np.percentile(np.arange(60), 95)))
-    assert find_best([shifted, one, nothing]) is nothing
+    assert find_best_score([shifted, one, nothing]) is nothing
     assert one.mean_mm == pytest.approx(29.5 / len(box.tumour_nodes)) and one.max_mm == pytest.approx(59.0)
 
 
@@ -59,7 +66,7 @@ def test_score_of_single_model_names_no_smallest_error(pretender, box, fresh):
 def test_permille_error_is_omitted_below_1000_loads(pretender, box, fresh):
     """A dash and a note replace it; from 1,000 loads on it is the 99.9th percentile."""
     distance = np.random.default_rng(0).uniform(size=(1000, 3))
-    few, many = compute_spread(distance[:999]), compute_spread(distance)
+    few, many = compute_statistics(distance[:999]), compute_statistics(distance)
     assert few[2] is None and many[2] == pytest.approx(np.percentile(distance, 99.9)) and few[3] <= 1.0
     assert few[:2] == pytest.approx((distance[:999].mean(), np.percentile(distance[:999], 95)))
     truth = pretender.deform(fresh, at=box.tumour_nodes).displacement + 1e-4

@@ -179,7 +179,7 @@ def test_judge_rejects_loads_of_the_training(folder, small_box, capsys):
     count = ["--count", "40", "--device", "cpu", "--json"]  # of which too few calibrate
     assert main(["simulate", str(folder / "box.vtu"), "--out", little, *count]) == 0
     assert main(["train", little, "--out", few, "--learners", "linear"]) == 0
-    printed, (weak,) = capsys.readouterr().out, [known.weak for known in read_reported_errors(few).values()]
+    printed, (weak,) = capsys.readouterr().out, [known.is_weak for known in read_reported_errors(few).values()]
     said = "scenes play it guarded" if weak else "scenes play it without FEM"
     assert re.search(rf"\(limit [\d.]+ (?:mm|%)\): {said}", printed)
     assert main(["judge", few, fresh]) == 0

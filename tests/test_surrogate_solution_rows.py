@@ -25,9 +25,9 @@ from sim.geometry.tetmesh import TetMesh
 from sim.loads import push
 from sim.material import read_tissue_json
 from sim.runtime.journal import DamageWarning
-from surrogate.data.dataset import FORMAT, OLD_FORMAT, SEAL_ATTRIBUTE, read_dataset, read_stored
+from surrogate.data.dataset import FORMAT, OLD_FORMAT, SEAL_ATTRIBUTE, read_array, read_dataset
 from surrogate.data.simulate import simulate
-from surrogate.data.solution_rows import compute_row_checksums, get_row_type
+from surrogate.data.solution_rows import compute_row_checksums, get_row_dtype
 from surrogate.data.tool_loads import draw
 from surrogate.training.train import train
 
@@ -63,7 +63,7 @@ def put_right(path, group):
     """Make the checksums those of the rows that are there."""
     with h5py.File(path, "r+") as file:
         columns = file[group]
-        rows = np.empty(len(columns["residual"]), get_row_type(columns["displacement"].shape[1]))
+        rows = np.empty(len(columns["residual"]), get_row_dtype(columns["displacement"].shape[1]))
         for name in rows.dtype.names:
             rows[name] = columns[name][:]
         columns["checksum"][:] = compute_row_checksums(rows)
@@ -86,7 +86,7 @@ class TestUnfinished:
                 solved = simulate(path, pretender, loads, SAID, 8)
             found = rows_in(path)
             assert found.keys() == good.keys() and all(np.array_equal(found[name], good[name]) for name in good)
-            resumed += 8 <= solved.rows < len(loads) + len(good["unit/node"])
+            resumed += 8 <= solved.total < len(loads) + len(good["unit/node"])
             path.unlink()
         assert resumed >= 4  # what was not damaged was not solved again
 
@@ -96,12 +96,12 @@ class TestUnfinished:
         (tmp_path / "data.h5.partial").write_bytes(raw)
         with pytest.warns(DamageWarning, match="rows from 0 on of `answers`: damaged"):
             solved = simulate(tmp_path / "data.h5", pretender, loads, SAID, 8)
-        assert solved.loads == 8 + 4 and solved.units == 0  # the last, short batch was never solved
+        assert solved.load_count == 8 + 4 and solved.unit_count == 0  # the last, short batch was never solved
 
     def test_damaged_file_header_loses_no_row(self, tmp_path, pretender, loads, unfinished):
         (tmp_path / "data.h5.partial").write_bytes(unfinished[:20] + b"#" + unfinished[21:])
         with pytest.warns(DamageWarning, match="its beginning: damaged"):
-            assert simulate(tmp_path / "data.h5", pretender, loads, SAID, 8).rows == 4
+            assert simulate(tmp_path / "data.h5", pretender, loads, SAID, 8).total == 4
 
     @pytest.mark.parametrize("content", [b"", b"some text", b"\x89HDF\r\n\x1a\n" + bytes(5000), b"sulcus\r\n" * 500])
     def test_foreign_partial_file_is_rejected_and_kept(self, tmp_path, pretender, loads, content):
@@ -142,7 +142,7 @@ class TestFinished:
             )
         with pytest.warns(DamageWarning, match=rf"row {row} of `{group}`: damaged"):
             solved = simulate(path, pretender, loads, SAID, 8)
-        assert solved.rows == (4 if row == 17 else 8)
+        assert solved.total == (4 if row == 17 else 8)
         good, found = rows_in(whole), rows_in(path)
         assert all(np.array_equal(found[item], good[item]) for item in good)
 
@@ -175,10 +175,10 @@ class TestFinished:
     def test_array_above_the_byte_limit_is_rejected(self, whole):
         """Also an array whose length only the file determines."""
         with h5py.File(whole) as file:
-            shape = read_stored(file, "anatomy/nodes", "f").shape
-            assert read_stored(file, "anatomy/nodes", "f", shape, 10_000).nbytes > 10_000
+            shape = read_array(file, "anatomy/nodes", "f").shape
+            assert read_array(file, "anatomy/nodes", "f", shape, 10_000).nbytes > 10_000
             with pytest.raises(InputError, match=r"`anatomy/nodes` declares more than such a file holds"):
-                read_stored(file, "anatomy/nodes", "f", None, 10_000)
+                read_array(file, "anatomy/nodes", "f", None, 10_000)
 
     def test_invalid_tool_in_provenance_is_rejected(self, whole):
         data = read_dataset(whole)
@@ -287,7 +287,7 @@ class TestRoom:
             simulate(tmp_path / "data.h5", pretender, loads, SAID, 8)
         assert [path.name for path in tmp_path.iterdir()] == ([] if asked else ["data.h5.partial"])
         if size > 3_000_000:  # all was solved
-            assert simulate(tmp_path / "data.h5", pretender, loads, SAID, 8).rows == 0
+            assert simulate(tmp_path / "data.h5", pretender, loads, SAID, 8).total == 0
 
 
 def test_displacement_is_reproduced_from_file_attributes(tmp_path):
@@ -332,6 +332,6 @@ def test_stored_arrays_of_wrong_type_or_shape_are_rejected(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["a"] = np.zeros(3)
         with pytest.raises(InputError, match="holds float64"):
-            read_stored(file, "a", "iu")
+            read_array(file, "a", "iu")
         with pytest.raises(InputError, match="measures 3, not n x 3"):
-            read_stored(file, "a", "f", (None, 3))
+            read_array(file, "a", "f", (None, 3))

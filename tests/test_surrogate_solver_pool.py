@@ -59,11 +59,11 @@ def test_dataset_is_independent_of_device_count(tmp_path, body, batch):
     counts = []
     for devices in (["cpu"], ["cpu", "cpu"]):
         with open_solvers(LazyFem(body, effects, TRAIN, "smoothed", batch, COUNT), devices, print) as solver:
-            assert (solver.element, solver.batch) == ("smoothed", batch)
+            assert (solver.element, solver.batch_size) == ("smoothed", batch)
             seen = []
             path = tmp_path / f"{len(devices)}.h5"
             said = simulate(path, solver.deformer, loads, SAID, batch, lambda *done, seen=seen: seen.append(done))
-            counts.append((said.units, said.loads, len(seen), seen[0], seen[-1]))
+            counts.append((said.unit_count, said.load_count, len(seen), seen[0], seen[-1]))
             assert said.load_seconds > 0.0
     assert counts[0] == counts[1] and counts[0][:2] == (3 * int(body.craniotomy.sum()), COUNT)
     assert undated(tmp_path / "1.h5") == undated(tmp_path / "2.h5")

@@ -20,7 +20,7 @@ from surrogate.data.simulate import simulate
 from surrogate.data.tool_loads import draw
 from surrogate.model.conformal import GROWTH, Bound
 from surrogate.model.store import load, read_learned_tissue, read_reported_errors, save
-from surrogate.model.training_range import Outside
+from surrogate.model.training_range import Excess
 from surrogate.training.train import train
 
 HOUSE = Path(__file__).parents[1]
@@ -141,7 +141,7 @@ def test_bounds_of_older_files_grow_only_beyond_the_reach(stored, models, box, t
     for bound in (found.bounds, found.tip.bound):
         assert (float(bound.growth), float(bound.near)) == (1e3 * GROWTH, reach)
     away = np.array([0.0, reach, reach + 1e-3])
-    outside = Outside(away, 0.0 * away, 0.0 * away)
+    outside = Excess(away, 0.0 * away, 0.0 * away)
     stated = found.bounds.evaluate(np.tile(found.bounds.mean, (3, 1)), np.full(3, 0.2), outside)[0]
     assert stated[0] == stated[1] and stated[2] == pytest.approx((1.0 + GROWTH) * stated[0])
 

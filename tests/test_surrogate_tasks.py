@@ -31,5 +31,5 @@ def test_killed_solver_process_loses_no_finished_case(tmp_path, body):
     assert not path.exists() and path.with_name("data.h5.partial").stat().st_size > 0
     left = 3 * int(body.craniotomy.sum()) + COUNT - max(done)
     assert 2 <= left <= 10  # what came after the sixth, and it
-    assert simulate(path, undisturbed, loads, SAID, 2).rows == left
+    assert simulate(path, undisturbed, loads, SAID, 2).total == left
     assert undated(path) == undated(whole)

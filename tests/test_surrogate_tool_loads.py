@@ -13,7 +13,7 @@ from surrogate.data.tool_loads import (
     compute_rejected_share,
     describe_rejected,
     draw,
-    spread,
+    select_spread,
 )
 
 
@@ -27,19 +27,22 @@ def test_tool_loads_stay_in_their_ranges(box, patch, name):
     force = np.linalg.norm(loads.force, axis=1)
     pressure = force / (np.pi * loads.footprint**2)
     cosine = -loads.force[:, 2] / force  # the open top faces +z
-    assert (loads.footprint >= tool.footprint[0]).all() and (loads.footprint <= tool.footprint[1]).all()
-    assert (force >= tool.force[0] * (1 - 1e-12)).all() and (force <= tool.force[1] * (1 + 1e-12)).all()
-    assert pressure.max() <= MAX_PRESSURE and pressure.min() >= tool.pressure[0]
-    assert (3 * force / (4 * PLANE_MODULUS * loads.footprint)).max() <= tool.depth
-    assert cosine.min() >= np.cos(tool.cone) - 1e-12
+    assert (loads.footprint >= tool.radius_range[0]).all() and (loads.footprint <= tool.radius_range[1]).all()
+    assert (force >= tool.force_range[0] * (1 - 1e-12)).all() and (force <= tool.force_range[1] * (1 + 1e-12)).all()
+    assert pressure.max() <= MAX_PRESSURE and pressure.min() >= tool.pressure_range[0]
+    assert (3 * force / (4 * PLANE_MODULUS * loads.footprint)).max() <= tool.max_depth
+    assert cosine.min() >= np.cos(tool.max_angle) - 1e-12
     assert (patch.compute_edge_distance(loads.point) >= loads.footprint).all()
 
 
 def test_load_points_directions_and_forces_are_uniform(box, patch):
     loads = pushes("bipolar", box, 4000, 0)
     inner = np.linalg.norm(loads.point[:, :2], axis=1) < 10e-3
-    allowed = patch.compute_covered(np.zeros((1, 3)), 10e-3) * patch.areas.sum()
-    pressable = patch.areas.sum() - 0.85e-3 * np.linalg.norm(patch.rim[:, 1] - patch.rim[:, 0], axis=1).sum()
+    allowed = patch.compute_coverage(np.zeros((1, 3)), 10e-3) * patch.areas.sum()
+    pressable = (
+        patch.areas.sum()
+        - 0.85e-3 * np.linalg.norm(patch.boundary_edges[:, 1] - patch.boundary_edges[:, 0], axis=1).sum()
+    )
     assert inner.mean() == pytest.approx(allowed / pressable, rel=0.12)
     loads = pushes("palpation", box, 4000, 0)
     force = np.linalg.norm(loads.force, axis=1)
@@ -59,7 +62,7 @@ def test_load_depends_only_on_seed_and_number(box):
 def test_mixed_preset_uses_every_tool(box):
     radii = pushes("mixed", box, 200, 0).footprint
     for tool in TOOLS.values():
-        assert ((radii >= tool.footprint[0]) & (radii <= tool.footprint[1])).sum() > 20
+        assert ((radii >= tool.radius_range[0]) & (radii <= tool.radius_range[1])).sum() > 20
 
 
 def test_seed_preset_follows_the_published_protocol(box):
@@ -70,7 +73,7 @@ def test_seed_preset_follows_the_published_protocol(box):
     assert len(loads.point) == 11 * 100 * 20
     assert len(np.unique(loads.point, axis=0)) == 11 and distance.min() >= 20e-3 and distance.max() <= 28e-3
     assert np.allclose(np.unique(magnitude.round(9)), np.arange(0.10, 1.051, 0.05))
-    assert (loads.footprint == PublishedSettings.footprint).all()
+    assert (loads.footprint == PublishedSettings.radius).all()
     rows = np.column_stack([loads.point, loads.force]).round(9)
     assert len(np.unique(rows, axis=0)) == len(rows)
 
@@ -99,13 +102,13 @@ def make_small_opening(box):
 
 def test_spread_selects_points_far_from_each_other():
     points = np.random.default_rng(0).random((400, 3)) * [1, 1, 0]
-    chosen = points[spread(points, 9)]
+    chosen = points[select_spread(points, 9)]
     gaps = np.linalg.norm(chosen[:, None] - chosen, axis=2) + np.eye(9) * 9
     assert gaps.min() > 0.3  # a 3 x 3 grid has 0.33-0.5
 
 
 def test_covered_share_equals_disc_area_share(box, patch):
-    assert patch.compute_covered(np.zeros((1, 3)), 12e-3) == pytest.approx(
+    assert patch.compute_coverage(np.zeros((1, 3)), 12e-3) == pytest.approx(
         np.pi * 12e-3**2 / patch.areas.sum(), rel=0.03
     )
 
@@ -114,10 +117,10 @@ def test_covered_share_equals_disc_area_share(box, patch):
 def test_rejected_share_matches_random_recount(name):
     """Counted again with random loads and the limits written in this test."""
     tool, random = TOOLS[name], np.random.default_rng(0)
-    radius = random.uniform(*tool.footprint, 40_000)
-    force = np.exp(random.uniform(*np.log(tool.force), 40_000))
+    radius = random.uniform(*tool.radius_range, 40_000)
+    force = np.exp(random.uniform(*np.log(tool.force_range), 40_000))
     pressure, depth = force / (np.pi * radius**2), 3.0 * force / (4.0 * PLANE_MODULUS * radius)
-    refused = (pressure < tool.pressure[0]) | (pressure > tool.pressure[1]) | (depth > tool.depth)
+    refused = (pressure < tool.pressure_range[0]) | (pressure > tool.pressure_range[1]) | (depth > tool.max_depth)
     assert compute_rejected_share(name) == pytest.approx(refused.mean(), abs=0.01)
 
 

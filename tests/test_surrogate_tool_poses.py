@@ -44,7 +44,7 @@ def test_pose_draw_depends_only_on_seed_and_number(box):
     assert other is not None
     assert not np.array_equal(some.pose, other.pose)
     depth = np.linalg.norm(to_indentation(many, BALL, open_patch(box)).force, axis=1) / BALL.radius
-    assert depth.min() >= ToolPoseSettings.min_depth_ratio * np.cos(TOOLS["palpation"].cone) - 1e-9
+    assert depth.min() >= ToolPoseSettings.min_depth_ratio * np.cos(TOOLS["palpation"].max_angle) - 1e-9
     assert depth.max() <= ToolPoseSettings.max_ball_depth + 1e-9
 
 
@@ -69,7 +69,7 @@ class PosedPretender:
 def data(tmp_path_factory, pretender):
     path = tmp_path_factory.mktemp("poses") / "data.h5"
     counted = simulate(path, PosedPretender(pretender), draw_poses("palpation", pretender.anatomy, 360, 0), SAID)
-    assert (counted.loads, counted.units) == (360, 0)
+    assert (counted.load_count, counted.unit_count) == (360, 0)
     return read_dataset(path)
 
 

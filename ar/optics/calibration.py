@@ -86,18 +86,18 @@ class Calibration:
         """Return the camera at a pose T_camera_world (4, 4) [m]; errors as in `Camera`."""
         return Camera(self.K, T_camera_world, self.width, self.height, self.lens)
 
-    def resize_calibration(self, width: int, height: int, scale: bool = False) -> Calibration:
-        """Return the calibration for an image size; another size needs `scale` and the same aspect ratio.
+    def resize_calibration(self, width: int, height: int, allow_scaling: bool = False) -> Calibration:
+        """Return the calibration for an image size; another size needs `allow_scaling` and the same aspect ratio.
 
         Raises
         ------
         ValueError
-            An image of another size without `scale`, or another aspect ratio.
+            An image of another size without `allow_scaling`, or another aspect ratio.
         """
         if (width, height) == (self.width, self.height):
             return self
         here = f"the camera was calibrated with images of {self.width} x {self.height}, not {width} x {height}"
-        if not scale:
+        if not allow_scaling:
             raise ValueError(f"{here}: calibrate with that size, or ask for the calibration to be scaled.")
         larger = self.build_camera(np.eye(4)).scale(width / self.width)
         if (larger.width, larger.height) != (width, height):

@@ -210,13 +210,9 @@ class Camera:
 
 
 def look_at(
-    eye: np.ndarray,
-    target: np.ndarray,
-    up: np.ndarray,
-    vertical_fov: float = np.radians(35.0),
-    width: int = 640,
+    eye: np.ndarray, target: np.ndarray, up: np.ndarray, vertical_fov: float = np.radians(35.0), width: int = 640,
     height: int = 480,
-) -> Camera:
+) -> Camera:  # fmt: skip
     """Build a camera at `eye` (3,) [m] that looks at `target` (3,) [m], with `up` (3,) upwards in the image.
 
     `vertical_fov` [rad]; square pixels, principal point in the centre. Raises ValueError if no direction is defined:

@@ -167,9 +167,9 @@ def undistort_pixels(lens: Lens, K: tuple[float, ...], width: int, height: int) 
     return to_pixels(matrix, places)
 
 
-def to_pixels(K: np.ndarray, places: np.ndarray) -> np.ndarray:
+def to_pixels(K: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Map normalised positions (..., 2) to pixels (..., 2) by K (3, 3)."""
-    return places @ K[:2, :2].T + K[:2, 2]
+    return points @ K[:2, :2].T + K[:2, 2]
 
 
 def to_normalised(K: np.ndarray, pixels: np.ndarray) -> np.ndarray:

@@ -11,8 +11,8 @@ import numpy as np
 
 from ..optics.camera import Camera
 from ..rendering.layer import Layer
-from .distances import build_tree, compute_signed_distance
-from .hud import WHITE, write_haloed
+from .distances import build_bvh, compute_signed_distance
+from .hud import WHITE, write_text_with_halo
 from .outlines import draw_dashes, find_outlines
 from .window import CLOSED_GROUND, FRONT
 
@@ -40,45 +40,45 @@ HALF_NUMBER_WIDTH = 10  # Half the width of a number [pixel].
 
 @dataclass(frozen=True, eq=False)
 class CutPlane:
-    """Plane through `middle` (3,) [m]: `along` (3,) the line of sight and, at right angles, `across` (3,)."""
+    """Plane through `centre` (3,) [m]: `along` (3,) the line of sight and, at right angles, `across` (3,)."""
 
-    middle: np.ndarray
+    centre: np.ndarray
     across: np.ndarray
     along: np.ndarray
 
     def to_plane(self, points: np.ndarray) -> np.ndarray:
         """Convert points (..., 3) [m] of the plane to (..., 2) [m]: across, and along the line of sight."""
-        return (points - self.middle) @ np.stack([self.across, self.along], axis=1)
+        return (points - self.centre) @ np.stack([self.across, self.along], axis=1)
 
     def to_world(self, coordinates: np.ndarray) -> np.ndarray:
         """Convert plane coordinates (..., 2) [m] back to points (..., 3) [m]."""
-        return self.middle + coordinates @ np.stack([self.across, self.along])
+        return self.centre + coordinates @ np.stack([self.across, self.along])
 
 
-def build_plane(camera: Camera, middle: np.ndarray, tip: np.ndarray | None) -> CutPlane:
+def build_plane(camera: Camera, centre: np.ndarray, tip: np.ndarray | None) -> CutPlane:
     """Build the plane through a camera's centre, a surface's centre (3,) [m] and a tip (3,) [m], right in the inset.
 
     Without a tip, or with one on the line of sight, the plane is horizontal in the image.
     """
-    along = (middle - camera.centre) / np.linalg.norm(middle - camera.centre)
+    along = (centre - camera.centre) / np.linalg.norm(centre - camera.centre)
     level = camera.T_camera_world[0, :3]
-    towards = level if tip is None else tip - middle
+    towards = level if tip is None else tip - centre
     across = towards - (towards @ along) * along
     if np.linalg.norm(across) < MIN_TIP_DISTANCE:
         across = level - (level @ along) * along
     across /= np.linalg.norm(across)
-    return CutPlane(middle, across if across @ level >= 0.0 else -across, along)
+    return CutPlane(centre, across if across @ level >= 0.0 else -across, along)
 
 
-def compute_profile(
-    camera: Camera, plane: CutPlane, depth: np.ndarray, roles: np.ndarray, reach: float
+def compute_surface_profile(
+    camera: Camera, plane: CutPlane, depth: np.ndarray, roles: np.ndarray, half_width: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Extract the visible surface along the plane: positions (n, 2) [m], in order across, and their roles (n,).
 
-    depth (H, W) [m] and roles (H, W) uint8 of the image; objects in front of the overlay are left out. `reach` [m] is
-    the half width of the search across.
+    depth (H, W) [m] and roles (H, W) uint8 of the image; objects in front of the overlay are left out. The search
+    across has a `half_width` [m].
     """
-    steps = np.linspace(-reach, reach, 4 * max(camera.width, 1))
+    steps = np.linspace(-half_width, half_width, 4 * max(camera.width, 1))
     pixels, _ = camera.project(plane.to_world(np.stack([steps, 0.0 * steps], axis=1)))
     pixels = np.unique(pixels[np.isfinite(pixels).all(axis=1)].round().astype(int), axis=0)
     pixels = pixels[((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)]
@@ -90,21 +90,15 @@ def compute_profile(
 
 
 def draw_section(
-    camera: Camera,
-    hidden: Layer,
-    plane: CutPlane,
-    seen: tuple[np.ndarray, np.ndarray],
-    size: tuple[int, int],
-    ink: tuple[float, ...],
-    tip: np.ndarray | None = None,
-    error: float | None = None,
-) -> np.ndarray:
+    camera: Camera, layer: Layer, plane: CutPlane, profile: tuple[np.ndarray, np.ndarray], size: tuple[int, int],
+    colour: tuple[float, ...], tip: np.ndarray | None = None, error: float | None = None,
+) -> np.ndarray:  # fmt: skip
     """Draw the inset (h, w, 3) uint8: tissue toned by its distance to the hidden surface, the inside in its colour.
 
     Parameters
     ----------
-    seen
-        Profile from `compute_profile`.
+    profile
+        Profile from `compute_surface_profile`.
     size
         Width and height [pixel].
     tip
@@ -113,33 +107,33 @@ def draw_section(
         Error bound of the surface [m]: drawn as a dashed line at this distance outside.
     """
     wide, tall = size
-    low, scale = _compute_frame(plane, hidden, seen[0], tip, size)
+    low, scale = _compute_frame(plane, layer, profile[0], tip, size)
     columns, rows = np.meshgrid(np.arange(wide), np.arange(tall))
     places = low + np.stack([columns, rows], axis=2) / scale
     distance = compute_signed_distance(
-        build_tree(hidden.vertices, hidden.triangles), plane.to_world(places).reshape(-1, 3), MAX_DISTANCE
+        build_bvh(layer.vertices, layer.triangles), plane.to_world(places).reshape(-1, 3), MAX_DISTANCE
     ).reshape(tall, wide)
     tone = np.nan_to_num(distance / TONE_WIDTH, nan=len(TONES)).clip(0, len(TONES) - 1).astype(int)
     out = TONES[tone]
-    out[distance < 0.0] = ink
-    if len(seen[0]):
-        out[places[..., 1] < np.interp(places[..., 0], seen[0][:, 0], seen[0][:, 1])] = EMPTY_COLOUR
+    out[distance < 0.0] = colour
+    if len(profile[0]):
+        out[places[..., 1] < np.interp(places[..., 0], profile[0][:, 0], profile[0][:, 1])] = EMPTY_COLOUR
     out = out.astype(np.uint8)
     if error is not None:
-        draw_dashes(out, find_outlines(distance < error), ink, INSET_STROKES, 2)
-    at = np.rint((seen[0] - low) * scale).astype(np.int32)
-    for (column, row), role in zip(at.tolist(), seen[1].tolist(), strict=True):
+        draw_dashes(out, find_outlines(distance < error), colour, INSET_STROKES, 2)
+    at = np.rint((profile[0] - low) * scale).astype(np.int32)
+    for (column, row), role in zip(at.tolist(), profile[1].tolist(), strict=True):
         cv2.circle(out, (column, row), 1, (*(CLOSED_COLOUR if role == CLOSED_GROUND else WHITE), 255), -1)
     if tip is not None:
         column, row = np.rint((plane.to_plane(tip) - low) * scale).astype(int).tolist()
         cv2.circle(out, (column, row), 5, (10, 12, 12, 255), -1, cv2.LINE_AA)
         cv2.circle(out, (column, row), 3, (*WHITE, 255), -1, cv2.LINE_AA)
-    _write_bands(out, distance, places, seen[0])
+    _write_bands(out, distance, places, profile[0])
     for letter, column in zip(END_LETTERS, (4, wide - 12), strict=True):
-        write_haloed(out, letter, (column, 12), INSET_TEXT_SCALE)
+        write_text_with_halo(out, letter, (column, 12), INSET_TEXT_SCALE)
     bar = round(SCALE_BAR_LENGTH * scale)
     cv2.line(out, (6, tall - 6), (6 + bar, tall - 6), (*WHITE, 255), 2)
-    write_haloed(out, f"{1e3 * SCALE_BAR_LENGTH:.0f} mm", (6, tall - 11), INSET_TEXT_SCALE)
+    write_text_with_halo(out, f"{1e3 * SCALE_BAR_LENGTH:.0f} mm", (6, tall - 11), INSET_TEXT_SCALE)
     return out
 
 
@@ -147,7 +141,7 @@ def add_caption(inset: np.ndarray, lines: list[str]) -> np.ndarray:
     """Add lines of text below an inset (h, w, 3) uint8, and a thin frame."""
     foot = np.full((INSET_LINE_SPACING * len(lines) + 4, inset.shape[1], 3), np.array(EMPTY_COLOUR), np.uint8)
     for number, line in enumerate(lines):
-        write_haloed(foot, line, (5, INSET_LINE_SPACING * (number + 1) - 2), INSET_TEXT_SCALE)
+        write_text_with_halo(foot, line, (5, INSET_LINE_SPACING * (number + 1) - 2), INSET_TEXT_SCALE)
     out = np.concatenate([inset, foot])
     cv2.rectangle(out, (0, 0), (out.shape[1] - 1, out.shape[0] - 1), (150, 154, 158, 255), 1)
     return out
@@ -182,6 +176,6 @@ def _write_bands(out: np.ndarray, distance: np.ndarray, places: np.ndarray, surf
             HALF_NUMBER_WIDTH < column < wide - HALF_NUMBER_WIDTH
             and tissue[column - HALF_NUMBER_WIDTH : column + HALF_NUMBER_WIDTH].all()
         ):
-            write_haloed(
+            write_text_with_halo(
                 out, f"{1e3 * step * TONE_WIDTH:.0f}", (column - HALF_NUMBER_WIDTH // 2, row + 4), INSET_TEXT_SCALE
             )

@@ -7,36 +7,36 @@ import numpy as np
 import warp as wp
 
 from ..optics.camera import Camera
-from ..rendering.parallel import forward_kernel, launch_in_bands, load
+from ..rendering.parallel import forward_kernel, launch_in_bands, load_modules
 from .hud import FONT, TEXT_SCALE
-from .outlines import OPAQUE, clip_to_sheet, cut_outlines, find_outlines
+from .outlines import OPAQUE, clip_to_canvas, clip_to_mask, find_outlines
 from .window import BORDER_COLOUR
 
 RAY_COUNT = wp.constant(3)  # Number of rays of the inside test: odd, so that there is always a majority.
 
 
-def build_tree(vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> wp.Mesh:
+def build_bvh(vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> wp.Mesh:
     """Build a BVH of the triangles (F, 3) of vertices (V, 3) [m]."""
     points = wp.array(vertices, dtype=wp.vec3f, device=device)
     return wp.Mesh(points, wp.array(np.asarray(triangles, np.int32).ravel(), dtype=wp.int32, device=device))
 
 
-def compute_signed_distance(tree: wp.Mesh, points: np.ndarray, reach: float) -> np.ndarray:
-    """Compute distances (n,) float32 of points (n, 3) to a closed surface, < 0 inside, NaN beyond `reach`; all [m]."""
-    device = str(tree.device)
-    load(device, __name__)
+def compute_signed_distance(bvh: wp.Mesh, points: np.ndarray, max_distance: float) -> np.ndarray:
+    """Compute distances (n,) float32 of points (n, 3) to a closed surface, < 0 inside, NaN if too far; all [m]."""
+    device = str(bvh.device)
+    load_modules(device, __name__)
     at = wp.array(points, dtype=wp.vec3f, device=device)
     found = wp.empty(len(points), dtype=wp.float32, device=device)
-    launch_in_bands(measure_points, [tree.id, at, float(reach)], [found], len(points), device)
+    launch_in_bands(measure_point_distances, [bvh.id, at, float(max_distance)], [found], len(points), device)
     return found.numpy()
 
 
-def compute_seen_distance(
-    tree: wp.Mesh, camera: Camera, box: tuple[slice, slice], depth: wp.array, where: np.ndarray, reach: float
+def compute_visible_distance(
+    bvh: wp.Mesh, camera: Camera, box: tuple[slice, slice], depth: wp.array, mask: np.ndarray, max_distance: float
 ) -> np.ndarray:
     """Compute the distance of the visible point at each pixel of a box from a surface: (h, w) float32 [m].
 
-    NaN beyond `reach` [m], and where `where` (h, w) bool is false.
+    NaN beyond `max_distance` [m], and where `mask` (h, w) bool is false.
 
     Parameters
     ----------
@@ -45,70 +45,58 @@ def compute_seen_distance(
     box
         Rows and columns of the box.
     """
-    device = str(tree.device)
-    load(device, __name__)
+    device = str(bvh.device)
+    load_modules(device, __name__)
     rows, columns = box
-    rays = np.concatenate([camera.straight[rows, columns], np.ones((*where.shape, 1))], axis=2)
+    rays = np.concatenate([camera.straight[rows, columns], np.ones((*mask.shape, 1))], axis=2)
     turn = camera.T_camera_world[:3, :3].T @ np.linalg.inv(camera.K)
-    found = wp.empty(where.shape, dtype=wp.float32, device=device)
+    found = wp.empty(mask.shape, dtype=wp.float32, device=device)
     inputs = [
-        tree.id, rows.start, columns.start, wp.array(rays @ turn.T, dtype=wp.vec3f, device=device),
-        wp.vec3f(camera.centre), depth, wp.array(np.ascontiguousarray(where).view(np.uint8), device=device),
-        float(reach),
+        bvh.id, rows.start, columns.start, wp.array(rays @ turn.T, dtype=wp.vec3f, device=device),
+        wp.vec3f(camera.centre), depth, wp.array(np.ascontiguousarray(mask).view(np.uint8), device=device),
+        float(max_distance),
     ]  # fmt: skip
-    launch_in_bands(measure_seen, inputs, [found], found.size, device, bands=4)
+    launch_in_bands(measure_visible_distances, inputs, [found], found.size, device, per_core=4)
     return found.numpy()
 
 
 @forward_kernel
-def measure_points(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    tree: wp.uint64,
-    points: wp.array(dtype=wp.vec3f),
-    reach: wp.float32,
+def measure_point_distances(
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, bvh: wp.uint64, points: wp.array(dtype=wp.vec3f),
+    max_distance: wp.float32,
     # output
     distance: wp.array(dtype=wp.float32),
-):
+):  # fmt: skip
     """Compute signed distances of a run of points."""
-    start = begin + wp.tid() * run
-    for index in range(start, wp.min(start + run, end)):
-        found = wp.mesh_query_point_sign_parity(tree, points[index], reach, RAY_COUNT)
+    start = begin + wp.tid() * chunk_size
+    for index in range(start, wp.min(start + chunk_size, end)):
+        found = wp.mesh_query_point_sign_parity(bvh, points[index], max_distance, RAY_COUNT)
         distance[index] = wp.nan
         if found.result:
-            nearest = wp.mesh_eval_position(tree, found.face, found.u, found.v)
+            nearest = wp.mesh_eval_position(bvh, found.face, found.u, found.v)
             distance[index] = found.sign * wp.length(points[index] - nearest)
 
 
 @forward_kernel
-def measure_seen(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    tree: wp.uint64,
-    top: wp.int32,
-    left: wp.int32,
-    rays: wp.array2d(dtype=wp.vec3f),
-    centre: wp.vec3f,
-    depth: wp.array2d(dtype=wp.float32),
-    where: wp.array2d(dtype=wp.uint8),
-    reach: wp.float32,
+def measure_visible_distances(
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, bvh: wp.uint64, top: wp.int32, left: wp.int32,
+    rays: wp.array2d(dtype=wp.vec3f), centre: wp.vec3f, depth: wp.array2d(dtype=wp.float32),
+    mask: wp.array2d(dtype=wp.uint8), max_distance: wp.float32,
     # output
     distance: wp.array2d(dtype=wp.float32),
-):
+):  # fmt: skip
     """Compute distances of visible points for a run of the box's pixels; `rays` end at z = 1."""
-    start = begin + wp.tid() * run
-    for index in range(start, wp.min(start + run, end)):
+    start = begin + wp.tid() * chunk_size
+    for index in range(start, wp.min(start + chunk_size, end)):
         row = index / distance.shape[1]
         column = index - row * distance.shape[1]
         distance[row, column] = wp.nan
         far = depth[top + row, left + column]
-        if where[row, column] != wp.uint8(0) and far > 0.0:
+        if mask[row, column] != wp.uint8(0) and far > 0.0:
             point = centre + far * rays[row, column]
-            found = wp.mesh_query_point_no_sign(tree, point, reach)
+            found = wp.mesh_query_point_no_sign(bvh, point, max_distance)
             if found.result:
-                nearest = wp.mesh_eval_position(tree, found.face, found.u, found.v)
+                nearest = wp.mesh_eval_position(bvh, found.face, found.u, found.v)
                 distance[row, column] = wp.length(point - nearest)
 
 
@@ -124,7 +112,7 @@ MIN_NUMBERED_LENGTH = 80  # Smallest length of a piece of a ring with a number o
 
 
 def draw_rings(
-    sheet: np.ndarray, distance: np.ndarray, free: np.ndarray, levels: Sequence[float] = RING_DISTANCES
+    canvas: np.ndarray, distance: np.ndarray, free_mask: np.ndarray, levels: Sequence[float] = RING_DISTANCES
 ) -> list[str]:
     """Draw rings with their numbers in millimetres, in place; return the numbers of the rings that are drawn.
 
@@ -132,11 +120,11 @@ def draw_rings(
 
     Parameters
     ----------
-    sheet
+    canvas
         Drawing (h, w, 4) uint8.
     distance
         Distance (h, w) float32 [m] from the visible point at each pixel to the hidden surface; NaN without a ring.
-    free
+    free_mask
         (h, w) bool: free places for a number; false at other lines.
     """
     ground = np.isfinite(distance).astype(np.uint8)
@@ -144,30 +132,30 @@ def draw_rings(
     rings: dict[str, list[np.ndarray]] = {}
     for level in levels:
         near = np.nan_to_num(distance, nan=np.inf) < level
-        lines = [line for line in cut_outlines(find_outlines(near), within) if len(line) >= MIN_RING_LENGTH]
-        lines = [line for piece in lines for line in clip_to_sheet(piece, sheet.shape[1], sheet.shape[0])]
+        lines = [line for line in clip_to_mask(find_outlines(near), within) if len(line) >= MIN_RING_LENGTH]
+        lines = [line for piece in lines for line in clip_to_canvas(piece, canvas.shape[1], canvas.shape[0])]
         if lines:
             rings[f"{1e3 * level:.0f}"] = sorted(lines, key=len, reverse=True)
     for lines in rings.values():
         for ink, width in ((BORDER_COLOUR, 3), (RING_COLOUR, 1)):
-            cv2.polylines(sheet, lines, False, (*ink, OPAQUE), width, cv2.LINE_AA)
-    taken, written = ~free, np.zeros(free.shape, bool)
+            cv2.polylines(canvas, lines, False, (*ink, OPAQUE), width, cv2.LINE_AA)
+    taken, written = ~free_mask, np.zeros(free_mask.shape, bool)
     for number, lines in rings.items():
-        found = [_write_on(sheet, line, number, taken, written) for line in lines if len(line) >= MIN_NUMBERED_LENGTH]
+        found = [_write_on(canvas, line, number, taken, written) for line in lines if len(line) >= MIN_NUMBERED_LENGTH]
         if not any(found):
             # Without free space, the number covers lines, or else another number.
             any(
-                _write_on(sheet, line, number, shut, written)
+                _write_on(canvas, line, number, shut, written)
                 for shut in (written, np.zeros_like(written))
                 for line in lines
             )
     return list(rings)
 
 
-def separate_rings(drawn: np.ndarray) -> np.ndarray:
-    """Separate rings (h, w) bool from their numbers, given the mask `drawn` (h, w) of both."""
-    numbers = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OPENING_SIDE,) * 2, np.uint8))
-    return drawn & (numbers == 0)
+def remove_labels(mask: np.ndarray) -> np.ndarray:
+    """Separate rings (h, w) bool from their numbers, given the mask `mask` (h, w) of both."""
+    numbers = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OPENING_SIDE,) * 2, np.uint8))
+    return mask & (numbers == 0)
 
 
 def _write_on(sheet: np.ndarray, line: np.ndarray, text: str, shut: np.ndarray, written: np.ndarray) -> bool:

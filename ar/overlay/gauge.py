@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from .hud import Below, format_millimetres, lay
+from .hud import Hideable, format_millimetres, place_text
 from .outlines import OPAQUE
 
 NUMBER_SCALE = 0.6  # Font scale of the number at the tip.
@@ -15,81 +15,80 @@ LINE_POINTS = 33  # Number of points of a straight line, to draw it under lens d
 
 
 @dataclass(frozen=True, eq=False)
-class Gauge:
+class DistanceGauge:
     """Distance of the tool from the hidden surface.
 
     Parameters
     ----------
-    tip, nearest
+    tip, nearest_point
         World points (3,) [m]: the tool's tip and the closest point of the hidden surface.
-    read
+    reading
         The distance [m], if known more accurately than by the line between the two.
     error
         Error bound of the distance [m]; None if not available.
-    inside
+    is_inside
         True if the tip is within the hidden surface.
     """
 
     tip: np.ndarray
-    nearest: np.ndarray
-    read: float | None = None
+    nearest_point: np.ndarray
+    reading: float | None = None
     error: float | None = None
-    inside: bool = False
+    is_inside: bool = False
 
     @property
     def distance(self) -> float:
         """Distance [m]."""
-        return float(np.linalg.norm(np.asarray(self.tip) - self.nearest)) if self.read is None else self.read
+        return (
+            float(np.linalg.norm(np.asarray(self.tip) - self.nearest_point)) if self.reading is None else self.reading
+        )
 
     def __str__(self) -> str:
         """Text next to the tip."""
-        return format_gauge(self.distance, self.error, self.inside)
+        return format_tip_distance(self.distance, self.error, self.is_inside)
 
 
-def format_gauge(distance: float, error: float | None, inside: bool) -> str:
+def format_tip_distance(distance: float, error: float | None, is_inside: bool) -> str:
     """Format the distance [m] of a tip from a surface, with its error bound [m]."""
     length = format_millimetres(distance, error)
-    return f"inside, {length} from its edge" if inside else length
+    return f"inside, {length} from its edge" if is_inside else length
 
 
-def draw_line(sheet: np.ndarray, camera: Camera, gauge: Gauge) -> None:
+def draw_gauge_line(canvas: np.ndarray, camera: Camera, gauge: DistanceGauge) -> None:
     """Draw the gauge's line, in place; nothing if a part of it is behind the camera or beyond its lens."""
     # Lens distortion bends it.
     shares = np.linspace(0.0, 1.0, 2 if camera.lens is None else LINE_POINTS)[:, None]
-    line, _ = camera.project((1.0 - shares) * gauge.tip + shares * gauge.nearest)
+    line, _ = camera.project((1.0 - shares) * gauge.tip + shares * gauge.nearest_point)
     if not np.isfinite(line).all():
         return
     line = np.clip(line, -1e4, 1e4).round().astype(np.int32)[:, None]
-    cv2.polylines(sheet, [line], False, (12, 14, 16, OPAQUE), 3, cv2.LINE_AA)
-    cv2.polylines(sheet, [line], False, (250, 250, 250, OPAQUE), 1, cv2.LINE_AA)
-    cv2.circle(sheet, line[-1, 0].tolist(), 3, (250, 250, 250, OPAQUE), -1, cv2.LINE_AA)
+    cv2.polylines(canvas, [line], False, (12, 14, 16, OPAQUE), 3, cv2.LINE_AA)
+    cv2.polylines(canvas, [line], False, (250, 250, 250, OPAQUE), 1, cv2.LINE_AA)
+    cv2.circle(canvas, line[-1, 0].tolist(), 3, (250, 250, 250, OPAQUE), -1, cv2.LINE_AA)
 
 
-def write_gauge(
-    colour: np.ndarray,
-    taken: np.ndarray,
-    camera: Camera,
-    gauge: Gauge,
-    covered: np.ndarray,
-    lines: np.ndarray,
-    thin: np.ndarray,
-) -> None:
+def write_distance(
+    image: np.ndarray, occupied: np.ndarray, camera: Camera, gauge: DistanceGauge, tool_mask: np.ndarray,
+    lines: np.ndarray, ring_lines: np.ndarray,
+) -> None:  # fmt: skip
     """Write the gauge's number next to the tip, in place; nothing if neither end of its line is visible.
 
     It is placed inside the image, even over other lines if there is no space.
 
     Parameters
     ----------
-    colour, taken
+    image, occupied
         See `lay`.
-    lines, thin
-        See `Below`.
-    covered
+    lines, ring_lines
+        See `Hideable`.
+    tool_mask
         (H, W) uint8: above 0 at tools, which the number does not cover if possible.
     """
-    ends, _ = camera.project(np.stack([gauge.tip, gauge.nearest]))
+    ends, _ = camera.project(np.stack([gauge.tip, gauge.nearest_point]))
     seen = ends[np.isfinite(ends).all(axis=1)]
     if len(seen):
         column, row = np.clip(seen[0], -1e4, 1e4).round().astype(int).tolist()
         wish = column + NUMBER_DISTANCE, row + NUMBER_DISTANCE
-        lay(colour, taken, [str(gauge)], wish, NUMBER_SCALE, needed=True, below=Below(covered, lines, thin))
+        place_text(
+            image, occupied, [str(gauge)], wish, NUMBER_SCALE, force=True, parts=Hideable(tool_mask, lines, ring_lines)
+        )

@@ -11,7 +11,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from .text_placement import BORDER_DISTANCE, find_free_place
+from .text_placement import BORDER_DISTANCE, find_free_position
 
 Corner = Literal["top left", "top right", "bottom left", "bottom right"]
 FONT = cv2.FONT_HERSHEY_SIMPLEX  # OpenCV font of all text in images.
@@ -33,80 +33,78 @@ BREAK_PATTERN = re.compile(
 )
 
 
-def write(colour: np.ndarray, text: str, at: tuple[int, int], scale: float = 0.5, ink: Sequence[float] = WHITE) -> None:
+def write_text(
+    image: np.ndarray, text: str, position: tuple[int, int], scale: float = 0.5, colour: Sequence[float] = WHITE
+) -> None:
     """Write one line of ASCII text into the image (H, W, 3) uint8, its baseline's left end at (column, row).
 
     A dark halo keeps it legible on any ground; the line is moved as needed to be inside the image.
     """
     (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
-    column = min(max(at[0], 2), max(colour.shape[1] - width - 3, 2))
-    row = min(max(at[1], above + 2), max(colour.shape[0] - below - 2, above + 2))
+    column = min(max(position[0], 2), max(image.shape[1] - width - 3, 2))
+    row = min(max(position[1], above + 2), max(image.shape[0] - below - 2, above + 2))
     box = slice(max(row - above - 4, 0), row + below + 5), slice(max(column - 4, 0), column + width + 5)
-    halo = np.zeros(colour[box].shape[:2], np.uint8)
+    halo = np.zeros(image[box].shape[:2], np.uint8)
     cv2.putText(halo, text, (column - box[1].start, row - box[0].start), FONT, scale, (200,), 1, cv2.LINE_AA)
     halo = cv2.dilate(halo, np.ones((3, 3), np.uint8))[..., None] / 255.0
-    colour[box] = colour[box] * (1.0 - halo) + 12.0 * halo
-    cv2.putText(colour, text, (column, row), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
+    image[box] = image[box] * (1.0 - halo) + 12.0 * halo
+    cv2.putText(image, text, (column, row), FONT, scale, tuple(colour), 1, cv2.LINE_AA)
 
 
-def write_haloed(sheet: np.ndarray, text: str, at: tuple[int, int], scale: float, ink: Sequence[float] = WHITE) -> None:
+def write_text_with_halo(
+    canvas: np.ndarray, text: str, position: tuple[int, int], scale: float, colour: Sequence[float] = WHITE
+) -> None:
     """Write one line of ASCII text with a dark halo at (column, row), its baseline's left end, in place.
 
     sheet (h, w, 3) or (h, w, 4) uint8: colour, or colour times coverage, and coverage.
     """
     (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
-    column, row = at
+    column, row = position
     box = np.s_[max(row - above - 4, 0) : row + below + 5, max(column - 4, 0) : column + width + 5]
-    halo = np.zeros(sheet.shape[:2], np.uint8)
-    cv2.putText(halo, text, at, FONT, scale, (255, 0, 0, 0), 1, cv2.LINE_AA)
+    halo = np.zeros(canvas.shape[:2], np.uint8)
+    cv2.putText(halo, text, position, FONT, scale, (255, 0, 0, 0), 1, cv2.LINE_AA)
     share = cv2.dilate(halo[box], np.ones((3, 3), np.uint8))[..., None] / 255.0
-    sheet[box] = sheet[box] * (1.0 - share) + share * np.array([10.0, 12.0, 12.0, 255.0])[: sheet.shape[2]]
-    cv2.putText(sheet, text, at, FONT, scale, (*ink, 255.0), 1, cv2.LINE_AA)
+    canvas[box] = canvas[box] * (1.0 - share) + share * np.array([10.0, 12.0, 12.0, 255.0])[: canvas.shape[2]]
+    cv2.putText(canvas, text, position, FONT, scale, (*colour, 255.0), 1, cv2.LINE_AA)
 
 
 @dataclass(frozen=True, eq=False)
-class Below:
+class Hideable:
     """Parts of an image that text may hide.
 
     Parameters
     ----------
-    sights
+    objects
         (H, W) uint8: above 0 where text hides what should stay visible, as a tool; used if there is no other space.
     lines
         (H, W) uint8: above 0 at lines without text, which `needed` text may cover.
-    thin
+    ring_lines
         (H, W) bool: lines that text covers rather than being farther than `MAX_TEXT_SHIFT` from its desired place.
     """
 
-    sights: np.ndarray | None = None
+    objects: np.ndarray | None = None
     lines: np.ndarray | None = None
-    thin: np.ndarray | None = None
+    ring_lines: np.ndarray | None = None
 
 
-COVER_NOTHING = Below()  # Default: text may cover no part of the image.
+COVER_NOTHING = Hideable()  # Default: text may cover no part of the image.
 
 
-def lay(
-    colour: np.ndarray,
-    taken: np.ndarray,
-    lines: Sequence[str],
-    wish: tuple[int, int],
-    scale: float = TEXT_SCALE,
-    ink: Sequence[float] = WHITE,
-    needed: bool = False,
-    below: Below = COVER_NOTHING,
-) -> None:
-    """Write lines of ASCII text at the free place closest to `wish`, and mark it in `taken`; arrays change in place.
+def place_text(
+    image: np.ndarray, occupied: np.ndarray, lines: Sequence[str], position: tuple[int, int],
+    scale: float = TEXT_SCALE, colour: Sequence[float] = WHITE, force: bool = False, parts: Hideable = COVER_NOTHING,
+) -> None:  # fmt: skip
+    """Write lines of ASCII text at the free place closest to `position`, and mark it in `occupied`; both in place.
 
-    Write the most important text first: without space nothing is written, unless it is `needed`.
+    Write the most important text first: without space nothing is written, unless it is `force`.
 
     Parameters
     ----------
-    colour, taken
+    image, occupied
         The image (H, W, 3) uint8; (H, W) uint8, above 0 at lines and text.
-    wish
-        Desired column and row of the upper left corner of the lines, as `find_free_place` takes it.
-    below
+    position
+        Desired column and row of the upper left corner of the lines, as `find_free_position` takes it.
+    parts
         Parts of the image that the text may hide.
     """
     if not lines:
@@ -114,30 +112,32 @@ def lay(
     sizes = [cv2.getTextSize(line, FONT, scale, 1) for line in lines]
     above, under = sizes[0][0][1], sizes[0][1]
     size = max(width for (width, _), _ in sizes), above + under + LINE_SPACING * (len(lines) - 1)
-    sights, thin = below.sights, below.thin
-    place = None if sights is None else find_free_place(taken | sights, size, wish)
-    place = place or find_free_place(taken, size, wish)
-    if thin is not None and (place is None or np.hypot(place[0] - wish[0], place[1] - wish[1]) > MAX_TEXT_SHIFT):
-        shut = taken * ~thin
-        place = find_free_place(shut if sights is None else shut | sights, size, wish) or place
-    if place is None and needed and below.lines is not None:
-        place = find_free_place(taken & (1 - below.lines), size, wish)
-    if place is None and needed:
-        place = find_free_place(np.zeros_like(taken), size, wish) or (BORDER_DISTANCE, BORDER_DISTANCE)
+    sights, thin = parts.objects, parts.ring_lines
+    place = None if sights is None else find_free_position(occupied | sights, size, position)
+    place = place or find_free_position(occupied, size, position)
+    if thin is not None and (
+        place is None or np.hypot(place[0] - position[0], place[1] - position[1]) > MAX_TEXT_SHIFT
+    ):
+        shut = occupied * ~thin
+        place = find_free_position(shut if sights is None else shut | sights, size, position) or place
+    if place is None and force and parts.lines is not None:
+        place = find_free_position(occupied & (1 - parts.lines), size, position)
+    if place is None and force:
+        place = find_free_position(np.zeros_like(occupied), size, position) or (BORDER_DISTANCE, BORDER_DISTANCE)
     if place is None:
         return
     column, row = place
     for number, line in enumerate(lines):
-        write(colour, line, (column, row + above + number * LINE_SPACING), scale, ink)
-    taken[row : row + size[1], column : column + size[0]] = 1
+        write_text(image, line, (column, row + above + number * LINE_SPACING), scale, colour)
+    occupied[row : row + size[1], column : column + size[0]] = 1
 
 
-def wrap_line(text: str, room: float, scale: float = TEXT_SCALE) -> list[str]:
-    """Break a line of text into as few lines as fit into `room` [pixel], at allowed breaks, of about equal width.
+def wrap_line(text: str, max_width: float, scale: float = TEXT_SCALE) -> list[str]:
+    """Break a line of text into as few lines as fit into `max_width` [pixel], at allowed breaks, of about equal width.
 
     A number stays next to its name, its error and its unit, even if that takes more space.
     """
-    return list(_wrap_line(text, room, scale))
+    return list(_wrap_line(text, max_width, scale))
 
 
 @lru_cache(maxsize=256)  # most texts recur in the next image, and a call takes 1 ms
@@ -173,12 +173,12 @@ def format_millimetres(length: float, error: float | None = None) -> str:
     """Format a length [m] in millimetres, with its error bound [m] rounded up if that is finite."""
     if error is None or not math.isfinite(error):
         return f"{1e3 * length:.1f} mm"
-    return f"{1e3 * length:.1f} +- {bound_words(error, 1)}"
+    return f"{1e3 * length:.1f} +- {format_bound(error, 1)}"
 
 
-def bound_words(metres: float, digits: int) -> str:
+def format_bound(bound: float, digits: int) -> str:
     """Format a bound [m] in millimetres, rounded up: at least one unit of the last digit."""
-    return f"{max(round_up(1e3 * metres, digits), 10.0**-digits):.{digits}f} mm"
+    return f"{max(round_up(1e3 * bound, digits), 10.0**-digits):.{digits}f} mm"
 
 
 def round_up(value: float, digits: int) -> float:
@@ -187,20 +187,16 @@ def round_up(value: float, digits: int) -> float:
 
 
 def draw_text_panel(
-    colour: np.ndarray,
-    lines: Sequence[str],
-    corner: Corner = "top left",
-    scale: float = 0.45,
-    below: int = 0,
-    sights: Sequence[np.ndarray] = (),
-) -> np.ndarray:
+    image: np.ndarray, lines: Sequence[str], corner: Corner = "top left", scale: float = 0.45, first_row: int = 0,
+    obstacles: Sequence[np.ndarray] = (),
+) -> np.ndarray:  # fmt: skip
     """Return a copy of the image (H, W, 3) uint8 with lines of ASCII text on a dark translucent ground in one corner.
 
-    A panel at the top begins `below` this row. If there is not enough space, the last lines are left out.
+    A panel at the top begins `first_row` this row. If there is not enough space, the last lines are left out.
 
     Parameters
     ----------
-    sights
+    obstacles
         Masks, each (H, W) uint8, above 0 where the panel would hide what should stay visible. The panel is placed as
         close to its corner as the first mask allows, with narrower or fewer lines if necessary. The next mask is used
         if not even one line fits; the corner itself if no mask has space.
@@ -212,7 +208,7 @@ def draw_text_panel(
     """
     if corner not in Corner.__args__:
         raise ValueError(f"there is no corner {corner!r}: choose one of {', '.join(Corner.__args__)}.")
-    out = colour.copy()
+    out = image.copy()
     if not lines:
         return out
     height, width = out.shape[:2]
@@ -221,17 +217,17 @@ def draw_text_panel(
         (letters, [wrap_line(line, room, letters) for line in lines])
         for letters, room in itertools.product((scale, RETRY_SCALE * scale), rooms)
     ]
-    wish = 0 if "left" in corner else width, BORDER_DISTANCE + below if "top" in corner else height
-    for sight, kept, (letters, parts) in itertools.product(sights, range(len(lines), 0, -1), shapes):
+    wish = 0 if "left" in corner else width, BORDER_DISTANCE + first_row if "top" in corner else height
+    for sight, kept, (letters, parts) in itertools.product(obstacles, range(len(lines), 0, -1), shapes):
         broken = [part for line in parts[:kept] for part in line]
         size, step = _compute_size(broken, letters)
-        place = find_free_place(sight, size, wish)
+        place = find_free_position(sight, size, wish)
         if place is not None:
             return _write_panel(out, broken, place, size, step, letters)
     broken = [part for line in lines for part in wrap_line(line, width - 4 * BORDER_DISTANCE, scale)]
-    broken = broken[: max((height - below - 3 * BORDER_DISTANCE) // _compute_size(broken, scale)[1], 1)]
+    broken = broken[: max((height - first_row - 3 * BORDER_DISTANCE) // _compute_size(broken, scale)[1], 1)]
     size, step = _compute_size(broken, scale)
-    top = BORDER_DISTANCE + below if "top" in corner else max(height - size[1] - BORDER_DISTANCE, 0)
+    top = BORDER_DISTANCE + first_row if "top" in corner else max(height - size[1] - BORDER_DISTANCE, 0)
     left = BORDER_DISTANCE if "left" in corner else max(width - size[0] - BORDER_DISTANCE, 0)
     return _write_panel(out, broken, (left, top), size, step, scale)
 
@@ -251,7 +247,7 @@ def _write_panel(
     ground = out[top : top + size[1], left : left + size[0]]
     ground[:] = ground * 0.35 + np.array([6.0, 9.0, 11.0])
     for number, line in enumerate(lines, start=1):
-        write(out, line, (left + BORDER_DISTANCE, top + number * step), scale)
+        write_text(out, line, (left + BORDER_DISTANCE, top + number * step), scale)
     return out
 
 
@@ -265,7 +261,7 @@ def name_direction(direction: np.ndarray) -> str:
     return "".join(SIDES[axis][int(part[axis] < 0.0)] for axis in axes)
 
 
-def name_bearings(rotation: np.ndarray) -> dict[str, str]:
+def name_edge_directions(rotation: np.ndarray) -> dict[str, str]:
     """Return orientation letters of an image's edges: `rotation` (3, 3) from RAS to x right, y down, z forward."""
     right, down = np.asarray(rotation)[:2]
     return {
@@ -276,14 +272,14 @@ def name_bearings(rotation: np.ndarray) -> dict[str, str]:
     }
 
 
-def draw_orientation_labels(colour: np.ndarray, rotation: np.ndarray, taken: np.ndarray) -> np.ndarray:
+def draw_orientation_labels(image: np.ndarray, rotation: np.ndarray, occupied: np.ndarray) -> np.ndarray:
     """Return a copy of the image (H, W, 3) uint8 with orientation letters at its edges.
 
-    rotation (3, 3): of the camera, as `name_bearings` takes it; taken (H, W) uint8: above 0 at lines and text.
+    rotation (3, 3): of the camera, as `name_edge_directions` takes it; taken (H, W) uint8: above 0 at lines and text.
     """
-    out, taken = colour.copy(), taken.copy()
-    height, width = taken.shape
-    for edge, letters in name_bearings(rotation).items():
+    out, occupied = image.copy(), occupied.copy()
+    height, width = occupied.shape
+    for edge, letters in name_edge_directions(rotation).items():
         (long, tall), below = cv2.getTextSize(letters, FONT, LETTER_SCALE, 1)
         # Not at the centre of the top and bottom edges: tools enter there, and a tumour may extend to the bottom.
         strip, wish = {
@@ -292,8 +288,8 @@ def draw_orientation_labels(colour: np.ndarray, rotation: np.ndarray, taken: np.
             "top": (np.s_[: tall + below + 2 * BORDER_DISTANCE], (width // 4 - long // 2, 0)),
             "bottom": (np.s_[-tall - below - 2 * BORDER_DISTANCE :], (3 * width // 4 - long // 2, height)),
         }[edge]
-        elsewhere = np.ones_like(taken)
-        elsewhere[strip] = taken[strip]
-        lay(out, elsewhere, [letters], wish, LETTER_SCALE)
-        taken[strip] = elsewhere[strip]
+        elsewhere = np.ones_like(occupied)
+        elsewhere[strip] = occupied[strip]
+        place_text(out, elsewhere, [letters], wish, LETTER_SCALE)
+        occupied[strip] = elsewhere[strip]
     return out

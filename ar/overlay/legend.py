@@ -6,7 +6,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from .hud import FONT, HEAD_ROW, WHITE, write_haloed
+from .hud import FONT, HEAD_ROW, WHITE, write_text_with_halo
 from .outlines import OPAQUE
 from .text_placement import BORDER_DISTANCE, TEXT_DISTANCE
 from .window import BORDER_COLOUR, DEPTH_STEP, DEPTH_STEP_COUNT, MAX_TINT_OPACITY, MIN_TINT_OPACITY
@@ -28,33 +28,33 @@ class LegendNames:
 
     Parameters
     ----------
-    now, margin, before
+    current, margin, initial
         The hidden surface, the dashed line round it, and its earlier position.
-    traces
+    outlines
         Other surfaces, in the given order.
     motion
         Name of the length at the bottom: motion of the hidden surface.
     """
 
-    now: str = ""
+    current: str = ""
     margin: str = ""
-    before: str = ""
-    traces: tuple[str, ...] = ()
+    initial: str = ""
+    outlines: tuple[str, ...] = ()
     motion: str = "moved"
 
 
 @dataclass(frozen=True)
-class Entry:
+class LegendEntry:
     """Line of a legend: name, colour (3,) in 0 .. 255, strokes and gaps [pixel] (None: solid) and width [pixel]."""
 
     name: str
-    ink: tuple[float, ...]
+    colour: tuple[float, ...]
     pattern: tuple[int, int] | None = None
     width: int = 2
 
 
 @lru_cache(maxsize=16)
-def draw_legend(entries: tuple[Entry, ...]) -> np.ndarray:
+def draw_legend(entries: tuple[LegendEntry, ...]) -> np.ndarray:
     """Draw a sheet (h, w, 4) uint8, colour times coverage and coverage: a sample of each line, and its name."""
     wide = max(cv2.getTextSize(entry.name, FONT, LEGEND_TEXT_SCALE, 1)[0][0] for entry in entries)
     sheet = np.zeros((LEGEND_LINE_HEIGHT * len(entries), SAMPLE_LENGTH + SAMPLE_GAP + wide + 4, 4), np.uint8)
@@ -63,15 +63,15 @@ def draw_legend(entries: tuple[Entry, ...]) -> np.ndarray:
         stroke, gap = entry.pattern or (SAMPLE_LENGTH, 0)
         strokes = [(left, min(left + stroke, SAMPLE_LENGTH) - 1) for left in range(2, SAMPLE_LENGTH - 2, stroke + gap)]
         rim = [(BORDER_COLOUR, entry.width + 2)] if entry.width > 1 else []  # border as in `draw_dashes`
-        for ink, width in (*rim, (entry.ink, entry.width)):
+        for ink, width in (*rim, (entry.colour, entry.width)):
             for left, right in strokes:
                 cv2.line(sheet, (left, row), (right, row), (*ink, OPAQUE), width, cv2.LINE_AA)
-        write_haloed(sheet, entry.name, (SAMPLE_LENGTH + SAMPLE_GAP, row + 4), LEGEND_TEXT_SCALE)
+        write_text_with_halo(sheet, entry.name, (SAMPLE_LENGTH + SAMPLE_GAP, row + 4), LEGEND_TEXT_SCALE)
     return sheet
 
 
 @lru_cache(maxsize=4)
-def draw_depth_scale(ink: tuple[float, ...], caption: str) -> np.ndarray:
+def draw_depth_scale(colour: tuple[float, ...], caption: str) -> np.ndarray:
     """Draw a sheet (h, w, 4) uint8: the tint of the depth style by depth, with millimetres and a caption."""
     lines = caption.split("\n")
     wide = max(cv2.getTextSize(line, FONT, LEGEND_TEXT_SCALE, 1)[0][0] for line in lines)
@@ -79,32 +79,32 @@ def draw_depth_scale(ink: tuple[float, ...], caption: str) -> np.ndarray:
         (LEGEND_LINE_HEIGHT * len(lines) + DEPTH_STEP_COUNT * TINT_STEP_HEIGHT + 10, wide + 4, 4), np.uint8
     )
     for number, line in enumerate(lines):
-        write_haloed(sheet, line, (0, LEGEND_LINE_HEIGHT * number + 12), LEGEND_TEXT_SCALE)
+        write_text_with_halo(sheet, line, (0, LEGEND_LINE_HEIGHT * number + 12), LEGEND_TEXT_SCALE)
     top = LEGEND_LINE_HEIGHT * len(lines) + 4
     for step in range(DEPTH_STEP_COUNT):
         tint = MAX_TINT_OPACITY - (MAX_TINT_OPACITY - MIN_TINT_OPACITY) * step / (DEPTH_STEP_COUNT - 1)
         row = top + step * TINT_STEP_HEIGHT
-        sheet[row : row + TINT_STEP_HEIGHT, 2:16, :3] = (1.0 - tint) * np.array(GROUND_COLOUR) + tint * np.array(ink)
+        sheet[row : row + TINT_STEP_HEIGHT, 2:16, :3] = (1.0 - tint) * np.array(GROUND_COLOUR) + tint * np.array(colour)
         sheet[row : row + TINT_STEP_HEIGHT, 2:16, 3] = OPAQUE
         if step % 2 == 0:
             cv2.line(sheet, (16, row), (20, row), (*WHITE, OPAQUE), 1)
-            write_haloed(sheet, f"{1e3 * DEPTH_STEP * step:.0f}", (24, row + 4), LEGEND_TEXT_SCALE)
+            write_text_with_halo(sheet, f"{1e3 * DEPTH_STEP * step:.0f}", (24, row + 4), LEGEND_TEXT_SCALE)
     return sheet
 
 
-def place_sheet(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, sights: np.ndarray) -> bool:
+def place_inset(image: np.ndarray, occupied: np.ndarray, inset: np.ndarray, obstacles: np.ndarray) -> bool:
     """Place a sheet at the right of an image, or else at its left, in free space; return True if there was space.
 
     Parameters
     ----------
-    colour, taken
+    image, occupied
         The image (H, W, 3) uint8; (H, W) uint8, above 0 at lines and text. Both change in place.
-    sheet
+    inset
         (h, w, 4) uint8: colour times coverage, and coverage.
-    sights
+    obstacles
         (H, W) uint8: above 0 on what should stay visible, as tools.
     """
-    (height, width), (tall, wide) = taken.shape, sheet.shape[:2]
+    (height, width), (tall, wide) = occupied.shape, inset.shape[:2]
     if width < MIN_IMAGE_WIDTH:
         return False
     upper, lower = (
@@ -118,19 +118,19 @@ def place_sheet(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, sights
             around = np.s_[
                 row - TEXT_DISTANCE : row + tall + TEXT_DISTANCE, column - TEXT_DISTANCE : column + wide + TEXT_DISTANCE
             ]
-            if not taken[around].any() and not sights[around].any():
-                paste(colour, taken, sheet, (column, row))
+            if not occupied[around].any() and not obstacles[around].any():
+                paste_inset(image, occupied, inset, (column, row))
                 return True
     return False
 
 
-def paste(colour: np.ndarray, taken: np.ndarray, sheet: np.ndarray, at: tuple[int, int]) -> None:
+def paste_inset(image: np.ndarray, occupied: np.ndarray, inset: np.ndarray, position: tuple[int, int]) -> None:
     """Paste a sheet (h, w, 4) uint8 over an image (H, W, 3) uint8 at a column and a row.
 
     Its place becomes `SHEET_VALUE`.
     """
-    column, row = at
-    box = np.s_[row : row + sheet.shape[0], column : column + sheet.shape[1]]
-    left = 1.0 - sheet[..., 3:] / np.float32(OPAQUE)
-    colour[box] = np.minimum(colour[box] * left + sheet[..., :3], 255.0)
-    taken[box] = SHEET_VALUE
+    column, row = position
+    box = np.s_[row : row + inset.shape[0], column : column + inset.shape[1]]
+    left = 1.0 - inset[..., 3:] / np.float32(OPAQUE)
+    image[box] = np.minimum(image[box] * left + inset[..., :3], 255.0)
+    occupied[box] = SHEET_VALUE

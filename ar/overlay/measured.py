@@ -9,15 +9,15 @@ import numpy as np
 from ..optics.camera import Camera
 from ..rendering.layer import Layer
 from ..rendering.renderer import Picture
-from .cut import END_LETTERS, CutPlane, add_caption, build_plane, compute_profile, draw_section
-from .distances import RING_COLOUR, RING_DISTANCES, build_tree, compute_seen_distance, draw_rings
-from .gauge import Gauge
-from .hud import HEAD_ROW, TEXT_SCALE, Below, bound_words, lay, wrap_line, write_haloed
-from .legend import LEGEND_TEXT_SCALE, draw_depth_scale, paste, place_sheet
-from .outlines import OPAQUE, compute_ink, draw_dashes, to_key
+from .cut import END_LETTERS, CutPlane, add_caption, build_plane, compute_surface_profile, draw_section
+from .distances import RING_COLOUR, RING_DISTANCES, build_bvh, compute_visible_distance, draw_rings
+from .gauge import DistanceGauge
+from .hud import HEAD_ROW, TEXT_SCALE, Hideable, format_bound, place_text, wrap_line, write_text_with_halo
+from .legend import LEGEND_TEXT_SCALE, draw_depth_scale, paste_inset, place_inset
+from .outlines import OPAQUE, average_colour, draw_dashes, shift_shade
 from .styles import Style
-from .text_placement import BORDER_DISTANCE, find_free_place
-from .window import FRONT, Roles
+from .text_placement import BORDER_DISTANCE, find_free_position
+from .window import FRONT, LayerRoles
 
 SEARCH_MARGIN = 3e-3  # Search margin beyond the last ring [m].
 INSET_WIDTHS = (0.34, 0.27, 0.21)  # Widths of a cut's inset as shares of the image width; the first that fits is used.
@@ -32,7 +32,7 @@ NO_ROOM_TEXT = "no room for the cut"  # Text in the image where no place for the
 
 
 @dataclass(frozen=True, eq=False)
-class Measure:
+class Measurement:
     """Measuring style, applied to one image.
 
     Parameters
@@ -44,23 +44,23 @@ class Measure:
     """
 
     style: Style
-    picture: Picture
+    image: Picture
     camera: Camera
-    hidden: Layer
-    roles: Roles
-    gauge: Gauge | None = None
+    layer: Layer
+    roles: LayerRoles
+    gauge: DistanceGauge | None = None
     name: str = ""
     error: float | None = None
 
     @property
-    def off(self) -> str:
+    def error_text(self) -> str:
         """Text of the error bound of the measured distances."""
-        return "error not known" if self.error is None else f"error {bound_words(self.error, 1)} (95 %)"
+        return "error not known" if self.error is None else f"error {format_bound(self.error, 1)} (95 %)"
 
     @property
-    def reached(self) -> np.ndarray:
+    def extent(self) -> np.ndarray:
         """Points (n, 3) [m] whose box in the image holds the lines drawn round the silhouette."""
-        low, high = self.hidden.vertices.min(axis=0), self.hidden.vertices.max(axis=0)
+        low, high = self.layer.vertices.min(axis=0), self.layer.vertices.max(axis=0)
         if self.style != "rings":
             return np.stack([low, high])[:0]
         beyond = RING_DISTANCES[-1] + SEARCH_MARGIN
@@ -69,32 +69,32 @@ class Measure:
     @property
     def plane(self) -> CutPlane:
         """Plane of a cut."""
-        middle = self.hidden.vertices.mean(axis=0)
+        middle = self.layer.vertices.mean(axis=0)
         return build_plane(self.camera, middle, None if self.gauge is None else self.gauge.tip)
 
-    def draw(self, sheet: np.ndarray, above: np.ndarray, box: tuple[slice, slice]) -> None:
+    def draw(self, canvas: np.ndarray, top_canvas: np.ndarray, box: tuple[slice, slice]) -> None:
         """Draw the rings, or the cutting line in the image, on the sheet of a box; in place.
 
-        Letters go on the sheet `above` all lines.
+        Letters go on the sheet `top_canvas` all lines.
         """
         if self.style == "rings":
-            free = self.roles.read_roles(self.picture.segmentation, box) == 0
-            tree = build_tree(self.hidden.vertices, self.hidden.triangles, str(self.picture.drawn.depth.device))
+            free = self.roles.read_roles(self.image.segmentation, box) == 0
+            tree = build_bvh(self.layer.vertices, self.layer.triangles, str(self.image.drawn.depth.device))
             reach = RING_DISTANCES[-1] + SEARCH_MARGIN
             draw_rings(
-                sheet,
-                compute_seen_distance(tree, self.camera, box, self.picture.drawn.depth[0], free, reach),
-                free & (sheet[..., 3] == 0) & (above[..., 3] == 0),
+                canvas,
+                compute_visible_distance(tree, self.camera, box, self.image.drawn.depth[0], free, reach),
+                free & (canvas[..., 3] == 0) & (top_canvas[..., 3] == 0),
             )
         if self.style == "cut":
             plane, part = self.plane, self.camera.crop_to(*box)
-            far = 1.45 * float(np.abs(plane.to_plane(self.hidden.vertices)[:, 0]).max())
+            far = 1.45 * float(np.abs(plane.to_plane(self.layer.vertices)[:, 0]).max())
             steps = np.linspace(-far, far, 2 * part.width)
             pixels, _ = part.project(plane.to_world(np.stack([steps, 0.0 * steps], axis=1)))
             line = pixels[np.isfinite(pixels).all(axis=1)].round().astype(np.int32)
             line = line[np.diff(line, axis=0, append=-1).any(axis=1)]
-            lines = np.ascontiguousarray(sheet[..., 3] > 0).astype(np.uint8)
-            draw_dashes(sheet, [line[:, None]], RING_COLOUR, CUT_STROKES, 1)
+            lines = np.ascontiguousarray(canvas[..., 3] > 0).astype(np.uint8)
+            draw_dashes(canvas, [line[:, None]], RING_COLOUR, CUT_STROKES, 1)
             line = line[
                 (
                     (line >= LETTER_EDGE_DISTANCE)
@@ -102,7 +102,7 @@ class Measure:
                 ).all(axis=1)
             ]
             # Place letters where no tool covers the line.
-            front = (self.roles.read_roles(self.picture.segmentation, box) == FRONT).astype(np.uint8)
+            front = (self.roles.read_roles(self.image.segmentation, box) == FRONT).astype(np.uint8)
             line = line[
                 cv2.dilate(front, np.ones((2 * LETTER_EDGE_DISTANCE + 1,) * 2, np.uint8))[line[:, 1], line[:, 0]] == 0
             ]
@@ -122,54 +122,55 @@ class Measure:
                 )
                 places = places[clear] if clear.any() else places
                 for letter, (column, row) in zip(END_LETTERS, places[[0, -1]].tolist(), strict=True):
-                    write_haloed(above, letter, (column - 4, row + 4), TEXT_SCALE, RING_COLOUR)
+                    write_text_with_halo(top_canvas, letter, (column - 4, row + 4), TEXT_SCALE, RING_COLOUR)
 
-    def lay(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
-        """Add scale, text or inset of the style to a composite image, in place; arguments as in `place_sheet`.
+    def draw_insets(self, image: np.ndarray, occupied: np.ndarray, obstacles: np.ndarray, required: np.ndarray) -> None:
+        """Add scale, text or inset of the style to a composite image, in place; arguments as in `place_inset`.
 
         needed (H, W) uint8: above 0 on objects that must stay visible even without other space.
         """
-        width = taken.shape[1]
+        width = occupied.shape[1]
         if self.style == "depth":
-            caption = f"{self.name or 'surface'}: mm under\nwhat is seen\n{self.off}"
-            scale = draw_depth_scale(to_key(compute_ink(self.hidden.colour)), caption)
-            if not place_sheet(colour, taken, scale, sights):
+            caption = f"{self.name or 'surface'}: mm under\nwhat is seen\n{self.error_text}"
+            scale = draw_depth_scale(shift_shade(average_colour(self.layer.colour)), caption)
+            if not place_inset(image, occupied, scale, obstacles):
                 # A tint needs a scale, which may cover cortex if there is no free space.
-                wish = colour.shape[1], HEAD_ROW
+                wish = image.shape[1], HEAD_ROW
                 places = (
-                    find_free_place(shut, scale.shape[1::-1], wish) for shut in (taken | sights, taken | needed, taken)
+                    find_free_position(shut, scale.shape[1::-1], wish)
+                    for shut in (occupied | obstacles, occupied | required, occupied)
                 )
                 place = next((each for each in places if each is not None), None)
                 if place is not None:
-                    paste(colour, taken, scale, place)
+                    paste_inset(image, occupied, scale, place)
         if self.style == "rings":
-            said = f"rings: mm to the {self.name or 'surface'}; {self.off}"
-            lay(colour, taken, wrap_line(said, 0.3 * width), (width, HEAD_ROW), below=Below(sights))
+            said = f"rings: mm to the {self.name or 'surface'}; {self.error_text}"
+            place_text(image, occupied, wrap_line(said, 0.3 * width), (width, HEAD_ROW), parts=Hideable(obstacles))
         if self.style == "cut":
-            self._lay_cut(colour, taken, sights, needed)
+            self._lay_cut(image, occupied, obstacles, required)
 
     def _lay_cut(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
-        roles = self.roles.read_roles(self.picture.segmentation)
+        roles = self.roles.read_roles(self.image.segmentation)
         plane = self.plane
-        reach = SEARCH_HALF_WIDTH * float(np.abs(plane.to_plane(self.hidden.vertices)[:, 0]).max())
-        seen = compute_profile(self.camera, plane, self.picture.depth, roles, reach)
+        reach = SEARCH_HALF_WIDTH * float(np.abs(plane.to_plane(self.layer.vertices)[:, 0]).max())
+        seen = compute_surface_profile(self.camera, plane, self.image.depth, roles, reach)
         tip = None if self.gauge is None else self.gauge.tip
-        ink = to_key(compute_ink(self.hidden.colour))
+        ink = shift_shade(average_colour(self.layer.colour))
         for shut, share in itertools.product((taken | sights, taken | needed), INSET_WIDTHS):
             wide = round(share * taken.shape[1])
             lines = [
                 line
-                for text in (f"cut: mm to the {self.name or 'surface'}", self.off)
+                for text in (f"cut: mm to the {self.name or 'surface'}", self.error_text)
                 for line in wrap_line(text, wide - BORDER_DISTANCE, LEGEND_TEXT_SCALE)
             ]
             inset = add_caption(np.zeros((round(INSET_ASPECT * wide), wide, 3), np.uint8), lines)
             shut[-HEAD_ROW:] = 1  # for the text at the bottom
-            place = find_free_place(shut, inset.shape[1::-1], (taken.shape[1], HEAD_ROW))
+            place = find_free_position(shut, inset.shape[1::-1], (taken.shape[1], HEAD_ROW))
             if place is not None:
                 drawn = draw_section(
-                    self.camera, self.hidden, plane, seen, (wide, round(INSET_ASPECT * wide)), ink, tip, self.error
+                    self.camera, self.layer, plane, seen, (wide, round(INSET_ASPECT * wide)), ink, tip, self.error
                 )
                 whole = add_caption(drawn, lines)
-                paste(colour, taken, np.dstack([whole, np.full(whole.shape[:2], OPAQUE, np.uint8)]), place)
+                paste_inset(colour, taken, np.dstack([whole, np.full(whole.shape[:2], OPAQUE, np.uint8)]), place)
                 return
-        lay(colour, taken, [NO_ROOM_TEXT], (taken.shape[1], HEAD_ROW))
+        place_text(colour, taken, [NO_ROOM_TEXT], (taken.shape[1], HEAD_ROW))

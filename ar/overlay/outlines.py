@@ -15,13 +15,13 @@ OPAQUE = 255  # Value of a sheet's fourth channel that covers what is under it.
 COARSE_SPACING = 16  # Grid spacing of the coarse search under lens distortion [pixel].
 
 
-def compute_ink(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
+def average_colour(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
     """Compute the mean of colours (3,) or (V, 3), sRGB in [0, 1], as a line colour: whole numbers of 0 .. 255."""
     red, green, blue = np.rint(255.0 * np.asarray(colour, np.float64).reshape(-1, 3).mean(axis=0)).tolist()
     return red, green, blue
 
 
-def allocate_sheet(camera: Camera) -> np.ndarray:
+def allocate_canvas(camera: Camera) -> np.ndarray:
     """Create a sheet (h, w, 4) uint8 for lines: colour times coverage, and coverage."""
     return np.zeros((camera.height, camera.width, 4), np.uint8)
 
@@ -104,49 +104,49 @@ def find_outlines(mask: np.ndarray) -> list[np.ndarray]:
 
 
 def draw_dashes(
-    out: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], pattern: tuple[int, int], width: int = 2
+    canvas: np.ndarray, lines: Sequence[np.ndarray], colour: Sequence[float], pattern: tuple[int, int], width: int = 2
 ) -> None:
     """Draw outlines, each (n, 1, 2), with strokes and gaps of lengths `pattern` [pixel], in place.
 
     A line of more than one pixel has a dark border. Nothing is drawn along the sheet's edge, where an outline is cut.
     """
     stroke, gap = pattern
-    lines = [piece for line in lines for piece in clip_to_sheet(line, out.shape[1], out.shape[0])]
+    lines = [piece for line in lines for piece in clip_to_canvas(line, canvas.shape[1], canvas.shape[0])]
     strokes = [line[start : start + stroke] for line in lines for start in range(0, len(line), stroke + gap)]
     if width > 1:
-        cv2.polylines(out, strokes, False, (*BORDER_COLOUR, OPAQUE), width + 2, cv2.LINE_AA)
-    cv2.polylines(out, strokes, False, (*ink, OPAQUE), width, cv2.LINE_AA)
+        cv2.polylines(canvas, strokes, False, (*BORDER_COLOUR, OPAQUE), width + 2, cv2.LINE_AA)
+    cv2.polylines(canvas, strokes, False, (*colour, OPAQUE), width, cv2.LINE_AA)
 
 
-def lay_lines(colour: np.ndarray, sheet: np.ndarray, mask: np.ndarray) -> None:
+def blend_canvas(image: np.ndarray, canvas: np.ndarray, mask: np.ndarray) -> None:
     """Draw a sheet (h, w, 4) of lines over an image (h, w, 3) uint8 where a mask (h, w) is True, in place."""
-    drawn = mask & (sheet[..., 3] > 0)
-    line, left = sheet[drawn, :3], 255 - sheet[drawn, 3:].astype(int)
-    colour[drawn] = (colour[drawn] * left // 255 + line).astype(np.uint8)
+    drawn = mask & (canvas[..., 3] > 0)
+    line, left = canvas[drawn, :3], 255 - canvas[drawn, 3:].astype(int)
+    image[drawn] = (image[drawn] * left // 255 + line).astype(np.uint8)
 
 
-def clip_to_sheet(line: np.ndarray, width: int, height: int) -> list[np.ndarray]:
+def clip_to_canvas(outline: np.ndarray, width: int, height: int) -> list[np.ndarray]:
     """Return the pieces of an outline (n, 1, 2) inside a sheet, away from its edge."""
-    inside = (line >= MAX_EDGE_DISTANCE) & (line < (width - MAX_EDGE_DISTANCE, height - MAX_EDGE_DISTANCE))
-    return split_runs(line, inside.all(axis=(1, 2)))
+    inside = (outline >= MAX_EDGE_DISTANCE) & (outline < (width - MAX_EDGE_DISTANCE, height - MAX_EDGE_DISTANCE))
+    return split_by_mask(outline, inside.all(axis=(1, 2)))
 
 
-def cut_outlines(lines: Sequence[np.ndarray], where: np.ndarray) -> list[np.ndarray]:
+def clip_to_mask(outlines: Sequence[np.ndarray], mask: np.ndarray) -> list[np.ndarray]:
     """Return the pieces of outlines, each (n, 1, 2), whose pixels are in a mask (H, W) bool."""
-    return [piece for line in lines for piece in split_runs(line, where[line[:, 0, 1], line[:, 0, 0]])]
+    return [piece for line in outlines for piece in split_by_mask(line, mask[line[:, 0, 1], line[:, 0, 0]])]
 
 
-def split_runs(line: np.ndarray, kept: np.ndarray) -> list[np.ndarray]:
+def split_by_mask(line: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:
     """Return the pieces of a line (n, 1, 2) whose points are kept (n,) bool; none for an empty line."""
     if not len(line):
         return []
-    cuts = np.flatnonzero(np.diff(kept)) + 1
-    return [piece for piece, wanted in zip(np.split(line, cuts), np.split(kept, cuts), strict=True) if wanted[0]]
+    cuts = np.flatnonzero(np.diff(mask)) + 1
+    return [piece for piece, wanted in zip(np.split(line, cuts), np.split(mask, cuts), strict=True) if wanted[0]]
 
 
-def to_key(ink: Sequence[float]) -> tuple[float, ...]:
+def shift_shade(colour: Sequence[float]) -> tuple[float, ...]:
     """Return a shade (3,) slightly different from a colour in 0 .. 255: the outline's colour is the outline's alone."""
-    return tuple(share + 8.0 if share < 128.0 else share - 8.0 for share in ink)
+    return tuple(share + 8.0 if share < 128.0 else share - 8.0 for share in colour)
 
 
 COLOUR_TOLERANCE = 2  # Colour tolerance in each channel: centres of lines have the exact colour, within rounding.
@@ -158,9 +158,10 @@ MIN_PIXELS = 60  # Minimum number of pixels for a share.
 TEXT_MARGIN = 8  # Margin round a line of text without its colour: else "1.5" would be found in "11.5" [pixel].
 
 
-def measure_outline_gap(
-    colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray, least: int = 1, gap: float = 0.0
-) -> float:
+def measure_outline_distance(
+    image: np.ndarray, colour: Sequence[float], silhouette: np.ndarray, occluders: np.ndarray, min_pixels: int = 1,
+    gap_length: float = 0.0,
+) -> float:  # fmt: skip
     """Compute the distance of the outline drawn in an image from the expected one [pixel].
 
     The larger of two 95th percentiles: from pixels of the colour to the true outline, and from the true outline to
@@ -168,40 +169,43 @@ def measure_outline_gap(
 
     Parameters
     ----------
-    colour, ink
+    image, colour
         The image (H, W, 3) uint8, and the colour (3,) in 0 .. 255 of outlines.
-    mask
+    silhouette
         (H, W) bool: the true silhouette.
-    covered
+    occluders
         (H, W) bool: objects in front of the overlay.
-    least
+    min_pixels
         Smallest number of pixels that counts. Above 1, each outline is compared with all of the other: the visible part
         of a broken line may be a gap.
-    gap
+    gap_length
         Length of the gaps of a broken line [pixel]: the true outline may be half of that from it.
     """
-    found = find_ink(colour, ink)
-    true = np.zeros(mask.shape, np.uint8)
-    for outline in find_outlines(mask):
+    found = find_colour(image, colour)
+    true = np.zeros(silhouette.shape, np.uint8)
+    for outline in find_outlines(silhouette):
         cv2.polylines(true, [outline], True, (1,))
     shut = cv2.dilate(
-        np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT_DISTANCE + 1,) * 2, np.uint8)
+        np.pad(occluders, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT_DISTANCE + 1,) * 2, np.uint8)
     )
     seen = shut[1:-1, 1:-1] == 0
     wanted = (true > 0) & seen
-    if max(np.count_nonzero(wanted), np.count_nonzero(found & seen)) < least:
+    if max(np.count_nonzero(wanted), np.count_nonzero(found & seen)) < min_pixels:
         return 0.0
-    there = (true > 0, found) if least > 1 else (wanted, found & seen)
+    there = (true > 0, found) if min_pixels > 1 else (wanted, found & seen)
     if not all(each.any() for each in there):
         return np.inf
-    apart = _compute_distance(true > 0)[found & seen], np.maximum(_compute_distance(found)[wanted] - 0.5 * gap, 0.0)
+    apart = (
+        _compute_distance(true > 0)[found & seen],
+        np.maximum(_compute_distance(found)[wanted] - 0.5 * gap_length, 0.0),
+    )
     return float(max(np.percentile(each, DISTANCE_PERCENTILE) for each in apart if len(each)))
 
 
-def find_ink(colour: np.ndarray, ink: Sequence[float], off: int = COLOUR_TOLERANCE) -> np.ndarray:
-    """Return the mask (H, W) bool of pixels of an image (H, W, 3) uint8 within `off` of a colour (3,) in 0 .. 255."""
-    low, high = (tuple(np.clip(np.rint(ink) + by, 0, 255).tolist()) for by in (-off, off))
-    return cv2.inRange(np.ascontiguousarray(colour), low, high) > 0
+def find_colour(image: np.ndarray, colour: Sequence[float], tolerance: int = COLOUR_TOLERANCE) -> np.ndarray:
+    """Return the mask (H, W) bool of pixels of an image (H, W, 3) uint8 within `tolerance` of a colour (3,)."""
+    low, high = (tuple(np.clip(np.rint(colour) + by, 0, 255).tolist()) for by in (-tolerance, tolerance))
+    return cv2.inRange(np.ascontiguousarray(image), low, high) > 0
 
 
 def _compute_distance(mask: np.ndarray) -> np.ndarray:
@@ -209,20 +213,20 @@ def _compute_distance(mask: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
-def has_text(colour: np.ndarray, text: str, scale: float, ink: Sequence[float] = WHITE) -> bool:
+def has_text(image: np.ndarray, text: str, scale: float, colour: Sequence[float] = WHITE) -> bool:
     """Return True if `hud.write` wrote exactly this text at this scale anywhere into the image (H, W, 3) uint8."""
-    return find_text(colour, text, scale, ink) is not None
+    return find_text(image, text, scale, colour) is not None
 
 
 def find_text(
-    colour: np.ndarray, text: str, scale: float, ink: Sequence[float] = WHITE
+    image: np.ndarray, text: str, scale: float, colour: Sequence[float] = WHITE
 ) -> tuple[int, int, int, int] | None:
     """Locate a line of text written by `hud.write`: left, top, right and bottom [pixel]; None if not found."""
     (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
     blank = np.zeros((above + below + 2, width + 2 * TEXT_MARGIN, 3), np.uint8)
-    cv2.putText(blank, text, (TEXT_MARGIN, above + 1), FONT, scale, tuple(ink), 1, cv2.LINE_AA)
-    shape = (blank == ink).all(axis=2).astype(np.float32)
-    here = np.pad(find_ink(colour, ink, 0), TEXT_MARGIN).astype(np.float32)
+    cv2.putText(blank, text, (TEXT_MARGIN, above + 1), FONT, scale, tuple(colour), 1, cv2.LINE_AA)
+    shape = (blank == colour).all(axis=2).astype(np.float32)
+    here = np.pad(find_colour(image, colour, 0), TEXT_MARGIN).astype(np.float32)
     if shape.shape[0] > here.shape[0] or shape.shape[1] > here.shape[1]:
         return None
     right = cv2.matchTemplate(here, shape, cv2.TM_CCORR)
@@ -236,28 +240,30 @@ def find_text(
     return left, foot - below - above, left + width, foot
 
 
-def compute_inked_share(colour: np.ndarray, ink: Sequence[float], mask: np.ndarray, covered: np.ndarray) -> float:
+def compute_drawn_share(
+    image: np.ndarray, colour: Sequence[float], silhouette: np.ndarray, occluders: np.ndarray
+) -> float:
     """Compute the share of a silhouette's outline that has a colour.
 
     NaN for an outline of fewer than `MIN_PIXELS` pixels.
 
-    Parameters as in `measure_outline_gap`: pixels near occluders and near the border are left out.
+    Parameters as in `measure_outline_distance`: pixels near occluders and near the border are left out.
     """
-    outline = np.zeros(mask.shape, np.uint8)
-    cv2.drawContours(outline, find_outlines(mask), -1, (1,))
+    outline = np.zeros(silhouette.shape, np.uint8)
+    cv2.drawContours(outline, find_outlines(silhouette), -1, (1,))
     shut = cv2.dilate(
-        np.pad(covered, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT_DISTANCE + 1,) * 2, np.uint8)
+        np.pad(occluders, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT_DISTANCE + 1,) * 2, np.uint8)
     )
-    return _share(find_ink(colour, ink), (outline > 0) & (shut[1:-1, 1:-1] == 0))
+    return _share(find_colour(image, colour), (outline > 0) & (shut[1:-1, 1:-1] == 0))
 
 
-def compute_changed_share(before: np.ndarray, after: np.ndarray, where: np.ndarray) -> float:
+def compute_changed_share(before: np.ndarray, after: np.ndarray, mask: np.ndarray) -> float:
     """Compute the share of pixels that differ between images (H, W, 3) uint8, in a mask (H, W) bool without its edge.
 
     NaN for fewer than `MIN_PIXELS` pixels.
     """
-    inner = cv2.erode(where.astype(np.uint8), np.ones((2 * LINE_DISTANCE + 1,) * 2, np.uint8), borderValue=0) > 0
-    return _share(~find_ink(cv2.absdiff(before, after), (0, 0, 0)), inner)
+    inner = cv2.erode(mask.astype(np.uint8), np.ones((2 * LINE_DISTANCE + 1,) * 2, np.uint8), borderValue=0) > 0
+    return _share(~find_colour(cv2.absdiff(before, after), (0, 0, 0)), inner)
 
 
 def _share(found: np.ndarray, where: np.ndarray) -> float:

@@ -32,27 +32,27 @@ class Opening:
     ----------
     ids
         Ids of the layers that are such ground, as cortex.
-    under
+    labels
         Labels of other layers, as drape, by id.
-    otherwise
-        Label of layers that are not in `under`.
+    default_label
+        Label of layers that are not in `labels`.
     """
 
     ids: tuple[int, ...]
-    under: tuple[tuple[int, str], ...] = ()
-    otherwise: str = "not in the open"
+    labels: tuple[tuple[int, str], ...] = ()
+    default_label: str = "not in the open"
 
-    def describe(self, counts: Mapping[int, int]) -> str:
+    def describe(self, pixel_counts: Mapping[int, int]) -> str:
         """Return the label of the ground in an image; empty if too little of the silhouette is under other layers.
 
-        counts: pixels of the silhouette by the id of the layer over it, without those in front of the overlay.
+        pixel_counts: pixels of the silhouette by the id of the layer over it, without those in front of the overlay.
         """
         under: dict[str, int] = {}
-        for layer, count in counts.items():
+        for layer, count in pixel_counts.items():
             if layer not in self.ids:
-                words = dict(self.under).get(layer, self.otherwise)
+                words = dict(self.labels).get(layer, self.default_label)
                 under[words] = under.get(words, 0) + count
-        total, shut = sum(counts.values()), sum(under.values())
+        total, shut = sum(pixel_counts.values()), sum(under.values())
         if not total or shut < MIN_REPORTED_SHARE * total:
             return ""
         most = max(under, key=lambda words: under[words])

@@ -10,23 +10,23 @@ SEARCH_RADII = 64, 256  # Search radii around the desired place [pixel], tried i
 SIDEWAYS_WEIGHT = 2  # Weight of a sideways distance relative to a vertical one: lines of text go below each other.
 
 
-def find_free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, int]) -> tuple[int, int] | None:
+def find_free_position(occupied: np.ndarray, size: tuple[int, int], desired: tuple[int, int]) -> tuple[int, int] | None:
     """Find the free place for a box closest to the desired one; None if there is no space.
 
     Parameters
     ----------
-    taken
+    occupied
         (H, W) uint8: above 0 where the box must not be.
-    size, wish
+    size, desired
         Width and height of the box; desired column and row of its upper left corner, which may be outside the image
         [pixel].
     """
-    (height, width), (wide, tall) = taken.shape, size
+    (height, width), (wide, tall) = occupied.shape, size
     right, low = width - BORDER_DISTANCE - wide, height - BORDER_DISTANCE - tall
     if right < BORDER_DISTANCE or low < BORDER_DISTANCE:
         return None
-    column, row = min(max(wish[0], BORDER_DISTANCE), right), min(max(wish[1], BORDER_DISTANCE), low)
-    near = taken[
+    column, row = min(max(desired[0], BORDER_DISTANCE), right), min(max(desired[1], BORDER_DISTANCE), low)
+    near = occupied[
         row - TEXT_DISTANCE : row + tall + TEXT_DISTANCE, column - TEXT_DISTANCE : column + wide + TEXT_DISTANCE
     ]
     if not near.any():
@@ -34,9 +34,12 @@ def find_free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, i
     whole = SIDEWAYS_WEIGHT * width + height
     for reach in (*SEARCH_RADII, whole):
         # All places within this radius, and the taken pixels round them.
-        columns, rows = list_places_within(column, reach // SIDEWAYS_WEIGHT, right), list_places_within(row, reach, low)
+        columns, rows = (
+            list_positions_within(column, reach // SIDEWAYS_WEIGHT, right),
+            list_positions_within(row, reach, low),
+        )
         top, left = rows[0] - TEXT_DISTANCE, columns[0] - TEXT_DISTANCE
-        there = taken[top : rows[-1] + tall + TEXT_DISTANCE, left : columns[-1] + wide + TEXT_DISTANCE]
+        there = occupied[top : rows[-1] + tall + TEXT_DISTANCE, left : columns[-1] + wide + TEXT_DISTANCE]
         # Integral image: the number of taken pixels in a box is a sum of four values.
         sums = cv2.integral((there > 0).astype(np.uint8))
         up, aside = rows[:, None] - TEXT_DISTANCE - top, columns - TEXT_DISTANCE - left
@@ -50,7 +53,7 @@ def find_free_place(taken: np.ndarray, size: tuple[int, int], wish: tuple[int, i
     return None
 
 
-def list_places_within(middle: int, reach: int, last: int) -> np.ndarray:
-    """List the candidate places PAD, PAD + GRID_SPACING, ... up to `last` that are at most `reach` from a centre."""
+def list_positions_within(centre: int, max_distance: int, last: int) -> np.ndarray:
+    """List the candidate places PAD, PAD + GRID_SPACING, ... up to `last` that are near a centre."""
     places = np.arange(BORDER_DISTANCE, last + 1, GRID_SPACING)
-    return places[np.abs(places - middle) <= reach]
+    return places[np.abs(places - centre) <= max_distance]

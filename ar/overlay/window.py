@@ -11,11 +11,11 @@ import warp as wp
 
 from ..optics.camera import Camera
 from ..rendering.layer import Layer, compute_vertex_normals
-from ..rendering.lens_rasteriser import pixel_at
-from ..rendering.parallel import forward_kernel, launch_in_bands, load
-from ..rendering.rasteriser import EMPTY_PIXEL, RasterisedSurface, depth_of, face_of
+from ..rendering.lens_rasteriser import undistort_pixel
+from ..rendering.parallel import forward_kernel, launch_in_bands, load_modules
+from ..rendering.rasteriser import EMPTY_PIXEL, RasterisedSurface, unpack_depth, unpack_face
 from ..rendering.renderer import Pictures
-from ..rendering.triangle import weights_of
+from ..rendering.triangle import compute_weights_from_corners
 
 FADE_DEPTH = wp.constant(0.03)  # Depth under the surface over which light falls to 1 / e [m].
 SOFT_EDGE_WIDTH = wp.constant(24)  # Width of the window's soft edge round the silhouette [pixel].
@@ -42,44 +42,38 @@ BORDER_INK = wp.constant(wp.vec3f(*BORDER_COLOUR))  # Colour of the dark border 
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class OverlayLines:
     """Lines of an overlay in a box of the image.
 
     Parameters
     ----------
-    ink
+    colour
         Colour (3,) in 0 .. 255 of the hidden surface's outline, and of its tint.
-    solid
+    is_solid
         True if the outline is drawn as one solid line.
-    under, above
+    canvas_below, canvas_above
         (h, w, 4) uint8: colour times coverage, and coverage, of further lines, under the outline and above it; or None.
     """
 
-    ink: tuple[float, float, float]
-    solid: bool = True
-    under: np.ndarray | None = None
-    above: np.ndarray | None = None
+    colour: tuple[float, float, float]
+    is_solid: bool = True
+    canvas_below: np.ndarray | None = None
+    canvas_above: np.ndarray | None = None
 
 
 def draw_overlay(
-    drawn: Pictures,
-    box: tuple[slice, slice],
-    camera: Camera,
-    hidden: Layer,
-    seen: RasterisedSurface,
-    roles: Roles,
-    style: str,
-    lines: Lines,
-) -> tuple[np.ndarray, np.ndarray]:
+    images: Pictures, box: tuple[slice, slice], camera: Camera, layer: Layer, surface: RasterisedSurface,
+    roles: LayerRoles, style: str, lines: OverlayLines,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Draw an overlay; return the image (H, W, 3) uint8, and the mask of its lines, (h, w) uint8 of the box.
 
     Parameters
     ----------
-    drawn
+    images
         Image to draw into, a batch of one, on its device.
     box, camera
         Rows and columns of the image in which to draw, and the camera of that part.
-    hidden, seen
+    layer, surface
         The surface, and its rendering by that camera, on the same device.
     roles
         Parts that stay unchanged, and parts that nothing shines through.
@@ -87,248 +81,220 @@ def draw_overlay(
         "window" dims the ground round the silhouette, where the surface shines through; "fill" tints it; "depth" the
         more the closer the surface is to the ground.
     """
-    device = str(drawn.colour.device)
-    load(device, __name__)
-    towards = compute_vertex_normals(hidden.vertices, hidden.triangles) @ camera.T_camera_world[2, :3]
-    looks = np.column_stack([towards, 255.0 * np.asarray(hidden.colour)])
+    device = str(images.colour.device)
+    load_modules(device, __name__)
+    towards = compute_vertex_normals(layer.vertices, layer.triangles) @ camera.T_camera_world[2, :3]
+    looks = np.column_stack([towards, 255.0 * np.asarray(layer.colour)])
     front = wp.empty((0, 0), dtype=wp.uint8, device=device)
-    if roles.covered is not None:
-        front = wp.array(roles.covered.view(np.uint8), dtype=wp.uint8, device=device)
+    if roles.occluder_mask is not None:
+        front = wp.array(roles.occluder_mask.view(np.uint8), dtype=wp.uint8, device=device)
     inputs = [
-        box[0].start, box[1].start, camera.width, seen.nearest[0], seen.points, seen.triangles, seen.unbent.pixels,
-        from_edge(seen), wp.array(looks, dtype=wp.vec4f, device=device), drawn.depth[0], drawn.segmentation[0],
-        get_on_device(roles.front, roles.open, device), front, int(SHADES.get(style, 0)), lines.solid,
-            wp.vec3f(lines.ink),
-        to_flat_sheet(lines.under, device), to_flat_sheet(lines.above, device),
+        box[0].start, box[1].start, camera.width, surface.z_buffer[0], surface.points, surface.triangles,
+        surface.undistortion.pixels, compute_edge_distance(surface), wp.array(looks, dtype=wp.vec4f, device=device),
+        images.depth[0], images.segmentation[0], get_role_table(roles.front_ids, roles.open_ids, device), front,
+        int(SHADES.get(style, 0)), lines.is_solid, wp.vec3f(lines.colour),
+        to_flat_canvas(lines.canvas_below, device), to_flat_canvas(lines.canvas_above, device),
     ]  # fmt: skip
-    ground = wp.clone(drawn.colour[0])
+    ground = wp.clone(images.colour[0])
     taken = wp.empty((camera.height, camera.width), dtype=wp.uint8, device=device)
-    launch_in_bands(lay_over, inputs, [ground, taken], taken.size, device, bands=2)
+    launch_in_bands(composite_pixels, inputs, [ground, taken], taken.size, device, per_core=2)
     return ground.numpy(), taken.numpy()
 
 
 @dataclass(frozen=True, eq=False)
-class Roles:
+class LayerRoles:
     """Roles of an image's parts for an overlay.
 
     Parameters
     ----------
-    front
+    front_ids
         Ids of the layers that stay unchanged: tools.
-    open
+    open_ids
         Ids of those that the surface may shine through; None: all.
-    covered
+    occluder_mask
         (H, W) bool: further parts that stay unchanged, as a hand in a real image; or None.
     """
 
-    front: tuple[int, ...] = ()
-    open: tuple[int, ...] | None = None
-    covered: np.ndarray | None = None
+    front_ids: tuple[int, ...] = ()
+    open_ids: tuple[int, ...] | None = None
+    occluder_mask: np.ndarray | None = None
 
     def read_roles(self, segmentation: np.ndarray, box: tuple[slice, slice] = np.s_[:, :]) -> np.ndarray:
         """Return the roles (h, w) uint8, `FRONT`, `CLOSED_GROUND` or 0, in a box of a segmentation (H, W) uint8."""
-        found = cv2.LUT(segmentation[box], build_role_table(self.front, self.open))
-        if self.covered is not None:
-            found[self.covered[box]] = FRONT
+        found = cv2.LUT(segmentation[box], build_role_table(self.front_ids, self.open_ids))
+        if self.occluder_mask is not None:
+            found[self.occluder_mask[box]] = FRONT
         return found
 
 
 @lru_cache(maxsize=8)
-def build_role_table(front: tuple[int, ...], open_to: tuple[int, ...] | None) -> np.ndarray:
+def build_role_table(front_ids: tuple[int, ...], open_ids: tuple[int, ...] | None) -> np.ndarray:
     """Return the table (256,) uint8 of roles by the id of a layer: `FRONT`, `CLOSED_GROUND` or 0."""
     ids = np.arange(256)
-    shut = np.zeros(256, bool) if open_to is None else ~np.isin(ids, open_to)
-    return np.where(np.isin(ids, front), FRONT, np.where(shut, CLOSED_GROUND, 0)).astype(np.uint8)
+    shut = np.zeros(256, bool) if open_ids is None else ~np.isin(ids, open_ids)
+    return np.where(np.isin(ids, front_ids), FRONT, np.where(shut, CLOSED_GROUND, 0)).astype(np.uint8)
 
 
 @lru_cache(maxsize=8)
-def get_on_device(front: tuple[int, ...], open_to: tuple[int, ...] | None, device: str) -> wp.array:
+def get_role_table(front_ids: tuple[int, ...], open_ids: tuple[int, ...] | None, device: str) -> wp.array:
     """Return `build_role_table` on a device, copied there once."""
-    return wp.array(build_role_table(front, open_to), dtype=wp.uint8, device=device)
+    return wp.array(build_role_table(front_ids, open_ids), dtype=wp.uint8, device=device)
 
 
-def to_flat_sheet(lines: np.ndarray | None, device: str) -> wp.array:
+def to_flat_canvas(canvas: np.ndarray | None, device: str) -> wp.array:
     """Copy a sheet (h, w, 4) of lines to a device, flattened; empty if there is none."""
-    if lines is None:
+    if canvas is None:
         return wp.empty(0, dtype=wp.vec4ub, device=device)
-    return wp.array(lines.reshape(-1, 4), dtype=wp.vec4ub, device=device, copy=False)
+    return wp.array(canvas.reshape(-1, 4), dtype=wp.vec4ub, device=device, copy=False)
 
 
-def from_edge(seen: RasterisedSurface) -> wp.array:
+def compute_edge_distance(surface: RasterisedSurface) -> wp.array:
     """Compute the chamfer distance (h, w) of each pixel from a silhouette's edge [pixel], up to the soft edge's width.
 
     OpenCV computes it on the CPU, kernels with the same result on a GPU.
     """
-    device, shape = str(seen.nearest.device), seen.nearest.shape[1:]
+    device, shape = str(surface.z_buffer.device), surface.z_buffer.shape[1:]
     beside = wp.empty(shape, dtype=wp.uint8, device=device)
-    launch_in_bands(find_edge, [seen.nearest[0]], [beside], beside.size, device)
+    launch_in_bands(mark_edges, [surface.z_buffer[0]], [beside], beside.size, device)
     if device != "cpu":
         return compute_chamfer_distance(beside, device)
     distance = cv2.distanceTransform(beside.numpy(), cv2.DIST_L2, cv2.DIST_MASK_3)
     return wp.array(distance, dtype=wp.float32, device=device, copy=False)
 
 
-def compute_chamfer_distance(beside: wp.array, device: str) -> wp.array:
-    """Compute the chamfer distance (h, w) [pixel] from pixels where `beside` is 0, up to `CHAMFER_RADIUS`."""
-    aside = wp.empty(beside.shape, dtype=wp.int32, device=device)
-    distance = wp.empty(beside.shape, dtype=wp.float32, device=device)
-    launch_in_bands(find_aside, [beside], [aside], beside.size, device)
-    launch_in_bands(find_distance, [aside], [distance], beside.size, device)
+def compute_chamfer_distance(non_edge: wp.array, device: str) -> wp.array:
+    """Compute the chamfer distance (h, w) [pixel] from pixels where `non_edge` is 0, up to `CHAMFER_RADIUS`."""
+    aside = wp.empty(non_edge.shape, dtype=wp.int32, device=device)
+    distance = wp.empty(non_edge.shape, dtype=wp.float32, device=device)
+    launch_in_bands(compute_row_distance, [non_edge], [aside], non_edge.size, device)
+    launch_in_bands(compute_pixel_distance, [aside], [distance], non_edge.size, device)
     return distance
 
 
 @forward_kernel
-def find_edge(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    nearest: wp.array2d(dtype=wp.uint64),
+def mark_edges(
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, z_buffer: wp.array2d(dtype=wp.uint64),
     # output
-    beside: wp.array2d(dtype=wp.uint8),
-):
+    non_edge: wp.array2d(dtype=wp.uint8),
+):  # fmt: skip
     """Mark each pixel: 0 if a surface is visible there but not at one of its four neighbours, else 1."""
-    start = begin + wp.tid() * run
-    for index in range(start, wp.min(start + run, end)):
-        row = index / nearest.shape[1]
-        column = index - row * nearest.shape[1]
+    start = begin + wp.tid() * chunk_size
+    for index in range(start, wp.min(start + chunk_size, end)):
+        row = index / z_buffer.shape[1]
+        column = index - row * z_buffer.shape[1]
         within = wp.uint8(1)
-        if nearest[row, column] != EMPTY_PIXEL:
-            up = nearest[wp.max(row - 1, 0), column] == EMPTY_PIXEL
-            down = nearest[wp.min(row + 1, nearest.shape[0] - 1), column] == EMPTY_PIXEL
-            left = nearest[row, wp.max(column - 1, 0)] == EMPTY_PIXEL
-            right = nearest[row, wp.min(column + 1, nearest.shape[1] - 1)] == EMPTY_PIXEL
+        if z_buffer[row, column] != EMPTY_PIXEL:
+            up = z_buffer[wp.max(row - 1, 0), column] == EMPTY_PIXEL
+            down = z_buffer[wp.min(row + 1, z_buffer.shape[0] - 1), column] == EMPTY_PIXEL
+            left = z_buffer[row, wp.max(column - 1, 0)] == EMPTY_PIXEL
+            right = z_buffer[row, wp.min(column + 1, z_buffer.shape[1] - 1)] == EMPTY_PIXEL
             if up or down or left or right:
                 within = wp.uint8(0)
-        beside[row, column] = within
+        non_edge[row, column] = within
 
 
 @forward_kernel
-def find_aside(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    beside: wp.array2d(dtype=wp.uint8),
+def compute_row_distance(
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, non_edge: wp.array2d(dtype=wp.uint8),
     # output
-    aside: wp.array2d(dtype=wp.int32),
-):
+    row_distance: wp.array2d(dtype=wp.int32),
+):  # fmt: skip
     """Compute the distance in columns of each pixel from the edge in its own row, at most `CHAMFER_RADIUS`."""
-    start = begin + wp.tid() * run
-    for index in range(start, wp.min(start + run, end)):
-        row = index / beside.shape[1]
-        column = index - row * beside.shape[1]
+    start = begin + wp.tid() * chunk_size
+    for index in range(start, wp.min(start + chunk_size, end)):
+        row = index / non_edge.shape[1]
+        column = index - row * non_edge.shape[1]
         least = wp.int32(CHAMFER_RADIUS)
-        for other in range(wp.max(column - CHAMFER_RADIUS, 0), wp.min(column + CHAMFER_RADIUS + 1, beside.shape[1])):
-            if beside[row, other] == wp.uint8(0):
+        for other in range(wp.max(column - CHAMFER_RADIUS, 0), wp.min(column + CHAMFER_RADIUS + 1, non_edge.shape[1])):
+            if non_edge[row, other] == wp.uint8(0):
                 least = wp.min(least, wp.abs(other - column))
-        aside[row, column] = least
+        row_distance[row, column] = least
 
 
 @forward_kernel
-def find_distance(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    aside: wp.array2d(dtype=wp.int32),
+def compute_pixel_distance(
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, row_distance: wp.array2d(dtype=wp.int32),
     # output
     distance: wp.array2d(dtype=wp.float32),
-):
+):  # fmt: skip
     """Compute the chamfer distance: shortest path of straight and diagonal steps from each row's nearest pixel."""
-    start = begin + wp.tid() * run
-    for index in range(start, wp.min(start + run, end)):
-        row = index / aside.shape[1]
-        column = index - row * aside.shape[1]
+    start = begin + wp.tid() * chunk_size
+    for index in range(start, wp.min(start + chunk_size, end)):
+        row = index / row_distance.shape[1]
+        column = index - row * row_distance.shape[1]
         least = wp.float32(2 * CHAMFER_RADIUS)
-        for other in range(wp.max(row - CHAMFER_RADIUS, 0), wp.min(row + CHAMFER_RADIUS + 1, aside.shape[0])):
+        for other in range(wp.max(row - CHAMFER_RADIUS, 0), wp.min(row + CHAMFER_RADIUS + 1, row_distance.shape[0])):
             away = wp.abs(other - row)
-            slanted = wp.min(away, aside[other, column])
-            straight = wp.max(away, aside[other, column]) - slanted
+            slanted = wp.min(away, row_distance[other, column])
+            straight = wp.max(away, row_distance[other, column]) - slanted
             least = wp.min(least, STRAIGHT_STEP * wp.float32(straight) + DIAGONAL_STEP * wp.float32(slanted))
         distance[row, column] = least
 
 
 @wp.func
 def smooth_distance(
-    row: wp.int32, column: wp.int32, away: wp.array2d(dtype=wp.float32), nearest: wp.array2d(dtype=wp.uint64)
+    row: wp.int32, column: wp.int32, distance: wp.array2d(dtype=wp.float32), z_buffer: wp.array2d(dtype=wp.uint64)
 ) -> wp.float32:
     """Signed distance of a pixel from the silhouette, below 0 inside: mean of nine pixels, which hides steps."""
     total = wp.float32(0.0)
     for i in range(-1, 2):
         for j in range(-1, 2):
-            y = wp.clamp(row + i, 0, away.shape[0] - 1)
-            x = wp.clamp(column + j, 0, away.shape[1] - 1)
-            total += wp.where(nearest[y, x] == EMPTY_PIXEL, away[y, x], -away[y, x])
+            y = wp.clamp(row + i, 0, distance.shape[0] - 1)
+            x = wp.clamp(column + j, 0, distance.shape[1] - 1)
+            total += wp.where(z_buffer[y, x] == EMPTY_PIXEL, distance[y, x], -distance[y, x])
     return total / 9.0
 
 
 @wp.func
-def over(line: wp.vec4ub, light: wp.vec3f) -> wp.vec3f:
+def blend_over(line: wp.vec4ub, background: wp.vec3f) -> wp.vec3f:
     """Blend a line (colour times coverage, and coverage) over light."""
     left = 1.0 - wp.float32(line[3]) / 255.0
-    return left * light + wp.vec3f(wp.float32(line[0]), wp.float32(line[1]), wp.float32(line[2]))
+    return left * background + wp.vec3f(wp.float32(line[0]), wp.float32(line[1]), wp.float32(line[2]))
 
 
 @wp.func
-def shining(
-    p: wp.vec3d,
-    key: wp.uint64,
-    q: wp.array2d(dtype=wp.vec3d),
-    triangles: wp.array(dtype=wp.vec3i),
-    looks: wp.array(dtype=wp.vec4f),
-    surface: wp.float32,
-) -> wp.vec3f:
-    """Compute the light of a hidden surface at a pixel p = (u, v, 1), through the ground at depth `surface` [m].
+def shade_through_ground(
+    p: wp.vec3d, key: wp.uint64, q: wp.array2d(dtype=wp.vec3d), triangles: wp.array(dtype=wp.vec3i),
+    appearance: wp.array(dtype=wp.vec4f), ground_depth: wp.float32,
+) -> wp.vec3f:  # fmt: skip
+    """Compute the light of a hidden surface at a pixel p = (u, v, 1), through the ground at depth `ground_depth` [m].
 
     0 where there is none.
     """
-    t = triangles[face_of(key)]
-    w = weights_of(p, q[0, t[0]], q[0, t[1]], q[0, t[2]])
-    look = w[0] * looks[t[0]] + w[1] * looks[t[1]] + w[2] * looks[t[2]]
+    t = triangles[unpack_face(key)]
+    w = compute_weights_from_corners(p, q[0, t[0]], q[0, t[1]], q[0, t[2]])
+    look = w[0] * appearance[t[0]] + w[1] * appearance[t[1]] + w[2] * appearance[t[2]]
     under = wp.float32(0.0)
-    if surface > 0.0:
-        under = wp.max(depth_of(key) - surface, 0.0)
+    if ground_depth > 0.0:
+        under = wp.max(unpack_depth(key) - ground_depth, 0.0)
     return 1.1 * (0.25 + 0.75 * wp.abs(look[0])) * wp.exp(-under / FADE_DEPTH) * wp.vec3f(look[1], look[2], look[3])
 
 
 @wp.func
-def strength(under: wp.float32) -> wp.float32:
+def compute_tint_opacity(depth: wp.float32) -> wp.float32:
     """Strength of the depth style's tint, at a depth under the ground [m]."""
-    share = wp.clamp(wp.floor(under / DEPTH_STEP) / wp.float32(DEPTH_STEP_COUNT - 1), 0.0, 1.0)
+    share = wp.clamp(wp.floor(depth / DEPTH_STEP) / wp.float32(DEPTH_STEP_COUNT - 1), 0.0, 1.0)
     return MAX_TINT_OPACITY - (MAX_TINT_OPACITY - MIN_TINT_OPACITY) * share
 
 
 @forward_kernel
-def lay_over(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    top: wp.int32,
-    left: wp.int32,
-    width: wp.int32,
-    nearest: wp.array2d(dtype=wp.uint64),
-    q: wp.array2d(dtype=wp.vec3d),
-    triangles: wp.array(dtype=wp.vec3i),
-    pixels: wp.array3d(dtype=wp.vec2d),
-    away: wp.array2d(dtype=wp.float32),
-    looks: wp.array(dtype=wp.vec4f),
-    depth: wp.array2d(dtype=wp.float32),
-    segmentation: wp.array2d(dtype=wp.uint8),
-    roles: wp.array(dtype=wp.uint8),
-    front: wp.array2d(dtype=wp.uint8),
-    shade: wp.int32,
-    outlined: wp.bool,
-    ink: wp.vec3f,
-    under: wp.array(dtype=wp.vec4ub),
-    above: wp.array(dtype=wp.vec4ub),
+def composite_pixels(
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, top: wp.int32, left: wp.int32, width: wp.int32,
+    z_buffer: wp.array2d(dtype=wp.uint64), q: wp.array2d(dtype=wp.vec3d), triangles: wp.array(dtype=wp.vec3i),
+    pixels: wp.array3d(dtype=wp.vec2d), edge_distance: wp.array2d(dtype=wp.float32),
+    appearance: wp.array(dtype=wp.vec4f), depth: wp.array2d(dtype=wp.float32),
+    segmentation: wp.array2d(dtype=wp.uint8), roles: wp.array(dtype=wp.uint8), front: wp.array2d(dtype=wp.uint8),
+    style: wp.int32, has_outline: wp.bool, colour: wp.vec3f, lines_below: wp.array(dtype=wp.vec4ub),
+    lines_above: wp.array(dtype=wp.vec4ub),
     # outputs
-    ground: wp.array2d(dtype=wp.vec3ub),
-    taken: wp.array2d(dtype=wp.uint8),
-):
-    """Composite pixels begin .. end - 1 of the box; `away` is the distance of each from the silhouette's edge [pixel].
+    image: wp.array2d(dtype=wp.vec3ub), occupied: wp.array2d(dtype=wp.uint8),
+):  # fmt: skip
+    """Composite pixels begin .. end - 1 of the box; `edge_distance` is that of each to the silhouette's edge [pixel].
 
-    `looks` of the hidden surface's vertices: cosine of their normals to the optical axis, and colour in 0 .. 255.
+    `appearance` of the hidden surface's vertices: cosine of their normals to the optical axis, and colour in 0 .. 255.
     """
-    start = begin + wp.tid() * run
-    for index in range(start, wp.min(start + run, end)):
+    start = begin + wp.tid() * chunk_size
+    for index in range(start, wp.min(start + chunk_size, end)):
         row = index / width
         column = index - row * width
         y = top + row
@@ -338,43 +304,43 @@ def lay_over(
         if front.shape[0] > 0 and front[y, x] != wp.uint8(0):
             free = False
         through = role != CLOSED_GROUND
-        key = nearest[row, column]
+        key = z_buffer[row, column]
         inside = through and key != EMPTY_PIXEL
         window = wp.float32(0.0)
-        if shade == WINDOW_SHADING and through:
+        if style == WINDOW_SHADING and through:
             window = wp.where(
-                inside, 1.0, wp.clamp(1.25 - 1.25 * away[row, column] / wp.float32(SOFT_EDGE_WIDTH), 0.0, 1.0)
+                inside, 1.0, wp.clamp(1.25 - 1.25 * edge_distance[row, column] / wp.float32(SOFT_EDGE_WIDTH), 0.0, 1.0)
             )
         # Coverage by the outline's dark rim, and by its ink.
         rim = wp.float32(0.0)
         line = wp.float32(0.0)
-        if outlined and through and away[row, column] < MAX_EDGE_DISTANCE:
-            far = wp.abs(smooth_distance(row, column, away, nearest))
+        if has_outline and through and edge_distance[row, column] < MAX_EDGE_DISTANCE:
+            far = wp.abs(smooth_distance(row, column, edge_distance, z_buffer))
             rim = wp.clamp(HALF_BORDER_WIDTH + 0.5 - far, 0.0, 1.0)
             line = wp.clamp(HALF_LINE_WIDTH + 0.5 - far, 0.0, 1.0)
         low = wp.vec4ub(wp.uint8(0))
         high = wp.vec4ub(wp.uint8(0))
-        if under.shape[0] > 0:
-            low = under[index]
-        if above.shape[0] > 0:
-            high = above[index]
+        if lines_below.shape[0] > 0:
+            low = lines_below[index]
+        if lines_above.shape[0] > 0:
+            high = lines_above[index]
         lined = rim > 0.0 or low[3] > wp.uint8(0) or high[3] > wp.uint8(0)
-        taken[row, column] = wp.uint8(wp.where(lined and free, 1, 0))
-        if free and (lined or window > 0.0 or (shade > WINDOW_SHADING and inside)):
-            was = ground[y, x]
+        occupied[row, column] = wp.uint8(wp.where(lined and free, 1, 0))
+        if free and (lined or window > 0.0 or (style > WINDOW_SHADING and inside)):
+            was = image[y, x]
             light = wp.vec3f(wp.float32(was[0]), wp.float32(was[1]), wp.float32(was[2]))
-            if shade == WINDOW_SHADING:
+            if style == WINDOW_SHADING:
                 light *= 1.0 - 0.62 * window * window * (3.0 - 2.0 * window)
                 if inside:
-                    p = pixel_at(0, column, row, pixels)
-                    light += shining(p, key, q, triangles, looks, depth[y, x])
+                    p = undistort_pixel(0, column, row, pixels)
+                    light += shade_through_ground(p, key, q, triangles, appearance, depth[y, x])
             light = wp.min(light, wp.vec3f(255.0))
-            if inside and shade == TINT_SHADING:
-                light = 0.55 * light + 0.45 * ink
-            if inside and shade == DEPTH_SHADING:
-                light += strength(depth_of(key) - depth[y, x]) * (ink - light)
-            light = over(low, light)
+            if inside and style == TINT_SHADING:
+                light = 0.55 * light + 0.45 * colour
+            if inside and style == DEPTH_SHADING:
+                light += compute_tint_opacity(unpack_depth(key) - depth[y, x]) * (colour - light)
+            light = blend_over(low, light)
             light = (1.0 - rim) * light + rim * BORDER_INK
-            light = (1.0 - line) * light + line * ink
-            light = over(high, light)
-            ground[y, x] = wp.vec3ub(wp.uint8(light[0]), wp.uint8(light[1]), wp.uint8(light[2]))
+            light = (1.0 - line) * light + line * colour
+            light = blend_over(high, light)
+            image[y, x] = wp.vec3ub(wp.uint8(light[0]), wp.uint8(light[1]), wp.uint8(light[2]))

@@ -44,28 +44,28 @@ class ConnectionLimits:
 
     Parameters
     ----------
-    visitors
+    max_clients
         Maximum number of connected browsers.
-    burst, per_second
+    max_burst, messages_per_second
         Messages that one client may send at once, and sustained per second; viser's own page sends some 50 a second at
         most.
-    sendings
+    updates_per_second
         Maximum updates per second that the page sends.
-    asides
+    slice_updates_per_second
         Maximum updates per second of slices and charts, which take longer to draw.
     """
 
-    visitors: int = 32
-    burst: float = 1000.0
-    per_second: float = 200.0
-    sendings: float = 30.0
-    asides: float = 2.0
+    max_clients: int = 32
+    max_burst: float = 1000.0
+    messages_per_second: float = 200.0
+    updates_per_second: float = 30.0
+    slice_updates_per_second: float = 2.0
 
 
 DEFAULT_LIMITS = ConnectionLimits()  # Default limits of connections.
 
 
-class UnguardedError(RuntimeError):
+class ViserError(RuntimeError):
     """Unsupported viser release."""
 
 
@@ -95,7 +95,7 @@ class AccessPolicy:
 
     def find_rejection(self, request: Request, address: str, port: int) -> str | None:
         """Return the reason to reject a request received at an address and a port; None to accept it."""
-        names = {"localhost", "127.0.0.1", "[::1]", to_bracketed(self.host), to_bracketed(address)}
+        names = {"localhost", "127.0.0.1", "[::1]", to_url_host(self.host), to_url_host(address)}
         if self.token is not None:
             names.add(socket.gethostname())
         places = {f"{name}:{port}".lower() for name in names}
@@ -143,7 +143,7 @@ class Connection(ServerConnection):
     ) -> None:
         super().__init__(*args, **settings)
         self.controls, self.limits = controls, limits
-        self.credit, self.counted = limits.burst, self.loop.time()
+        self.credit, self.counted = limits.max_burst, self.loop.time()
 
     def data_received(self, data: bytes) -> None:
         """Reject requests other than GET, to which websockets would not respond."""
@@ -158,7 +158,7 @@ class Connection(ServerConnection):
         while True:
             message = await super().recv(decode)
             try:
-                self.count()
+                self.count_message()
                 return check_message(message, self.controls)
             except MessageError as error:
                 self.logger.warning("A client's message was rejected: %s.", error)
@@ -167,7 +167,7 @@ class Connection(ServerConnection):
                 elif error.malformed:
                     await self.close(1008, "The message has an invalid format.")
 
-    def count(self) -> None:
+    def count_message(self) -> None:
         """Count a message.
 
         Raises
@@ -176,7 +176,7 @@ class Connection(ServerConnection):
             The rate limit is exceeded.
         """
         now, limits = self.loop.time(), self.limits
-        self.credit = min(limits.burst, self.credit + (now - self.counted) * limits.per_second) - 1.0
+        self.credit = min(limits.max_burst, self.credit + (now - self.counted) * limits.messages_per_second) - 1.0
         self.counted = now
         if self.credit < 0.0:
             raise MessageError("there are too many", malformed=True)
@@ -199,7 +199,7 @@ class ConnectionLog(logging.Filter):
 
 
 @dataclass
-class Controls:
+class ControlLookup:
     """Lookup of controls and commands by identifier; empty before viser's server runs."""
 
     server: viser.ViserServer | None = None
@@ -225,8 +225,8 @@ def open_server(
         An unsupported viser release: nothing is served.
     """
     if not viser.__version__.startswith(VISER_VERSION):
-        raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {VISER_VERSION}*.")
-    door, controls = AccessPolicy.create(host, origins), Controls()
+        raise ViserError(f"viser {viser.__version__} cannot be guarded: install viser {VISER_VERSION}*.")
+    door, controls = AccessPolicy.create(host, origins), ControlLookup()
     with guard_server(door, controls, limits) as opened:
         server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
     try:
@@ -237,7 +237,7 @@ def open_server(
             server._websock_server.unregister_handler(message)
     except (AttributeError, AssertionError, KeyError) as error:
         server.stop()
-        raise UnguardedError(f"viser {viser.__version__} cannot be guarded: install viser {VISER_VERSION}1.") from error
+        raise ViserError(f"viser {viser.__version__} cannot be guarded: install viser {VISER_VERSION}1.") from error
     return server, door.token
 
 
@@ -245,7 +245,7 @@ PATCH_LOCK = threading.Lock()  # Lock while websockets' `serve` is replaced.
 
 
 @contextmanager
-def guard_server(door: AccessPolicy, controls: Controls, limits: ConnectionLimits) -> Iterator[list[bool]]:
+def guard_server(policy: AccessPolicy, controls: ControlLookup, limits: ConnectionLimits) -> Iterator[list[bool]]:
     """Guard the server that viser opens within this context; the yielded list is non-empty once it is open."""
     opened: list[bool] = []
     serve = websockets.asyncio.server.serve
@@ -256,7 +256,7 @@ def guard_server(door: AccessPolicy, controls: Controls, limits: ConnectionLimit
         opened.append(True)
         visit = partial(Connection, controls=controls, limits=limits)
         settings |= {"max_size": MAX_MESSAGE_BYTES, "logger": log, "create_connection": visit}
-        return serve(*args, process_request=partial(handle_request, door, limits, process_request), **settings)
+        return serve(*args, process_request=partial(handle_request, policy, limits, process_request), **settings)
 
     with PATCH_LOCK:
         websockets.asyncio.server.serve = guarded
@@ -267,20 +267,20 @@ def guard_server(door: AccessPolicy, controls: Controls, limits: ConnectionLimit
 
 
 def handle_request(
-    door: AccessPolicy, limits: ConnectionLimits, served: Callable, connection: ServerConnection, request: Request
+    policy: AccessPolicy, limits: ConnectionLimits, respond: Callable, connection: ServerConnection, request: Request
 ) -> Response | None:
     """Respond to a request as viser does, if it is accepted; None opens a WebSocket connection."""
     address, port = connection.local_address[:2]
-    refusal = door.find_rejection(request, address, port)
+    refusal = policy.find_rejection(request, address, port)
     if refusal is not None:
         return connection.respond(HTTPStatus.FORBIDDEN, refusal)
     if request.headers.get_all("Upgrade"):
         if request.headers.get_all("Sec-WebSocket-Protocol") != [f"viser-v{viser.__version__}"]:
             return connection.respond(HTTPStatus.BAD_REQUEST, "The page is of another version: reload it.\n")
-        if len(connection.server.connections) >= limits.visitors:
-            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"At most {limits.visitors} visitors.\n")
+        if len(connection.server.connections) >= limits.max_clients:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"At most {limits.max_clients} visitors.\n")
     try:
-        response = served(connection, request)
+        response = respond(connection, request)
     except (OSError, ValueError):
         response = connection.respond(HTTPStatus.NOT_FOUND, "There is no such file.\n")
     if response is not None:
@@ -289,9 +289,9 @@ def handle_request(
             response.body = build_document(bytes(response.body), response.headers.get("Content-Encoding") == "gzip")
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
-        if door.token is not None:
-            secret = f"{get_cookie_name(port)}={door.token}; HttpOnly; SameSite=Strict; Path=/"
-            response.headers["Set-Cookie"] = secret + "; Secure" * door.is_encrypted(request)
+        if policy.token is not None:
+            secret = f"{get_cookie_name(port)}={policy.token}; HttpOnly; SameSite=Strict; Path=/"
+            response.headers["Set-Cookie"] = secret + "; Secure" * policy.is_encrypted(request)
     return response
 
 
@@ -306,7 +306,7 @@ def format_origin(address: str) -> str:
     try:
         parts = urlsplit(address)
         scheme, name, port = parts.scheme.lower(), parts.hostname or "", parts.port
-        rebuilt = f"{to_bracketed(name)}{'' if port is None else f':{port}'}"
+        rebuilt = f"{to_url_host(name)}{'' if port is None else f':{port}'}"
         if ":" in name:
             ipaddress.IPv6Address(name)
     except ValueError:
@@ -319,7 +319,7 @@ def format_origin(address: str) -> str:
         or address.lower().rstrip("/") != f"{scheme}://{rebuilt}"
     ):
         raise ValueError(f"{address!r}: must be https://NAME or https://NAME:PORT, without a path.")
-    return f"{scheme}://{to_bracketed(name)}" + ("" if port in (None, DEFAULT_PORTS[scheme]) else f":{port}")
+    return f"{scheme}://{to_url_host(name)}" + ("" if port in (None, DEFAULT_PORTS[scheme]) else f":{port}")
 
 
 def list_hosts(origin: str) -> set[str]:
@@ -328,7 +328,7 @@ def list_hosts(origin: str) -> set[str]:
     return {place} if place.rpartition(":")[2].isdecimal() else {place, f"{place}:{DEFAULT_PORTS[scheme]}"}
 
 
-def to_bracketed(host: str) -> str:
+def to_url_host(host: str) -> str:
     """Write a host as part of an address (IPv6 in brackets)."""
     return f"[{host}]" if ":" in host else host
 

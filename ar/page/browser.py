@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import viser
 
-from .access_guard import DEFAULT_LIMITS, ConnectionLimits, check_address, open_server, to_bracketed
+from .access_guard import DEFAULT_LIMITS, ConnectionLimits, check_address, open_server, to_url_host
 from .control_lock import Clients, Inputs, format_note
 from .elements import (
     ASIDE_SPOT,
@@ -27,12 +27,12 @@ from .elements import (
     SAID,
     build_image_element,
     build_tabs,
-    keep_together,
+    keep_numbers_together,
     to_data_url,
 )
-from .parts import Control, Fold, LastChange, Note, Playback, ScenePicture, SceneSurface, SceneViewpoint, Sign
+from .parts import Control, Folder, LastChange, Note, Playback, SceneImage, SceneLabel, SceneSurface, SceneViewpoint
 from .recording import Recorder
-from .scene import add_body, set_up_scene
+from .scene import add_surface, fill_scene
 from .style import PAGE, STATUS, build_style
 
 LAST_ORDER = 1e9  # Sort order that keeps an element last on the page.
@@ -51,20 +51,12 @@ class Browser:
     """
 
     def __init__(
-        self,
-        bodies: Sequence[SceneSurface],
-        viewpoint: SceneViewpoint,
-        playback: Playback,
-        controls: Sequence[Control | Fold | Note] = (),
-        title: str = "sulcus",
-        words: str = "",
-        host: str = "127.0.0.1",
-        port: int = 8080,
-        size: tuple[int, int] = (640, 480),
-        signs: Sequence[Sign | ScenePicture] = (),
-        limits: ConnectionLimits = DEFAULT_LIMITS,
+        self, bodies: Sequence[SceneSurface], viewpoint: SceneViewpoint, playback: Playback,
+        controls: Sequence[Control | Folder | Note] = (), title: str = "sulcus", words: str = "",
+        host: str = "127.0.0.1", port: int = 8080, size: tuple[int, int] = (640, 480),
+        signs: Sequence[SceneLabel | SceneImage] = (), limits: ConnectionLimits = DEFAULT_LIMITS,
         origins: tuple[str, ...] = (),
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Start the server; if `port` is taken, the next free one is used, see `address`.
 
         `words` is HTML under the image, `size` the image's width and height [pixel] until the first arrives. `origins`
@@ -82,13 +74,13 @@ class Browser:
         check_address(host, port)
         self.limits, self.origins = limits, origins
         self.server, self.token = open_server(host, port, title, limits, origins)
-        set_up_scene(self.server, viewpoint, signs)
+        fill_scene(self.server, viewpoint, signs)
         gui = self.server.gui
         gui.add_html(build_style(size[0] / size[1]))
         blank = np.full((size[1], size[0], 3), 24, np.uint8)
         gui.add_html(build_element(PICTURE, ""))
         # The words come last: in a low window without space under the image, the controls precede them.
-        self.words = gui.add_html(build_element(PAGE, keep_together(words)), order=LAST_ORDER)
+        self.words = gui.add_html(build_element(PAGE, keep_numbers_together(words)), order=LAST_ORDER)
         self.line = gui.add_html("")
         self.text = gui.add_html(build_element(SAID, ""))
         # Shown and requested state: frame, image and words. Last encoded image, and number of images sent.
@@ -96,7 +88,7 @@ class Browser:
         self.wanted: Shown = self.shown
         self.coded, self.sent = to_data_url(blank), 0
         self.sight = gui.add_html(build_image_element(0, self.coded, ""))
-        gui.add_html(build_tabs(KEYS if playback.frames else LIVE_KEYS, bodies))
+        gui.add_html(build_tabs(KEYS if playback.frame_count else LIVE_KEYS, bodies))
         self.beside = gui.add_html("")
         # Function that draws slices and charts, if not yet sent; earliest time to send them [s].
         self.drawn: Callable[[], tuple[np.ndarray, str]] | None = None
@@ -113,13 +105,9 @@ class Browser:
         self.sender.start()
 
     def fill(
-        self,
-        bodies: Sequence[SceneSurface],
-        playback: Playback,
-        controls: Sequence[Control | Fold | Note] = (),
-        title: str = "sulcus",
-        words: str = "",
-    ) -> None:
+        self, bodies: Sequence[SceneSurface], playback: Playback, controls: Sequence[Control | Folder | Note] = (),
+        title: str = "sulcus", words: str = "",
+    ) -> None:  # fmt: skip
         """Replace bodies, playback, controls, title and words.
 
         Pending updates of the old ones are dropped.
@@ -133,7 +121,7 @@ class Browser:
                 self.folder.remove()
             self.server.gui.set_panel_label(title)
             self.title = title
-            self.words.content, self.line.content = build_element(PAGE, keep_together(words)), ""
+            self.words.content, self.line.content = build_element(PAGE, keep_numbers_together(words)), ""
             self.wanted, self.shown = (0, self.shown[1], "", 0), (0, self.shown[1], self.shown[2], 0)
             self.report("")
             self.controls.clear()
@@ -144,7 +132,7 @@ class Browser:
                 self.add_savers()
                 for control in controls:
                     self.controls.add(control)
-            self.meshes = {body.name: add_body(self.server, body) for body in bodies}
+            self.meshes = {body.name: add_surface(self.server, body) for body in bodies}
 
     @property
     def inputs(self) -> dict[str, viser.GuiInputHandle]:
@@ -160,7 +148,7 @@ class Browser:
     def address(self) -> str:
         """Address of the page as seen from this machine, with the token that other machines need."""
         host = self.server.get_host()
-        name = "localhost" if host in LOCAL_ADDRESSES else to_bracketed(host)
+        name = "localhost" if host in LOCAL_ADDRESSES else to_url_host(host)
         return f"http://{name}:{self.server.get_port()}" + (f"/?token={self.token}" if self.token else "")
 
     @property
@@ -210,8 +198,8 @@ class Browser:
     def put_sight(self, code: str, words: str) -> None:
         """Send a `to_data_url` image and words (HTML) at once."""
         self.sent += 1
-        self.sight.content = build_image_element(self.sent, code, keep_together(words))
-        self.recorder.take(code)
+        self.sight.content = build_image_element(self.sent, code, keep_numbers_together(words))
+        self.recorder.add_image(code)
 
     def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
         """Show an image (H, W, 3) uint8 of slices, and charts (HTML) of the last seconds, in tabs next to the 3-D view.
@@ -228,7 +216,7 @@ class Browser:
             drawn = self.drawn if clock.monotonic() >= self.due and self.visitors else None
             if drawn is None:
                 return
-            self.drawn, self.due = None, clock.monotonic() + 1.0 / self.limits.asides
+            self.drawn, self.due = None, clock.monotonic() + 1.0 / self.limits.slice_updates_per_second
         colour, words = drawn()
         self.sent += 1
         self.beside.content = build_image_element(self.sent, to_data_url(colour), words, ASIDE_SPOT)
@@ -272,7 +260,7 @@ class Browser:
 
         def send() -> None:
             if not self.closed.is_set():
-                self.crowd.read(line)
+                self.crowd.show_lines(line)
 
         # While this thread runs `send`, no client leaves.
         self.note("lines", lambda: self.server.get_event_loop().call_soon_threadsafe(send))
@@ -315,7 +303,7 @@ class Browser:
 
     def send(self) -> None:
         """Send the newest updates until the page is closed; updates of one interval arrive together."""
-        while not self.closed.wait(1.0 / self.limits.sendings):
+        while not self.closed.wait(1.0 / self.limits.updates_per_second):
             with self.sending:
                 with self.lock:
                     newest, self.newest = self.newest, {}
@@ -326,24 +314,24 @@ class Browser:
 
     def add_playback(self, playback: Playback) -> None:
         """Add a play/pause button and a slider over the frames, if there are any; keys do the same."""
-        gui, self.playing, seekable = self.server.gui, True, playback.frames > 0
+        gui, self.playing, seekable = self.server.gui, True, playback.frame_count > 0
         self.button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
-        self.frame = gui.add_slider("frame", 0, max(playback.frames - 1, 1), 1, 0, visible=seekable)
+        self.frame = gui.add_slider("frame", 0, max(playback.frame_count - 1, 1), 1, 0, visible=seekable)
 
         def toggle(_: viser.ClientHandle | None = None) -> None:
             self.show_playback(not self.playing)
-            playback.played(self.playing)
+            playback.on_play(self.playing)
 
         def step(by: int) -> None:
-            number = min(max(self.shown[0] + by, 0), playback.frames - 1)
+            number = min(max(self.shown[0] + by, 0), playback.frame_count - 1)
             self.show_playback(False)
-            playback.played(False)
-            playback.sought(number)
+            playback.on_play(False)
+            playback.on_seek(number)
             self.controls.assign(self.frame, number)
 
-        self.controls.press(self.button, toggle)
+        self.controls.bind_button(self.button, toggle)
         # A slider needs two positions, even for a single frame.
-        self.controls.receive_input(self.frame, lambda number: playback.sought(min(number, playback.frames - 1)))
+        self.controls.receive_input(self.frame, lambda number: playback.on_seek(min(number, playback.frame_count - 1)))
         self.controls.bind_key(PLAY_KEY, toggle)
         if seekable:
             self.controls.bind_key(BACK_KEY, lambda _: step(-1))
@@ -362,9 +350,9 @@ class Browser:
                 event.client.send_file_download(f"{name}-{number}.png", written.tobytes(), save_immediately=True)
 
         def record(client: viser.ClientHandle) -> None:
-            self.recorder.toggle(client, self.coded)
+            self.recorder.toggle_recording(client, self.coded)
 
-        self.controls.press(self.recorder.add_button(name), record)
+        self.controls.bind_button(self.recorder.add_button(name), record)
         self.controls.bind_key(RECORD_KEY, record)
 
     status, plays = show_status, show_playback  # Former names, for one release.

@@ -8,7 +8,7 @@ from typing import Any
 
 import viser
 
-from .parts import Control, Dropdown, Fold, Key, LastChange, Note, Slider, Toggle
+from .parts import Control, Dropdown, Folder, Key, LastChange, Note, Slider, Toggle
 from .style import NOTE, VIEW_ONLY_STYLE
 
 MAX_IDLE_TIME = 60.0
@@ -19,48 +19,48 @@ MAX_IDLE_TIME = 60.0
 class ControlLock:
     """State of the lock: number of the client with control, time of its last action [s], queue of requests."""
 
-    leader: int | None = None
-    acted: float = 0.0
-    asking: tuple[int, ...] = ()
+    holder: int | None = None
+    last_action: float = 0.0
+    queue: tuple[int, ...] = ()
 
-    def see(self, here: Collection[int], now: float) -> None:
+    def update_clients(self, present: Collection[int], time: float) -> None:
         """Update the clients present: if the one with control has left, the first in the queue or the oldest has it."""
-        self.asking = tuple(visitor for visitor in self.asking if visitor in here)
-        if self.leader not in here:
-            self._give_control((*self.asking, *sorted(here), None)[0], now)
+        self.queue = tuple(visitor for visitor in self.queue if visitor in present)
+        if self.holder not in present:
+            self._give_control((*self.queue, *sorted(present), None)[0], time)
 
-    def record_change(self, visitor: int, now: float) -> bool:
+    def record_change(self, client: int, time: float) -> bool:
         """Record that a client sets something; return True if it has control."""
-        if visitor == self.leader:
-            self.acted = now
-        return visitor == self.leader
+        if client == self.holder:
+            self.last_action = time
+        return client == self.holder
 
-    def ask(self, visitor: int, now: float) -> None:
+    def request_control(self, client: int, time: float) -> None:
         """Record that a client requests control."""
-        if visitor == self.leader or visitor in self.asking:
+        if client == self.holder or client in self.queue:
             return
-        self.asking += (visitor,)
-        if now - self.acted >= MAX_IDLE_TIME:
-            self.give(now)
+        self.queue += (client,)
+        if time - self.last_action >= MAX_IDLE_TIME:
+            self.give_control(time)
 
-    def give(self, now: float) -> None:
+    def give_control(self, time: float) -> None:
         """Hand over control to the first client in the queue."""
-        if self.asking:
-            self._give_control(self.asking[0], now)
+        if self.queue:
+            self._give_control(self.queue[0], time)
 
     def _give_control(self, visitor: int | None, now: float) -> None:
-        self.leader, self.acted = visitor, now
-        self.asking = tuple(other for other in self.asking if other != visitor)
+        self.holder, self.last_action = visitor, now
+        self.queue = tuple(other for other in self.queue if other != visitor)
 
-    def describe_control(self, visitor: int, here: Collection[int]) -> str:
+    def describe_control(self, client: int, present: Collection[int]) -> str:
         """Return the status line of a client in Markdown; empty with a single client."""
-        if len(here) < 2:
+        if len(present) < 2:
             return ""
-        if visitor == self.leader:
-            asked = f" **Visitor {self.asking[0]} requests control.**" if self.asking else ""
+        if client == self.holder:
+            asked = f" **Visitor {self.queue[0]} requests control.**" if self.queue else ""
             return f"You have control; the others can only view.{asked}"
-        waits = " You have requested control." if visitor in self.asking else ""
-        return f"Visitor {self.leader} has control: your changes are reset.{waits}"
+        waits = " You have requested control." if client in self.queue else ""
+        return f"Visitor {self.holder} has control: your changes are reset.{waits}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,17 +68,17 @@ class ClientRow:
     """Elements that one client sees: line, buttons to request and hand over control, rules that dim the controls."""
 
     line: viser.GuiMarkdownHandle
-    ask: viser.GuiButtonHandle
-    give: viser.GuiButtonHandle
-    dim: viser.GuiHtmlHandle
+    request_button: viser.GuiButtonHandle
+    release_button: viser.GuiButtonHandle
+    dim_style: viser.GuiHtmlHandle
 
 
 class Clients:
     """Clients of a page, by their numbers from 1 in order of arrival. Only for viser's own thread."""
 
-    def __init__(self, server: viser.ViserServer, order: float) -> None:
-        """Build the list; `order` is the position on the page of each client's line."""
-        self.server, self.order = server, order
+    def __init__(self, server: viser.ViserServer, position: float) -> None:
+        """Build the list; `position` is the position on the page of each client's line."""
+        self.server, self.order = server, position
         self.lead = ControlLock()
         self.rows: dict[int, ClientRow] = {}
 
@@ -90,25 +90,27 @@ class Clients:
     def record_activity(self, client: viser.ClientHandle) -> bool:
         """Record that a client acts on the page; return True if it has control."""
         now = clock.monotonic()
-        self.lead.see(self.here | {client.client_id + 1}, now)
+        self.lead.update_clients(self.here | {client.client_id + 1}, now)
         return self.lead.record_change(client.client_id + 1, now)
 
-    def read(self, line: Callable[[int], str]) -> None:
-        """Show each client its own line: the result of `line`, then who has control."""
+    def show_lines(self, format_line: Callable[[int], str]) -> None:
+        """Show each client its own line: the result of `format_line`, then who has control."""
         clients = self.server.get_clients()
         self.rows = {identifier: row for identifier, row in self.rows.items() if identifier in clients}
         here = self.here
-        self.lead.see(here, clock.monotonic())
+        self.lead.update_clients(here, clock.monotonic())
         for identifier, client in clients.items():
             visitor = identifier + 1
             row = self.rows.get(identifier) or self.add_row(client)
             self.rows[identifier] = row
-            words = "  \n".join(part for part in (line(visitor), self.lead.describe_control(visitor, here)) if part)
-            leads = visitor == self.lead.leader
+            words = "  \n".join(
+                part for part in (format_line(visitor), self.lead.describe_control(visitor, here)) if part
+            )
+            leads = visitor == self.lead.holder
             _set(row.line, "content", words)
-            _set(row.ask, "visible", not leads and visitor not in self.lead.asking)
-            _set(row.give, "visible", leads and bool(self.lead.asking))
-            _set(row.dim, "content", "" if leads else VIEW_ONLY_STYLE)
+            _set(row.request_button, "visible", not leads and visitor not in self.lead.queue)
+            _set(row.release_button, "visible", leads and bool(self.lead.queue))
+            _set(row.dim_style, "content", "" if leads else VIEW_ONLY_STYLE)
 
     def add_row(self, client: viser.ClientHandle) -> ClientRow:
         """Add the elements that only this client sees to its page."""
@@ -118,12 +120,12 @@ class Clients:
 
         @ask.on_click
         async def asked(_: viser.GuiEvent) -> None:
-            lead.ask(client.client_id + 1, clock.monotonic())
+            lead.request_control(client.client_id + 1, clock.monotonic())
 
         @give.on_click
         async def given(_: viser.GuiEvent) -> None:
             if lead.record_change(client.client_id + 1, clock.monotonic()):
-                lead.give(clock.monotonic())
+                lead.give_control(clock.monotonic())
 
         return ClientRow(gui.add_markdown("", order=self.order), ask, give, gui.add_html("", order=self.order + 0.3))
 
@@ -147,8 +149,8 @@ class Inputs:
         Folders and texts of notes by their labels.
     """
 
-    def __init__(self, server: viser.ViserServer, crowd: Clients) -> None:
-        self.server, self.crowd = server, crowd
+    def __init__(self, server: viser.ViserServer, clients: Clients) -> None:
+        self.server, self.crowd = server, clients
         self.deed: LastChange | None = None
         self.handles: dict[str, viser.GuiInputHandle] = {}
         # Keyed by identity, as viser's controls have no hash.
@@ -163,78 +165,78 @@ class Inputs:
         self.handles, self.kept, self.notes, self.commands = {}, {}, {}, []
 
     def assign(
-        self, control: viser.GuiInputHandle, value: float | str, wanted: Callable[[], bool] | None = None
+        self, control: viser.GuiInputHandle, value: float | str, condition: Callable[[], bool] | None = None
     ) -> None:
         """Set a control on the thread that receives clients' messages: another could overwrite an unread value.
 
-        With `wanted` it is set only if the value differs and `wanted` returns True there.
+        With `condition` it is set only if the value differs and `condition` returns True there.
         """
 
         def put() -> None:
             # The page may have been filled again meanwhile.
-            if id(control) in self.kept and (wanted is None or (control.value != value and wanted())):
+            if id(control) in self.kept and (condition is None or (control.value != value and condition())):
                 self.kept[id(control)] = value
                 control.value = value
 
         self.server.get_event_loop().call_soon_threadsafe(put)
 
-    def press(self, button: viser.GuiButtonHandle, act: Callable[[viser.ClientHandle], None]) -> None:
+    def bind_button(self, button: viser.GuiButtonHandle, action: Callable[[viser.ClientHandle], None]) -> None:
         """Bind a button to an action of the client with control."""
 
         @button.on_click
         async def pressed(event: viser.GuiEvent) -> None:
             if event.client is not None and self.crowd.record_activity(event.client):
                 self.deed = LastChange(event.client.client_id + 1, button.label)
-                act(event.client)
+                action(event.client)
 
-    def bind_key(self, key: Key, act: Callable[[viser.ClientHandle], None]) -> None:
+    def bind_key(self, key: Key, action: Callable[[viser.ClientHandle], None]) -> None:
         """Bind a key of the keyboard to an action of the client with control."""
-        handle = self.server.gui.add_command(key.does.capitalize(), hotkey=key.hotkey)
+        handle = self.server.gui.add_command(key.action.capitalize(), hotkey=key.hotkey)
         self.commands.append(handle)
 
         @handle.on_trigger
         async def hit(event: viser.CommandEvent) -> None:
             if event.client is not None and self.crowd.record_activity(event.client):
-                self.deed = LastChange(event.client.client_id + 1, key.does)
-                act(event.client)
+                self.deed = LastChange(event.client.client_id + 1, key.action)
+                action(event.client)
 
-    def add(self, control: Control | Fold | Note) -> None:
+    def add(self, control: Control | Folder | Note) -> None:
         """Add a slider, a list, a checkbox, a folder of them, or a folder of words."""
         gui = self.server.gui
-        if isinstance(control, Note) and control.plain:
-            text = gui.add_html(format_note(control.words), visible=bool(control.words))
+        if isinstance(control, Note) and control.is_plain:
+            text = gui.add_html(format_note(control.text), visible=bool(control.text))
             self.notes[control.label] = text, text
             return
         if isinstance(control, Note):
-            with gui.add_folder(control.label, expand_by_default=False, visible=bool(control.words)) as folder:
-                self.notes[control.label] = folder, gui.add_html(format_note(control.words))
+            with gui.add_folder(control.label, expand_by_default=False, visible=bool(control.text)) as folder:
+                self.notes[control.label] = folder, gui.add_html(format_note(control.text))
             return
-        if isinstance(control, Fold):
-            with gui.add_folder(control.label, expand_by_default=control.opened):
+        if isinstance(control, Folder):
+            with gui.add_folder(control.label, expand_by_default=control.is_open):
                 for inner in control.controls:
                     self.add(inner)
             return
-        words, hint = control.words or control.label, control.hint
+        words, hint = control.text or control.label, control.hint
         match control:
             case Toggle():
-                handle = gui.add_checkbox(words, control.start, hint=hint)
+                handle = gui.add_checkbox(words, control.initial, hint=hint)
             case Slider():
-                handle = gui.add_slider(words, control.low, control.high, control.step, control.start, hint=hint)
+                handle = gui.add_slider(words, control.lower, control.upper, control.step, control.initial, hint=hint)
             case Dropdown():
-                handle = gui.add_dropdown(words, control.options, initial_value=control.start, hint=hint)
+                handle = gui.add_dropdown(words, control.options, initial_value=control.initial, hint=hint)
         self.handles[control.label] = handle
-        self.receive_input(handle, control.changed)
+        self.receive_input(handle, control.on_change)
         if isinstance(control, Dropdown) and control.key is not None:
             self.bind_key(control.key, partial(self.select_next, handle, control))
 
-    def select_next(self, handle: viser.GuiInputHandle, choice: Dropdown, _: viser.ClientHandle) -> None:
+    def select_next(self, handle: viser.GuiInputHandle, dropdown: Dropdown, _: viser.ClientHandle) -> None:
         """Select the next of several names."""
-        options = choice.options
+        options = dropdown.options
         name = options[(options.index(str(handle.value)) + 1) % len(options)]
         self.assign(handle, name)
-        choice.changed(name)
+        dropdown.on_change(name)
 
-    def receive_input(self, control: viser.GuiInputHandle, changed: Callable[[Any], None]) -> None:
+    def receive_input(self, control: viser.GuiInputHandle, callback: Callable[[Any], None]) -> None:
         """Pass on values set by the client with control, on the receiving thread, before anything else there."""
         self.kept[id(control)] = control.value
 
@@ -248,9 +250,9 @@ class Inputs:
                 return
             self.kept[id(control)] = control.value
             self.deed = LastChange(event.client.client_id + 1, control.label)
-            changed(control.value)
+            callback(control.value)
 
 
-def format_note(words: str) -> str:
+def format_note(html: str) -> str:
     """Wrap the words of a note in an element with a class, for the style rules."""
-    return f'<div class="{NOTE}">{words}</div>'
+    return f'<div class="{NOTE}">{html}</div>'

@@ -26,18 +26,18 @@ SLICES, HISTORY = "sulcus-slices", "sulcus-history"
 
 
 @dataclass(frozen=True)
-class Spot:
+class ImageElementIds:
     """Ids of the elements that show an image and its words, and of those that wait; `alt` describes the image."""
 
-    picture: str
-    words: str
-    waits: str
+    image: str
+    text: str
+    waiting: str
     alt: str
 
 
-MAIN = Spot(PICTURE, SAID, NEXT, "camera image with overlay")  # Place of the camera image.
+MAIN = ImageElementIds(PICTURE, SAID, NEXT, "camera image with overlay")  # Place of the camera image.
 # Place of the slices.
-ASIDE_SPOT = Spot(SLICES, HISTORY, "sulcus-next-aside", "axial, coronal and sagittal slices of the scan")
+ASIDE_SPOT = ImageElementIds(SLICES, HISTORY, "sulcus-next-aside", "axial, coronal and sagittal slices of the scan")
 # Script that shows the next image. If images are loaded out of order, older ones are dropped.
 SWAP = """
 const words = this.parentNode.querySelector('template').content, number = Number(this.dataset.number);
@@ -51,27 +51,27 @@ if (number >= Number(picture.dataset.number || 0)) {
 """
 
 
-def keep_together(words: str) -> str:
+def keep_numbers_together(html: str) -> str:
     """Keep numbers on one line with their name, error and unit: replace spaces in words (HTML) by no-break spaces."""
     return re.sub(
         r"<[^>]*>|\s+",
-        lambda part: part[0] if part[0][0] == "<" or BREAK_PATTERN.match(words, part.start()) else "&nbsp;",
-        words,
+        lambda part: part[0] if part[0][0] == "<" or BREAK_PATTERN.match(html, part.start()) else "&nbsp;",
+        html,
     )
 
 
-def to_data_url(colour: np.ndarray) -> str:
+def to_data_url(image: np.ndarray) -> str:
     """Encode an image (H, W, 3) uint8 as a data URL."""
-    written = cv2.imencode(".jpg", cv2.cvtColor(colour, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+    written = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(written.tobytes()).decode()}"
 
 
-def build_image_element(number: int, picture: str, words: str, spot: Spot = MAIN) -> str:
+def build_image_element(number: int, data_url: str, html: str, ids: ImageElementIds = MAIN) -> str:
     """Build the element that puts a `to_data_url` image and words (HTML) into their places; `number` counts them."""
-    swap = escape(" ".join(SWAP.replace("PICTURE", spot.picture).replace("SAID", spot.words).split()))
+    swap = escape(" ".join(SWAP.replace("PICTURE", ids.image).replace("SAID", ids.text).split()))
     # Decoded synchronously: otherwise the words would be painted first.
-    image = f'<img alt="{spot.alt}" decoding="sync" data-number="{number}" onload="{swap}" src="{picture}">'
-    return f'<div id="{spot.waits}" hidden>{image}<template>{words}</template></div>'
+    image = f'<img alt="{ids.alt}" decoding="sync" data-number="{number}" onload="{swap}" src="{data_url}">'
+    return f'<div id="{ids.waiting}" hidden>{image}<template>{html}</template></div>'
 
 
 ASIDE, HELP = "sulcus-aside", "sulcus-keys"
@@ -132,21 +132,21 @@ if (!window.sulcusKeys) {
 """
 
 
-def build_tabs(keys: Sequence[Key] = KEYS, bodies: Sequence[SceneSurface] = ()) -> str:
+def build_tabs(keys: Sequence[Key] = KEYS, surfaces: Sequence[SceneSurface] = ()) -> str:
     """Build the element with the tabs, a legend of bodies, places for slices and charts, and the list of keys."""
     tabs = "".join(
         f'<input type="radio" name="{ASIDE}" id="{name}"{" checked" if number == 0 else ""}>'
         f'<label for="{name}">{words}</label>'
         for number, (words, name) in enumerate(TABS)
     )
-    rows = "".join(f"<tr><td><kbd>{key.shown}</kbd></td><td>{key.does}</td></tr>" for key in keys)
+    rows = "".join(f"<tr><td><kbd>{key.symbol}</kbd></td><td>{key.action}</td></tr>" for key in keys)
     rows += "<tr><td><kbd>?</kbd></td><td>this list</td></tr><tr><td><kbd>Enter</kbd></td><td>press a button</td></tr>"
     listed = ", ".join(f"'{key.name}'" for key in keys)
     script = escape(" ".join(SCRIPT.replace("KEYS", listed, 1).replace("HELP", HELP).split()))
     opens = f"document.getElementById('{HELP}').showModal()"
     legend = "".join(
         f'<span><b style="color: rgb({" ".join(f"{c:.0%}" for c in body.colour)})">&#9632;</b> {body.meaning}</span>'
-        for body in reversed(bodies)
+        for body in reversed(surfaces)
         if body.meaning
     )
     return (

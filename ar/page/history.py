@@ -20,7 +20,7 @@ HALF_DOT_WIDTH = 0.06  # Half the width of an isolated sample [s].
 
 
 @dataclass(frozen=True)
-class Line:
+class Trace:
     """Line of a chart: its name, unit and colour; `error_source` names the source of its error."""
 
     name: str
@@ -42,7 +42,7 @@ class Sample:
 class History:
     """Recent samples of some lines. Samples more than `TIME_SPAN` older than the newest are dropped."""
 
-    lines: tuple[Line, ...]
+    lines: tuple[Trace, ...]
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
 
     def add(self, sample: Sample) -> None:
@@ -51,7 +51,7 @@ class History:
         while self.samples[0].time < sample.time - TIME_SPAN:
             self.samples.popleft()
 
-    def break_off(self, time: float) -> None:
+    def interrupt_lines(self, time: float) -> None:
         """Interrupt all lines at a time [s]."""
         unknown = (None,) * len(self.lines)
         self.add(Sample(time, unknown, unknown))
@@ -76,7 +76,7 @@ def _format_newest(samples: Sequence[Sample], number: int) -> str:
     return "not known" if value is None else f"{value:.2f}"
 
 
-def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
+def _plot(line: Trace, number: int, samples: Sequence[Sample]) -> str:
     """Draw one line with its scale; dotted where its error is not available, interrupted where its value is not."""
     known = [each for each in samples if each.values[number] is not None]
     top, end = CHART_HEIGHT * number + TOP_MARGIN, samples[-1].time if samples else 0.0
@@ -127,7 +127,7 @@ def _plot(line: Line, number: int, samples: Sequence[Sample]) -> str:
     return f'<text x="{LEFT_MARGIN:g}" y="{top - 6:g}">{escape(said)}</text>{scale}{times}{"".join(drawn)}'
 
 
-def split_line(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
+def split_line(samples: Iterable[Sample], line_index: int) -> list[list[Sample]]:
     """Split a line into joined pieces, each with or without an error throughout.
 
     They end where the value is not available.
@@ -135,14 +135,14 @@ def split_line(samples: Iterable[Sample], number: int) -> list[list[Sample]]:
     found: list[list[Sample]] = []
     last: Sample | None = None
     for each in samples:
-        before, last = last, each if each.values[number] is not None else None
+        before, last = last, each if each.values[line_index] is not None else None
         if last is None:
             continue
         if before is not None and each.time - before.time < MAX_TIME_GAP:
-            if (before.errors[number] is None) == (each.errors[number] is None):
+            if (before.errors[line_index] is None) == (each.errors[line_index] is None):
                 found[-1].append(each)
                 continue
-            found.append([before, each] if each.errors[number] is None else [each])
+            found.append([before, each] if each.errors[line_index] is None else [each])
             continue
         found.append([each])
     return found

@@ -45,7 +45,7 @@ class PageCamera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", fo
             raise ValueError("It looks nowhere.")
 
 
-class Value(msgspec.Struct, forbid_unknown_fields=True):
+class ControlValue(msgspec.Struct, forbid_unknown_fields=True):
     """The one property of a control that a client may change."""
 
     value: bool | int | float | str
@@ -55,7 +55,7 @@ class ControlSetting(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", f
     """Control that a client set, in viser's message format."""
 
     uuid: str
-    updates: Value
+    updates: ControlValue
 
 
 class Command(msgspec.Struct, tag_field="type", tag="CommandTriggerMessage", forbid_unknown_fields=True):
@@ -67,8 +67,8 @@ class Command(msgspec.Struct, tag_field="type", tag="CommandTriggerMessage", for
 DECODER = msgspec.msgpack.Decoder(PageCamera | ControlSetting | Command)  # Decoder of the messages of a client.
 
 
-def check_message(message: str | bytes, control: Callable[[str], object]) -> bytes:
-    """Return the checked message, encoded again; `control` finds a control or command by its identifier.
+def check_message(message: str | bytes, find_control: Callable[[str], object]) -> bytes:
+    """Return the checked message, encoded again; `find_control` finds a control or command by its identifier.
 
     Raises
     ------
@@ -84,8 +84,8 @@ def check_message(message: str | bytes, control: Callable[[str], object]) -> byt
     except (ValueError, RecursionError) as error:
         raise MessageError("it cannot be read", malformed=True) from error
     if isinstance(said, ControlSetting):
-        said.updates.value = clamp_value(control(said.uuid), said.updates.value)
-    if isinstance(said, Command) and not isinstance(control(said.uuid), viser.CommandHandle):
+        said.updates.value = clamp_value(find_control(said.uuid), said.updates.value)
+    if isinstance(said, Command) and not isinstance(find_control(said.uuid), viser.CommandHandle):
         raise MessageError("it is a command that is not there")
     return msgspec.msgpack.encode(said)
 

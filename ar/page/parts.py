@@ -28,38 +28,38 @@ class SceneSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class ScenePicture:
+class SceneImage:
     """Image (H, W, 4) uint8 in the 3-D view: centre (3,), edges to its right and downwards (3,) [m]."""
 
     name: str
-    colour: np.ndarray
+    image: np.ndarray
     centre: np.ndarray
     right: np.ndarray
     down: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class Sign:
+class SceneLabel:
     """Text label in the 3-D view, at a position (3,) [m]."""
 
-    word: str
-    place: np.ndarray
+    text: str
+    position: np.ndarray
 
 
 @dataclass(frozen=True)
 class Slider:
-    """Slider for a number; `changed` receives the number, on the page's own thread, and must return at once.
+    """Slider for a number; `on_change` receives the number, on the page's own thread, and must return at once.
 
-    `label` is its name for `Browser.put`; `words` are shown instead of the name, `hint` as a tooltip.
+    `label` is its name for `Browser.put`; `text` are shown instead of the name, `hint` as a tooltip.
     """
 
     label: str
-    low: float
-    high: float
+    lower: float
+    upper: float
     step: float
-    start: float
-    changed: Callable[[float], None]
-    words: str = ""
+    initial: float
+    on_change: Callable[[float], None]
+    text: str = ""
     hint: str | None = None
 
 
@@ -69,8 +69,8 @@ class Key:
 
     name: str
     hotkey: Literal["space", "arrowleft", "arrowright", "S", "R"]
-    shown: str
-    does: str
+    symbol: str
+    action: str
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,9 @@ class Dropdown:
 
     label: str
     options: tuple[str, ...]
-    start: str
-    changed: Callable[[str], None]
-    words: str = ""
+    initial: str
+    on_change: Callable[[str], None]
+    text: str = ""
     hint: str | None = None
     key: Key | None = None
 
@@ -91,28 +91,28 @@ class Toggle:
     """Checkbox; other fields as in `Slider`."""
 
     label: str
-    start: bool
-    changed: Callable[[bool], None]
-    words: str = ""
+    initial: bool
+    on_change: Callable[[bool], None]
+    text: str = ""
     hint: str | None = None
 
 
 @dataclass(frozen=True)
-class Fold:
-    """Folder of controls and notes, closed at first unless it is `opened`."""
+class Folder:
+    """Folder of controls and notes, closed at first unless it is `is_open`."""
 
     label: str
     controls: tuple[Slider | Dropdown | Toggle | Note, ...]
-    opened: bool = False
+    is_open: bool = False
 
 
 @dataclass(frozen=True)
 class Note:
-    """Folder of words (HTML) that a user can open, for `Browser.write`; hidden while empty. `plain`: without folder."""
+    """Folder of words (HTML) that a user can open, for `Browser.write`; hidden while empty. `is_plain`: no folder."""
 
     label: str
-    words: str = ""
-    plain: bool = False
+    text: str = ""
+    is_plain: bool = False
 
 
 Control = Slider | Dropdown | Toggle
@@ -120,21 +120,21 @@ Control = Slider | Dropdown | Toggle
 
 @dataclass(frozen=True)
 class Playback:
-    """Play, pause and seek over frames 0 .. frames - 1: `played` receives whether to play, `sought` a frame number.
+    """Play, pause and seek over frames 0 .. frames - 1: `on_play` receives whether to play, `on_seek` a frame number.
 
     With 0 frames, as for a camera, there is no seeking.
     """
 
-    frames: int
-    played: Callable[[bool], None]
-    sought: Callable[[int], None]
+    frame_count: int
+    on_play: Callable[[bool], None]
+    on_seek: Callable[[int], None]
 
 
 @dataclass(frozen=True)
 class LastChange:
     """Last action of a client: its number, from 1, and the label of the control."""
 
-    visitor: int
+    client: int
     label: str
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import viser
 
-from ..screen import write_film
+from ..screen import write_movie
 
 MAX_DURATION = 60.0  # Maximum duration of a recording [s]; it then ends automatically.
 MAX_RECORDING_SIZE = 64_000_000  # Maximum size of a recording [characters of coded images]; it then ends automatically.
@@ -26,22 +26,22 @@ RECORD_LABEL, STOP_LABEL, ENCODE_LABEL = "Record", "Stop recording", "Encoding t
 class PageRecording:
     """Images encoded by `to_data_url`, each with its arrival time [s]."""
 
-    began: float
-    taken: list[tuple[float, str]] = field(default_factory=list)
+    start_time: float
+    images: list[tuple[float, str]] = field(default_factory=list)
     size: int = 0
 
-    def take(self, code: str, now: float) -> None:
+    def add_image(self, data_url: str, time: float) -> None:
         """Keep an image, unless it equals the last one, or the recording is full."""
-        if (not self.taken or self.taken[-1][1] is not code) and not self.is_full(now):
-            self.taken.append((now, code))
-            self.size += len(code)
+        if (not self.images or self.images[-1][1] is not data_url) and not self.is_full(time):
+            self.images.append((time, data_url))
+            self.size += len(data_url)
 
-    def is_full(self, now: float) -> bool:
+    def is_full(self, time: float) -> bool:
         """Return True if the recording is full."""
-        return now - self.began >= MAX_DURATION or self.size >= MAX_RECORDING_SIZE
+        return time - self.start_time >= MAX_DURATION or self.size >= MAX_RECORDING_SIZE
 
-    def encode_video(self, ended: float) -> bytes:
-        """Return an MP4 video of the recording up to `ended` [s], in real time; all frames have the size of the first.
+    def encode_video(self, end_time: float) -> bytes:
+        """Return an MP4 video of the recording up to `end_time` [s], in real time; frames have the size of the first.
 
         Raises
         ------
@@ -52,22 +52,24 @@ class PageRecording:
         """
         with tempfile.TemporaryDirectory(prefix="sulcus-") as folder:
             path = Path(folder) / "page.mp4"
-            write_film(path, replay_images(self.taken, min(ended, self.began + MAX_DURATION), FRAME_RATE), FRAME_RATE)
+            write_movie(
+                path, replay_images(self.images, min(end_time, self.start_time + MAX_DURATION), FRAME_RATE), FRAME_RATE
+            )
             return path.read_bytes()
 
 
-def replay_images(taken: Sequence[tuple[float, str]], ended: float, rate: float) -> Iterator[np.ndarray]:
+def replay_images(images: Sequence[tuple[float, str]], end_time: float, rate: float) -> Iterator[np.ndarray]:
     """Yield the image (H, W, 3) uint8 shown at each step of a clock with `rate` steps a second."""
     size: tuple[int, int] | None = None
-    for number, (began, code) in enumerate(taken):
-        until = taken[number + 1][0] if number + 1 < len(taken) else max(ended, began)
+    for number, (began, code) in enumerate(images):
+        until = images[number + 1][0] if number + 1 < len(images) else max(end_time, began)
         # Steps before each end are counted, so that the video lasts as long as the recording.
-        start, stop = (round((time - taken[0][0]) * rate) for time in (began, until))
-        if number + 1 == len(taken):
+        start, stop = (round((time - images[0][0]) * rate) for time in (began, until))
+        if number + 1 == len(images):
             stop = max(stop, start + 1)
         if stop == start:
             continue
-        colour = decode_recorded(code)
+        colour = decode_data_url(code)
         size = size or (colour.shape[1], colour.shape[0])
         if (colour.shape[1], colour.shape[0]) != size:
             colour = cv2.resize(colour, size, interpolation=cv2.INTER_AREA)
@@ -75,9 +77,9 @@ def replay_images(taken: Sequence[tuple[float, str]], ended: float, rate: float)
             yield colour
 
 
-def decode_recorded(code: str) -> np.ndarray:
+def decode_data_url(data_url: str) -> np.ndarray:
     """Decode an image (H, W, 3) uint8 from a data URL of `to_data_url`."""
-    written = np.frombuffer(base64.b64decode(code.partition(",")[2]), np.uint8)
+    written = np.frombuffer(base64.b64decode(data_url.partition(",")[2]), np.uint8)
     return cv2.cvtColor(cv2.imdecode(written, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)  # type: ignore[arg-type]
 
 
@@ -93,29 +95,29 @@ class Recorder:
         self.name = "sulcus"
         self.making = False
 
-    def add_button(self, name: str) -> viser.GuiButtonHandle:
-        """Add the button to the page; `name` is the file name without suffix."""
+    def add_button(self, file_name: str) -> viser.GuiButtonHandle:
+        """Add the button to the page; `file_name` is the file name without suffix."""
         hint = f"record the image as a video (.mp4), at most {MAX_DURATION:.0f} seconds"
         self.button, self.name = (
             self.server.gui.add_button(RECORD_LABEL, hint=hint, icon=viser.Icon.PLAYER_RECORD, color="gray"),
-            name,
+            file_name,
         )
         self.update_label()
         return self.button
 
-    def toggle(self, client: viser.ClientHandle, code: str) -> None:
+    def toggle_recording(self, client: viser.ClientHandle, data_url: str) -> None:
         """Start with a shown `coded` image, or end and send the video."""
         with self.lock:
             if self.making:
                 return
             if self.recording is None:
                 self.recording, self.client = PageRecording(clock.monotonic()), client
-                self.recording.take(code, clock.monotonic())
+                self.recording.add_image(data_url, clock.monotonic())
                 self.update_label()
                 return
-        self.end()
+        self.end_recording()
 
-    def take(self, code: str) -> None:
+    def add_image(self, data_url: str) -> None:
         """Keep a shown `coded` image, and end the recording once full; discard it if its client has left."""
         with self.lock:
             recording, client = self.recording, self.client
@@ -125,11 +127,11 @@ class Recorder:
                 self.recording = self.client = None
                 self.update_label()
                 return
-            recording.take(code, clock.monotonic())
+            recording.add_image(data_url, clock.monotonic())
         if recording.is_full(clock.monotonic()):
-            self.end()
+            self.end_recording()
 
-    def end(self) -> None:
+    def end_recording(self) -> None:
         """Encode the video on a thread of its own, and send it."""
         with self.lock:
             recording, client = self.recording, self.client
@@ -139,13 +141,13 @@ class Recorder:
             self.making = True
             self.update_label()
         threading.Thread(
-            target=self.send, args=(recording, client, clock.monotonic()), name="film", daemon=True
+            target=self.send_video, args=(recording, client, clock.monotonic()), name="film", daemon=True
         ).start()
 
-    def send(self, recording: PageRecording, client: viser.ClientHandle, ended: float) -> None:
+    def send_video(self, recording: PageRecording, client: viser.ClientHandle, end_time: float) -> None:
         """Send the video of the recording; if that fails, report the reason."""
         try:
-            client.send_file_download(f"{self.name}.mp4", recording.encode_video(ended), save_immediately=True)
+            client.send_file_download(f"{self.name}.mp4", recording.encode_video(end_time), save_immediately=True)
         except (OSError, ValueError) as error:
             client.add_notification("The video could not be written.", str(error), color="red")
         finally:

@@ -6,12 +6,12 @@ import numpy as np
 import viser
 from scipy.spatial.transform import Rotation
 
-from .parts import ScenePicture, SceneSurface, SceneViewpoint, Sign
+from .parts import SceneImage, SceneLabel, SceneSurface, SceneViewpoint
 
 PANEL_WIDTH = 676.0  # Width of the docked panel in browsers that do not support the page's rules [CSS pixel].
 
 
-def set_up_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Sequence[Sign | ScenePicture]) -> None:
+def fill_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, labels: Sequence[SceneLabel | SceneImage]) -> None:
     """Set up colours, light, labels, images, the panel's place and the first view of the 3-D scene."""
     gui, scene = server.gui, server.scene
     gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
@@ -24,29 +24,29 @@ def set_up_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, signs: Se
     for name, side, strength in (("left", -1.0, 1.8), ("right", 1.0, 0.6)):
         place = np.asarray(viewpoint.eye) + side * across / np.linalg.norm(across)
         scene.add_light_directional(f"/light/{name}", intensity=strength, position=tuple(place))
-    for sign in signs:
-        if isinstance(sign, Sign):
-            scene.add_label(f"/sign/{sign.word}", sign.word, position=np.asarray(sign.place), anchor="center-center")
+    for sign in labels:
+        if isinstance(sign, SceneLabel):
+            scene.add_label(f"/sign/{sign.text}", sign.text, position=np.asarray(sign.position), anchor="center-center")
             continue
         sides = [float(np.linalg.norm(edge)) for edge in (sign.right, sign.down)]
         x, y = sign.right / sides[0], sign.down / sides[1]
         turn = Rotation.from_matrix(np.stack([x, y, np.cross(x, y)], axis=1)).as_quat(scalar_first=True)
-        scene.add_image(f"/{sign.name}", sign.colour, *sides, format="png", wxyz=turn, position=sign.centre)
+        scene.add_image(f"/{sign.name}", sign.image, *sides, format="png", wxyz=turn, position=sign.centre)
     start = server.initial_camera
     start.position, start.look_at = tuple(viewpoint.eye), tuple(viewpoint.target)
     start.up, start.fov = tuple(viewpoint.up), viewpoint.fov
 
 
-def add_body(server: viser.ViserServer, body: SceneSurface) -> viser.MeshHandle:
+def add_surface(server: viser.ViserServer, surface: SceneSurface) -> viser.MeshHandle:
     """Add a surface to the 3-D view."""
     return server.scene.add_mesh_simple(
-        f"/{body.name}",
-        np.asarray(body.vertices, np.float32),
-        np.asarray(body.triangles, np.uint32),
-        color=np.asarray(body.colour, np.float64),
-        opacity=None if body.opacity >= 1.0 else body.opacity,
-        wireframe=body.wireframe,
-        side=body.side,
+        f"/{surface.name}",
+        np.asarray(surface.vertices, np.float32),
+        np.asarray(surface.triangles, np.uint32),
+        color=np.asarray(surface.colour, np.float64),
+        opacity=None if surface.opacity >= 1.0 else surface.opacity,
+        wireframe=surface.wireframe,
+        side=surface.side,
         cast_shadow=False,
         receive_shadow=False,
     )

@@ -10,9 +10,9 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 from ..overlay.composite import BROKEN_STROKES, DOUBTFUL_COLOUR, MARGIN_STROKES
-from ..overlay.hud import TEXT_SCALE, WHITE, bound_words, name_direction, write
+from ..overlay.hud import TEXT_SCALE, WHITE, format_bound, name_direction, write_text
 from ..overlay.marks import BEFORE_COLOUR, BEFORE_STROKES
-from ..overlay.outlines import compute_ink, draw_dashes
+from ..overlay.outlines import average_colour, draw_dashes
 from ..rendering.layer import Layer, Solid
 
 HALF_VIEW = 40e-3  # Half the side of a view [m].
@@ -42,14 +42,14 @@ class SliceView:
         """(3,): viewing direction, away from the viewer."""
         return np.cross(self.right, self.down)
 
-    def compute_points(self, middle: np.ndarray, count: int) -> np.ndarray:
+    def compute_points(self, centre: np.ndarray, count: int) -> np.ndarray:
         """Compute positions (count, count, 3) [m] of a square pixel grid round a centre (3,) [m], row by row."""
         steps = HALF_VIEW * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
-        return middle + steps[:, None, None] * np.asarray(self.down) + steps[None, :, None] * np.asarray(self.right)
+        return centre + steps[:, None, None] * np.asarray(self.down) + steps[None, :, None] * np.asarray(self.right)
 
-    def project_points(self, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    def project_points(self, points: np.ndarray, centre: np.ndarray) -> np.ndarray:
         """Project positions (n, 3) [m] to columns and rows (n, 2) of a view; whole numbers are pixel centres."""
-        off = (np.asarray(points) - middle) @ np.stack([self.right, self.down], axis=1)
+        off = (np.asarray(points) - centre) @ np.stack([self.right, self.down], axis=1)
         return (off / HALF_VIEW + 1.0) * (0.5 * VIEW_SIDE) - 0.5
 
 
@@ -62,16 +62,16 @@ PLANES = (
 
 
 @dataclass(frozen=True, eq=False)
-class Cut:
+class SlicedSurfaces:
     """Surfaces to cut by the planes.
 
     Parameters
     ----------
-    now, before
+    current, initial
         The tumour's surface, deformed and in the scan.
     error
         Bound [m] on the distance of every point with a probability of 95 %; None: not available.
-    doubtful
+    is_unreliable
         True if the position is unreliable. Then its outline is amber and broken, and has no band.
     others
         Further surfaces, such as the tool: plain lines of their colours.
@@ -81,68 +81,74 @@ class Cut:
         Source of the error, in a word.
     """
 
-    now: Layer
-    before: Layer
+    current: Layer
+    initial: Layer
     error: float | None = None
-    doubtful: bool = False
+    is_unreliable: bool = False
     others: Sequence[Layer] = ()
     tip: np.ndarray | None = None
     error_source: str = "tumour"
 
 
-def draw_slices(scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
+def draw_slices(scan: Solid | None, centre: np.ndarray, layers: SlicedSurfaces) -> np.ndarray:
     """Draw three views (VIEW_SIDE, 3 VIEW_SIDE, 3) uint8 through a centre (3,) [m], side by side.
 
     Plain ground without a scan.
     """
-    return np.concatenate([view(plane, scan, np.asarray(middle, np.float64), cut) for plane in PLANES], axis=1)
+    return np.concatenate([draw_view(plane, scan, np.asarray(centre, np.float64), layers) for plane in PLANES], axis=1)
 
 
-def view(plane: SliceView, scan: Solid | None, middle: np.ndarray, cut: Cut) -> np.ndarray:
+def draw_view(plane: SliceView, scan: Solid | None, centre: np.ndarray, layers: SlicedSurfaces) -> np.ndarray:
     """Draw one view (VIEW_SIDE, VIEW_SIDE, 3) uint8."""
     grey = (
-        np.full((VIEW_SIDE, VIEW_SIDE), OUTSIDE_GREY, np.uint8) if scan is None else resample_view(plane, scan, middle)
+        np.full((VIEW_SIDE, VIEW_SIDE), OUTSIDE_GREY, np.uint8) if scan is None else resample_view(plane, scan, centre)
     )
     colour = np.repeat(grey[..., None], 3, axis=2)
-    ink = compute_ink(DOUBTFUL_COLOUR if cut.doubtful else cut.now.colour if len(cut.now.vertices) else BEFORE_COLOUR)
-    if cut.error is not None and not cut.doubtful:
-        inside = find_pixels_within(plane, middle, cut.now, cut.error)
+    ink = average_colour(
+        DOUBTFUL_COLOUR
+        if layers.is_unreliable
+        else layers.current.colour
+        if len(layers.current.vertices)
+        else BEFORE_COLOUR
+    )
+    if layers.error is not None and not layers.is_unreliable:
+        inside = find_pixels_within(plane, centre, layers.current, layers.error)
         colour[inside] = (1.0 - BAND_OPACITY) * colour[inside] + BAND_OPACITY * np.array(ink)
         edges = cv2.findContours(inside.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
         draw_dashes(colour, list(edges), ink, MARGIN_STROKES, 1)
-    for layer in cut.others:
-        draw_strokes(colour, cut_by_plane(plane, layer, middle), compute_ink(layer.colour))
+    for layer in layers.others:
+        draw_strokes(colour, cut_by_plane(plane, layer, centre), average_colour(layer.colour))
     draw_dashes(
         colour,
-        [to_pixel_line(line) for line in cut_by_plane(plane, cut.before, middle)],
-        compute_ink(BEFORE_COLOUR),
+        [to_pixel_line(line) for line in cut_by_plane(plane, layers.initial, centre)],
+        average_colour(BEFORE_COLOUR),
         BEFORE_STROKES,
     )
-    now = cut_by_plane(plane, cut.now, middle)
-    if cut.doubtful:
+    now = cut_by_plane(plane, layers.current, centre)
+    if layers.is_unreliable:
         draw_dashes(colour, [to_pixel_line(line) for line in now], ink, BROKEN_STROKES)
     else:
         draw_strokes(colour, now, ink, 2)
-    if cut.tip is not None:
-        mark(colour, plane, np.asarray(cut.tip), middle)
-    label(colour, plane, middle)
-    write(colour, describe_band(cut), (EDGE_DISTANCE, 4 * EDGE_DISTANCE + 6), TEXT_SCALE)
+    if layers.tip is not None:
+        mark_tip(colour, plane, np.asarray(layers.tip), centre)
+    label_view(colour, plane, centre)
+    write_text(colour, describe_error_band(layers), (EDGE_DISTANCE, 4 * EDGE_DISTANCE + 6), TEXT_SCALE)
     colour[:, -1] = EDGE_GREY
     return colour
 
 
-def describe_band(cut: Cut) -> str:
+def describe_error_band(layers: SlicedSurfaces) -> str:
     """Describe the band in a few words."""
-    if cut.doubtful or cut.error is None:
-        return f"{cut.error_source}: not known"
-    return f"{cut.error_source}: within {bound_words(cut.error, 1)}"
+    if layers.is_unreliable or layers.error is None:
+        return f"{layers.error_source}: not known"
+    return f"{layers.error_source}: within {format_bound(layers.error, 1)}"
 
 
-def resample_view(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarray:
+def resample_view(plane: SliceView, scan: Solid, centre: np.ndarray) -> np.ndarray:
     """Resample the scan in a view, (VIEW_SIDE, VIEW_SIDE) uint8; `OUTSIDE_GREY` outside it."""
     count = round(2.0 * HALF_VIEW / SAMPLING_DISTANCE)
     matrix = scan.T_index_world
-    index = plane.compute_points(middle, count) @ matrix[:3, :3].T + matrix[:3, 3]
+    index = plane.compute_points(centre, count) @ matrix[:3, :3].T + matrix[:3, 3]
     held = ((index >= -0.5) & (index <= np.array(scan.values.shape) - 0.5)).all(axis=-1)
     read = np.zeros((count, count), np.float32)
     map_coordinates(scan.values, np.moveaxis(index, -1, 0), order=1, mode="nearest", output=read)
@@ -151,7 +157,7 @@ def resample_view(plane: SliceView, scan: Solid, middle: np.ndarray) -> np.ndarr
     return np.where(inside, np.clip(large, 0.0, 255.0), OUTSIDE_GREY).astype(np.uint8)
 
 
-def find_pixels_within(plane: SliceView, middle: np.ndarray, layer: Layer, error: float) -> np.ndarray:
+def find_pixels_within(plane: SliceView, centre: np.ndarray, layer: Layer, distance: float) -> np.ndarray:
     """Compute the mask (VIEW_SIDE, VIEW_SIDE) bool of pixels within a distance (error [m]) of a surface, in 3-D."""
     count = VIEW_SIDE // COARSE_SPACING
     if not len(layer.triangles):
@@ -159,10 +165,10 @@ def find_pixels_within(plane: SliceView, middle: np.ndarray, layer: Layer, error
     corners = layer.vertices[layer.triangles]
     halves = 0.5 * (corners + np.roll(corners, 1, axis=1))
     samples = np.concatenate([layer.vertices, halves.reshape(-1, 3), corners.mean(axis=1)])
-    far = error + 4.0 * HALF_VIEW / count
-    away = KDTree(samples).query(plane.compute_points(middle, count).reshape(-1, 3), distance_upper_bound=far)[0]
+    far = distance + 4.0 * HALF_VIEW / count
+    away = KDTree(samples).query(plane.compute_points(centre, count).reshape(-1, 3), distance_upper_bound=far)[0]
     grid = np.minimum(away, far).reshape(count, count)
-    return cv2.resize(grid, (VIEW_SIDE, VIEW_SIDE), interpolation=cv2.INTER_LINEAR) <= error
+    return cv2.resize(grid, (VIEW_SIDE, VIEW_SIDE), interpolation=cv2.INTER_LINEAR) <= distance
 
 
 def cut_surface(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
@@ -204,16 +210,16 @@ def join_segments(segments: np.ndarray) -> list[list[int]]:
     return lines
 
 
-def cut_by_plane(plane: SliceView, layer: Layer, middle: np.ndarray) -> list[np.ndarray]:
+def cut_by_plane(plane: SliceView, layer: Layer, centre: np.ndarray) -> list[np.ndarray]:
     """Cut a surface by a view's plane; return lines, each (n, 2) as columns and rows."""
-    found = cut_surface(layer.vertices, layer.triangles, middle, plane.normal)
-    return [plane.project_points(line, middle) for line in found]
+    found = cut_surface(layer.vertices, layer.triangles, centre, plane.normal)
+    return [plane.project_points(line, centre) for line in found]
 
 
-def draw_strokes(colour: np.ndarray, lines: Sequence[np.ndarray], ink: Sequence[float], width: int = 1) -> None:
+def draw_strokes(image: np.ndarray, lines: Sequence[np.ndarray], colour: Sequence[float], width: int = 1) -> None:
     """Draw lines, each (n, 2), with subpixel accuracy into an image (H, W, 3), in place."""
     fine = [np.rint(line * 2**SUBPIXEL_BITS).astype(np.int32)[:, None] for line in lines]
-    cv2.polylines(colour, fine, False, tuple(ink), width, cv2.LINE_AA, SUBPIXEL_BITS)
+    cv2.polylines(image, fine, False, tuple(colour), width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def to_pixel_line(line: np.ndarray) -> np.ndarray:
@@ -224,21 +230,21 @@ def to_pixel_line(line: np.ndarray) -> np.ndarray:
     return np.rint(at).astype(np.int32)[:, None]
 
 
-def mark(colour: np.ndarray, plane: SliceView, tip: np.ndarray, middle: np.ndarray) -> None:
+def mark_tip(image: np.ndarray, plane: SliceView, tip: np.ndarray, centre: np.ndarray) -> None:
     """Mark a tip (3,) [m], in place: a dot if it is in the plane, else a ring."""
-    ((column, row),) = np.clip(plane.project_points(tip[None], middle), -1e4, 1e4).round().astype(int).tolist()
-    beside = abs(float((tip - middle) @ plane.normal)) > PLANE_TOLERANCE
-    cv2.circle(colour, (column, row), 5, (12, 14, 16), 1 if beside else -1, cv2.LINE_AA)
-    cv2.circle(colour, (column, row), 4, WHITE, 1 if beside else -1, cv2.LINE_AA)
+    ((column, row),) = np.clip(plane.project_points(tip[None], centre), -1e4, 1e4).round().astype(int).tolist()
+    beside = abs(float((tip - centre) @ plane.normal)) > PLANE_TOLERANCE
+    cv2.circle(image, (column, row), 5, (12, 14, 16), 1 if beside else -1, cv2.LINE_AA)
+    cv2.circle(image, (column, row), 4, WHITE, 1 if beside else -1, cv2.LINE_AA)
 
 
-def label(colour: np.ndarray, plane: SliceView, middle: np.ndarray) -> None:
+def label_view(image: np.ndarray, plane: SliceView, centre: np.ndarray) -> None:
     """Draw a view's name and position, the orientation labels and a scale bar, in place."""
     right, down = np.asarray(plane.right), np.asarray(plane.down)
     axis = int(np.argmax(np.abs(plane.normal)))
-    write(
-        colour,
-        f"{plane.name}  {'xyz'[axis]} {1e3 * middle[axis]:.0f} mm",
+    write_text(
+        image,
+        f"{plane.name}  {'xyz'[axis]} {1e3 * centre[axis]:.0f} mm",
         (EDGE_DISTANCE, 2 * EDGE_DISTANCE + 4),
         TEXT_SCALE,
     )
@@ -250,8 +256,8 @@ def label(colour: np.ndarray, plane: SliceView, middle: np.ndarray) -> None:
         (down, (half, VIEW_SIDE - EDGE_DISTANCE)),
     )
     for way, at in places:
-        write(colour, name_direction(way), at)
+        write_text(image, name_direction(way), at)
     length, row = round(0.5 * VIEW_SIDE * BAR_LENGTH / HALF_VIEW), VIEW_SIDE - EDGE_DISTANCE
     for ink, width in (((12, 14, 16), 4), (WHITE, 2)):
-        cv2.line(colour, (EDGE_DISTANCE, row), (EDGE_DISTANCE + length, row), ink, width)
-    write(colour, f"{1e3 * BAR_LENGTH:.0f} mm", (EDGE_DISTANCE, row - EDGE_DISTANCE), TEXT_SCALE)
+        cv2.line(image, (EDGE_DISTANCE, row), (EDGE_DISTANCE + length, row), ink, width)
+    write_text(image, f"{1e3 * BAR_LENGTH:.0f} mm", (EDGE_DISTANCE, row - EDGE_DISTANCE), TEXT_SCALE)

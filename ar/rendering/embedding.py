@@ -9,27 +9,20 @@ import warp as wp
 from scipy import sparse
 
 from .layer import compute_vertex_normals
-from .parallel import forward_kernel, launch_in_bands, load
+from .parallel import forward_kernel, launch_in_bands, load_modules
 
 
 @forward_kernel
-def embed(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    corners: wp.array(dtype=wp.vec3i),
-    weights: wp.array(dtype=wp.vec3d),
-    depth: wp.array(dtype=wp.float64),
-    coarse: wp.array(dtype=wp.vec3d),
-    normals: wp.array(dtype=wp.vec3d),
-    rounding: wp.float64,
-    highest: wp.float64,
+def embed_vertices(
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, corners: wp.array(dtype=wp.vec3i),
+    weights: wp.array(dtype=wp.vec3d), depth: wp.array(dtype=wp.float64), coarse: wp.array(dtype=wp.vec3d),
+    normals: wp.array(dtype=wp.vec3d), rounding: wp.float64, max_height: wp.float64,
     # output
     fine: wp.array(dtype=wp.vec3d),
-):
+):  # fmt: skip
     """Place fine vertices above the facets of a coarse surface by the height of its rounded facets minus a depth."""
-    start = begin + wp.tid() * run
-    for index in range(start, wp.min(start + run, end)):
+    start = begin + wp.tid() * chunk_size
+    for index in range(start, wp.min(start + chunk_size, end)):
         c, w = corners[index], weights[index]
         p = w[0] * coarse[c[0]] + w[1] * coarse[c[1]] + w[2] * coarse[c[2]]
         normal = wp.vec3d(wp.float64(0.0))
@@ -40,7 +33,7 @@ def embed(
             away -= w[k] * wp.dot(p - coarse[c[k]], n) * n
         normal = wp.normalize(normal)
         height = rounding * wp.dot(away, normal) - depth[index]
-        fine[index] = p + wp.min(height, highest) * normal
+        fine[index] = p + wp.min(height, max_height) * normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +55,7 @@ class EmbeddedSurface:
         Depths (m,) [m] below the rounded coarse surface.
     rounding
         Share of Phong tessellation (Boubekeur, Alexa 2008) that rounds the coarse facets: 0.5 makes a circle round.
-    highest
+    max_height
         Largest height above the coarse facets [m].
     """
 
@@ -72,32 +65,34 @@ class EmbeddedSurface:
     triangles: np.ndarray
     depth: np.ndarray
     rounding: float = 0.75
-    highest: float = 0.0
+    max_height: float = 0.0
 
     @cached_property
     def _inputs(self) -> list[wp.array]:
         kinds = wp.vec3i, wp.vec3d, wp.float64
         arrays = self.corners.astype(np.int32), self.weights, self.depth
-        load("cpu", embed.module)
+        load_modules("cpu", embed_vertices.module)
         return [wp.array(array, dtype=kind, device="cpu") for array, kind in zip(arrays, kinds, strict=True)]
 
     def interpolate(self, values: np.ndarray) -> np.ndarray:
         """Return values (m, ...) at the fine vertices of values (n, ...) at the coarse ones."""
         return np.einsum("mk,mk...->m...", self.weights, values[self.corners])
 
-    def place(self, positions: np.ndarray) -> np.ndarray:
+    def compute_vertices(self, positions: np.ndarray) -> np.ndarray:
         """Return fine vertices (m, 3) [m] for coarse vertices at positions (n, 3) [m]."""
         both = positions, compute_vertex_normals(positions, self.coarse)
         coarse = [wp.array(np.ascontiguousarray(each), dtype=wp.vec3d, device="cpu") for each in both]
         fine = wp.empty(len(self.depth), dtype=wp.vec3d, device="cpu")
-        launch_in_bands(embed, [*self._inputs, *coarse, self.rounding, self.highest], [fine], len(self.depth), "cpu")
+        launch_in_bands(
+            embed_vertices, [*self._inputs, *coarse, self.rounding, self.max_height], [fine], len(self.depth), "cpu"
+        )
         return fine.numpy()
 
 
 def build_embedded_surface(
-    points: np.ndarray, triangles: np.ndarray, target: Callable[[np.ndarray], np.ndarray]
+    points: np.ndarray, triangles: np.ndarray, edge_length: Callable[[np.ndarray], np.ndarray]
 ) -> EmbeddedSurface:
-    """Subdivide triangles (S, 3) of points (n, 3) [m] until each edge is as short as `target` [m] at its centre (e, 3).
+    """Subdivide triangles (S, 3) of points (n, 3) [m] until edges have the `edge_length` [m] at their centres (e, 3).
 
     The fine surface has no depth. Triangles that share an edge share its vertices.
     """
@@ -107,7 +102,7 @@ def build_embedded_surface(
         ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
         keys, number = np.unique(ends @ [len(at), 1], return_inverse=True)
         a, b = np.divmod(keys, len(at))
-        long = np.linalg.norm(at[a] - at[b], axis=1) > target(0.5 * (at[a] + at[b]))
+        long = np.linalg.norm(at[a] - at[b], axis=1) > edge_length(0.5 * (at[a] + at[b]))
         if not long.any():
             break
         new = np.where(long, len(at) + np.cumsum(long) - 1, -1)

@@ -7,43 +7,43 @@ import numpy as np
 import warp as wp
 
 from ..optics.camera import Camera
-from .parallel import forward_kernel, load, run_length
+from .parallel import forward_kernel, get_chunk_size, load_modules
 
 CELL_PIXELS = 64  # Average number of pixels in a cell of the lookup table.
 
 
 @wp.struct
-class Unbent:
+class Undistortion:
     """Undistorted pixels of B images, and a lookup table of the pixels in each cell of the undistorted image.
 
     `pixels` (B, H, W) [pixel], NaN where the lens sees nothing; empty if no camera has a lens. `cells` (B, n, m, 4):
     bounding box of the pixels in a cell, as first column and row, and last column and row. It is empty if a cell has no
-    pixel. `corner` and `scale` (B,) map an undistorted pixel to its cell: (column, row) = (pixel - corner) scale.
+    pixel. `origin` and `scale` (B,) map an undistorted pixel to its cell: (column, row) = (pixel - corner) scale.
     """
 
     pixels: wp.array3d(dtype=wp.vec2d)
     cells: wp.array4d(dtype=wp.int32)
-    corner: wp.array(dtype=wp.vec2d)
+    origin: wp.array(dtype=wp.vec2d)
     scale: wp.array(dtype=wp.vec2d)
 
 
-def build_undistortion(cameras: Sequence[Camera], device: str) -> Unbent:
+def build_undistortion(cameras: Sequence[Camera], device: str) -> Undistortion:
     """Compute undistorted pixels of cameras of one size; for a camera without a lens, the pixels themselves."""
     if all(camera.lens is None for camera in cameras):
-        return get_no_undistortion(device)
+        return build_empty_undistortion(device)
     return get_undistortion(tuple(cameras), device)
 
 
 @lru_cache(maxsize=4)
-def get_no_undistortion(device: str) -> Unbent:
+def build_empty_undistortion(device: str) -> Undistortion:
     """Build the empty argument for kernels without a lens."""
-    out = Unbent()
+    out = Undistortion()
     out.pixels = wp.empty((0, 0, 0), dtype=wp.vec2d, device=device)
     return out
 
 
 @lru_cache(maxsize=4)
-def get_undistortion(cameras: tuple[Camera, ...], device: str) -> Unbent:
+def get_undistortion(cameras: tuple[Camera, ...], device: str) -> Undistortion:
     """Compute `build_undistortion`, cached: a fixed camera is used in every image, and a part of it by each surface."""
     straight = np.stack([camera.straight for camera in cameras])
     count, height, width = straight.shape[:3]
@@ -53,38 +53,38 @@ def get_undistortion(cameras: tuple[Camera, ...], device: str) -> Unbent:
         high = np.fmax.reduce(straight.reshape(count, -1, 2), axis=1)
     scale = (side - 1e-6) / np.maximum(high - low, 1e-9)
     cells = np.tile(np.array([2**30, 2**30, -1, -1], np.int32), (count, side, side, 1))
-    out = Unbent()
+    out = Undistortion()
     out.pixels = wp.array(straight, dtype=wp.vec2d, device=device)
     out.cells = wp.array(cells, dtype=wp.int32, device=device)
-    out.corner = wp.array(np.nan_to_num(low), dtype=wp.vec2d, device=device)
+    out.origin = wp.array(np.nan_to_num(low), dtype=wp.vec2d, device=device)
     out.scale = wp.array(np.nan_to_num(scale), dtype=wp.vec2d, device=device)
-    load(device, fill_cells.module)
-    run = run_length(device)
+    load_modules(device, fill_cells.module)
+    run = get_chunk_size(device)
     wp.launch(fill_cells, -(-out.pixels.size // run), [out, run, out.pixels.size], [out.cells], device=device)
     return out
 
 
 @forward_kernel
 def fill_cells(
-    through: Unbent,
-    run: wp.int32,
+    undistortion: Undistortion,
+    chunk_size: wp.int32,
     end: wp.int32,
     # output
     cells: wp.array4d(dtype=wp.int32),
 ):
     """Extend the box of each pixel's cell, for a run of pixels."""
-    start = wp.tid() * run
-    height = through.pixels.shape[1]
-    width = through.pixels.shape[2]
-    for index in range(start, wp.min(start + run, end)):
+    start = wp.tid() * chunk_size
+    height = undistortion.pixels.shape[1]
+    width = undistortion.pixels.shape[2]
+    for index in range(start, wp.min(start + chunk_size, end)):
         picture = index / (height * width)
         row = (index / width) % height
         column = index % width
-        at = through.pixels[picture, row, column]
+        at = undistortion.pixels[picture, row, column]
         if wp.isfinite(at[0]):
-            scale = through.scale[picture]
-            m = wp.int32((at[0] - through.corner[picture][0]) * scale[0])
-            n = wp.int32((at[1] - through.corner[picture][1]) * scale[1])
+            scale = undistortion.scale[picture]
+            m = wp.int32((at[0] - undistortion.origin[picture][0]) * scale[0])
+            n = wp.int32((at[1] - undistortion.origin[picture][1]) * scale[1])
             wp.atomic_min(cells, picture, n, m, 0, column)
             wp.atomic_min(cells, picture, n, m, 1, row)
             wp.atomic_max(cells, picture, n, m, 2, column)
@@ -92,23 +92,23 @@ def fill_cells(
 
 
 @wp.func
-def pixel_at(picture: wp.int32, column: wp.int32, row: wp.int32, pixels: wp.array3d(dtype=wp.vec2d)) -> wp.vec3d:
+def undistort_pixel(image: wp.int32, column: wp.int32, row: wp.int32, pixels: wp.array3d(dtype=wp.vec2d)) -> wp.vec3d:
     """Return a pixel as (u, v, 1), at its undistorted position."""
     if pixels.shape[0] == 0:
         return wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
-    at = pixels[picture, row, column]
+    at = pixels[image, row, column]
     return wp.vec3d(at[0], at[1], wp.float64(1.0))
 
 
 @wp.func
-def box_through_lens(picture: wp.int32, low: wp.vec2d, high: wp.vec2d, through: Unbent) -> wp.vec4i:
+def distort_pixel_box(image: wp.int32, low: wp.vec2d, high: wp.vec2d, undistortion: Undistortion) -> wp.vec4i:
     """Return the pixel box (first column, first row, last column, last row) of a box of the undistorted image."""
     out = wp.vec4i(2147483647, 2147483647, -1, -1)
-    corner = through.corner[picture]
-    scale = through.scale[picture]
+    corner = undistortion.origin[image]
+    scale = undistortion.scale[image]
     zero = wp.float64(0.0)
-    rows = through.cells.shape[1]
-    columns = through.cells.shape[2]
+    rows = undistortion.cells.shape[1]
+    columns = undistortion.cells.shape[2]
     # One cell more on each side, so that rounding loses no pixel.
     top = wp.int32(wp.clamp((low[1] - corner[1]) * scale[1] - wp.float64(1.0), zero, wp.float64(rows)))
     left = wp.int32(wp.clamp((low[0] - corner[0]) * scale[0] - wp.float64(1.0), zero, wp.float64(columns)))
@@ -117,9 +117,9 @@ def box_through_lens(picture: wp.int32, low: wp.vec2d, high: wp.vec2d, through: 
     for i in range(top, below):
         for j in range(left, right):
             out = wp.vec4i(
-                wp.min(out[0], through.cells[picture, i, j, 0]),
-                wp.min(out[1], through.cells[picture, i, j, 1]),
-                wp.max(out[2], through.cells[picture, i, j, 2]),
-                wp.max(out[3], through.cells[picture, i, j, 3]),
+                wp.min(out[0], undistortion.cells[image, i, j, 0]),
+                wp.min(out[1], undistortion.cells[image, i, j, 1]),
+                wp.max(out[2], undistortion.cells[image, i, j, 2]),
+                wp.max(out[3], undistortion.cells[image, i, j, 3]),
             )
     return out

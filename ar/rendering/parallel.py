@@ -17,7 +17,7 @@ forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
 _loading = Lock()
 
 
-def load(device: str, *modules: wp.Module | ModuleType | str) -> None:
+def load_modules(device: str, *modules: wp.Module | ModuleType | str) -> None:
     """Load modules of kernels on a device; those that Warp has not cached are compiled, which takes seconds.
 
     One thread does it at a time, and others wait: Warp alone would compile a module once per requesting thread.
@@ -27,33 +27,33 @@ def load(device: str, *modules: wp.Module | ModuleType | str) -> None:
             wp.load_module(module, device=device)
 
 
-def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str, bands: int = 1) -> None:
-    """Launch a kernel over `count` independent items; it takes (begin, end, run) first, see `run_length`.
+def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str, per_core: int = 1) -> None:
+    """Launch a kernel over `count` independent items; it takes (begin, end, run) first, see `get_chunk_size`.
 
-    On a CPU there are `bands` bands for each core: several if some items take longer than others.
+    On a CPU there are `per_core` bands for each core: several if some items take longer than others.
     """
-    run = run_length(device)
+    run = get_chunk_size(device)
 
     def launch(begin: int, end: int) -> None:
         wp.launch(kernel, -(-(end - begin) // run), [begin, end, run, *inputs], outputs, device=device)
 
-    run_in_bands(launch, count, device, bands)
+    run_in_bands(launch, count, device, per_core)
 
 
-def run_length(device: str) -> int:
+def get_chunk_size(device: str) -> int:
     """Return the number of items per kernel thread: on a CPU each thread copies its arguments, which costs the most."""
     return 64 if device == "cpu" else 1
 
 
-def run_in_bands(draw: Callable[[int, int], None], count: int, device: str, bands: int = 1) -> None:
-    """Call `draw(begin, end)` on ranges that cover 0 .. count: `bands` for each core, on a CPU.
+def run_in_bands(draw: Callable[[int, int], None], count: int, device: str, per_core: int = 1) -> None:
+    """Call `draw(begin, end)` on ranges that cover 0 .. count: `per_core` for each core, on a CPU.
 
     The ranges must not write to the same places; the modules of their kernels must be loaded.
     """
     pool, cores = get_workers()
     if device != "cpu" or cores == 1:
         return draw(0, count)
-    edges = np.linspace(0, count, bands * cores + 1).astype(int).tolist()
+    edges = np.linspace(0, count, per_core * cores + 1).astype(int).tolist()
     list(pool.map(draw, edges[:-1], edges[1:]))
 
 

@@ -20,9 +20,15 @@ import numpy as np
 import warp as wp
 
 from ..optics.camera import Camera
-from .lens_rasteriser import Unbent, box_through_lens, build_undistortion, get_no_undistortion, pixel_at
-from .parallel import forward_kernel, get_workers, launch_in_bands, load, run_in_bands, run_length
-from .triangle import box_of, edge, first_row, weights_of
+from .lens_rasteriser import (
+    Undistortion,
+    build_empty_undistortion,
+    build_undistortion,
+    distort_pixel_box,
+    undistort_pixel,
+)
+from .parallel import forward_kernel, get_chunk_size, get_workers, launch_in_bands, load_modules, run_in_bands
+from .triangle import compute_edge, compute_triangle_box, compute_weights_from_corners, find_first_row
 
 EMPTY_PIXEL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 """Value of an empty z-buffer entry."""
@@ -84,7 +90,7 @@ def rasterise(
     face = wp.full(shape, value=-1, dtype=wp.int32, device=device)
     weights = wp.zeros(shape, dtype=wp.vec3f, device=device)
     depth = wp.zeros(shape, dtype=wp.float32, device=device)
-    inputs = [found.nearest[0, rows], found.points, found.triangles, rows.start, found.unbent.pixels]
+    inputs = [found.z_buffer[0, rows], found.points, found.triangles, rows.start, found.undistortion.pixels]
     launch_in_bands(
         read_nearest, inputs, [face[rows], weights[rows], depth[rows]], (rows.stop - rows.start) * camera.width, device
     )
@@ -101,16 +107,16 @@ class RasterisedSurface:
 
     points: wp.array
     triangles: wp.array
-    nearest: wp.array
+    z_buffer: wp.array
     rows: slice
-    unbent: Unbent
+    undistortion: Undistortion
 
     @cached_property
     def mask(self) -> np.ndarray:
         """(H, W) bool: mask of the pixels whose centres the surface covers."""
-        mask = wp.empty(self.nearest.size, dtype=wp.uint8, device=self.nearest.device)
-        launch_in_bands(mark_covered, [self.nearest.flatten()], [mask], mask.size, str(mask.device))
-        return mask.numpy().reshape(self.nearest.shape[1:]).view(bool)
+        mask = wp.empty(self.z_buffer.size, dtype=wp.uint8, device=self.z_buffer.device)
+        launch_in_bands(mark_covered, [self.z_buffer.flatten()], [mask], mask.size, str(mask.device))
+        return mask.numpy().reshape(self.z_buffer.shape[1:]).view(bool)
 
 
 def rasterise_surface(
@@ -122,13 +128,13 @@ def rasterise_surface(
         raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
     homogeneous = camera.to_camera_frame(vertices) @ camera.K.T
     rows = (
-        slice(*find_rows_reached(homogeneous, near, camera.height)) if camera.lens is None else slice(0, camera.height)
+        slice(*find_covered_rows(homogeneous, near, camera.height)) if camera.lens is None else slice(0, camera.height)
     )
     points = wp.array(homogeneous[None], dtype=wp.vec3d, device=device)
     corners = wp.array(triangles, dtype=wp.vec3i, device=device, copy=False)
     nearest = allocate_z_buffer(1, camera.height, camera.width, device)
     through = build_undistortion([camera], device)
-    draw(points, corners, 0, rows, nearest, device, near, through)
+    draw_triangles(points, corners, 0, rows, nearest, device, near, through)
     return RasterisedSurface(points, corners, nearest, rows, through)
 
 
@@ -137,53 +143,47 @@ def allocate_z_buffer(count: int, height: int, width: int, device: str) -> wp.ar
     return wp.full((count, height, width), value=EMPTY_PIXEL, dtype=wp.uint64, device=device)
 
 
-def draw(
-    points: wp.array,
-    triangles: wp.array,
-    since: int,
-    rows: slice,
-    nearest: wp.array,
-    device: str,
-    near: float = NEAR_PLANE,
-    through: Unbent | None = None,
-) -> None:
-    """Draw the triangles from number `since` on into z-buffers (B, H, W), in some rows.
+def draw_triangles(
+    points: wp.array, triangles: wp.array, start: int, rows: slice, z_buffer: wp.array, device: str,
+    near: float = NEAR_PLANE, undistortion: Undistortion | None = None,
+) -> None:  # fmt: skip
+    """Draw the triangles from number `start` on into z-buffers (B, H, W), in some rows.
 
-    points (B, V) vec3d: homogeneous, in each image; triangles (F,) vec3i, the same in all images; `through`: the lenses
-    of the cameras, if they have any.
+    points (B, V) vec3d: homogeneous, in each image; triangles (F,) vec3i, the same in all images; `undistortion` of the
+    cameras' lenses, if they have any.
     """
-    through = get_no_undistortion(device) if through is None else through
-    load(device, keep_nearest.module)
-    count, run = triangles.shape[0] - since, run_length(device)
+    undistortion = build_empty_undistortion(device) if undistortion is None else undistortion
+    load_modules(device, keep_nearest.module)
+    count, run = triangles.shape[0] - start, get_chunk_size(device)
     # On a GPU the rows of a triangle are shared by several threads.
     parts = 1 if device == "cpu" else ROW_THREADS
 
-    def scan(begin: int, end: int, first: int = 0, last: int = count, out: wp.array = nearest) -> None:
-        size = nearest.shape[0], -(-(last - first) // run), parts
+    def scan(begin: int, end: int, first: int = 0, last: int = count, out: wp.array = z_buffer) -> None:
+        size = z_buffer.shape[0], -(-(last - first) // run), parts
         span = rows.start + begin, rows.start + end
-        inputs = [points, triangles[: since + last], since + first, wp.float64(near), *span, parts, run, through]
+        inputs = [points, triangles[: start + last], start + first, wp.float64(near), *span, parts, run, undistortion]
         wp.launch(keep_nearest, size, inputs, [out], device=device)
 
     pool, cores = get_workers()
     if not count:
         return None
-    if device != "cpu" or cores == 1 or count * MIN_PIXELS < nearest.size:
+    if device != "cpu" or cores == 1 or count * MIN_PIXELS < z_buffer.size:
         return run_in_bands(scan, rows.stop - rows.start, device)
     # Many small triangles: every band of rows would prepare all of them, so each thread draws some into its own buffer.
     edges = np.linspace(0, count, cores + 1).astype(int).tolist()
-    buffers = [nearest, *(wp.full_like(nearest, EMPTY_PIXEL) for _ in edges[2:])]
+    buffers = [z_buffer, *(wp.full_like(z_buffer, EMPTY_PIXEL) for _ in edges[2:])]
     list(pool.map(partial(scan, 0, rows.stop - rows.start), edges[:-1], edges[1:], buffers))
     for other in buffers[1:]:
-        np.minimum(nearest.numpy(), other.numpy(), out=nearest.numpy())
+        np.minimum(z_buffer.numpy(), other.numpy(), out=z_buffer.numpy())
 
 
-def find_rows_reached(homogeneous: np.ndarray, near: float, height: int) -> tuple[int, int]:
+def find_covered_rows(points: np.ndarray, near: float, height: int) -> tuple[int, int]:
     """Return the row range of the image that points (V, 3) (u w, v w, w) can cover: all, if one is too near."""
-    if not len(homogeneous):
+    if not len(points):
         return 0, 0
-    if homogeneous[:, 2].min() < near:
+    if points[:, 2].min() < near:
         return 0, height
-    rows = homogeneous[:, 1] / homogeneous[:, 2]
+    rows = points[:, 1] / points[:, 2]
     first, last = np.clip([np.floor(rows.min()), np.ceil(rows.max()) + 1.0], 0, height).astype(int).tolist()
     return first, last
 
@@ -202,19 +202,19 @@ def check_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray,
 
 
 @wp.func
-def depth_of(key: wp.uint64) -> wp.float32:
+def unpack_depth(key: wp.uint64) -> wp.float32:
     """Return the depth in an entry of the z-buffer."""
     return wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
 
 
 @wp.func
-def face_of(key: wp.uint64) -> wp.int32:
+def unpack_face(key: wp.uint64) -> wp.int32:
     """Return the face in an entry of the z-buffer."""
     return wp.int32(key & wp.uint64(0xFFFFFFFF))
 
 
 @wp.func
-def within(slope: wp.float64, offset: wp.float64, span: wp.vec2d) -> wp.vec2d:
+def clip_row_span(slope: wp.float64, offset: wp.float64, span: wp.vec2d) -> wp.vec2d:
     """Restrict a row's span to slope u + offset >= 0, with a margin: each pixel is tested again."""
     slack = wp.float64(1.0e-3)
     if slope > wp.float64(0.0):
@@ -226,44 +226,36 @@ def within(slope: wp.float64, offset: wp.float64, span: wp.vec2d) -> wp.vec2d:
 
 @wp.func
 def draw_triangle(
-    picture: wp.int32,
-    face: wp.int32,
-    q: wp.array2d(dtype=wp.vec3d),
-    triangles: wp.array(dtype=wp.vec3i),
-    near: wp.float64,
-    begin: wp.int32,
-    end: wp.int32,
-    part: wp.int32,
-    parts: wp.int32,
-    through: Unbent,
-    nearest: wp.array3d(dtype=wp.uint64),
-):
+    image: wp.int32, face: wp.int32, q: wp.array2d(dtype=wp.vec3d), triangles: wp.array(dtype=wp.vec3i),
+    near: wp.float64, begin: wp.int32, end: wp.int32, part: wp.int32, part_count: wp.int32, undistortion: Undistortion,
+    z_buffer: wp.array3d(dtype=wp.uint64),
+):  # fmt: skip
     """Keep, at each pixel centre inside triangle `face`, the minimum of (depth, face).
 
     Only in the rows begin + part, begin + part + parts, ... below end. Both fit in 64 bits, because the bits of
     positive floats sort as the floats do. With a lens a pixel is tested at its undistorted position.
     """
     t = triangles[face]
-    a = q[picture, t[0]]
-    b = q[picture, t[1]]
-    c = q[picture, t[2]]
+    a = q[image, t[0]]
+    b = q[image, t[1]]
+    c = q[image, t[2]]
     normal = wp.cross(b - a, c - a)
     volume = wp.dot(normal, a)
     if volume == wp.float64(0.0):
         return
-    box = box_of(a, b, c, near)
+    box = compute_triangle_box(a, b, c, near)
     # Tolerance, so that rounding excludes no pixel on the box.
     slack = wp.vec2d(wp.float64(1.0e-6))
     low = wp.vec2d(box[0], box[1]) - slack
     high = wp.vec2d(box[2], box[3]) + slack
     zero = wp.float64(0.0)
-    left = wp.clamp(wp.ceil(low[0]), zero, wp.float64(nearest.shape[2]))
-    right = wp.clamp(wp.floor(high[0]), wp.float64(-1.0), wp.float64(nearest.shape[2] - 1))
+    left = wp.clamp(wp.ceil(low[0]), zero, wp.float64(z_buffer.shape[2]))
+    right = wp.clamp(wp.floor(high[0]), wp.float64(-1.0), wp.float64(z_buffer.shape[2] - 1))
     first = wp.int32(wp.clamp(wp.ceil(low[1]), wp.float64(begin), wp.float64(end)))
     stop = wp.int32(wp.clamp(wp.floor(high[1]) + wp.float64(1.0), wp.float64(begin), wp.float64(end)))
-    bent = through.pixels.shape[0] > 0
+    bent = undistortion.pixels.shape[0] > 0
     if bent:
-        held = box_through_lens(picture, low, high, through)
+        held = distort_pixel_box(image, low, high, undistortion)
         left = wp.float64(held[0])
         right = wp.float64(held[2])
         first = wp.max(held[1], begin)
@@ -271,23 +263,23 @@ def draw_triangle(
     if left > right or first >= stop:
         return
     side = wp.sign(volume)
-    ea = edge(b, c, t[1], t[2]) * side
-    eb = edge(c, a, t[2], t[0]) * side
-    ec = edge(a, b, t[0], t[1]) * side
-    for row in range(first_row(first, begin, part, parts), stop, parts):
+    ea = compute_edge(b, c, t[1], t[2]) * side
+    eb = compute_edge(c, a, t[2], t[0]) * side
+    ec = compute_edge(a, b, t[0], t[1]) * side
+    for row in range(find_first_row(first, begin, part, part_count), stop, part_count):
         v = wp.float64(row)
         ra = ea[1] * v + ea[2]
         rb = eb[1] * v + eb[2]
         rc = ec[1] * v + ec[2]
         span = wp.vec2d(left, right)
         if not bent:
-            span = within(ec[0], rc, within(eb[0], rb, within(ea[0], ra, span)))
+            span = clip_row_span(ec[0], rc, clip_row_span(eb[0], rb, clip_row_span(ea[0], ra, span)))
         first_u = wp.int32(wp.min(wp.ceil(span[0]), right + wp.float64(1.0)))
         last_u = wp.int32(wp.max(wp.floor(span[1]), left - wp.float64(1.0)))
         for column in range(first_u, last_u + 1):
             u = wp.float64(column)
             if bent:
-                at = through.pixels[picture, row, column]
+                at = undistortion.pixels[image, row, column]
                 u = at[0]
                 v = at[1]
                 ra = ea[1] * v + ea[2]
@@ -299,70 +291,53 @@ def draw_triangle(
                     z = volume / across
                     if z >= near:
                         bits = wp.uint64(wp.cast(wp.float32(z), wp.uint32))
-                        wp.atomic_min(nearest, picture, row, column, (bits << wp.uint64(32)) | wp.uint64(face))
+                        wp.atomic_min(z_buffer, image, row, column, (bits << wp.uint64(32)) | wp.uint64(face))
 
 
 @forward_kernel
 def keep_nearest(
-    q: wp.array2d(dtype=wp.vec3d),
-    triangles: wp.array(dtype=wp.vec3i),
-    since: wp.int32,
-    near: wp.float64,
-    begin: wp.int32,
-    end: wp.int32,
-    parts: wp.int32,
-    run: wp.int32,
-    through: Unbent,
+    q: wp.array2d(dtype=wp.vec3d), triangles: wp.array(dtype=wp.vec3i), first: wp.int32, near: wp.float64,
+    begin: wp.int32, end: wp.int32, part_count: wp.int32, chunk_size: wp.int32, undistortion: Undistortion,
     # outputs
-    nearest: wp.array3d(dtype=wp.uint64),
-):
+    z_buffer: wp.array3d(dtype=wp.uint64),
+):  # fmt: skip
     """Draw a run of triangles in one image, each in a part of the rows begin .. end - 1."""
     picture, chunk, part = wp.tid()
-    start = since + chunk * run
-    for face in range(start, wp.min(start + run, triangles.shape[0])):
-        draw_triangle(picture, face, q, triangles, near, begin, end, part, parts, through, nearest)
+    start = first + chunk * chunk_size
+    for face in range(start, wp.min(start + chunk_size, triangles.shape[0])):
+        draw_triangle(picture, face, q, triangles, near, begin, end, part, part_count, undistortion, z_buffer)
 
 
 @forward_kernel
 def mark_covered(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    nearest: wp.array(dtype=wp.uint64),
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, z_buffer: wp.array(dtype=wp.uint64),
     # output
     mask: wp.array(dtype=wp.uint8),
-):
+):  # fmt: skip
     """Set each pixel: 1 if a surface is visible."""
-    start = begin + wp.tid() * run
-    for index in range(start, wp.min(start + run, end)):
-        mask[index] = wp.uint8(wp.where(nearest[index] != EMPTY_PIXEL, 1, 0))
+    start = begin + wp.tid() * chunk_size
+    for index in range(start, wp.min(start + chunk_size, end)):
+        mask[index] = wp.uint8(wp.where(z_buffer[index] != EMPTY_PIXEL, 1, 0))
 
 
 @forward_kernel
 def read_nearest(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    nearest: wp.array2d(dtype=wp.uint64),
-    q: wp.array2d(dtype=wp.vec3d),
-    triangles: wp.array(dtype=wp.vec3i),
-    first: wp.int32,
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, z_buffer: wp.array2d(dtype=wp.uint64),
+    q: wp.array2d(dtype=wp.vec3d), triangles: wp.array(dtype=wp.vec3i), first_row: wp.int32,
     pixels: wp.array3d(dtype=wp.vec2d),
     # outputs
-    face: wp.array2d(dtype=wp.int32),
-    weights: wp.array2d(dtype=wp.vec3f),
-    depth: wp.array2d(dtype=wp.float32),
-):
-    """Read the visible face, its barycentric weights and its depth at each pixel; `first` is the arrays' first row."""
-    start = begin + wp.tid() * run
-    for index in range(start, wp.min(start + run, end)):
-        row = index / nearest.shape[1]
-        column = index - row * nearest.shape[1]
-        key = nearest[row, column]
+    face: wp.array2d(dtype=wp.int32), weights: wp.array2d(dtype=wp.vec3f), depth: wp.array2d(dtype=wp.float32),
+):  # fmt: skip
+    """Read the visible face, its barycentric weights and its depth at each pixel, from `first_row` on."""
+    start = begin + wp.tid() * chunk_size
+    for index in range(start, wp.min(start + chunk_size, end)):
+        row = index / z_buffer.shape[1]
+        column = index - row * z_buffer.shape[1]
+        key = z_buffer[row, column]
         if key != EMPTY_PIXEL:
-            winner = face_of(key)
+            winner = unpack_face(key)
             t = triangles[winner]
             face[row, column] = winner
-            p = pixel_at(0, column, first + row, pixels)
-            weights[row, column] = weights_of(p, q[0, t[0]], q[0, t[1]], q[0, t[2]])
-            depth[row, column] = depth_of(key)
+            p = undistort_pixel(0, column, first_row + row, pixels)
+            weights[row, column] = compute_weights_from_corners(p, q[0, t[0]], q[0, t[1]], q[0, t[2]])
+            depth[row, column] = unpack_depth(key)

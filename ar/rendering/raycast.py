@@ -30,14 +30,10 @@ def raycast(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: f
 
 @forward_kernel
 def cast_rays(
-    mesh: wp.uint64,
-    rays: wp.array2d(dtype=wp.vec3f),
-    near: wp.float32,
+    mesh: wp.uint64, rays: wp.array2d(dtype=wp.vec3f), near: wp.float32,
     # outputs
-    face: wp.array2d(dtype=wp.int32),
-    weights: wp.array2d(dtype=wp.vec3f),
-    depth: wp.array2d(dtype=wp.float32),
-):
+    face: wp.array2d(dtype=wp.int32), weights: wp.array2d(dtype=wp.vec3f), depth: wp.array2d(dtype=wp.float32),
+):  # fmt: skip
     """Cast one ray from the near plane on."""
     row, column = wp.tid()
     ray = rays[row, column]

@@ -8,15 +8,15 @@ import warp as wp
 
 from ..optics.camera import Camera
 from .layer import Layer
-from .parallel import forward_kernel, launch_in_bands, load
+from .parallel import forward_kernel, launch_in_bands, load_modules
 from .rasteriser import rasterise
 from .renderer import Picture, Pictures
 
 SOFT_EDGE_SHARE = wp.constant(0.12)  # Width of the field's soft edge as a share of its radius.
 
 
-def add_vignette(picture: Picture, field: float) -> Picture:
-    """Darken an image outside a round field with radius `field` x half its longer side; depths and ids are unchanged.
+def add_vignette(image: Picture, radius_ratio: float) -> Picture:
+    """Darken an image outside the radius `radius_ratio` x half its longer side; depths and ids are unchanged.
 
     Its colours change in place, on their device.
 
@@ -25,31 +25,28 @@ def add_vignette(picture: Picture, field: float) -> Picture:
     ValueError
         A field that is not a number above 0.
     """
-    if not 0.0 < field < float("inf"):
-        raise ValueError(f"a round field has a radius above 0, not {field}.")
-    colour = picture.drawn.colour
+    if not 0.0 < radius_ratio < float("inf"):
+        raise ValueError(f"a round field has a radius above 0, not {radius_ratio}.")
+    colour = image.drawn.colour
     device = str(colour.device)
-    load(device, __name__)
+    load_modules(device, __name__)
     count, height, width = colour.shape
-    radius = 0.5 * field * max(height, width)
-    launch_in_bands(darken, [wp.float32(radius)], [colour], count * height * width, device)
-    return Picture(picture.drawn)
+    radius = 0.5 * radius_ratio * max(height, width)
+    launch_in_bands(darken_outside_radius, [wp.float32(radius)], [colour], count * height * width, device)
+    return Picture(image.drawn)
 
 
 @forward_kernel
-def darken(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    radius: wp.float32,
+def darken_outside_radius(
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, radius: wp.float32,
     # output
-    colour: wp.array3d(dtype=wp.vec3ub),
-):
+    image: wp.array3d(dtype=wp.vec3ub),
+):  # fmt: skip
     """Darken a run of the pixels begin .. end - 1 beyond a radius [pixel] about the centre of each image."""
-    start = begin + wp.tid() * run
-    height = colour.shape[1]
-    width = colour.shape[2]
-    for index in range(start, wp.min(start + run, end)):
+    start = begin + wp.tid() * chunk_size
+    height = image.shape[1]
+    width = image.shape[2]
+    for index in range(start, wp.min(start + chunk_size, end)):
         picture = index / (height * width)
         row = (index / width) % height
         column = index % width
@@ -59,8 +56,8 @@ def darken(
         if inside < 1.0:
             share = wp.max(inside, 0.0)
             share = share * share * (3.0 - 2.0 * share)
-            was = colour[picture, row, column]
-            colour[picture, row, column] = wp.vec3ub(
+            was = image[picture, row, column]
+            image[picture, row, column] = wp.vec3ub(
                 wp.uint8(share * wp.float32(was[0])),
                 wp.uint8(share * wp.float32(was[1])),
                 wp.uint8(share * wp.float32(was[2])),
@@ -68,7 +65,7 @@ def darken(
 
 
 def build_real_image(
-    colour: np.ndarray, camera: Camera, layers: Sequence[Layer], box: tuple[slice, slice], device: str = "cpu"
+    image: np.ndarray, camera: Camera, layers: Sequence[Layer], box: tuple[slice, slice], device: str = "cpu"
 ) -> Picture:
     """Combine a camera image (H, W, 3) uint8 with the depth and segmentation of layers that should be visible.
 
@@ -84,9 +81,9 @@ def build_real_image(
     ValueError
         An image of another size than the camera's.
     """
-    if colour.shape != (camera.height, camera.width, 3):
-        raise ValueError(f"the image is {colour.shape}, the camera {(camera.height, camera.width, 3)}.")
-    depth, segmentation = np.zeros(colour.shape[:2], np.float32), np.zeros(colour.shape[:2], np.uint8)
+    if image.shape != (camera.height, camera.width, 3):
+        raise ValueError(f"the image is {image.shape}, the camera {(camera.height, camera.width, 3)}.")
+    depth, segmentation = np.zeros(image.shape[:2], np.float32), np.zeros(image.shape[:2], np.uint8)
     if layers:
         starts = np.cumsum([0, *(len(layer.vertices) for layer in layers)])
         triangles = [layer.triangles + start for layer, start in zip(layers, starts, strict=False)]
@@ -95,16 +92,16 @@ def build_real_image(
         found = rasterise(camera.crop_to(*box), vertices, np.concatenate(triangles), device=device)
         depth[box] = found.depth
         segmentation[box] = np.where(found.mask, ids[found.face], 0)
-    return _upload_picture(colour.copy(), depth, segmentation, device)
+    return _upload_picture(image.copy(), depth, segmentation, device)
 
 
-def scale_picture(picture: Picture, width: int, height: int) -> Picture:
+def scale_image(image: Picture, width: int, height: int) -> Picture:
     """Return an image on more pixels: colours interpolated, depths and ids of the nearest pixel."""
-    size, device = (width, height), str(picture.drawn.colour.device)
+    size, device = (width, height), str(image.drawn.colour.device)
     depth, segmentation = (
-        cv2.resize(values, size, interpolation=cv2.INTER_NEAREST) for values in (picture.depth, picture.segmentation)
+        cv2.resize(values, size, interpolation=cv2.INTER_NEAREST) for values in (image.depth, image.segmentation)
     )
-    return _upload_picture(cv2.resize(picture.colour, size), depth, segmentation, device)
+    return _upload_picture(cv2.resize(image.colour, size), depth, segmentation, device)
 
 
 def _upload_picture(colour: np.ndarray, depth: np.ndarray, segmentation: np.ndarray, device: str) -> Picture:

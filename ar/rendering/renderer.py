@@ -9,11 +9,18 @@ import warp as wp
 
 from ..optics.camera import Camera, look_at
 from .layer import Layer
-from .lens_rasteriser import Unbent, build_undistortion
-from .parallel import launch_in_bands, load
-from .rasteriser import NEAR_PLANE, allocate_z_buffer, draw, find_rows_reached
-from .shade import HALF_SOFT_WIDTH, TILE_SIDE, WHITE_LEVEL, bound, remember, shade
-from .surfaces import Light, PlacedSurface, Shadow, Stack, place
+from .lens_rasteriser import Undistortion, build_undistortion
+from .parallel import launch_in_bands, load_modules
+from .rasteriser import NEAR_PLANE, allocate_z_buffer, draw_triangles, find_covered_rows
+from .shade import (
+    HALF_SOFT_WIDTH,
+    TILE_SIDE,
+    WHITE_LEVEL,
+    compute_shadow_depths,
+    compute_shadow_positions,
+    shade_pixels,
+)
+from .surfaces import LayerStack, Light, PlacedSurface, Shadow, place_vertices
 
 DRAPE_COLOUR = (0.13, 0.30, 0.36)  # Colour of the drape (RGB, scene-linear).
 SHADOW_PIXELS = 384  # Side of the shadow map [pixel].
@@ -60,18 +67,18 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
-class Backdrop:
+class StaticBackground:
     """Image of the fixed layers for one camera, without shadows.
 
-    `nearest` is the z-buffer, `placed` holds the positions of all layers when it was drawn; `lit_at` (H W) is the
-    shadow map position of each pixel.
+    `surface` holds the positions of all layers when the z-buffer was drawn; `shadow_positions` (H W) is the shadow map
+    position of each pixel.
     """
 
     camera: Camera
-    nearest: wp.array
-    placed: PlacedSurface
-    pictures: Pictures
-    lit_at: wp.array
+    z_buffer: wp.array
+    surface: PlacedSurface
+    images: Pictures
+    shadow_positions: wp.array
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,14 +140,14 @@ class Renderer:
 
     def __init__(self, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> None:
         """Copy the layers to a Warp device; ValueError if two of different names have one id."""
-        load(device, shade.module, place.module)
-        self.device, self.stack = device, Stack(layers, device)
-        self.light, self.lamp_camera = as_light(lamp), lamp.build_camera()
+        load_modules(device, shade_pixels.module, place_vertices.module)
+        self.device, self.stack = device, LayerStack(layers, device)
+        self.light, self.lamp_camera = to_light(lamp), lamp.build_camera()
         self.curve = wp.array(build_tone_curve(), dtype=wp.uint8, device=device)
         self.unshaded = wp.empty(0, dtype=wp.vec3i, device=device)
         self.nowhere = wp.empty(0, dtype=wp.vec3f, device=device)
         self.seen_by: Camera | None = None
-        self.backdrop: Backdrop | None = None
+        self.backdrop: StaticBackground | None = None
 
     def render(self, camera: Camera, vertices: Sequence[np.ndarray]) -> Picture:
         """Render the image of a camera; vertices (V, 3) [m]: of each moving layer, in order.
@@ -179,7 +186,7 @@ class Renderer:
             raise ValueError("the cameras have several sizes: draw those of each size together.")
         return self._draw_images([*cameras] * (count // len(cameras)), moved, None)
 
-    def _draw_images(self, cameras: Sequence[Camera], moved: wp.array, backdrop: Backdrop | None) -> Pictures:
+    def _draw_images(self, cameras: Sequence[Camera], moved: wp.array, backdrop: StaticBackground | None) -> Pictures:
         """Draw every image, upon the backdrop if there is one."""
         count, height, width = len(cameras), cameras[0].height, cameras[0].width
         if count * max(height * width, SHADOW_PIXELS**2) >= 2**31:
@@ -189,27 +196,22 @@ class Renderer:
             nearest, placed = allocate_z_buffer(count, height, width, self.device), stack.allocate_placed(count)
             pictures, lit_at = allocate_images(count, height, width, self.device), self.nowhere
         else:
-            vertex, face, lit_at = stack.still_vertices, stack.still_faces, backdrop.lit_at
-            nearest, placed = wp.clone(backdrop.nearest), copy_placed(backdrop.placed)
-            pictures = Pictures(*(wp.clone(array) for array in backdrop.pictures.arrays))
+            vertex, face, lit_at = stack.still_vertices, stack.still_faces, backdrop.shadow_positions
+            nearest, placed = wp.clone(backdrop.z_buffer), copy_surface(backdrop.surface)
+            pictures = Pictures(*(wp.clone(array) for array in backdrop.images.arrays))
         self._place(cameras, moved, placed, vertex)
         through = build_undistortion(cameras, self.device)
-        rows = slice(0, height) if through.pixels.size else self._find_rows(placed.seen, vertex, height)
-        draw(placed.seen, stack.surfaces.triangles, face, rows, nearest, self.device, through=through)
+        rows = slice(0, height) if through.pixels.size else self._find_rows(placed.camera_points, vertex, height)
+        draw_triangles(
+            placed.camera_points, stack.surfaces.triangles, face, rows, nearest, self.device, undistortion=through
+        )
         self._shade(cameras, placed, nearest, stack.casting, face, lit_at, through, pictures)
         return pictures
 
     def _shade(
-        self,
-        cameras: Sequence[Camera],
-        placed: PlacedSurface,
-        nearest: wp.array,
-        casting: wp.array,
-        still: int,
-        lit_at: wp.array,
-        through: Unbent,
-        pictures: Pictures,
-    ) -> None:
+        self, cameras: Sequence[Camera], placed: PlacedSurface, nearest: wp.array, casting: wp.array, still: int,
+        lit_at: wp.array, through: Undistortion, pictures: Pictures,
+    ) -> None:  # fmt: skip
         """Shade the pixels of the z-buffers, with shadows of the `casting` triangles, into images with a background."""
         count, height, width = nearest.shape
         shadow = self._draw_shadow(placed, casting)
@@ -219,7 +221,7 @@ class Renderer:
             shadow, self.curve, still, lit_at, through.pixels,
         ]  # fmt: skip
         outputs = [array.flatten() for array in pictures.arrays]
-        launch_in_bands(shade, inputs, outputs, count * height * width, self.device, bands=4)
+        launch_in_bands(shade_pixels, inputs, outputs, count * height * width, self.device, per_core=4)
 
     def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: PlacedSurface, since: int) -> None:
         """Project the vertices from number `since` on in each image."""
@@ -230,30 +232,30 @@ class Renderer:
             stack.surfaces.triangles,
             stack.around, stack.faces,
         ]  # fmt: skip
-        launch_in_bands(place, inputs, [placed], len(cameras) * (stack.vertices - since), self.device)
+        launch_in_bands(place_vertices, inputs, [placed], len(cameras) * (stack.vertices - since), self.device)
 
     def _find_rows(self, seen: wp.array, since: int, height: int) -> slice:
         """Return the rows that vertices from number `since` on can cover: on a GPU all, as a test would take longer."""
         if self.device != "cpu":
             return slice(0, height)
-        return slice(*find_rows_reached(seen.numpy()[:, since:].reshape(-1, 3), NEAR_PLANE, height))
+        return slice(*find_covered_rows(seen.numpy()[:, since:].reshape(-1, 3), NEAR_PLANE, height))
 
     def _draw_shadow(self, placed: PlacedSurface, casting: wp.array) -> Shadow:
         """Draw the shadow map of each image."""
-        count, tiles = placed.lit.shape[0], SHADOW_PIXELS // int(TILE_SIDE)
+        count, tiles = placed.lamp_points.shape[0], SHADOW_PIXELS // int(TILE_SIDE)
         shadow = Shadow()
         shadow.size = SHADOW_PIXELS
         shadow.depth = wp.empty(count * SHADOW_PIXELS**2, dtype=wp.float32, device=self.device)
         shadow.bounds = wp.empty(count * tiles**2, dtype=wp.vec2f, device=self.device)
         nearest = allocate_z_buffer(count, SHADOW_PIXELS, SHADOW_PIXELS, self.device)
-        draw(placed.lit, casting, 0, slice(0, SHADOW_PIXELS), nearest, self.device)
-        launch_in_bands(bound, [nearest], [shadow], count * tiles**2, self.device)
+        draw_triangles(placed.lamp_points, casting, 0, slice(0, SHADOW_PIXELS), nearest, self.device)
+        launch_in_bands(compute_shadow_depths, [nearest], [shadow], count * tiles**2, self.device)
         return shadow
 
     def _get_centres(self, cameras: Sequence[Camera]) -> wp.array:
         return wp.array([camera.centre for camera in cameras], dtype=wp.vec3f, device=self.device)
 
-    def _get_backdrop(self, camera: Camera, moved: wp.array) -> Backdrop:
+    def _get_backdrop(self, camera: Camera, moved: wp.array) -> StaticBackground:
         """Return the image of the fixed layers for a camera; that of the last camera is cached."""
         if self.backdrop is not None and self.backdrop.camera is camera:
             return self.backdrop
@@ -263,13 +265,13 @@ class Renderer:
         self._place([camera], moved, placed, 0)
         there = stack.surfaces.triangles[: stack.still_faces]
         through = build_undistortion([camera], self.device)
-        draw(placed.seen, there, 0, slice(0, height), nearest, self.device, through=through)
+        draw_triangles(placed.camera_points, there, 0, slice(0, height), nearest, self.device, undistortion=through)
         self._shade([camera], placed, nearest, self.unshaded, 0, self.nowhere, through, pictures)
         lit_at = wp.zeros(height * width, dtype=wp.vec3f, device=self.device)
         centres = self._get_centres([camera])
         inputs = [width, nearest.flatten(), stack.surfaces, placed, centres, self.light, through.pixels]
-        launch_in_bands(remember, inputs, [lit_at], height * width, self.device)
-        self.backdrop = Backdrop(camera, nearest, placed, pictures, lit_at)
+        launch_in_bands(compute_shadow_positions, inputs, [lit_at], height * width, self.device)
+        self.backdrop = StaticBackground(camera, nearest, placed, pictures, lit_at)
         return self.backdrop
 
     picture, pictures = render, render_batch  # Former names, for one release.
@@ -285,11 +287,11 @@ def allocate_images(count: int, height: int, width: int, device: str) -> Picture
     return Pictures(colour, depth, wp.zeros(shape, dtype=wp.uint8, device=device))
 
 
-def copy_placed(placed: PlacedSurface) -> PlacedSurface:
+def copy_surface(surface: PlacedSurface) -> PlacedSurface:
     """Copy the arrays."""
     out = PlacedSurface()
-    for name in ("seen", "lit", "vertices", "normals"):
-        setattr(out, name, wp.clone(getattr(placed, name)))
+    for name in ("camera_points", "lamp_points", "vertices", "normals"):
+        setattr(out, name, wp.clone(getattr(surface, name)))
     return out
 
 
@@ -300,7 +302,7 @@ def compute_projection(camera: Camera) -> np.ndarray:
     return P
 
 
-def as_light(lamp: Lamp) -> Light:
+def to_light(lamp: Lamp) -> Light:
     """Convert the lamp for the kernel."""
     camera = lamp.build_camera()
     axis = np.asarray(lamp.target) - lamp.position

@@ -48,13 +48,13 @@ class LayerShading:
 class Surfaces:
     """All layers as one surface, the same in every image.
 
-    `triangles` (F,) of vertices, `look_of` each, `looks` of the layers; `colours` (V,) scene-linear, `rest` (V,) [m];
+    `triangles` (F,), `shading_index` of each, `shadings` of the layers; `colours` (V,) scene-linear, `rest` (V,) [m];
     `texels` (T,) of all solid textures, one after the other: value and gradient.
     """
 
     triangles: wp.array(dtype=wp.vec3i)
-    look_of: wp.array(dtype=wp.uint8)
-    looks: wp.array(dtype=LayerShading)
+    shading_index: wp.array(dtype=wp.uint8)
+    shadings: wp.array(dtype=LayerShading)
     colours: wp.array(dtype=wp.vec3f)
     rest: wp.array(dtype=wp.vec3f)
     texels: wp.array(dtype=wp.vec4f)
@@ -64,8 +64,8 @@ class Surfaces:
 class PlacedSurface:
     """Surface in each image (B, V): homogeneous as seen by the camera, and by the lamp, in the world, normals."""
 
-    seen: wp.array2d(dtype=wp.vec3d)
-    lit: wp.array2d(dtype=wp.vec3d)
+    camera_points: wp.array2d(dtype=wp.vec3d)
+    lamp_points: wp.array2d(dtype=wp.vec3d)
     vertices: wp.array2d(dtype=wp.vec3f)
     normals: wp.array2d(dtype=wp.vec3f)
 
@@ -105,81 +105,76 @@ class FaceCorners:
 
 
 @wp.struct
-class Point:
+class VisiblePoint:
     """Visible point of a pixel: position [m], unit directions to the viewer and of the normal, base colour."""
 
-    place: wp.vec3f
+    position: wp.vec3f
     view: wp.vec3f
     normal: wp.vec3f
     base: wp.vec3f
 
 
-def find_faces_around(triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """List the faces at each of `count` vertices: start of each list (count + 1,), and the faces (3 F,), int32."""
+def list_vertex_faces(triangles: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray]:
+    """List the faces at each vertex: start of each list (count + 1,), and the faces (3 F,), int32."""
     corners = triangles.reshape(-1)
-    begins = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=count))])
+    begins = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=vertex_count))])
     return begins.astype(np.int32), (np.argsort(corners, kind="stable") // 3).astype(np.int32)
 
 
 @wp.func
-def place_of(
-    picture: wp.int32, vertex: wp.int32, still: wp.array(dtype=wp.vec3d), moved: wp.array2d(dtype=wp.vec3d)
+def get_vertex_position(
+    image: wp.int32, vertex: wp.int32, fixed: wp.array(dtype=wp.vec3d), moving: wp.array2d(dtype=wp.vec3d)
 ) -> wp.vec3d:
     """Return the position of a vertex [m]: those of fixed layers come first."""
-    if vertex < still.shape[0]:
-        return still[vertex]
-    return moved[picture, vertex - still.shape[0]]
+    if vertex < fixed.shape[0]:
+        return fixed[vertex]
+    return moving[image, vertex - fixed.shape[0]]
 
 
 @wp.func
-def projected(P: wp.mat44d, x: wp.vec3d) -> wp.vec3d:
+def project_point(P: wp.mat44d, x: wp.vec3d) -> wp.vec3d:
     """Project a point to homogeneous pixel coordinates (u w, v w, w)."""
     q = P * wp.vec4d(x[0], x[1], x[2], wp.float64(1.0))
     return wp.vec3d(q[0], q[1], q[2])
 
 
 @forward_kernel
-def place(
-    begin: wp.int32,
-    end: wp.int32,
-    run: wp.int32,
-    since: wp.int32,
-    still: wp.array(dtype=wp.vec3d),
-    moved: wp.array2d(dtype=wp.vec3d),
-    cameras: wp.array(dtype=wp.mat44d),
-    lamp: wp.mat44d,
-    triangles: wp.array(dtype=wp.vec3i),
-    around: wp.array(dtype=wp.int32),
-    faces: wp.array(dtype=wp.int32),
+def place_vertices(
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, first: wp.int32, fixed: wp.array(dtype=wp.vec3d),
+    moving: wp.array2d(dtype=wp.vec3d), cameras: wp.array(dtype=wp.mat44d), lamp: wp.mat44d,
+    triangles: wp.array(dtype=wp.vec3i), face_starts: wp.array(dtype=wp.int32), faces: wp.array(dtype=wp.int32),
     # output
     placed: PlacedSurface,
-):
-    """Place each vertex from number `since` on, in each image; normals are the faces' weighted by area."""
-    start = begin + wp.tid() * run
-    each = placed.seen.shape[1] - since
-    for index in range(start, wp.min(start + run, end)):
+):  # fmt: skip
+    """Place each vertex from number `first` on, in each image; normals are the faces' weighted by area."""
+    start = begin + wp.tid() * chunk_size
+    each = placed.camera_points.shape[1] - first
+    for index in range(start, wp.min(start + chunk_size, end)):
         picture = index / each
-        vertex = since + index - picture * each
-        x = place_of(picture, vertex, still, moved)
-        placed.seen[picture, vertex] = projected(cameras[picture], x)
-        placed.lit[picture, vertex] = projected(lamp, x)
+        vertex = first + index - picture * each
+        x = get_vertex_position(picture, vertex, fixed, moving)
+        placed.camera_points[picture, vertex] = project_point(cameras[picture], x)
+        placed.lamp_points[picture, vertex] = project_point(lamp, x)
         placed.vertices[picture, vertex] = wp.vec3f(x)
         normal = wp.vec3d(wp.float64(0.0))
-        for k in range(around[vertex], around[vertex + 1]):
+        for k in range(face_starts[vertex], face_starts[vertex + 1]):
             t = triangles[faces[k]]
-            a = place_of(picture, t[0], still, moved)
-            normal += wp.cross(place_of(picture, t[1], still, moved) - a, place_of(picture, t[2], still, moved) - a)
+            a = get_vertex_position(picture, t[0], fixed, moving)
+            normal += wp.cross(
+                get_vertex_position(picture, t[1], fixed, moving) - a,
+                get_vertex_position(picture, t[2], fixed, moving) - a,
+            )
         length = wp.length(normal)
         if length > wp.float64(0.0):
             normal /= length
         placed.normals[picture, vertex] = wp.vec3f(normal)
 
 
-class Stack:
+class LayerStack:
     """Layers one after the other, fixed ones first.
 
     `still` (S,) [m] are the vertices that never move, `still_faces` the number of their triangles. `casting` (C,) are
-    the triangles that cast shadows; `around` and `faces` are as in `find_faces_around`.
+    the triangles that cast shadows; `around` and `faces` are as in `list_vertex_faces`.
     """
 
     def __init__(self, layers: Sequence[Layer], device: str) -> None:
@@ -193,7 +188,7 @@ class Stack:
         triangles = np.concatenate([np.zeros((0, 3), np.int32), *parts]).astype(np.int32)
         casting = [part for layer, part in zip(layers, parts, strict=True) if layer.casts_shadow]
         numbers = np.repeat(np.arange(len(layers)), [len(part) for part in parts])
-        begins, faces = find_faces_around(triangles, int(starts[-1]))
+        begins, faces = list_vertex_faces(triangles, int(starts[-1]))
         still = [layer for layer in layers if layer.still]
         here = partial(wp.array, device=device)
         vectors = partial(here, dtype=wp.vec3f)
@@ -206,8 +201,8 @@ class Stack:
         self.around, self.faces = here(begins, dtype=wp.int32), here(faces, dtype=wp.int32)
         self.surfaces = Surfaces()
         self.surfaces.triangles = here(triangles, dtype=wp.vec3i)
-        self.surfaces.look_of = here(numbers.astype(np.uint8), dtype=wp.uint8)
-        self.surfaces.looks = here(looks, dtype=LayerShading)
+        self.surfaces.shading_index = here(numbers.astype(np.uint8), dtype=wp.uint8)
+        self.surfaces.shadings = here(looks, dtype=LayerShading)
         self.surfaces.colours = vectors(
             np.concatenate([np.zeros((0, 3)), *(np.square(layer.colour) for layer in layers)])
         )
@@ -237,7 +232,9 @@ class Stack:
     def allocate_placed(self, count: int) -> PlacedSurface:
         """Allocate positions of the surface in `count` images."""
         placed, shape = PlacedSurface(), (count, self.vertices)
-        placed.seen, placed.lit = (wp.empty(shape, dtype=wp.vec3d, device=self.device) for _ in range(2))
+        placed.camera_points, placed.lamp_points = (
+            wp.empty(shape, dtype=wp.vec3d, device=self.device) for _ in range(2)
+        )
         placed.vertices, placed.normals = (wp.empty(shape, dtype=wp.vec3f, device=self.device) for _ in range(2))
         return placed
 
@@ -256,11 +253,11 @@ def collect_textures(layers: Sequence[Layer], device: str) -> tuple[wp.array, li
             look.T_index_world, look.relief = wp.mat44f(layer.solid.T_index_world), layer.solid.relief
             look.dark = wp.vec3f(layer.solid.dark)
         looks.append(look)
-    return as_texels(tuple(solids), device), looks
+    return to_texels(tuple(solids), device), looks
 
 
 @lru_cache(maxsize=4)
-def as_texels(solids: tuple[Solid, ...], device: str) -> wp.array:
+def to_texels(solids: tuple[Solid, ...], device: str) -> wp.array:
     """Copy solid textures to the device, one after the other."""
     each = [solid.texels.reshape(-1, 4) for solid in solids]
     # A single one, as of a scan, is large: on the CPU it is used without a copy.

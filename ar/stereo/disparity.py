@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from .rectified import Rectified
+from .rectified import RectifiedPair
 
 # Standard deviation over mean absolute value of a Gaussian: converts the mean difference of two windows.
 DEVIATION_RATIO = float(np.sqrt(0.5 * np.pi))
@@ -62,26 +62,26 @@ class StereoView:
         Geometry of the stereo pair.
     left, right
         Windows (size, size) uint8, normalised.
-    hidden
+    invalid
         Mask (size, size) bool of the left window: tools, glare, and too little texture.
-    hidden_right
+    invalid_right
         Mask of tools and glare in the right window.
     settings
         Settings of its matches.
     """
 
-    geometry: Rectified
+    geometry: RectifiedPair
     left: np.ndarray
     right: np.ndarray
-    hidden: np.ndarray
-    hidden_right: np.ndarray
+    invalid: np.ndarray
+    invalid_right: np.ndarray
     settings: StereoSettings = StereoSettings()
 
     @cached_property
     def disparity(self) -> np.ndarray:
         """(size, size) float32 [pixel] to a whole pixel or better; NaN where nothing is matched."""
         settings = self.settings
-        reach = int(np.ceil(self.geometry.gauge / self.geometry.depth**2 * settings.depth_range))
+        reach = int(np.ceil(self.geometry.depth_disparity / self.geometry.depth**2 * settings.depth_range))
         # OpenCV takes multiples of 16.
         count = 16 * int(np.ceil(2 * reach / 16))
         matcher = cv2.StereoSGBM.create(
@@ -91,7 +91,7 @@ class StereoView:
         # Otherwise the left border of the left window has no match.
         wide = [cv2.copyMakeBorder(each, 0, 0, count, count, cv2.BORDER_REPLICATE) for each in (self.left, self.right)]
         found = matcher.compute(*wide)[:, count:-count].astype(np.float32) / 16.0
-        return np.where(self.hidden | (found < -count // 2), np.nan, found)
+        return np.where(self.invalid | (found < -count // 2), np.nan, found)
 
     @cached_property
     def slope(self) -> np.ndarray:
@@ -99,7 +99,7 @@ class StereoView:
         slope = cv2.Sobel(self.left, cv2.CV_32F, 1, 0, scale=0.125)
         return cv2.boxFilter(slope * slope, -1, 2 * (self.settings.subpixel_side,), normalize=False)
 
-    def sample(self, pixels: np.ndarray, field: np.ndarray) -> np.ndarray:
+    def sample_field(self, pixels: np.ndarray, field: np.ndarray) -> np.ndarray:
         """Return values (n,) of a field (size, size) at the pixels nearest to (n, 2); NaN or True beyond its border."""
         here = np.nan_to_num(np.round(pixels).clip(-1.0, self.geometry.size), nan=-1.0).astype(int)
         inside = np.all((here >= 0) & (here < self.geometry.size), axis=1)
@@ -109,12 +109,12 @@ class StereoView:
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
+class StereoCloud:
     """Points with stereo depth.
 
     Parameters
     ----------
-    which
+    indices
         (k,): numbers of the requested pixels.
     points
         World points (k, 3) [m].
@@ -122,19 +122,16 @@ class Cloud:
         (k,) [m]: standard deviation of the depth's error; lateral errors are smaller.
     """
 
-    which: np.ndarray
+    indices: np.ndarray
     points: np.ndarray
     sigma: np.ndarray
 
 
 def compute_stereo_view(
-    geometry: Rectified,
-    left: np.ndarray,
-    right: np.ndarray,
-    tool: tuple[np.ndarray, np.ndarray] | None = None,
-    settings: StereoSettings = StereoSettings(),
-) -> StereoView:
-    """Build the stereo view of two images (H, W, 3) uint8; `tool` holds the masks of a tool in each, (H, W) bool.
+    geometry: RectifiedPair, left: np.ndarray, right: np.ndarray,
+    tool_masks: tuple[np.ndarray, np.ndarray] | None = None, settings: StereoSettings = StereoSettings(),
+) -> StereoView:  # fmt: skip
+    """Build the stereo view of two images (H, W, 3) uint8; `tool_masks` holds the masks of a tool in each, (H, W) bool.
 
     Raises
     ------
@@ -147,12 +144,12 @@ def compute_stereo_view(
         if grey.mean() < settings.dark_level:
             raise ValueError(f"the {name} eye sees nothing: check its light and its cable.")
     covers = [find_glare(window, settings) for window in windows]
-    if tool is not None:
-        shadows = geometry.rectify(*(mask.astype(np.uint8) for mask in tool))
+    if tool_masks is not None:
+        shadows = geometry.rectify(*(mask.astype(np.uint8) for mask in tool_masks))
         covers = [cover | (shadow > 0) for cover, shadow in zip(covers, shadows, strict=True)]
     square = 2 * int(0.5 * settings.normalisation_side * geometry.focal / geometry.depth) + 1
     hidden = [grow_mask(cover, settings.hidden_margin) for cover in covers]
-    (one, varies), (other, _) = (equalise(*each, square, settings) for each in zip(greys, hidden, strict=True))
+    (one, varies), (other, _) = (equalise_contrast(*each, square, settings) for each in zip(greys, hidden, strict=True))
     return StereoView(geometry, one, other, hidden[0] | (varies < settings.min_texture), hidden[1], settings)
 
 
@@ -163,29 +160,29 @@ def find_glare(window: np.ndarray, settings: StereoSettings) -> np.ndarray:
     return (most >= settings.glare_brightness) & (most - least < settings.glare_saturation * most)
 
 
-def grow_mask(mask: np.ndarray, by: int) -> np.ndarray:
-    """Dilate a mask (H, W) bool by `by` pixels."""
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * by + 1, 2 * by + 1), np.uint8)) > 0
+def grow_mask(mask: np.ndarray, margin: int) -> np.ndarray:
+    """Dilate a mask (H, W) bool by `margin` pixels."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)) > 0
 
 
-def equalise(
-    grey: np.ndarray, covered: np.ndarray, square: int, settings: StereoSettings
+def equalise_contrast(
+    grey: np.ndarray, mask: np.ndarray, window_size: int, settings: StereoSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Normalise grey levels (H, W) uint8 by the mean and standard deviation in a square of `square` pixels a side.
+    """Normalise grey levels (H, W) uint8 by the mean and standard deviation in a square of `window_size` pixels a side.
 
     Pixels that are covered (H, W) bool are excluded, and become grey. The standard deviation (H, W) is returned too.
     """
-    part = np.where(covered, np.float32(0.0), np.float32(1.0))
-    count = np.maximum(cv2.blur(part, (square, square)), np.float32(1e-3))
+    part = np.where(mask, np.float32(0.0), np.float32(1.0))
+    count = np.maximum(cv2.blur(part, (window_size, window_size)), np.float32(1e-3))
     level = grey.astype(np.float32)
-    level = (level - cv2.blur(level * part, (square, square)) / count) * part
+    level = (level - cv2.blur(level * part, (window_size, window_size)) / count) * part
     # Running sums along a row may round to negative values.
-    varies = cv2.sqrt(np.maximum(cv2.blur(level * level, (square, square)), np.float32(0.0)) / count)
+    varies = cv2.sqrt(np.maximum(cv2.blur(level * level, (window_size, window_size)), np.float32(0.0)) / count)
     level *= settings.normalised_contrast / (varies + settings.halving_contrast)
     return np.clip(level + 128.0, 0.0, 255.0).astype(np.uint8), varies
 
 
-def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
+def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> StereoCloud:
     """Compute 3-D points at pixels (n, 2) of the left window that the right camera also sees.
 
     Raises
@@ -193,10 +190,10 @@ def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
     ValueError
         Rows of the two images that do not correspond: cameras other than the calibrated ones.
     """
-    rough, settings = view.sample(pixels, view.disparity), view.settings
+    rough, settings = view.sample_field(pixels, view.disparity), view.settings
     which = np.flatnonzero(np.isfinite(rough))
     if not len(which):
-        return Cloud(which, np.zeros((0, 3)), np.zeros(0))
+        return StereoCloud(which, np.zeros((0, 3)), np.zeros(0))
     here, rough = pixels[which].astype(np.float32), rough[which]
     there = here - np.stack([rough, np.zeros_like(rough)], axis=1)
     there, found, apart = cv2.calcOpticalFlowPyrLK(
@@ -209,20 +206,20 @@ def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> Cloud:
     rows = float(np.median(np.abs(down[matched]))) if matched.any() else 0.0
     if rows > settings.max_row_difference:
         raise ValueError(f"rows of the eyes are {rows:.1f} pixels apart: calibrate the pair again.")
-    matched &= (np.abs(down) < settings.max_row_shift) & ~view.sample(there, view.hidden_right)
-    steep = view.sample(here, view.slope)
+    matched &= (np.abs(down) < settings.max_row_shift) & ~view.sample_field(there, view.invalid_right)
+    steep = view.sample_field(here, view.slope)
     apart = np.where(found.ravel() > 0, apart.ravel(), np.inf)  # not set where nothing was found
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = np.hypot(settings.correlation_factor * DEVIATION_RATIO * apart / np.sqrt(steep), settings.min_sigma)
     depth = view.geometry.compute_depths(disparity)
-    deviation = depth**2 / view.geometry.gauge * sigma
+    deviation = depth**2 / view.geometry.depth_disparity * sigma
     points = view.geometry.compute_points(here.astype(float), disparity)
-    return Cloud(which[matched], points[matched], deviation[matched])
+    return StereoCloud(which[matched], points[matched], deviation[matched])
 
 
 @dataclass(frozen=True)
 class FlowSettings:
-    """Settings of `follow_pixels` and `find_supported`."""
+    """Settings of `track_pixels` and `find_consistent_motions`."""
 
     coarse_pixel: float = 1.0 / 3000.0  # Pixel size of the coarse search [m].
     half_template: int = 10  # Half the side of the template of the coarse search [coarse pixels].
@@ -238,30 +235,32 @@ class FlowSettings:
     max_motion_deviation: float = 0.5e-3
 
 
-def follow_pixels(
-    before: StereoView, now: StereoView, pixels: np.ndarray, settings: FlowSettings = FlowSettings()
+def track_pixels(
+    previous: StereoView, current: StereoView, pixels: np.ndarray, settings: FlowSettings = FlowSettings()
 ) -> tuple[np.ndarray, np.ndarray]:
     """Track the pixels (n, 2) of one left window into another; return the numbers (k,) found, and positions (k, 2).
 
     Both windows have the same resolution and target, so that pixels have equal size.
     """
-    guess, alike = _find_coarse(before, now, pixels, settings)
+    guess, alike = _find_coarse(previous, current, pixels, settings)
     which = np.nonzero(alike > settings.min_correlation)[0]
     if not len(which):
         return which, np.zeros((0, 2))
     start = pixels[which].astype(np.float32)
-    there, found = _track_pixels(before.left, now.left, start, guess[which].astype(np.float32), settings)
-    back, found_back = _track_pixels(now.left, before.left, there, start, settings)
+    there, found = _track_pixels(previous.left, current.left, start, guess[which].astype(np.float32), settings)
+    back, found_back = _track_pixels(current.left, previous.left, there, start, settings)
     kept = found & found_back & (np.linalg.norm(back - start, axis=1) < settings.max_return_distance)
-    kept &= ~now.sample(there, now.hidden)
+    kept &= ~current.sample_field(there, current.invalid)
     return which[kept], there[kept].astype(float)
 
 
-def find_supported(places: np.ndarray, motions: np.ndarray, settings: FlowSettings = FlowSettings()) -> np.ndarray:
+def find_consistent_motions(
+    positions: np.ndarray, motions: np.ndarray, settings: FlowSettings = FlowSettings()
+) -> np.ndarray:
     """Return the mask (n,) of motions (n, 3) [m] at positions (n, 3) [m] that agree with those of their neighbours."""
-    if len(places) <= settings.neighbour_count:
-        return np.ones(len(places), bool)
-    near = motions[np.asarray(KDTree(places).query(places, settings.neighbour_count + 1)[1])[:, 1:]]
+    if len(positions) <= settings.neighbour_count:
+        return np.ones(len(positions), bool)
+    near = motions[np.asarray(KDTree(positions).query(positions, settings.neighbour_count + 1)[1])[:, 1:]]
     middle = np.median(near, axis=1)
     spread = 1.4826 * np.median(np.linalg.norm(near - middle[:, None], axis=2), axis=1)
     return np.linalg.norm(motions - middle, axis=1) <= np.maximum(

@@ -14,7 +14,7 @@ Maps = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class Rectified:
+class RectifiedPair:
     """Rectified windows of a stereo pair. Points at the target's depth have the same position in both.
 
     Fusiello, Trucco, Verri 2000, "A compact algorithm for rectification of stereo pairs", Mach. Vis. Appl. 12:16-22.
@@ -47,15 +47,15 @@ class Rectified:
         return cv2.remap(left, *one, cv2.INTER_LINEAR), cv2.remap(right, *other, cv2.INTER_LINEAR)
 
     @property
-    def gauge(self) -> float:
+    def depth_disparity(self) -> float:
         """Disparity [pixel] times depth [m], both without the target's offset."""
         return self.focal * self.baseline
 
     def compute_disparity(self, depth: np.ndarray) -> np.ndarray:
         """Compute the disparity [pixel] of a depth [m]: shift to the left in the right window, 0 at the target."""
-        return self.gauge / depth - self.gauge / self.depth
+        return self.depth_disparity / depth - self.depth_disparity / self.depth
 
-    def place(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def project_points(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Project world points (n, 3) [m] to pixels (n, 2) of the left window, and disparities (n,)."""
         at = points @ self.T_window_world[:3, :3].T + self.T_window_world[:3, 3]
         return self.focal * at[:, :2] / at[:, 2:] + self.principal, self.compute_disparity(at[:, 2])
@@ -68,14 +68,14 @@ class Rectified:
 
     def compute_depths(self, disparity: np.ndarray) -> np.ndarray:
         """Compute depths [m] from disparities [pixel]."""
-        return self.gauge / (disparity + self.gauge / self.depth)
+        return self.depth_disparity / (disparity + self.depth_disparity / self.depth)
 
 
 @lru_cache(maxsize=4)
-def rectify(
-    left: Camera, right: Camera, target: tuple[float, float, float], reach: float, fineness: float
-) -> Rectified:
-    """Rectify about a target [m]: windows with half width `reach` [m] and `fineness` pixels per metre at its depth.
+def build_rectification(
+    left: Camera, right: Camera, target: tuple[float, float, float], half_width: float, pixels_per_metre: float
+) -> RectifiedPair:
+    """Rectify about a target [m]: windows of `half_width` [m] and `pixels_per_metre`, both at its depth.
 
     Raises
     ------
@@ -94,14 +94,14 @@ def rectify(
     at = R @ np.asarray(target) + T[:3, 3]
     if not at[2] > 0.0:
         raise ValueError("the target is not ahead of the eyes: check where they are.")
-    size, focal = 2 * round(reach * fineness), fineness * float(at[2])
+    size, focal = 2 * round(half_width * pixels_per_metre), pixels_per_metre * float(at[2])
     middle = 0.5 * (size - 1)
     principal = middle - focal * at[:2] / at[2]
     shift = np.array([focal * baseline / at[2], 0.0])
     maps = tuple(
         _build_maps(eye, R, focal, place, size) for eye, place in ((left, principal), (right, principal + shift))
     )
-    return Rectified(T, focal, principal, baseline, float(at[2]), size, (maps[0], maps[1]))
+    return RectifiedPair(T, focal, principal, baseline, float(at[2]), size, (maps[0], maps[1]))
 
 
 def _build_maps(eye: Camera, R: np.ndarray, focal: float, principal: np.ndarray, size: int) -> Maps:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, minimize_scalar
 
 from ..optics.camera import Camera
-from .pose import PoseSettings, fit_least_squares
+from .pose import PoseSettings, compute_pose_residual
 from .targets import DetectedCorners, Target
 
 MAX_RELATIVE_ERROR = 0.05  # Relative error above which a focal length differs.
@@ -39,7 +39,7 @@ class FocalFit:
 
 
 def fit_focal_length(
-    camera: Camera, seen: Sequence[tuple[Target, DetectedCorners]], settings: FocalFitSettings = FocalFitSettings()
+    camera: Camera, observed: Sequence[tuple[Target, DetectedCorners]], settings: FocalFitSettings = FocalFitSettings()
 ) -> FocalFit | None:
     """Estimate the factor on both focal lengths that fits targets' corners best; None: too few corners.
 
@@ -47,7 +47,7 @@ def fit_focal_length(
     minimum and the residual variance of corners. Source: Triggs et al. 2000, "Bundle adjustment: a modern synthesis",
     section 6.1.
     """
-    enough = [(target, corners) for target, corners in seen if len(corners.points) >= settings.min_corners]
+    enough = [(target, corners) for target, corners in observed if len(corners.points) >= settings.min_corners]
     freedom = sum(2 * len(corners.points) - 6 for _, corners in enough) - 1
     if freedom <= 0:
         return None
@@ -55,7 +55,7 @@ def fit_focal_length(
     def squares(factor: float) -> float:
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= factor
-        return sum(fit_least_squares(replace(camera, K=K), target, corners) for target, corners in enough)
+        return sum(compute_pose_residual(replace(camera, K=K), target, corners) for target, corners in enough)
 
     options = {"xatol": settings.factor_tolerance}
     found = minimize_scalar(squares, bounds=settings.factor_bounds, method="bounded", options=options)

@@ -30,7 +30,7 @@ TOO_LARGE_ERROR = (
 
 
 @dataclass(frozen=True, eq=False)
-class Named:
+class NamedImage:
     """Image with name and time.
 
     Parameters
@@ -51,7 +51,7 @@ class Named:
     colour: np.ndarray | None = None
 
 
-def read_images(path: Path) -> Iterator[Named]:
+def read_images(path: Path) -> Iterator[NamedImage]:
     """Read at most `MAX_IMAGES` of the PNG and JPEG files of a folder, or of the frames of a video, in their order.
 
     Raises
@@ -61,17 +61,17 @@ def read_images(path: Path) -> Iterator[Named]:
     """
     if path.is_dir():
         files = _list_files(path)
-        return (Named(files[index].name, _read(files[index])) for index in _spread(len(files)))
+        return (NamedImage(files[index].name, _read(files[index])) for index in _spread(len(files)))
     return islice(_read_video_frames(path, None), MAX_IMAGES)
 
 
-def read_video(path: Path, rate: float, colour: bool = False, first: int = 0) -> Iterator[Named]:
-    """Read every image, from the `first` on, of a video or of a folder, with its time [s].
+def read_video(path: Path, rate: float, with_colour: bool = False, first_frame: int = 0) -> Iterator[NamedImage]:
+    """Read every image, from the `first_frame` on, of a video or of a folder, with its time [s].
 
     The order in a folder is that of the numbers in the names. Pixels are used as stored: a video's orientation metadata
     and EXIF are ignored.
 
-    `rate` is the frame rate [1/s] of a folder; a video has its own times. `colour` requests colour images.
+    `rate` is the frame rate [1/s] of a folder; a video has its own times. `with_colour` requests colour images.
 
     Raises
     ------
@@ -79,11 +79,11 @@ def read_video(path: Path, rate: float, colour: bool = False, first: int = 0) ->
         See `read_images`.
     """
     if path.is_dir():
-        files = islice(enumerate(_list_files(path)), first, None)
-        if colour:
+        files = islice(enumerate(_list_files(path)), first_frame, None)
+        if with_colour:
             return (to_named_image(file.name, _read(file, "RGB"), number / rate) for number, file in files)
-        return (Named(file.name, _read(file), number / rate) for number, file in files)
-    return _read_video_frames(path, 1, colour, first)
+        return (NamedImage(file.name, _read(file), number / rate) for number, file in files)
+    return _read_video_frames(path, 1, with_colour, first_frame)
 
 
 def count_frames(path: Path) -> int:
@@ -104,9 +104,9 @@ def count_frames(path: Path) -> int:
     return count if count > 0 else sum(1 for _ in _read_video_frames(path, 1))
 
 
-def to_named_image(name: str, colour: np.ndarray, time: float) -> Named:
+def to_named_image(name: str, colour: np.ndarray, time: float) -> NamedImage:
     """Build a named image from colour (H, W, 3) uint8 sRGB, with its grey image."""
-    return Named(name, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), time, colour)
+    return NamedImage(name, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), time, colour)
 
 
 def _list_files(folder: Path) -> list[Path]:
@@ -163,7 +163,7 @@ def _read(path: Path, kind: str = "L") -> np.ndarray:
         raise ValueError(f"{path}: is not a readable image. Remove it, or write it again.") from error
 
 
-def _read_video_frames(path: Path, step: int | None, colour: bool = False, first: int = 0) -> Iterator[Named]:
+def _read_video_frames(path: Path, step: int | None, colour: bool = False, first: int = 0) -> Iterator[NamedImage]:
     """Read one in `step` frames of a video from the `first` on; None: a step that gives `MAX_IMAGES` frames."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file. {REMEDY}")
@@ -191,7 +191,7 @@ def _read_video_frames(path: Path, step: int | None, colour: bool = False, first
                 if good and colour:
                     yield to_named_image(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), time)
                 elif good:
-                    yield Named(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), time)
+                    yield NamedImage(f"frame {number}", cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), time)
             number += 1
     finally:
         video.release()

@@ -87,22 +87,22 @@ def _compute_sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
 
 
 def choose_views(
-    views: Sequence[BoardView], face: Face, most: int, settings: IntrinsicsSettings = IntrinsicsSettings()
+    views: Sequence[BoardView], face: Face, max_views: int, settings: IntrinsicsSettings = IntrinsicsSettings()
 ) -> list[BoardView]:
-    """Select at most `most` of the sharp views, each as different from the views before it as possible.
+    """Select at most `max_views` of the sharp views, each as different from the views before it as possible.
 
     Views are compared by the position of the board's outline in the image. Gonzalez (1985), "Clustering to minimize the
     maximum intercluster distance": the farthest view from all chosen ones comes next.
     """
     median = np.median([view.sharpness for view in views]) if views else 0.0
     sharp = [view for view in views if view.sharpness >= settings.min_sharpness * median]
-    if len(sharp) <= most:
+    if len(sharp) <= max_views:
         return sharp
     outline = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) * face.size
     places = np.array([cv2.perspectiveTransform(outline[:, None], view.homography).ravel() for view in sharp])
     first = int(np.argmax([len(view.pixels) for view in sharp]))
     order, far = [first], np.linalg.norm(places - places[first], axis=1)
-    while len(order) < most:
+    while len(order) < max_views:
         order.append(int(far.argmax()))
         far = np.minimum(far, np.linalg.norm(places - places[order[-1]], axis=1))
     return [sharp[index] for index in sorted(order)]
@@ -141,7 +141,7 @@ REMEDY = "Tilt the board by 20 to 45 degrees to all sides, near and far, and als
 
 
 def compute_calibration_error(
-    camera: Camera, T_camera_target: np.ndarray, corners: np.ndarray, place: np.ndarray, covariance: np.ndarray
+    camera: Camera, T_camera_target: np.ndarray, corners: np.ndarray, point: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
     """Propagate a calibration's covariance to a target point: (3, 3) [m^2] in the camera's frame.
 
@@ -154,7 +154,7 @@ def compute_calibration_error(
         Camera that took the image; its pose is ignored.
     T_camera_target
         (4, 4) [m]: fitted to the corners by this camera.
-    corners, place
+    corners, point
         Corners (n, 3) and point (3,) [m] in the target's frame.
     covariance
         Covariance (9, 9) of `ar.tracking.intrinsics.PARAMETERS`.
@@ -163,7 +163,7 @@ def compute_calibration_error(
     turn = cv2.Rodrigues(T_camera_target[:3, :3])[0]
     slopes = [
         cv2.projectPoints(points, turn, T_camera_target[:3, 3], camera.K, distortion)[1]
-        for points in (corners, place[None])
+        for points in (corners, point[None])
     ]
     seen, there = slopes
     taken_up = np.linalg.lstsq(seen[:, POSE_COLUMNS], seen[:, INTRINSIC_COLUMNS], rcond=None)[0]
@@ -172,7 +172,7 @@ def compute_calibration_error(
     return across @ covariance @ across.T
 
 
-def to_values(calibration: Calibration) -> np.ndarray:
+def to_parameters(calibration: Calibration) -> np.ndarray:
     """Return a calibration's values (9,) of `PARAMETERS`."""
     return np.array([*calibration.focal, *calibration.principal, *calibration.lens.coefficients[:5]])
 
@@ -189,23 +189,23 @@ class Intrinsics:
         Covariance (9, 9) of `PARAMETERS`.
     rms
         Root mean square distance [pixel] between detected and projected corners, over all views used.
-    used, excluded
+    used_views, excluded_views
         Names of views: those used, and those whose errors were too large.
-    covered
+    covered_share
         Share of the image that is inside the corners of a view.
     """
 
     calibration: Calibration
     covariance: np.ndarray
     rms: float
-    used: tuple[str, ...]
-    excluded: tuple[str, ...]
-    covered: float
+    used_views: tuple[str, ...]
+    excluded_views: tuple[str, ...]
+    covered_share: float
 
     @property
-    def values(self) -> np.ndarray:
+    def parameters(self) -> np.ndarray:
         """(9,) of `PARAMETERS`."""
-        return to_values(self.calibration)
+        return to_parameters(self.calibration)
 
     @property
     def deviations(self) -> np.ndarray:
@@ -214,12 +214,9 @@ class Intrinsics:
 
 
 def calibrate_intrinsics(
-    views: Sequence[BoardView],
-    width: int,
-    height: int,
-    name: str = "",
+    views: Sequence[BoardView], width: int, height: int, name: str = "",
     settings: IntrinsicsSettings = IntrinsicsSettings(),
-) -> Intrinsics:
+) -> Intrinsics:  # fmt: skip
     """Calibrate the camera of these views, taken in images of `width` x `height`.
 
     Zhang (2000), "A flexible new technique for camera calibration", by OpenCV; a lens of Brown and Conrady with five

@@ -8,7 +8,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from .image_sequences import Named, to_named_image
+from .image_sequences import NamedImage, to_named_image
 
 MAX_FAILURES = 10  # Number of consecutive failed images before the camera is opened again.
 RETRY_PAUSE = 0.05  # Pause between two tries [s].
@@ -40,11 +40,11 @@ def open_camera(number: int, width: int, height: int) -> FrameSource:
 
 
 def read_camera_images(
-    source: FrameSource, name: str, again: Callable[[], FrameSource], now: Callable[[], float] = clock.perf_counter
-) -> Generator[Named | None]:
+    source: FrameSource, name: str, reopen: Callable[[], FrameSource], now: Callable[[], float] = clock.perf_counter
+) -> Generator[NamedImage | None]:
     """Yield images of a camera, each with its arrival time [s] by `now`; None if there was none.
 
-    A camera that stops responding is released, and opened `again` until it responds.
+    A camera that stops responding is released, and opened `reopen` until it responds.
     """
     failed = 0
     try:
@@ -59,13 +59,13 @@ def read_camera_images(
             clock.sleep(RETRY_PAUSE)
             if failed % MAX_FAILURES == 0:
                 source.release()
-                source = again()
+                source = reopen()
     finally:
         source.release()
 
 
-def read_newest(pictures: Generator[Named | None], patience: float) -> Iterator[Named | None]:
-    """Yield the newest image at each request; None if none arrived within `patience` [s].
+def read_newest_images(images: Generator[NamedImage | None], timeout: float) -> Iterator[NamedImage | None]:
+    """Yield the newest image at each request; None if none arrived within `timeout` [s].
 
     A separate thread reads the images; those that arrive between requests are dropped. The thread ends, and closes the
     images, when this iterator ends.
@@ -75,14 +75,14 @@ def read_newest(pictures: Generator[Named | None], patience: float) -> Iterator[
     Exception
         Any exception of the images.
     """
-    waiting: list[Named] = []
+    waiting: list[NamedImage] = []
     ended: list[BaseException | None] = []
     came, left = threading.Condition(), threading.Event()
 
     def take() -> None:
         failure: BaseException | None = None
         try:
-            for picture in pictures:
+            for picture in images:
                 if left.is_set():
                     break
                 if picture is not None:
@@ -91,7 +91,7 @@ def read_newest(pictures: Generator[Named | None], patience: float) -> Iterator[
                         came.notify()
         except Exception as error:
             failure = error
-        pictures.close()
+        images.close()
         with came:
             ended.append(failure)
             came.notify()
@@ -100,7 +100,7 @@ def read_newest(pictures: Generator[Named | None], patience: float) -> Iterator[
     try:
         while True:
             with came:
-                came.wait_for(lambda: waiting or ended, patience)
+                came.wait_for(lambda: waiting or ended, timeout)
                 picture, over = (waiting.pop() if waiting else None), list(ended)
             if picture is None and over:
                 if over[0] is not None:

@@ -49,18 +49,18 @@ class PlacedFace:
         Face to print.
     left, top
         Distances of its left and upper side from the page's upper left corner [mm], without its border.
-    turns
+    quarter_turns
         Quarter turns clockwise.
     """
 
     face: Face
     left: float
     top: float
-    turns: int = 0
+    quarter_turns: int = 0
 
 
 @dataclass(frozen=True, eq=False)
-class Page:
+class PrintedPage:
     """One page.
 
     Parameters
@@ -69,16 +69,16 @@ class Page:
         Name of its target.
     pixels
         Image (H, W) uint8, 0 or 255, `PER_MM` per millimetre.
-    placed
+    faces
         Faces on it.
     """
 
     name: str
     pixels: np.ndarray
-    placed: tuple[PlacedFace, ...]
+    faces: tuple[PlacedFace, ...]
 
 
-def build_printed_pages() -> tuple[Page, ...]:
+def build_printed_pages() -> tuple[PrintedPage, ...]:
     """Draw the pages of the tool's cube, the patient's reference and the calibration board."""
     cube, plate, board = list_targets()
     return _draw_cube_page(cube), _draw_plate_page(plate), _draw_board_page(board)
@@ -91,14 +91,14 @@ def to_face_name(face: Face) -> str:
     return f"{'+' if outwards[axis] > 0.0 else '-'}{'xyz'[axis]}"
 
 
-def to_png(page: Page) -> bytes:
+def to_png(page: PrintedPage) -> bytes:
     """Encode a page as a PNG of one bit a pixel, with its resolution."""
     said = PngInfo()
     said.add_text("Source", PROGRAM_NAME)
     return _encode_pages([page], "PNG", dpi=(DPI, DPI), pnginfo=said)
 
 
-def to_pdf(pages: Sequence[Page]) -> bytes:
+def to_pdf(pages: Sequence[PrintedPage]) -> bytes:
     """Encode pages as one PDF, each as large as its paper."""
     return _encode_pages(pages, "PDF", resolution=DPI, creator=PROGRAM_NAME, title="Targets of sulcus")
 
@@ -144,7 +144,7 @@ def _to_millimetres(metres: float | np.ndarray):
     return (np.round(1e3 * np.asarray(metres), 6) + 0.0).tolist()
 
 
-def _draw_cube_page(target: Target) -> Page:
+def _draw_cube_page(target: Target) -> PrintedPage:
     """Draw the three faces so that they fold into a corner of the cube: +z above +x, and +y to the right of it."""
     along_x, along_y, along_z = target.faces
     wide, border = _to_millimetres(along_x.size[0] + 2.0 * BORDER_WIDTH), _to_millimetres(BORDER_WIDTH)
@@ -179,7 +179,7 @@ def _draw_cube_page(target: Target) -> Page:
     return _compose_page(target, page, ink, placed, said, ((20.0, top), (55.0, top + 2.0 * wide + 20.0)))
 
 
-def _draw_plate_page(target: Target) -> Page:
+def _draw_plate_page(target: Target) -> PrintedPage:
     """Draw one face with its border, to be cut out."""
     (face,) = target.faces
     wide, border = _to_millimetres(face.size[0] + 2.0 * BORDER_WIDTH), _to_millimetres(BORDER_WIDTH)
@@ -201,7 +201,7 @@ def _draw_plate_page(target: Target) -> Page:
     return _compose_page(target, page, ink, (placed,), said, ((20.0, top), (55.0, top + wide + 50.0)))
 
 
-def _draw_board_page(target: Target) -> Page:
+def _draw_board_page(target: Target) -> PrintedPage:
     """Draw the board across the page; nothing is cut."""
     (face,) = target.faces
     page, ink = _create_page((A4[1], A4[0]))
@@ -213,23 +213,19 @@ def _draw_board_page(target: Target) -> Page:
     _write_paragraph(ink, said, 15.0, 183.0)
     _draw_ruler(ink, 15.0, 40.0, down=True)
     _draw_ruler(ink, 180.0, 192.0, down=False)
-    return Page(target.name, _read_pixels(page), (placed,))
+    return PrintedPage(target.name, _read_pixels(page), (placed,))
 
 
 def _compose_page(
-    target: Target,
-    page: Image.Image,
-    ink: ImageDraw.ImageDraw,
-    placed: tuple[PlacedFace, ...],
-    said: Sequence[str],
+    target: Target, page: Image.Image, ink: ImageDraw.ImageDraw, placed: tuple[PlacedFace, ...], said: Sequence[str],
     rulers: tuple[tuple[float, float], tuple[float, float]],
-) -> Page:
+) -> PrintedPage:  # fmt: skip
     """Finish an upright page: title, text, and rulers down and right from two places."""
     _write(ink, f"sulcus: {target.name}", 15.0, 14.0, TITLE_HEIGHT)
     _write_paragraph(ink, said, 15.0, 25.0)
     _draw_ruler(ink, *rulers[0], down=True)
     _draw_ruler(ink, *rulers[1], down=False)
-    return Page(target.name, _read_pixels(page), placed)
+    return PrintedPage(target.name, _read_pixels(page), placed)
 
 
 def _describe_sizes(target: Target) -> tuple[str, str]:
@@ -249,7 +245,7 @@ def _create_page(size: tuple[float, float]) -> tuple[Image.Image, ImageDraw.Imag
 
 
 def _print(page: Image.Image, placed: PlacedFace) -> None:
-    picture = np.rot90(placed.face.draw(_to_pixels(_to_millimetres(placed.face.square))), -placed.turns)
+    picture = np.rot90(placed.face.draw(_to_pixels(_to_millimetres(placed.face.square))), -placed.quarter_turns)
     page.paste(Image.fromarray(np.ascontiguousarray(picture)), (_to_pixels(placed.left), _to_pixels(placed.top)))
 
 
@@ -304,7 +300,7 @@ def _read_pixels(page: Image.Image) -> np.ndarray:
     return np.asarray(page.convert("L"))
 
 
-def _encode_pages(pages: Sequence[Page], form: str, **how: object) -> bytes:
+def _encode_pages(pages: Sequence[PrintedPage], form: str, **how: object) -> bytes:
     """Encode pages with Pillow as one image file, or several in one file."""
     first, *others = [Image.fromarray(page.pixels).convert("1", dither=Image.Dither.NONE) for page in pages]
     more = {"save_all": True, "append_images": others} if others else {}

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ..optics.camera import Camera
-from .rigid import build_cross_matrices, compute_angles
+from .rigid import build_cross_matrices, compute_rotation_angles
 from .targets import DetectedCorners, Detector, Target, find_window, is_seen_from_front
 
 
@@ -28,7 +28,7 @@ class PoseSettings:
     max_pose_turn: float = np.radians(15.0)
 
 
-class Verdict(Enum):
+class PoseStatus(Enum):
     """Result of a target's detection in an image, as readable text."""
 
     GOOD = "seen"
@@ -69,25 +69,22 @@ class Pose:
         T = np.linalg.inv(other.T_camera_target) @ self.T_camera_target
         return Pose(T, covariance, max(self.residual, other.residual), min(self.corners, other.corners))
 
-    def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def transform_point(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a point of the target (3,) [m] in the camera's frame (3,) [m], and its covariance (3, 3) [m^2]."""
-        arm = self.T_camera_target[:3, :3] @ place
+        arm = self.T_camera_target[:3, :3] @ point
         slope = np.hstack([np.eye(3), -build_cross_matrices(arm)])
         return arm + self.T_camera_target[:3, 3], slope @ self.covariance @ slope.T
 
 
 def find_pose(
-    camera: Camera,
-    target: Target,
-    corners: DetectedCorners | None,
-    before: np.ndarray | None = None,
+    camera: Camera, target: Target, corners: DetectedCorners | None, previous: np.ndarray | None = None,
     settings: PoseSettings = PoseSettings(),
-) -> tuple[Verdict, Pose | None]:
+) -> tuple[PoseStatus, Pose | None]:  # fmt: skip
     """Estimate the pose of a target; no pose is returned if it is uncertain or ambiguous.
 
     Every face has two poses that mirror each other (Schweighofer, Pinz 2006, "Robust pose estimation from a planar
     target", IEEE Trans. Pattern Anal. Mach. Intell. 28:2024-2030). Each is fitted to all corners. A pose is returned if
-    no other one fits about as well, or if a pose just `before` distinguishes them.
+    no other one fits about as well, or if a pose just `previous` distinguishes them.
 
     Parameters
     ----------
@@ -95,35 +92,35 @@ def find_pose(
         Camera that took the image; its pose is ignored.
     corners
         Corners of `target`, from `Detector.detect`; None: none.
-    before
+    previous
         Previous T_camera_target (4, 4), if it was certain.
     """
     if corners is None or len(corners.points) < settings.min_corners:
-        return Verdict.LOST, None
+        return PoseStatus.LOST, None
     fits = sorted(_fit_candidates(camera, target, corners), key=lambda fit: fit[1])
     if not fits:
-        return Verdict.POOR, None
+        return PoseStatus.POOR, None
     best, squares = fits[0]
     count = len(corners.points)
     residual = float(np.sqrt(squares / count))
     if not residual <= settings.max_residual:
-        return Verdict.POOR, None
+        return PoseStatus.POOR, None
     variance = max(squares / (2 * count - 6), settings.min_deviation**2)
     limit = squares + settings.min_chi2_excess * variance
     rivals = [T for T, other in fits[1:] if other < limit and not _is_same_pose(T, best, settings)]
     if rivals:
-        near = sorted([best, *rivals], key=lambda T: np.inf if before is None else _turn(T, before))
+        near = sorted([best, *rivals], key=lambda T: np.inf if previous is None else _turn(T, previous))
         if (
-            before is None
-            or _turn(near[0], before) > settings.max_pose_turn
-            or _turn(near[1], before) < 2.0 * _turn(near[0], before)
+            previous is None
+            or _turn(near[0], previous) > settings.max_pose_turn
+            or _turn(near[1], previous) < 2.0 * _turn(near[0], previous)
         ):
-            return Verdict.AMBIGUOUS, None
+            return PoseStatus.AMBIGUOUS, None
         best = near[0]
-    return Verdict.GOOD, Pose(best, variance * _compute_covariance(camera, best, corners.points), residual, count)
+    return PoseStatus.GOOD, Pose(best, variance * _compute_covariance(camera, best, corners.points), residual, count)
 
 
-def fit_least_squares(camera: Camera, target: Target, corners: DetectedCorners) -> float:
+def compute_pose_residual(camera: Camera, target: Target, corners: DetectedCorners) -> float:
     """Return the smallest sum of squared distances [pixel^2] of a target's corners over its poses; inf if none."""
     return min((squares for _, squares in _fit_candidates(camera, target, corners)), default=np.inf)
 
@@ -181,7 +178,7 @@ def _build_rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 def _turn(one: np.ndarray, other: np.ndarray) -> float:
     """Compute the angle [rad] between two poses."""
-    return float(compute_angles(one[:3, :3] @ other[:3, :3].T))
+    return float(compute_rotation_angles(one[:3, :3] @ other[:3, :3].T))
 
 
 def _is_same_pose(one: np.ndarray, other: np.ndarray, settings: PoseSettings) -> bool:
@@ -208,18 +205,18 @@ class TrackedTargets:
     ----------
     number
         Number of the image.
-    verdicts
+    statuses
         Result of each target.
     poses
         Poses of the targets that are certain.
-    last
+    last_poses
         The last certain pose (4, 4) of each target that had one, and the number of its image.
     """
 
     number: int
-    verdicts: Mapping[str, Verdict]
+    statuses: Mapping[str, PoseStatus]
     poses: Mapping[str, Pose]
-    last: Mapping[str, tuple[np.ndarray, int]]
+    last_poses: Mapping[str, tuple[np.ndarray, int]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +242,8 @@ class Tracker:
         object.__setattr__(self, "camera", replace(self.camera, T_camera_world=np.eye(4)))
         object.__setattr__(self, "_detector", Detector(self.targets))
 
-    def track(self, grey: np.ndarray, before: TrackedTargets | None = None) -> TrackedTargets:
-        """Track the targets in an image (H, W) uint8 of the camera's size; `before` is the previous result.
+    def track(self, grey: np.ndarray, previous: TrackedTargets | None = None) -> TrackedTargets:
+        """Track the targets in an image (H, W) uint8 of the camera's size; `previous` is the previous result.
 
         Raises
         ------
@@ -254,8 +251,8 @@ class Tracker:
             An image of another size or kind.
         """
         check_image_size(grey, self.camera.width, self.camera.height)
-        number = 0 if before is None else before.number + 1
-        earlier = {} if before is None else before.last
+        number = 0 if previous is None else previous.number + 1
+        earlier = {} if previous is None else previous.last_poses
         last = {name: each for name, each in earlier.items() if number - each[1] <= self.settings.max_pose_age}
         found = self._detect_corners(grey, number, last)
         verdicts, poses = {}, {}

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .pose import Pose
-from .rigid import turn_vectors
+from .rigid import to_rotation_vectors
 
 MAX_GAP = 0.1  # Largest gap between samples with interpolation [s].
 MAX_EXTRAPOLATION = 0.05  # Largest extrapolation after the last sample [s].
@@ -19,7 +19,7 @@ REMEDY = "Move the tool to and fro by centimetres, quickly and unevenly, while m
 
 @dataclass(frozen=True)
 class ClockSettings:
-    """Settings of `estimate_clock_by_motion`."""
+    """Settings of `estimate_clock_offset`."""
 
     offset_step: float = 0.01  # Step of tried time offsets [s].
     min_images: int = 8  # Minimum number of images for an estimate of the time offset.
@@ -55,14 +55,14 @@ class PoseStream:
     covariances
         Covariances (n, 6, 6) of translation [m] in the tracker frame and rotation [rad] about the body's origin in its
         axes.
-    daily
+    has_daily_clock
         True if the clock restarts after 24 hours: then times are defined up to whole days.
     """
 
     times: np.ndarray
     poses: np.ndarray
     covariances: np.ndarray
-    daily: bool = False
+    has_daily_clock: bool = False
 
     def interpolate(self, time: float) -> Pose | None:
         """Interpolate the pose at a time [s], with constant velocity between two samples; None if there is none.
@@ -71,7 +71,7 @@ class PoseStream:
         extrapolated for `MAX_EXTRAPOLATION`. The covariance includes the interpolation error for a body that
         accelerates as observed here.
         """
-        time = self.to_stream_day(time)
+        time = self.to_stream_time(time)
         first = int(np.searchsorted(self.times, time + TIME_TOLERANCE, side="right")) - 1
         if first < 0:
             return None
@@ -88,13 +88,13 @@ class PoseStream:
 
     def compute_age(self, time: float) -> float:
         """Return the time [s] since the last sample before `time`; infinite before the first."""
-        time = self.to_stream_day(time)
+        time = self.to_stream_time(time)
         first = int(np.searchsorted(self.times, time, side="right")) - 1
         return np.inf if first < 0 else float(time - self.times[first])
 
-    def to_stream_day(self, time: float) -> float:
+    def to_stream_time(self, time: float) -> float:
         """Convert a time [s] to this stream's clock: for a 24-hour clock, to the day nearest to its samples."""
-        if not self.daily:
+        if not self.has_daily_clock:
             return time
         middle = 0.5 * float(self.times[0] + self.times[-1])
         return time - DAY_SECONDS * round((time - middle) / DAY_SECONDS)
@@ -119,7 +119,7 @@ class PoseStream:
         if len(steps) < 2:
             return np.zeros(2)
         shifts = np.diff(poses[:, :3, 3], axis=0) / steps[:, None]
-        turns = turn_vectors(poses[1:, :3, :3] @ poses[:-1, :3, :3].transpose(0, 2, 1)) / steps[:, None]
+        turns = to_rotation_vectors(poses[1:, :3, :3] @ poses[:-1, :3, :3].transpose(0, 2, 1)) / steps[:, None]
         apart = 0.5 * (steps[1:] + steps[:-1])
         near = apart <= MAX_GAP
         changes = [np.linalg.norm(np.diff(each, axis=0), axis=1) / apart for each in (shifts, turns)]
@@ -151,13 +151,10 @@ class Clock:
     error: float = 0.0
 
 
-def estimate_clock_by_motion(
-    times: np.ndarray,
-    places: np.ndarray,
-    samples: np.ndarray,
-    others: np.ndarray,
+def estimate_clock_offset(
+    times: np.ndarray, positions: np.ndarray, tracker_times: np.ndarray, tracker_positions: np.ndarray,
     settings: ClockSettings = ClockSettings(),
-) -> Clock:
+) -> Clock:  # fmt: skip
     """Estimate the time offset between a point's motion in images (n,) [s], (n, 3) [m], and by a tracker (m,), (m, 3).
 
     Both points may differ by a constant. The error is that of least squares, from the scatter of residuals.
@@ -172,7 +169,7 @@ def estimate_clock_by_motion(
         raise ValueError(
             f"{len(times)} images show what the poses have, and {settings.min_images} are needed. {REMEDY}"
         )
-    low, high = samples[0] - times[0], samples[-1] - times[-1]
+    low, high = tracker_times[0] - times[0], tracker_times[-1] - times[-1]
     if high < low:
         raise ValueError("the poses end before the images do: record them for longer than the video.")
     if high - low > settings.max_offset_range:
@@ -181,18 +178,23 @@ def estimate_clock_by_motion(
         )
     tried = np.arange(low, high + settings.offset_step, settings.offset_step).clip(low, high)
     squares = np.array(
-        [_sum_squares(_compute_differences(times + offset, places, samples, others)) for offset in tried]
+        [
+            _sum_squares(_compute_differences(times + offset, positions, tracker_times, tracker_positions))
+            for offset in tried
+        ]
     )
     if not np.isfinite(squares).any():
         raise ValueError(f"the poses have gaps of more than {MAX_GAP:g} s wherever the images are.")
     best = int(np.argmin(squares))
-    clock, least = _refine_offset(float(tried[best]), times, places, samples, others, settings)
+    clock, least = _refine_offset(float(tried[best]), times, positions, tracker_times, tracker_positions, settings)
     walled = np.pad(squares, 1, constant_values=np.inf)
     valley = (squares <= walled[:-2]) & (squares <= walled[2:])
     far = np.where(valley & (np.abs(tried - tried[best]) > settings.min_offset_difference), squares, np.inf)
     if np.isfinite(far.min()):
-        _, rival = _refine_offset(float(tried[int(np.argmin(far))]), times, places, samples, others, settings)
-        if rival < settings.min_squares_ratio * max(least, places.size * settings.position_noise**2):
+        _, rival = _refine_offset(
+            float(tried[int(np.argmin(far))]), times, positions, tracker_times, tracker_positions, settings
+        )
+        if rival < settings.min_squares_ratio * max(least, positions.size * settings.position_noise**2):
             raise ValueError(f"more than one offset of the clocks fits. {REMEDY}")
     return clock
 

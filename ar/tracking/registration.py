@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from scipy.stats import chi2, f
 
-from .rigid import build_cross_matrices, move_about
+from .rigid import build_cross_matrices, move_rigidly
 
 MIN_PAIRS = 3  # Minimum number of pairs of points.
 LEVEL = 0.95  # Confidence level of the registration's error.
@@ -36,7 +36,7 @@ class RegistrationSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Scanned:
+class RegisteredScan:
     """Scan that a registration was made for.
 
     Parameters
@@ -53,7 +53,7 @@ class Scanned:
     bounds: np.ndarray
     target: np.ndarray
 
-    def compute_distance(self, other: Scanned) -> float:
+    def compute_distance(self, other: RegisteredScan) -> float:
         """Compute the largest distance between two bodies' bounds and targets [m]."""
         return float(max(np.abs(self.bounds - other.bounds).max(), np.linalg.norm(self.target - other.target)))
 
@@ -73,9 +73,9 @@ class Registration:
         (3,) [m]: centroid of the points, in the scan.
     rms
         Root mean square residual distance [m] of the pairs.
-    pairs, surface
+    pair_count, surface_count
         Number of pairs, and number of surface points.
-    scanned
+    scan
         Scan that the registration was made for, if known.
     """
 
@@ -83,19 +83,19 @@ class Registration:
     covariance: np.ndarray
     centre: np.ndarray
     rms: float
-    pairs: int
-    surface: int = 0
-    scanned: Scanned | None = None
+    pair_count: int
+    surface_count: int = 0
+    scan: RegisteredScan | None = None
 
-    def point(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def transform_point(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a scan position (3,) [m] in the reference's frame (3,) [m], and its covariance (3, 3) [m^2]."""
         T = self.T_patient_scan
-        slope = np.hstack([np.eye(3), -build_cross_matrices(T[:3, :3] @ (place - self.centre))])
-        return T[:3, :3] @ place + T[:3, 3], slope @ self.covariance @ slope.T
+        slope = np.hstack([np.eye(3), -build_cross_matrices(T[:3, :3] @ (point - self.centre))])
+        return T[:3, :3] @ point + T[:3, 3], slope @ self.covariance @ slope.T
 
 
 def register_points(
-    scan: np.ndarray, patient: np.ndarray, settings: RegistrationSettings = RegistrationSettings()
+    scan_points: np.ndarray, patient_points: np.ndarray, settings: RegistrationSettings = RegistrationSettings()
 ) -> Registration:
     """Fit the rigid motion from points of the scan (n, 3) [m] to their positions in the reference's frame (n, 3) [m].
 
@@ -109,23 +109,20 @@ def register_points(
         Fewer than three pairs, points on a line, or two sets of different size. A mirrored set, two pairs that are
         swapped, one that fits far worse than the others, or pairs that fit no rigid motion.
     """
-    _check_shape(scan, patient, settings)
-    T, off = _fit_rigid(scan, patient)
-    _check_fit(scan, patient, off, settings)
-    centre = scan.mean(axis=0)
-    freedom = 3 * len(scan) - 6
-    J = compute_jacobian(T, scan, centre) / _scatter(off, freedom, settings)
-    return Registration(T, _widen_covariance(J.T @ J, freedom), centre, _compute_rms(off), len(scan))
+    _check_shape(scan_points, patient_points, settings)
+    T, off = _fit_rigid(scan_points, patient_points)
+    _check_fit(scan_points, patient_points, off, settings)
+    centre = scan_points.mean(axis=0)
+    freedom = 3 * len(scan_points) - 6
+    J = compute_jacobian(T, scan_points, centre) / _scatter(off, freedom, settings)
+    return Registration(T, _widen_covariance(J.T @ J, freedom), centre, _compute_rms(off), len(scan_points))
 
 
 def refine_registration(
-    scan: np.ndarray,
-    patient: np.ndarray,
-    seen: np.ndarray,
-    nearest: Nearest,
+    scan_points: np.ndarray, patient_points: np.ndarray, surface_points: np.ndarray, find_nearest: Nearest,
     settings: RegistrationSettings = RegistrationSettings(),
-) -> Registration:
-    """Fit as in `register_points`, with additional points `seen` (m, 3) [m] of the surface, in the reference's frame.
+) -> Registration:  # fmt: skip
+    """Fit as in `register_points`, with additional `surface_points` (m, 3) [m], in the reference's frame.
 
     Pairs (n, 3) and distances from the surface's tangent planes (Chen, Medioni 1992, "Object modelling by registration
     of multiple range images") are weighted by their own scatter. A surface that moved since the scan biases the result.
@@ -136,24 +133,26 @@ def refine_registration(
         See `register_points`; too few points, or points that remain farther than 5 mm from the surface (root mean
         square).
     """
-    if len(seen) < settings.min_surface_points:
-        raise ValueError(f"{len(seen)} points of the surface are too few: trace {settings.min_surface_points} or more.")
-    start = register_points(scan, patient, settings)
+    if len(surface_points) < settings.min_surface_points:
+        raise ValueError(
+            f"{len(surface_points)} points of the surface are too few: trace {settings.min_surface_points} or more."
+        )
+    start = register_points(scan_points, patient_points, settings)
     T, centre = start.T_patient_scan, start.centre
-    freedom = 3 * len(scan) - 6
-    touched = _scatter(scan @ T[:3, :3].T + T[:3, 3] - patient, freedom, settings)
+    freedom = 3 * len(scan_points) - 6
+    touched = _scatter(scan_points @ T[:3, :3].T + T[:3, 3] - patient_points, freedom, settings)
     normal, off, away = np.eye(6), np.zeros((1, 3)), np.zeros(1)
     for _ in range(settings.max_iterations):
-        off = scan @ T[:3, :3].T + T[:3, 3] - patient
-        place, outward = nearest((seen - T[:3, 3]) @ T[:3, :3])
+        off = scan_points @ T[:3, :3].T + T[:3, 3] - patient_points
+        place, outward = find_nearest((surface_points - T[:3, 3]) @ T[:3, :3])
         turned = outward @ T[:3, :3].T
-        away = np.einsum("ni,ni->n", turned, place @ T[:3, :3].T + T[:3, 3] - seen)
-        traced = _scatter(away, len(seen), settings)
-        J = compute_jacobian(T, scan, centre) / touched
+        away = np.einsum("ni,ni->n", turned, place @ T[:3, :3].T + T[:3, 3] - surface_points)
+        traced = _scatter(away, len(surface_points), settings)
+        J = compute_jacobian(T, scan_points, centre) / touched
         K = np.einsum("ni,nij->nj", turned, compute_jacobian(T, place, centre).reshape(-1, 3, 6)) / traced
         normal = J.T @ J + K.T @ K
         step = -np.linalg.solve(normal, J.T @ off.ravel() / touched + K.T @ away / traced)
-        T = move_about(T, centre, step)
+        T = move_rigidly(T, centre, step)
         if np.abs(step).max() < settings.step_tolerance:
             break
     if not max(_compute_rms(off), _compute_rms(away[:, None])) <= settings.max_rms:
@@ -162,7 +161,12 @@ def refine_registration(
             f"{1e3 * _compute_rms(off):.1f} mm: trace the surface that the scan shows, before it moves."
         )
     return Registration(
-        T, _widen_covariance(normal, freedom + len(seen)), centre, _compute_rms(off), len(scan), len(seen)
+        T,
+        _widen_covariance(normal, freedom + len(surface_points)),
+        centre,
+        _compute_rms(off),
+        len(scan_points),
+        len(surface_points),
     )
 
 
@@ -235,12 +239,12 @@ def _fit_rigid(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.nd
     return T, scan @ T[:3, :3].T + T[:3, 3] - patient
 
 
-def compute_jacobian(T: np.ndarray, scan: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def compute_jacobian(T: np.ndarray, points: np.ndarray, centre: np.ndarray) -> np.ndarray:
     """Compute the Jacobian (3 n, 6) of scan positions (n, 3), in the reference, by shift and turn about `centre`."""
-    arms = (scan - centre) @ T[:3, :3].T
-    return np.concatenate([np.broadcast_to(np.eye(3), (len(scan), 3, 3)), -build_cross_matrices(arms)], axis=2).reshape(
-        -1, 6
-    )
+    arms = (points - centre) @ T[:3, :3].T
+    return np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -build_cross_matrices(arms)], axis=2
+    ).reshape(-1, 6)
 
 
 def _widen_covariance(normal: np.ndarray, freedom: int) -> np.ndarray:
@@ -267,35 +271,35 @@ class PairResiduals:
 
     Parameters
     ----------
-    off
+    residuals
         Residual distances (n,) [m] in the registration by all pairs.
     held_out
         Residual distances (n,) [m] in the registration by the other pairs.
     studentised
         `held_out` (n,) divided by its standard deviation as predicted from the others' scatter. NaN for three pairs,
         from which scatter cannot be estimated.
-    chance
+    p_value
         Probability that a set without outliers has a residual as large as the largest of these; NaN for three pairs.
     """
 
-    off: np.ndarray
+    residuals: np.ndarray
     held_out: np.ndarray
     studentised: np.ndarray
-    chance: float
+    p_value: float
 
     @property
-    def worst(self) -> int:
+    def worst_pair(self) -> int:
         """Index of the pair that fits the other pairs worst."""
         return int(np.argmax(self.held_out if np.isnan(self.studentised).any() else self.studentised))
 
     @property
-    def suspect(self) -> bool:
+    def has_outlier(self) -> bool:
         """True if the worst pair fits worse than in all but `FALSE_ALARM_RATE` of valid sets."""
-        return self.chance < FALSE_ALARM_RATE
+        return self.p_value < FALSE_ALARM_RATE
 
 
 def compute_pair_residuals(
-    scan: np.ndarray, patient: np.ndarray, settings: RegistrationSettings = RegistrationSettings()
+    scan_points: np.ndarray, patient_points: np.ndarray, settings: RegistrationSettings = RegistrationSettings()
 ) -> PairResiduals:
     """Compute residuals of pairs of points (n, 3) [m], in the scan and in the reference's frame.
 
@@ -308,14 +312,14 @@ def compute_pair_residuals(
     ValueError
         See `register_points`.
     """
-    found = register_points(scan, patient, settings)
-    T, count = found.T_patient_scan, len(scan)
-    off = scan @ T[:3, :3].T + T[:3, 3] - patient
+    found = register_points(scan_points, patient_points, settings)
+    T, count = found.T_patient_scan, len(scan_points)
+    off = scan_points @ T[:3, :3].T + T[:3, 3] - patient_points
     if count == MIN_PAIRS:
         # Two pairs, the remainder of three, determine no registration.
         none = np.full(count, np.nan)
         return PairResiduals(np.linalg.norm(off, axis=1), none, none, np.nan)
-    J = compute_jacobian(T, scan, found.centre)
+    J = compute_jacobian(T, scan_points, found.centre)
     hat = J @ np.linalg.solve(J.T @ J, J.T)
     freedom = 3 * count - 9
     free = np.stack([np.eye(3) - hat[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(count)])

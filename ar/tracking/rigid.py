@@ -11,12 +11,12 @@ def build_cross_matrices(vectors: np.ndarray) -> np.ndarray:
     return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*vectors.shape, 3)
 
 
-def compute_angles(rotations: np.ndarray) -> np.ndarray:
+def compute_rotation_angles(rotations: np.ndarray) -> np.ndarray:
     """Compute the angles (...) [rad] of rotations (..., 3, 3)."""
     return np.arccos(np.clip(0.5 * (np.trace(rotations, 0, -2, -1) - 1.0), -1.0, 1.0))
 
 
-def move_about(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndarray:
+def move_rigidly(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Apply `step` (6,), a shift [m] and a rotation [rad] about T `centre` (3,) [m], to a rigid motion T (4, 4)."""
     out = np.eye(4)
     out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
@@ -24,20 +24,20 @@ def move_about(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndarra
     return out
 
 
-def is_rigid(T: np.ndarray, rounding: float) -> bool:
-    """Return True if a matrix (4, 4) is a rigid motion; R^T R may differ from 1 by less than `rounding`."""
+def is_rigid(T: np.ndarray, tolerance: float) -> bool:
+    """Return True if a matrix (4, 4) is a rigid motion; R^T R may differ from 1 by less than `tolerance`."""
     if T.shape != (4, 4) or not np.isfinite(T).all() or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
         return False
     turn = T[:3, :3]
-    return bool(np.abs(turn.T @ turn - np.eye(3)).max() < rounding and np.linalg.det(turn) > 0.0)
+    return bool(np.abs(turn.T @ turn - np.eye(3)).max() < tolerance and np.linalg.det(turn) > 0.0)
 
 
-def turn_vectors(rotations: np.ndarray) -> np.ndarray:
+def to_rotation_vectors(rotations: np.ndarray) -> np.ndarray:
     """Convert rotations (n, 3, 3) to rotation vectors (n, 3) [rad]."""
     return Rotation.from_matrix(rotations).as_rotvec()
 
 
-def read_conventions(poses: np.ndarray) -> dict[str, np.ndarray]:
+def list_conventions(poses: np.ndarray) -> dict[str, np.ndarray]:
     """Return poses (n, 4, 4) by convention: as given, and reinterpreted under other quaternion conventions."""
     read = Rotation.from_matrix(poses[:, :3, :3])
     forms = {"": read, "as w, x, y, z": Rotation.from_quat(np.roll(read.as_quat(), -1, axis=1)), "inverted": read.inv()}

@@ -16,14 +16,14 @@ FACE_MARGIN = 3.0  # Margin round a face [pixel]: its edges are straight only wi
 INK, PAPER = 25.0, 225.0  # Grey levels of black ink and white paper.
 
 
-def render_targets(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, np.ndarray]]) -> np.ndarray:
+def render_targets(image: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, np.ndarray]]) -> np.ndarray:
     """Render targets in front of an image (H, W) or (H, W, 3) uint8, sharp and evenly lit.
 
     Every pixel is the mean of `SAMPLES_PER_SIDE`^2 rays, each traced through the lens to the first face that it meets.
 
     Parameters
     ----------
-    picture
+    image
         Background.
     camera
         Camera with its pose in the world.
@@ -41,7 +41,7 @@ def render_targets(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[
     ]
     seen = [(face, T, where) for face, T, where in windows if where is not None and is_seen_from_front(T)]
     if not seen:
-        return picture.copy()
+        return image.copy()
     box = tuple(
         slice(min(where[axis].start for *_, where in seen), max(where[axis].stop for *_, where in seen))
         for axis in (0, 1)
@@ -61,11 +61,11 @@ def render_targets(picture: np.ndarray, camera: Camera, targets: Sequence[tuple[
             front = ~np.isnan(here) & (depth > 0.0) & (depth < nearest[part])
             grey[part], nearest[part] = np.where(front, here, grey[part]), np.where(front, depth, nearest[part])
         ink, cover = ink + grey, cover + (nearest < np.inf)
-    behind = picture[box].astype(np.float64)
+    behind = image[box].astype(np.float64)
     share, ink = 1.0 - cover / SAMPLES_PER_SIDE**2, ink / SAMPLES_PER_SIDE**2
-    if picture.ndim == 3:
+    if image.ndim == 3:
         share, ink = share[..., None], ink[..., None]
-    out = picture.copy()
+    out = image.copy()
     out[box] = np.clip(np.rint(share * behind + ink), 0.0, 255.0).astype(np.uint8)
     return out
 
@@ -117,7 +117,7 @@ STRIP_WIDTH = CELL_SIDE * CELL_COUNT
 MAX_BLACK, MIN_WHITE = 90.0, 165.0  # Grey levels below which a cell is black, and above which it is white.
 
 
-def stamp_time(colour: np.ndarray, time: float) -> np.ndarray:
+def stamp_time(image: np.ndarray, time: float) -> np.ndarray:
     """Return a copy of an image (H, W, 3) or (H, W) uint8 with a time [s] in its upper right corner.
 
     Raises
@@ -128,18 +128,18 @@ def stamp_time(colour: np.ndarray, time: float) -> np.ndarray:
     count = round(time / TIME_UNIT) if np.isfinite(time) else -1
     if not 0 <= count < 2**TIME_BITS:
         raise ValueError(f"the time stamp {time:g} s is out of range: give 0 to {2**TIME_BITS * TIME_UNIT:g} s.")
-    if colour.shape[0] < CELL_SIDE or colour.shape[1] < STRIP_WIDTH:
+    if image.shape[0] < CELL_SIDE or image.shape[1] < STRIP_WIDTH:
         raise ValueError(
-            f"a time needs {STRIP_WIDTH} x {CELL_SIDE} pixels: the image has {colour.shape[1]} x {colour.shape[0]}."
+            f"a time needs {STRIP_WIDTH} x {CELL_SIDE} pixels: the image has {image.shape[1]} x {image.shape[0]}."
         )
     bits = [*START_CELLS, *_to_bits(count, TIME_BITS), *_to_bits(_check(count), CHECK_BITS)]
     strip = np.kron(np.array(bits, np.uint8), np.ones((CELL_SIDE, CELL_SIDE), np.uint8)) * 255
-    out = colour.copy()
-    out[:CELL_SIDE, -STRIP_WIDTH:] = strip if colour.ndim == 2 else strip[..., None]
+    out = image.copy()
+    out[:CELL_SIDE, -STRIP_WIDTH:] = strip if image.ndim == 2 else strip[..., None]
     return out
 
 
-def read_stamp(grey: np.ndarray) -> float | None:
+def read_time_stamp(grey: np.ndarray) -> float | None:
     """Read the time [s] in the upper right corner of an image (H, W) uint8; None if there is none, or a damaged one."""
     if grey.shape[0] < CELL_SIDE or grey.shape[1] < STRIP_WIDTH:
         return None

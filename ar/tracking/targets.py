@@ -32,7 +32,7 @@ class Face:
         Squares, both odd.
     square
         Side of a square [m].
-    first
+    first_marker
         Number of its first marker in the dictionary; the others follow.
     T_target_face
         (4, 4): the face's frame has its origin in the upper left corner, x to the right, y down, z into the target.
@@ -41,13 +41,13 @@ class Face:
     columns: int
     rows: int
     square: float
-    first: int
+    first_marker: int
     T_target_face: np.ndarray
 
     @property
     def ids(self) -> np.ndarray:
         """Numbers of its markers (n,)."""
-        return self.first + np.arange(self.columns * self.rows // 2)
+        return self.first_marker + np.arange(self.columns * self.rows // 2)
 
     @property
     def size(self) -> np.ndarray:
@@ -74,9 +74,11 @@ class Face:
         own = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
         return (own * [*self.size, 1.0]) @ self.T_target_face[:3, :3].T + self.T_target_face[:3, 3]
 
-    def draw(self, pixels: int) -> np.ndarray:
-        """Draw the print (H, W) uint8, `pixels` along each side of a square, which are a multiple of 8."""
-        return np.asarray(self.board.generateImage((pixels * self.columns, pixels * self.rows), marginSize=0))
+    def draw(self, square_pixels: int) -> np.ndarray:
+        """Draw the print (H, W) uint8, `square_pixels` along each side of a square, which are a multiple of 8."""
+        return np.asarray(
+            self.board.generateImage((square_pixels * self.columns, square_pixels * self.rows), marginSize=0)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,17 +239,17 @@ class Detector:
         return DetectedCorners(np.concatenate(points), np.concatenate(pixels), np.concatenate(on))
 
 
-def find_window(camera: Camera, points: np.ndarray, share: float, least: float) -> Window | None:
+def find_window(camera: Camera, points: np.ndarray, relative_margin: float, min_margin: float) -> Window | None:
     """Return rows and columns round points (n, 3) [m] in a camera's frame; None if they are out of view.
 
-    The margin is a `share` of their extent, and `least` pixels at least. The camera is at the world's origin.
+    The margin is `relative_margin` x their extent, at least `min_margin` pixels. The camera is at the world's origin.
     """
     pixels = camera.project(points)[0]
     pixels = pixels[~np.isnan(pixels).any(axis=1)]
     if not len(pixels):
         return None
     low, high = pixels.min(axis=0), pixels.max(axis=0)
-    wide, limits = np.maximum(share * (high - low), least), [camera.width, camera.height]
+    wide, limits = np.maximum(relative_margin * (high - low), min_margin), [camera.width, camera.height]
     left, top = np.clip(low - wide, 0, limits).astype(int).tolist()
     right, bottom = np.clip(high + wide + 1.0, 0, limits).astype(int).tolist()
     return None if left >= right or top >= bottom else (slice(top, bottom), slice(left, right))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .rigid import build_cross_matrices, compute_angles
+from .rigid import build_cross_matrices, compute_rotation_angles
 
 # Largest root mean square residual angle of motions [rad]: two trackers with noise of 0.5 degrees give 1 degree.
 MAX_RESIDUAL_TURN = np.radians(2.0)
@@ -37,35 +37,34 @@ class HandEye:
     ----------
     X
         (4, 4): x_first = X x_second [m].
-    turn, shift
+    rotation_error, translation_error
         Root mean square residuals of the motions: angle [rad] and distance [m] between A X and X B.
-    motions
+    motion_count
         Number of motions used.
-    spread
+    axis_spread
         Root mean square angle [rad] of the motions' axes from their closest common axis.
     distances
-        Root mean square (n,) `shift` of the motions from and to each pose [m]; 0 for poses without any.
+        Root mean square (n,) `translation_error` of the motions from and to each pose [m]; 0 for poses without any.
     """
 
     X: np.ndarray
-    turn: float
-    shift: float
-    motions: int
-    spread: float
+    rotation_error: float
+    translation_error: float
+    motion_count: int
+    axis_spread: float
     distances: np.ndarray
 
     @property
     def misfit(self) -> str:
         """Description of residuals and their limits; empty within the limits."""
-        if self.turn <= MAX_RESIDUAL_TURN and self.shift <= MAX_RESIDUAL_SHIFT:
+        if self.rotation_error <= MAX_RESIDUAL_TURN and self.translation_error <= MAX_RESIDUAL_SHIFT:
             return ""
-        found = (
-            f"motions of the bodies differ by {np.degrees(self.turn):.1f} degrees and {1e3 * self.shift:.1f} mm (rms)"
-        )
+        angle, distance = np.degrees(self.rotation_error), 1e3 * self.translation_error
+        found = f"motions of the bodies differ by {angle:.1f} degrees and {distance:.1f} mm (rms)"
         return f"{found}: at most {np.degrees(MAX_RESIDUAL_TURN):.0f} and {1e3 * MAX_RESIDUAL_SHIFT:.0f} are required"
 
 
-def solve_hand_eye(first: np.ndarray, second: np.ndarray, settings: HandEyeSettings = HandEyeSettings()) -> HandEye:
+def solve_hand_eye(poses_a: np.ndarray, poses_b: np.ndarray, settings: HandEyeSettings = HandEyeSettings()) -> HandEye:
     """Compute X with A X = X B for all motions A and B of two bodies, given by poses (n, 4, 4) [m] in their trackers.
 
     Motions lead from pose i to pose j: A = P_i^-1 P_j of the first, B = Q_i^-1 Q_j of the second. Daniilidis (1999),
@@ -76,11 +75,11 @@ def solve_hand_eye(first: np.ndarray, second: np.ndarray, settings: HandEyeSetti
     ValueError
         Different numbers of poses, too few, too small rotations, or axes that are all parallel.
     """
-    if len(first) != len(second):
-        raise ValueError(f"{len(first)} and {len(second)} poses: give both bodies' poses at the same times.")
-    if len(first) < settings.min_poses:
-        raise ValueError(f"{len(first)} poses are too few: record {settings.min_poses} or more. {REMEDY}")
-    A, B, ends = _select_motions(first, second, settings)
+    if len(poses_a) != len(poses_b):
+        raise ValueError(f"{len(poses_a)} and {len(poses_b)} poses: give both bodies' poses at the same times.")
+    if len(poses_a) < settings.min_poses:
+        raise ValueError(f"{len(poses_a)} poses are too few: record {settings.min_poses} or more. {REMEDY}")
+    A, B, ends = _select_motions(poses_a, poses_b, settings)
     (a, a_dual), (b, b_dual) = to_dual_quaternions(A), to_dual_quaternions(B)
     axes = a[:, 1:] / np.linalg.norm(a[:, 1:], axis=1, keepdims=True)
     across = 1.0 - np.linalg.eigvalsh(axes.T @ axes / len(axes))[-1]
@@ -92,9 +91,9 @@ def solve_hand_eye(first: np.ndarray, second: np.ndarray, settings: HandEyeSetti
         )
     X = _solve_transform(a, a_dual, b, b_dual)
     left, right = A @ X, X @ B
-    turns = compute_angles(left[:, :3, :3] @ right[:, :3, :3].transpose(0, 2, 1))
+    turns = compute_rotation_angles(left[:, :3, :3] @ right[:, :3, :3].transpose(0, 2, 1))
     shifts = np.linalg.norm(left[:, :3, 3] - right[:, :3, 3], axis=1)
-    squares, counts = (np.bincount(ends.ravel(), each, len(first)) for each in (np.tile(shifts**2, 2), None))
+    squares, counts = (np.bincount(ends.ravel(), each, len(poses_a)) for each in (np.tile(shifts**2, 2), None))
     return HandEye(
         X, _compute_rms(turns), _compute_rms(shifts), len(A), spread, np.sqrt(squares / np.maximum(counts, 1))
     )
@@ -107,7 +106,7 @@ def _select_motions(
     kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), settings.max_poses)).round().astype(int))
     start, end = np.triu_indices(len(kept), 1)
     A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
-    angles = np.array([compute_angles(M[:, :3, :3]) for M in (A, B)])
+    angles = np.array([compute_rotation_angles(M[:, :3, :3]) for M in (A, B)])
     good = np.flatnonzero((angles.min(axis=0) > settings.min_turn) & (angles.max(axis=0) < settings.max_turn))
     if len(good) < settings.min_poses:
         raise ValueError(

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write tables, compare; return 1 if a figure failed, missed its target, or got worse."""
-    from ..figures.figure_tables import read_page, table, write_page
+    from ..figures.figure_tables import format_table, read_page, write_page
 
     if args.source and (args.json or args.quick or args.anatomy):
         raise InputError("--from measures nothing: leave out --json, --quick and --anatomy beside it.")
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     record = _only(record, args.only)
     code = 0
     if not args.source:
-        print(table(record.rows))
+        print(format_table(record.rows))
         code = int(any(entry.state in ("failed", "missed") for entry in record.rows))
     for path in args.tables:
         print(f"{path}: {'written' if write_page(path, record) else 'unchanged'}")
@@ -91,8 +91,8 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
     """Measure the requested figures that the record lacks; return the completed record."""
     from sim.bodies.meshfile import read_anatomy
 
-    from ..figures.figure_record import record_of, write_record
-    from ..figures.figure_runs import Run, entry_of, version_here
+    from ..figures.figure_record import build_record, write_record
+    from ..figures.figure_runs import Run, get_code_version, measure_figure
 
     out = args.json or OUT
     found: dict[str, Entry] = {}
@@ -100,7 +100,7 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
         out = check_output_path(out, ".json", inputs=[args.anatomy, args.against, *args.tables], resumed=True)
         found = {entry.name: entry for entry in _begun(out, args.force)}
     body = read_anatomy(args.anatomy or get_template_path()).digest
-    run = Run(version_here(), body, args.anatomy, args.quick)
+    run = Run(get_code_version(), body, args.anatomy, args.quick)
     with tqdm(total=len(args.only), unit="figure", file=sys.stderr) as bar:
 
         def heard(line: str) -> None:
@@ -113,12 +113,12 @@ def _measured(args: argparse.Namespace, stop_if_asked: Callable[[], None]) -> Re
         for name in args.only:
             bar.set_description(name)
             before = found.get(name)
-            entry = found[name] = entry_of(NAMED[name], run, before, heard)
+            entry = found[name] = measure_figure(NAMED[name], run, before, heard)
             if not args.quick:
-                write_record(out, record_of(run.origin("auto"), list(found.values())))
+                write_record(out, build_record(run.build_origin("auto"), list(found.values())))
             heard(f"{name}: {'kept' if entry is before else entry.state}{entry.reason and ': '}{entry.reason}")
             bar.update()
-    return record_of(run.origin("auto"), list(found.values()))
+    return build_record(run.build_origin("auto"), list(found.values()))
 
 
 def _begun(out: Path, force: bool) -> tuple[Entry, ...]:
@@ -133,16 +133,16 @@ def _begun(out: Path, force: bool) -> tuple[Entry, ...]:
 
 def _compared(old: Record, new: Record) -> int:
     """Print the changed numbers; return 1 if one got worse or is no longer measured."""
-    from ..figures.figure_comparison import MARGIN, compared
+    from ..figures.figure_comparison import MARGIN, compare_records
 
-    found = compared(old, new)
+    found = compare_records(old, new)
     print("| number | old | new | unit | new / old |\n|---|---|---|---|---|")
-    print("\n".join(change.line for change in found.changes))
+    print("\n".join(change.table_row for change in found.changes))
     print("", *found.notes, sep="\n")
     for reason in found.lost:
         print(f"no longer measured as before: {reason}")
-    for change in found.worse:
+    for change in found.regressions:
         print(f"worse by more than {MARGIN - 1.0:.0%}: {change.name} ({change.ratio:.2f} times)")
-    if not found.worse and not found.lost:
+    if not found.regressions and not found.lost:
         print(f"nothing is worse by more than {MARGIN - 1.0:.0%}")
-    return int(bool(found.worse or found.lost))
+    return int(bool(found.regressions or found.lost))

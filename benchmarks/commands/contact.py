@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, row by row; return 1 if a solution is not good."""
     from scenes.analysis.measurement import describe_machine
 
-    from ..studies.contact_mesh import rows
+    from ..studies.contact_mesh import measure_forces
 
     if min(*args.depths, args.ball) <= 0.0:
         raise InputError("--depths and --ball are lengths in mm: give numbers above 0.")
@@ -56,9 +56,9 @@ def run(args: argparse.Namespace) -> int:
     anatomy, found = read_anatomy(args.anatomy or get_template_path()), []
     print(f"{where}\n\n| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", file=table)
     depths = [depth / 1e3 for depth in args.depths]
-    for row in rows(anatomy, args.elements, depths, args.ball / 1e3, parse_tissue(args), args.device):
+    for row in measure_forces(anatomy, args.elements, depths, args.ball / 1e3, parse_tissue(args), args.device):
         force = f"{row.element} | {1e3 * row.depth:g} | {1e3 * row.along.mean():.1f}"
-        shares = f"{row.share:+.1%} | {row.scatter:.1%} | {(row.sideways / row.along).max():.1%}"
+        shares = f"{row.relative_excess:+.1%} | {row.relative_range:.1%} | {(row.sideways / row.along).max():.1%}"
         print(f"| {force} | {shares} | {row.seconds:.1f} | {row.fine_seconds:.1f} |", file=table, flush=True)
         found.append(row)
     print(LEGEND, file=table)

@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, row by row; return 1 if a solve did not converge."""
     from scenes.analysis.measurement import describe_machine
 
-    from ..studies.elements import Press, limits, rows
+    from ..studies.elements import PressCase, extrapolate_motions, measure_motions
 
     bodies = [read_anatomy(path) for path in args.anatomies or [get_template_path()]]
     anatomies = bodies if args.coarse else [mesh for body in bodies for mesh in (body, refine(body))]
@@ -41,12 +41,12 @@ def run(args: argparse.Namespace) -> int:
     print(f"{where}\n\n| nu | element | vertices | tumour moves [mm] | set-up [s] | solve [s] | outer |", file=table)
     print("|---|---|---|---|---|---|---|", file=table)
     found = []
-    for row in rows(anatomies, args.elements, args.poisson, Press(force=args.force), args.device):
+    for row in measure_motions(anatomies, args.elements, args.poisson, PressCase(force=args.force), args.device):
         found.append(row)
         moved = f"{row.motion:.4f}" if row.good else f"{row.motion:.4f} (not converged)"
         cost = f"{row.set_up:.1f} | {row.solve:.2f} | {row.outer}"
         print(f"| {row.poisson:g} | {row.element} | {row.vertices} | {moved} | {cost} |", file=table, flush=True)
-    limit = limits(found)
+    limit = extrapolate_motions(found)
     if limit:
         print("\n| nu | limit [mm] | of it, by element and vertices |\n|---|---|---|", file=table)
     for poisson, motion in sorted(limit.items()):

@@ -9,7 +9,7 @@ from pathlib import Path
 from scenes.options.shared_options import add_anatomy, add_device, add_json, add_seed
 from sim.arguments import check_integer
 
-from .locate import bar, check_finer, finer_of, locator_of
+from .locate import check_finer_mesh, open_locator, read_finer_mesh, show_progress
 
 HEADS = (
     "noise", "ratio: off by", "within x1.5 [%]", "in its interval [%]", "held or sliding [%]", "skull [%]",
@@ -43,33 +43,35 @@ def run(args: argparse.Namespace) -> int:
     from scenes.script.shipped_files import get_template_path
     from sim.bodies.meshfile import read_anatomy
 
-    from ..studies.fit_study import fitted_to, library_of, row
-    from ..studies.fit_twins import patients
-    from ..studies.locate_study import PointsSeen
+    from ..studies.fit_study import fit_patient, solve_library, summarise_fits
+    from ..studies.fit_twins import solve_patients
+    from ..studies.locate_study import PointModel
 
     for name, least in (("twins", 1), ("presses", 1), ("drained", 0), ("forces", 0), ("points", 6), ("cover", 1)):
         check_integer(f"--{name}", getattr(args, name), least)
-    check_finer(args)
-    body, finer = read_anatomy(args.anatomy or get_template_path()), finer_of(args)
-    with bar("patients") as heard:
+    check_finer_mesh(args)
+    body, finer = read_anatomy(args.anatomy or get_template_path()), read_finer_mesh(args)
+    with show_progress("patients") as heard:
         every = list(
-            patients(body, finer, args.twins, args.presses, args.drained, args.seed, args.device, args.folder, heard)
+            solve_patients(
+                body, finer, args.twins, args.presses, args.drained, args.seed, args.device, args.folder, heard
+            )
         )
     found = [seen for seen in every if seen is not None]
-    locator = locator_of(args, body)
-    with bar("tissues") as heard:
-        library = library_of(locator, args.device, args.folder and args.folder / "fit.parts", heard)
+    locator = open_locator(args, body)
+    with show_progress("tissues") as heard:
+        library = solve_library(locator, args.device, args.folder and args.folder / "fit.parts", heard)
     table = sys.stderr if args.json else sys.stdout
     print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
     made = []
     for noise in args.noise:
-        sight, said = PointsSeen(args.points, args.cover, noise), []
-        with bar("fits") as heard:
+        sight, said = PointModel(args.points, args.cover, noise), []
+        with show_progress("fits") as heard:
             for number, seen in enumerate(found):
-                tissue = fitted_to(locator, library, seen, sight, args.seed, number < args.forces, args.device)
+                tissue = fit_patient(locator, library, seen, sight, args.seed, number < args.forces, args.device)
                 said.append((seen.patient, tissue))
                 heard(number + 1, len(found))
-        made.append(row(noise, said))
+        made.append(summarise_fits(noise, said))
         print(f"| {' | '.join(_cells(asdict(made[-1])))} |", file=table, flush=True)
     failed = len(every) - len(found)
     if args.json:

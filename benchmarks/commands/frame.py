@@ -34,12 +34,12 @@ def run(args: argparse.Namespace) -> int:
 
     from scenes.analysis.measurement import describe_machine
 
-    from ..studies.frame import batch_rate, frames_of, measure_size, table
+    from ..studies.frame import measure_batch_rate, parse_image_size, summarise_stages, time_frames
 
     check_integer("--frames", args.frames, 1)
     if args.batch is not None:
         check_integer("--batch", args.batch, 1)
-    width, height = measure_size(args.size)
+    width, height = parse_image_size(args.size)
     theatre = open_patient(args, args.scene)
     scene = build_requested_scene(args, args.scene, theatre)
     scene = replace(scene, viewpoint=replace(scene.viewpoint, width=width, height=height))
@@ -47,10 +47,10 @@ def run(args: argparse.Namespace) -> int:
     player = theatre.build_player(name, scene)
     where = f"{describe_machine(args.device)}; {scene.name} by {name}, {width} x {height}"
     with redirect_stdout(sys.stderr):  # viser prints its address there
-        frames = frames_of(player, args.frames)
-        found = table(list(tqdm(frames, "frames", args.frames, unit="frame", file=sys.stderr)))
+        frames = time_frames(player, args.frames)
+        found = summarise_stages(list(tqdm(frames, "frames", args.frames, unit="frame", file=sys.stderr)))
     count = args.batch or (4 if player.stage.device == "cpu" else 64)
-    rate = batch_rate(player, count)
+    rate = measure_batch_rate(player, count)
     if args.json:
         rows = [asdict(row) for row in found]
         print(json.dumps({"machine": where, "rows": rows, "batch": count, "pictures_per_second": rate}))

@@ -18,7 +18,7 @@ from sim.arguments import check_integer
 from sim.elements import ELEMENTS, RECOMMENDED
 
 if TYPE_CHECKING:
-    from ..studies.scaling import Row
+    from ..studies.scaling import ScalingRow
 
 SIZES = (2000, 5300, 17_000, 50_000, 100_000, 200_000)
 
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from sim.runtime.device import find_device
     from sim.runtime.journal import open_journal
 
-    from ..studies.scaling import Row, Trial, panels, rows
+    from ..studies.scaling import MeshTrial, ScalingRow, build_panels, measure_meshes
 
     check_integer("--batch", min(args.batch), 1)
     for size in args.sizes:
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         check_output_path(path, suffix, args.force, resumed=kept.exists())
     if args.force:
         kept.unlink(missing_ok=True)
-    trial = Trial(args.element, args.device, args.out.parent)
+    trial = MeshTrial(args.element, args.device, args.out.parent)
     stated = {"machine": where.split(";")[0], "device": args.device, "element": args.element}
     table = sys.stderr if args.json else sys.stdout
     print(where, file=table)
@@ -65,15 +65,15 @@ def run(args: argparse.Namespace) -> int:
         open_journal(kept, stated) as journal,
         tqdm(total=len(args.sizes) * len(args.batch), unit="row", file=sys.stderr) as bar,
     ):
-        found = [row for row in journal.read_rows(Row) if row.size in args.sizes and row.asked in args.batch]
+        found = [row for row in journal.read_rows(ScalingRow) if row.size in args.sizes and row.asked in args.batch]
         bar.update(len(found))
-        for row in rows(trial, args.sizes, args.batch, tuple(found), bar.set_description):
+        for row in measure_meshes(trial, args.sizes, args.batch, tuple(found), bar.set_description):
             journal.append(row)
             found.append(row)
             bar.update()
     found.sort(key=lambda row: (row.nodes, row.batch))
     write_table(record, [asdict(row) for row in found])
-    write_png(args.out, draw_panels(panels(found)))
+    write_png(args.out, draw_panels(build_panels(found)))
     _print(found, table)
     print(f"\n{args.out}: written; its rows are in {record}, its meshes beside it", file=table)
     if args.json:
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(row.converged == row.loads for row in found) else 1
 
 
-def _print(found: Sequence[Row], table) -> None:
+def _print(found: Sequence[ScalingRow], table) -> None:
     names = (
         "nodes", "tetrahedra", "preconditioner", "set-up [s]", "batch", "a load [s]", "outer", "converged",
         "host [GiB]", "card [GiB]", "card, foreseen [GiB]",

@@ -41,12 +41,12 @@ def run(args: argparse.Namespace) -> int:
     from scenes.analysis.measurement import describe_machine
     from scenes.gym.environment import make_many
 
-    from ..studies.frame import measure_size
+    from ..studies.frame import parse_image_size
     from ..studies.gym_rates import measure_rate
 
     for name in ("envs", "steps", "repeats"):
         check_integer(f"--{name}", getattr(args, name), 1)
-    size, rows = measure_size(args.size), []
+    size, rows = parse_image_size(args.size), []
     apart = ", each in a process of its own" if args.processes else ""
     where = f"{describe_machine(args.device)}; {args.envs} environments{apart}, pictures of {size[0]} x {size[1]}"
     for task in args.tasks or TASKS:

@@ -9,7 +9,7 @@ from scenes.options.shared_options import add_json
 from sim.arguments import check_integer
 from sim.errors import InputError
 
-from .locate import bar
+from .locate import show_progress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,16 +25,16 @@ def run(args: argparse.Namespace) -> int:
     """Measure the latency in several runs, and print the best and the median run; return 0."""
     from scenes.analysis.measurement import describe_machine
 
-    from ..studies.link_latency import CLIENTS, measured
+    from ..studies.link_latency import CLIENTS, measure_latency
 
     check_integer("--points", args.points, 3)
     check_integer("--runs", args.runs, 1)
     if not (0.0 < args.rate <= 1000.0 and 0.0 < args.seconds <= 3600.0):
         raise InputError("--rate and --seconds: give up to 1000 poses a second, and up to 3600 seconds, both above 0.")
     found = []
-    with bar("runs") as heard:
+    with show_progress("runs") as heard:
         for number in range(args.runs):
-            found.append(measured(args.points, args.rate, args.seconds))
+            found.append(measure_latency(args.points, args.rate, args.seconds))
             heard(number + 1, args.runs)
     best = min(found, key=lambda each: each.p99)
     middle = sorted(found, key=lambda each: each.p99)[len(found) // 2]

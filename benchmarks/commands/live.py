@@ -21,7 +21,7 @@ from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 
 if TYPE_CHECKING:
-    from ..studies.live import Tally
+    from ..studies.live import RideStatistics
 
 CHECKED = 20
 """Default number of frames that are compared with the converged solution."""
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from scenes.script.craniotomy_frame import build_craniotomy_frame
     from scenes.script.scene import find_scene
 
-    from ..studies.live import RIDES, errors, frames_of, live_fem, loads_of, tally
+    from ..studies.live import RIDES, build_live_fem, build_loads, compute_errors, solve_frames, summarise_ride
 
     check_integer("--frames", args.frames, 1)
     checked = min(CHECKED, args.frames) if args.checked is None else args.checked
@@ -60,13 +60,13 @@ def run(args: argparse.Namespace) -> int:
     scene = replace(
         find_scene("press"), effects=build_push_effects(site.anatomy, parse_elasticity(args, site.anatomy.mesh))
     )
-    fem = live_fem(scene, site, args.device, args.element)
+    fem = build_live_fem(scene, site, args.device, args.element)
     found = []
     for ride in RIDES:
-        loads = loads_of(ride, scene, site, args.frames)
-        frames = list(tqdm(frames_of(fem, loads), ride.name, args.frames, unit="frame", file=sys.stderr))
+        loads = build_loads(ride, scene, site, args.frames)
+        frames = list(tqdm(solve_frames(fem, loads), ride.name, args.frames, unit="frame", file=sys.stderr))
         sample = frames[:: args.frames // checked][:checked]
-        found.append(tally(ride, frames, errors(sample, scene, site, args.element)))
+        found.append(summarise_ride(ride, frames, compute_errors(sample, scene, site, args.element)))
     where = f"{describe_machine(args.device)}; {len(site.anatomy.mesh.nodes)} nodes, {args.element}"
     if args.json:
         print(
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(item.good and item.error <= 1e3 * MAX_LIVE_ERROR for item in found) else 1
 
 
-def _print(where: str, rides: Sequence[Tally]) -> None:
+def _print(where: str, rides: Sequence[RideStatistics]) -> None:
     names = ("tool", "frames", "ms: median", "p95", "p99", "worst", "outer steps: mean", "most", "outcomes", "off [mm]")
     print(f"{where}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}")
     for item in rides:

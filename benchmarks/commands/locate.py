@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sim.anatomy import Anatomy
     from surrogate.locating.locator import Locator
 
-    from ..studies.locate_study import Row
+    from ..studies.locate_study import LocateRow
 
 HEADS = (
     "points", "cover [%]", "noise", "estimator", "removed [%]", "error: mean [mm]", "p95 [mm]", "in the 95 % ellipsoid",
@@ -83,26 +83,26 @@ def run(args: argparse.Namespace) -> int:
     from scenes.script.shipped_files import get_template_path
     from sim.bodies.meshfile import read_anatomy
 
-    from ..studies.locate_rivals import rivals
-    from ..studies.locate_study import rows, sights_of
-    from ..studies.locate_twins import twins
+    from ..studies.locate_rivals import build_baselines
+    from ..studies.locate_study import build_point_models, measure_baselines
+    from ..studies.locate_twins import solve_cases
 
     _check(args)
     body = read_anatomy(args.anatomy or get_template_path())
-    finer = finer_of(args)
-    with bar("twins") as heard:
-        found = list(twins(body, finer, args.twins, args.seed, args.device, args.element, args.folder, heard))
+    finer = read_finer_mesh(args)
+    with show_progress("twins") as heard:
+        found = list(solve_cases(body, finer, args.twins, args.seed, args.device, args.element, args.folder, heard))
     failed = [number for number, twin in enumerate(found) if twin is None]
     some = [twin for twin in found if twin is not None]
-    locator = locator_of(args, body)
+    locator = open_locator(args, body)
     table = sys.stderr if args.json else sys.stdout
     where = f"{describe_machine(args.device)}; truths of {len(finer.mesh.nodes)} nodes, {args.element}"
     print(f"{where}\n\n{len(some)} twins\n\n| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
     others = {"named": not args.clouds, "slip": 1e-3 * args.slip, "wrong": args.wrong_registration}
-    sights = sights_of(args.points, args.cover, args.noise, **others)
+    sights = build_point_models(args.points, args.cover, args.noise, **others)
     made = []
-    with bar("observations") as heard:
-        for row in rows(some, sights, rivals(body), locator, args.seed, heard):
+    with show_progress("observations") as heard:
+        for row in measure_baselines(some, sights, build_baselines(body), locator, args.seed, heard):
             made.append(row)
             print(f"| {' | '.join(_cells(row))} |", file=table, flush=True)
     if failed:
@@ -131,16 +131,16 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError(
             f"--slip {args.slip:g}: give how far all points are displaced, from 0 to {MOST_SLIPPED:g} [mm]."
         )
-    check_finer(args)
+    check_finer_mesh(args)
 
 
-def check_finer(args: argparse.Namespace) -> None:
+def check_finer_mesh(args: argparse.Namespace) -> None:
     """Raise InputError for a user's brain without its finer mesh."""
     if args.anatomy is not None and args.finer is None:
         raise InputError("--anatomy needs --finer: a finer mesh of the same brain, by `sulcus anatomy --nodes`.")
 
 
-def finer_of(args: argparse.Namespace) -> Anatomy:
+def read_finer_mesh(args: argparse.Namespace) -> Anatomy:
     """Return the mesh on which the ground truths are solved."""
     from sim.bodies.meshfile import read_anatomy, write_anatomy
     from sim.bodies.subject import MeshPlan, make_anatomy
@@ -157,17 +157,17 @@ def finer_of(args: argparse.Namespace) -> Anatomy:
     return anatomy
 
 
-def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
+def open_locator(args: argparse.Namespace, anatomy: Anatomy) -> Locator:
     """Read the given locator, or the one in the folder, or build a new one."""
     from surrogate.locating.locator_store import load_locator, make_locator, save_locator
 
-    path = args.locator or (args.folder and args.folder / f"{body.digest}.locator.npz")
+    path = args.locator or (args.folder and args.folder / f"{anatomy.digest}.locator.npz")
     if args.locator or (path and path.is_file()):
-        return load_locator(path, body)
+        return load_locator(path, anatomy)
     parts = None if path is None else path.with_suffix(".parts")
-    with bar("locator") as heard:
+    with show_progress("locator") as heard:
         locator = make_locator(
-            body, device=args.device, folder=parts, progress=lambda stage, done, total: heard(done, total, stage)
+            anatomy, device=args.device, folder=parts, progress=lambda stage, done, total: heard(done, total, stage)
         )
     if path is not None:
         save_locator(path, locator)
@@ -175,7 +175,7 @@ def locator_of(args: argparse.Namespace, body: Anatomy) -> Locator:
 
 
 @contextmanager
-def bar(name: str) -> Iterator[Callable[..., None]]:
+def show_progress(name: str) -> Iterator[Callable[..., None]]:
     """Show a progress bar on the error stream; yield a function that sets its count, total and stage."""
     from tqdm import tqdm
 
@@ -188,7 +188,7 @@ def bar(name: str) -> Iterator[Callable[..., None]]:
         yield heard
 
 
-def _cells(row: Row) -> Iterable[str]:
+def _cells(row: LocateRow) -> Iterable[str]:
     """Format the cells of a table row."""
     held = "" if row.held is None else f"{row.held:.0f} %"
     took = "" if row.milliseconds is None else f"{row.milliseconds:.3g}"

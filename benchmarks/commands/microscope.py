@@ -8,7 +8,7 @@ from scenes.options.patient_options import add_patient, build_requested_scene, o
 from scenes.options.shared_options import add_json
 from sim.arguments import check_integer
 
-from .locate import bar
+from .locate import show_progress
 
 HEADS = (
     "seed", "frames", "refused", "points", "tumour moves by up to [mm]", "off: median", "95 %", "most", "removed [%]",
@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure the errors for each seed, and print the table; return 0."""
     from scenes.script.observation_models import StereoObservation
 
-    from ..studies.stereo_study import rows
+    from ..studies.stereo_study import measure_scene
 
     check_integer("--seeds", args.seeds, 1)
     check_integer("--every", args.every, 1)
@@ -40,8 +40,8 @@ def run(args: argparse.Namespace) -> int:
     if isinstance(scene.observation_model, StereoObservation):
         model = replace(scene.observation_model, named=not args.cloud, vessels=not args.plain)
         scene = replace(scene, observation_model=model)
-    with bar("estimates") as heard:
-        found = list(rows(theatre, scene, range(args.seeds), args.every, heard))
+    with show_progress("estimates") as heard:
+        found = list(measure_scene(theatre, scene, range(args.seeds), args.every, heard))
     if args.json:
         print(json.dumps([asdict(row) for row in found]))
         return 0

@@ -23,7 +23,7 @@ from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 
 if TYPE_CHECKING:
-    from ..studies.robustness import Tally
+    from ..studies.robustness import SetStatistics
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,13 +45,13 @@ def run(args: argparse.Namespace) -> int:
     from scenes.analysis.measurement import describe_machine, write_table
     from sim.runtime.journal import open_journal
 
-    from ..studies.robustness import Record, Trial, records, tallies
+    from ..studies.robustness import LoadRecord, SolverTrial, solve_loads, summarise_sets
 
     if args.count < 2 or args.batch < 1:
         raise InputError(f"--count {args.count} --batch {args.batch} tries nothing: give --count >= 2, --batch >= 1.")
     anatomy = read_anatomy(args.anatomy or get_template_path())
     effects = build_push_effects(anatomy, parse_elasticity(args, anatomy.mesh))
-    trial = Trial(anatomy, effects, args.element, args.device, args.batch)
+    trial = SolverTrial(anatomy, effects, args.element, args.device, args.batch)
     stated = {"anatomy": anatomy.digest, "effects": repr(effects), "element": args.element}
     stated |= {"count": str(args.count), "seed": str(args.seed)}
     kept = args.out and args.out.with_suffix(".rows")
@@ -63,9 +63,9 @@ def run(args: argparse.Namespace) -> int:
         open_journal(kept, stated) if kept else nullcontext() as journal,
         tqdm(total=args.count, unit="load", file=sys.stderr) as bar,
     ):
-        found = journal.read_rows(Record) if journal is not None else []
+        found = journal.read_rows(LoadRecord) if journal is not None else []
         bar.update(len(found))
-        for some in records(trial, args.count, args.seed, tuple(found)):
+        for some in solve_loads(trial, args.count, args.seed, tuple(found)):
             found += some
             bar.update(len(some))
             if journal is not None:
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
                     journal.append(record)
     if kept:
         write_table(args.out, [asdict(record) for record in found])
-    sets = tallies(found)
+    sets = summarise_sets(found)
     where = describe_machine(args.device)
     if args.json:
         print(json.dumps({"machine": where, "sets": [asdict(item) for item in sets]}))
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(item.converged == item.loads for item in sets) else 1
 
 
-def _print(where: str, sets: Sequence[Tally]) -> None:
+def _print(where: str, sets: Sequence[SetStatistics]) -> None:
     names = ("set", "loads", "converged", "rescued", "outer: median", "p99", "ms a load", "float64 residual", "hardest")
     print(f"{where}\n\n| {' | '.join(names)} |\n|{'---|' * len(names)}")
     for item in sets:

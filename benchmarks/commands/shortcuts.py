@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     from scenes.script.craniotomy_frame import build_craniotomy_frame
     from sim.runtime.device import find_device
 
-    from ..studies.shortcuts import measure, works
+    from ..studies.shortcuts import list_cases, measure_case
 
     check_integer("--runs", args.runs, 1)
     site = build_craniotomy_frame(read_anatomy(args.anatomy or get_template_path()))
@@ -34,8 +34,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"{where}\n\n| shortcut | work | runs | with: median, p95 [ms] | without | ratio | of totals |", file=table)
     print(f"|{'---|' * 7}", file=table)
     found = []
-    for work in works(site, args.runs, find_device(args.device, LIVE.precision).on_cuda):
-        row = measure(work, site, args.device)
+    for work in list_cases(site, args.runs, find_device(args.device, LIVE.precision).on_cuda):
+        row = measure_case(work, site, args.device)
         if row is None:
             continue
         found.append(row)

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, row by row; return 1 if a solve did not converge."""
     from scenes.analysis.measurement import describe_machine
 
-    from ..studies.skull_models import rows
+    from ..studies.skull_models import measure_skulls
 
     check_integer("--loads", args.loads, 1)
     plans = [MeshPlan(count) for count in args.nodes]
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     print("| skull | nu | vertices | tumour moves [mm] | leaks | bond bears | a load [s] |", file=table)
     print("|---|---|---|---|---|---|---|", file=table)
     found = []
-    for row in rows(bodies, args.skulls, args.poisson, loads, args.device):
+    for row in measure_skulls(bodies, args.skulls, args.poisson, loads, args.device):
         found.append(row)
         moved = f"{row.motion:.4f}" + (f" ({row.failed} not converged)" if row.failed else "")
         bond = "" if row.bond is None else f"{row.bond:.2f}"

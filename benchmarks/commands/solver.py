@@ -19,7 +19,7 @@ from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 
 if TYPE_CHECKING:
-    from ..peers.comparison import Row
+    from ..peers.comparison import EngineRow
 
 NAMES = ("tled", "modified-newton", "torch-fem", "scikit-fem", "felupe")
 COLUMNS = (
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     from scenes.analysis.measurement import describe_machine
     from sim.runtime.device import find_device
 
-    from ..peers.comparison import LEAST, OWN, PEERS, build_judge, case_of, compare
+    from ..peers.comparison import LEAST, OWN, PEERS, build_case, build_reference_solver, compare_engines
 
     for name, value, least in (
         ("--loads", args.loads, 2),
@@ -77,8 +77,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--tolerance {wrong[0]:g} cannot be judged: give numbers from {LEAST:g} to below 1.")
     find_device(args.device, "float64")
     asked = () if args.peers is None else args.peers or NAMES
-    engines = [engine.on(args.device) for engine in (OWN, *(peer for peer in PEERS if peer.name in asked))]
-    cases = [case_of(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [get_template_path()]]
+    engines = [engine.select_device(args.device) for engine in (OWN, *(peer for peer in PEERS if peer.name in asked))]
+    cases = [build_case(read_anatomy(path), args.loads, args.seed) for path in args.mesh or [get_template_path()]]
     table = sys.stderr if args.json else sys.stdout
     where = describe_machine(args.device)
     print(
@@ -90,15 +90,15 @@ def run(args: argparse.Namespace) -> int:
     )
     found, each = [], args.starts + args.loads
     for case in cases:
-        started = sum(not engine.missing for engine in engines)
+        started = sum(not engine.missing_reason for engine in engines)
         size = {"nodes": len(case.nodes), "tets": len(case.tets)}
         print(f"\n{size['nodes']} nodes, {size['tets']} tetrahedra\n\n| {' | '.join(COLUMNS)} |", file=table)
         print(f"|{'---|' * len(COLUMNS)}", file=table, flush=True)
-        judge = build_judge(case)
+        judge = build_reference_solver(case)
         with tqdm(total=len(args.tolerance) * started * each, unit="answer", file=sys.stderr) as bar:
             for tolerance in args.tolerance:
                 to_this = replace(case, tolerance=tolerance)
-                rows = compare(to_this, judge, engines, args.starts, args.threads, bar.update)
+                rows = compare_engines(to_this, judge, engines, args.starts, args.threads, bar.update)
                 _print(rows, table)
                 found.append({**size, "tolerance": tolerance, "rows": [_plain(row) for row in rows]})
     if args.json:
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(answer["good"] for mesh in found for answer in mesh["rows"][0]["answers"]) else 1
 
 
-def _print(rows: Sequence[Row], table: Any) -> None:
+def _print(rows: Sequence[EngineRow], table: Any) -> None:
     for row in rows:
         if row.missing:
             print(f"| {row.engine} | {row.tolerance:g} | {row.missing} |{' |' * (len(COLUMNS) - 3)}", file=table)
@@ -132,6 +132,6 @@ def _figure(value: float, form: str) -> str:
     return format(value, form) if np.isfinite(value) else ""
 
 
-def _plain(row: Row) -> dict[str, Any]:
+def _plain(row: EngineRow) -> dict[str, Any]:
     answers = [{**asdict(answer), "good": answer.good} for answer in row.answers]
     return {**asdict(row), "first": row.first, "further": row.further, "answers": answers}

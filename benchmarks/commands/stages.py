@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from scenes.script.scene import SCENES, find_scene
     from sim.effects import ToolForce
 
-    from ..studies.stages import rows
+    from ..studies.stages import measure_stages
 
     check_integer("--batch", args.batch, 1)
     theatre = open_patient(args, args.scene)
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     where = describe_machine(args.device)
     table = sys.stderr if args.json else sys.stdout
     print(f"{where}\n\n| stage | median | p95 | | what |\n|---|---|---|---|---|", file=table)
-    for row in rows(theatre, player, name, args.solves, args.batch, solvers.append):
+    for row in measure_stages(theatre, player, name, args.solves, args.batch, solvers.append):
         found.append(row)
         p95 = "" if row.p95 is None else f"{row.p95:.3g}"
         print(f"| {row.name} | {row.median:.3g} | {p95} | {row.unit} | {row.note} |", file=table, flush=True)

@@ -20,12 +20,12 @@ from sim.elements import ELEMENTS, RECOMMENDED
 from sim.material import LAWS, Material
 from surrogate.data.tool_loads import PRESETS
 
-from ..figures.figure_tables import three_digits
+from ..figures.figure_tables import format_number
 
 if TYPE_CHECKING:
     from sim.effects import Effect
 
-    from ..studies.throughput import Drawn, Row, Together
+    from ..studies.throughput import Drawn, ThroughputRow, ToolsRow
 
 YOUNG = 3000.0
 # Batch size on the CPU, where larger ones gain nothing; number of loads of a row on the CPU, and on CUDA.
@@ -71,8 +71,8 @@ def run(args: argparse.Namespace) -> int:
     from sim.runtime.device import parse_device_names
     from surrogate.data.tool_poses import BALL_PRESETS, choose_ball
 
-    from ..studies.robustness import Trial
-    from ..studies.throughput import drawn, rows, together
+    from ..studies.robustness import SolverTrial
+    from ..studies.throughput import combine_rows, measure_rates, sample_loads
 
     devices = parse_device_names(args.device)
     on_cuda = devices[0].startswith("cuda")
@@ -82,18 +82,18 @@ def run(args: argparse.Namespace) -> int:
         check_integer(name, value, 1)
     materials = [Material(law, YOUNG, poisson) for law in args.laws for poisson in args.poisson]
     anatomy = read_anatomy(args.anatomy or get_template_path())
-    trial = Trial(anatomy, (), args.element, devices[0], batch)
-    sets = drawn(anatomy, args.presets or (BALL_PRESETS if args.poses else PRESETS), count, args.poses)
+    trial = SolverTrial(anatomy, (), args.element, devices[0], batch)
+    sets = sample_loads(anatomy, args.presets or (BALL_PRESETS if args.poses else PRESETS), count, args.poses)
     groups: list[tuple[dict[str, Drawn], tuple[Effect, ...]]] = [(sets, ())]
     if args.poses:
         groups = [({name: loads}, (ToolContact((choose_ball(name),)),)) for name, loads in sets.items()]
     table = sys.stderr if args.json else sys.stdout
     where = describe_machine(devices[0]) + (f"; at once on {', '.join(devices)}" if len(devices) > 1 else "")
     print(where, file=table)
-    found: list[Row] = []
+    found: list[ThroughputRow] = []
     with tqdm(total=len(materials) * len(sets) * (args.repeats + 2), unit="solve", file=sys.stderr) as bar:
         measured = (
-            rows(trial, material, some, args.repeats, bar.update, tools, devices)
+            measure_rates(trial, material, some, args.repeats, bar.update, tools, devices)
             for material in materials
             for some, tools in groups
         )
@@ -103,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
                     print(_header(row, batch, args.repeats), file=table)
                 print(_line(row), file=table, flush=True)
             found.append(row)
-    tools = together(found)
+    tools = combine_rows(found)
     print("", *map(_sentence, tools), sep="\n", file=table)
     if args.json:
         said = {"machine": where, "batch": batch, "rows": [{**asdict(row), "rate": row.rate} for row in found]}
@@ -111,28 +111,28 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(row.converged == row.loads for row in found) else 1
 
 
-def _header(row: Row, batch: int, repeats: int) -> str:
+def _header(row: ThroughputRow, batch: int, repeats: int) -> str:
     each = "" if row.devices == 1 else f"; {row.devices} processes, each with all loads of a set"
     done = f"preconditioner: {row.preconditioner}; batches of at most {batch}, E {YOUNG:g} Pa, to {TRAIN.tolerance:g}"
     head = f"\n\n| {' | '.join(NAMES)} |\n|{'---|' * len(NAMES)}"
     return f"{done} in {TRAIN.precision}, median of {repeats}{each}{head}"
 
 
-def _line(row: Row) -> str:
+def _line(row: ThroughputRow) -> str:
     cells = (
         row.law, f"{row.poisson:g}", row.element, row.nodes, row.preset, row.loads, row.converged,
-        f"{row.steps_median:g}", f"{row.steps_p99:g}", three_digits(row.rate), three_digits(1e6 / row.rate),
-        three_digits(row.loads / row.draw_seconds), f"<= {row.double:.1e} of {row.checked}",
+        f"{row.steps_median:g}", f"{row.steps_p99:g}", format_number(row.rate), format_number(1e6 / row.rate),
+        format_number(row.loads / row.draw_seconds), f"<= {row.double:.1e} of {row.checked}",
     )  # fmt: skip
     return f"| {' | '.join(map(str, cells))} |"
 
 
-def _sentence(item: Together) -> str:
+def _sentence(item: ToolsRow) -> str:
     tissue = f"{item.law}, nu {item.poisson:g}: set-up {item.set_up:.3g} s"
     if item.rate is None:
         return tissue
-    names, rate = ", ".join(item.presets), three_digits(item.rate)
-    drawing = three_digits(item.loads / (item.seconds + item.draw_seconds))
+    names, rate = ", ".join(item.presets), format_number(item.rate)
+    drawing = format_number(item.loads / (item.seconds + item.draw_seconds))
     return (
         f"{tissue}; the tools together ({names}): {item.loads} loads in {item.seconds:.3g} s, "
         f"{rate} solves/s; {drawing} with drawing them"

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from scenes.options.shared_options import add_json, add_seed
 from sim.arguments import check_integer
 
-from .locate import bar
+from .locate import show_progress
 
 HEADS = (
     "protocol", "pictures", "tip: median [mm]", "p95", "largest", "certain [%]", "wrong", "held at 95 % [%]", "ms",
@@ -24,12 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure; return 1 if a wrong pose was reported as certain."""
-    from ..studies.track_study import studied
+    from ..studies.track_study import measure_protocols
 
     check_integer("--pictures", args.pictures, 2)
     check_integer("--seed", args.seed, 0)
-    with bar("pictures") as heard:
-        rows = studied(args.pictures, args.seed, heard)
+    with show_progress("pictures") as heard:
+        rows = measure_protocols(args.pictures, args.seed, heard)
     if args.json:
         print(json.dumps([asdict(row) for row in rows]))
     else:

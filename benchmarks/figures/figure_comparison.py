@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from sim.errors import InputError
 
 from .figure_record import Entry, Record, Value
-from .figure_tables import three_digits
+from .figure_tables import format_number
 
 MARGIN = 1.1
 """Factor above which a number counts as worse."""
@@ -28,16 +28,16 @@ class Change:
         return self.new.value / self.old.value if self.old.value else math.inf
 
     @property
-    def worse(self) -> bool:
+    def is_worse(self) -> bool:
         """True if the new number is worse by more than the margin."""
         grown, shrunk = self.ratio > MARGIN, self.ratio < 1.0 / MARGIN
         return {"smaller": grown, "larger": shrunk, "same": grown or shrunk}[self.new.better]
 
     @property
-    def line(self) -> str:
+    def table_row(self) -> str:
         """Row of the Markdown table."""
-        numbers = " | ".join(three_digits(one.value) for one in (self.old, self.new))
-        ratio = f"**{self.ratio:.2f}**" if self.worse else f"{self.ratio:.2f}"
+        numbers = " | ".join(format_number(one.value) for one in (self.old, self.new))
+        ratio = f"**{self.ratio:.2f}**" if self.is_worse else f"{self.ratio:.2f}"
         return f"| {self.name} | {numbers} | {self.new.unit} | {ratio} |"
 
 
@@ -50,12 +50,12 @@ class Comparison:
     notes: tuple[str, ...]
 
     @property
-    def worse(self) -> tuple[Change, ...]:
+    def regressions(self) -> tuple[Change, ...]:
         """Changes for the worse, beyond the margin."""
-        return tuple(change for change in self.changes if change.worse)
+        return tuple(change for change in self.changes if change.is_worse)
 
 
-def compared(old: Record, new: Record) -> Comparison:
+def compare_records(old: Record, new: Record) -> Comparison:
     """Compare the figures of both records that one command measured on one anatomy.
 
     Raises

@@ -26,15 +26,15 @@ class Reading:
     place: Place
 
 
-def number_at(said: Any, place: Place) -> float | None:
+def read_number(output: Any, place: Place) -> float | None:
     """Return the number >= 0 at a place in JSON output; None if there is none, or several."""
     try:
         for step in place:
             if isinstance(step, Mapping):
-                (said,) = (item for item in said if all(_fits(item[key], wanted) for key, wanted in step.items()))
+                (output,) = (item for item in output if all(_fits(item[key], wanted) for key, wanted in step.items()))
             else:
-                said = said[step]
-        number = math.nan if isinstance(said, bool) else float(said)
+                output = output[step]
+        number = math.nan if isinstance(output, bool) else float(output)
     except (LookupError, TypeError, ValueError, OverflowError):
         return None
     return number if 0.0 <= number <= MAX_MAGNITUDE else None
@@ -57,12 +57,12 @@ def _same(name: str, unit: str, *place: str | int | Mapping[str, str | float]) -
     return Reading(name, unit, "same", place)
 
 
-def rates(*presets: str) -> tuple[Reading, ...]:
+def list_rates(*presets: str) -> tuple[Reading, ...]:
     """List loads per second of `benchmarks throughput`."""
     return tuple(_larger(name, "loads/s", "rows", {"preset": name}, "rate") for name in presets)
 
 
-def steps(*presets: str) -> tuple[Reading, ...]:
+def list_steps(*presets: str) -> tuple[Reading, ...]:
     """List the solver's steps of `benchmarks throughput`."""
     return tuple(
         _smaller(f"{name}, {kind}", "steps", "rows", {"preset": name}, f"steps_{kind}")
@@ -99,7 +99,7 @@ PICTURE = (
 """Numbers of `benchmarks frame`."""
 
 
-def shortcuts(*pairs: tuple[str, str]) -> tuple[Reading, ...]:
+def list_shortcut_medians(*pairs: tuple[str, str]) -> tuple[Reading, ...]:
     """List the medians of `benchmarks shortcuts` with and without each acceleration."""
     return tuple(
         _smaller(f"{shortcut}, {work}: {kind}", "ms", "rows", {"shortcut": shortcut, "work": work}, field)
@@ -108,7 +108,7 @@ def shortcuts(*pairs: tuple[str, str]) -> tuple[Reading, ...]:
     )
 
 
-def growth(*batches: str) -> tuple[Reading, ...]:
+def list_growth(*batches: str) -> tuple[Reading, ...]:
     """List one mesh size of `benchmarks growth`, with batches of these numbers of loads, 1 included."""
     return (
         _smaller("set-up", "s", "rows", {"asked": 1}, "set_up"),
@@ -117,7 +117,7 @@ def growth(*batches: str) -> tuple[Reading, ...]:
     )
 
 
-def beside(tolerances: Sequence[str], peers: Sequence[str]) -> tuple[Reading, ...]:
+def list_peer_ratios(tolerances: Sequence[str], peers: Sequence[str]) -> tuple[Reading, ...]:
     """List the seconds of sulcus in `benchmarks solver`, and each peer's ratio to them."""
     loads = (("first load", "first", "first_ratio"), ("a further one", "further", "ratio"))
     found = []
@@ -132,7 +132,7 @@ def beside(tolerances: Sequence[str], peers: Sequence[str]) -> tuple[Reading, ..
     return tuple(found)
 
 
-def robust(*presets: str) -> tuple[Reading, ...]:
+def list_robustness(*presets: str) -> tuple[Reading, ...]:
     """List numbers of `benchmarks robust`."""
     found = []
     for name in presets:
@@ -144,7 +144,7 @@ def robust(*presets: str) -> tuple[Reading, ...]:
     return tuple(found)
 
 
-def skulls(*names: str) -> tuple[Reading, ...]:
+def list_skull_motions(*names: str) -> tuple[Reading, ...]:
     """List numbers of `benchmarks skull` with one mesh and one Poisson's ratio."""
     found = []
     for name in names:
@@ -153,7 +153,7 @@ def skulls(*names: str) -> tuple[Reading, ...]:
     return tuple(found)
 
 
-def elements(names: Sequence[str], poissons: Sequence[float]) -> tuple[Reading, ...]:
+def list_element_motions(names: Sequence[str], poissons: Sequence[float]) -> tuple[Reading, ...]:
     """List numbers of `benchmarks elements --coarse` with one mesh."""
     found = []
     for name in names:

@@ -77,7 +77,7 @@ class Record:
     rows: tuple[Entry, ...]
 
 
-def record_of(origin: Origin, entries: Sequence[Entry]) -> Record:
+def build_record(origin: Origin, entries: Sequence[Entry]) -> Record:
     """Build the record of a run at `origin`."""
     return Record(FORMAT, origin.version, origin.machine, origin.date, tuple(entries))
 

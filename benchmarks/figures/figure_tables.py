@@ -9,7 +9,7 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import wrap_errors
 
 from .figure_record import Entry, Record
-from .figures import NAMED, command_of
+from .figures import NAMED, format_command
 
 BEGIN, END = "<!-- bench:", "<!-- end -->"
 MARKED = re.compile(rf"({BEGIN} ([^\n]*?) -->\n)(.*?)({END})", re.DOTALL)
@@ -18,12 +18,12 @@ PLACES = "| measured on | figures |\n|---|---|"
 NOT_HERE = "not measured here"
 
 
-def three_digits(value: float) -> str:
+def format_number(value: float) -> str:
     """Format a number with three digits; from 100 on, as a whole number with separated thousands."""
     return f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}"
 
 
-def table(entries: Sequence[Entry]) -> str:
+def format_table(entries: Sequence[Entry]) -> str:
     """Format a row for each figure, its numbers or a reason; below the table, machines and dates."""
     lines = [_line(it.name, _numbers(it) or f"{it.state}: {it.reason}", it.command) for it in entries]
     return _with_origins(lines, [it for it in entries if it.values])
@@ -44,7 +44,7 @@ def _line(name: str, cell: str, command: str) -> str:
 
 
 def _numbers(entry: Entry) -> str:
-    said = "; ".join(f"{one.name} {three_digits(one.value)} {one.unit}" for one in entry.values)
+    said = "; ".join(f"{one.name} {format_number(one.value)} {one.unit}" for one in entry.values)
     return f"{said} ({entry.reason})" if said and entry.reason else said
 
 
@@ -92,7 +92,7 @@ def _marked(names: Sequence[str], record: Record) -> str:
     lines = [
         _line(name, _numbers(there[name]), there[name].command)
         if name in there
-        else _line(name, NOT_HERE, command_of(NAMED[name]))
+        else _line(name, NOT_HERE, format_command(NAMED[name]))
         for name in names
     ]
     return _with_origins(lines, list(there.values()))

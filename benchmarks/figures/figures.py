@@ -11,14 +11,14 @@ from .figure_readings import (
     STAGES,
     TOGETHER,
     Reading,
-    beside,
-    elements,
-    growth,
-    rates,
-    robust,
-    shortcuts,
-    skulls,
-    steps,
+    list_element_motions,
+    list_growth,
+    list_peer_ratios,
+    list_rates,
+    list_robustness,
+    list_shortcut_medians,
+    list_skull_motions,
+    list_steps,
 )
 
 Kind = Literal["cpu", "cuda"]
@@ -37,9 +37,9 @@ class Figure:
         Required device.
     readings
         Numbers of the figure.
-    quick
+    quick_options
         Further arguments for a smoke test with small counts; a repeated option overrides the earlier one.
-    body
+    anatomy_option
         Option for an anatomy; empty: the anatomy is a positional argument; None: not supported.
     modules
         Further required Python modules.
@@ -49,8 +49,8 @@ class Figure:
     command: str
     device: Kind
     readings: tuple[Reading, ...]
-    quick: str = ""
-    body: str | None = "--anatomy"
+    quick_options: str = ""
+    anatomy_option: str | None = "--anatomy"
     modules: tuple[str, ...] = ()
 
 
@@ -71,7 +71,7 @@ STABLE = "--laws stable-neo-hookean --poisson 0.45"
 
 def _throughput(name: str, device: Kind, words: str, *presets: str, more: tuple[Reading, ...] = ()) -> Figure:
     command = f"throughput {words} --presets {' '.join(presets)}"
-    return Figure(name, command, device, (*rates(*presets), *more), "--count 4 --repeats 1")
+    return Figure(name, command, device, (*list_rates(*presets), *more), "--count 4 --repeats 1")
 
 
 def _live(name: str, device: Kind, words: str) -> Figure:
@@ -85,7 +85,7 @@ def _picture(device: Kind, size: str) -> Figure:
 
 def _growth(device: Kind, size: int, *batches: str) -> Figure:
     command = f"growth --element p1 --sizes {size} --batch {' '.join(batches)}"
-    return Figure(f"growth-{size}-{device}", command, device, growth(*batches), "--sizes 2000", None)
+    return Figure(f"growth-{size}-{device}", command, device, list_growth(*batches), "--sizes 2000", None)
 
 
 def _poses(element: str, count: int) -> Figure:
@@ -95,15 +95,15 @@ def _poses(element: str, count: int) -> Figure:
 
 def _solver(name: str, device: Kind, words: str, tolerances: str, *peers: str, modules=()) -> Figure:
     command = f"solver --peers {' '.join(peers)} --starts 1 --tolerance {tolerances} {words}"
-    return Figure(name, command, device, beside(tolerances.split(), peers), "--loads 2", "--mesh", modules)
+    return Figure(name, command, device, list_peer_ratios(tolerances.split(), peers), "--loads 2", "--mesh", modules)
 
 
 def _skull(name: str, nodes: int, *skull: str) -> Figure:
     command = f"skull --nodes {nodes} --poisson 0.49 --skulls {' '.join(skull)}"
-    return Figure(f"skull-{name}-cpu", command, "cpu", skulls(*skull), "--loads 1", "")
+    return Figure(f"skull-{name}-cpu", command, "cpu", list_skull_motions(*skull), "--loads 1", "")
 
 
-_STEPS = steps("palpation", "spatula")
+_STEPS = list_steps("palpation", "spatula")
 _ALL = (*TOOLS, "mixed")
 _PACKAGES = ("pypardiso", "felupe", "skfem")
 
@@ -113,12 +113,12 @@ FIGURES = (
     _live("live-cpu", "cpu", "--frames 60"),
     _live("live-cuda", "cuda", "--frames 1000"),
     Figure("stages-cpu", "stages press", "cpu", STAGES, "--solves 4 --batch 4"),
-    Figure("shortcuts-cpu", "shortcuts --runs 8", "cpu", shortcuts(*SHORTCUTS), "--runs 1"),
+    Figure("shortcuts-cpu", "shortcuts --runs 8", "cpu", list_shortcut_medians(*SHORTCUTS), "--runs 1"),
     Figure(
         "shortcuts-cuda",
         "shortcuts --runs 40",
         "cuda",
-        shortcuts(("frame as one captured graph", "frames of `press`, smoothed")),
+        list_shortcut_medians(("frame as one captured graph", "frames of `press`, smoothed")),
         "--runs 1",
     ),
     *(_picture(device, size) for device in Kind.__args__ for size in ("640x480", "800x600", "960x540")),
@@ -142,14 +142,14 @@ FIGURES = (
         f"--element p1 {STABLE} --count 6600",
         "seed",
         "brutal",
-        more=steps("seed", "brutal"),
+        more=list_steps("seed", "brutal"),
     ),
     _throughput(
         "throughput-quadratic-cuda",
         "cuda",
         f"--element p2 {STABLE} --count 2048",
         *TOOLS,
-        more=(*steps(*TOOLS), *TOGETHER),
+        more=(*list_steps(*TOOLS), *TOGETHER),
     ),
     *(_poses(element, count) for element in ("p1", "smoothed") for count in (64, 1024)),
     *(_growth("cpu", size, "1", "8") for size in (2000, 5300, 17_000, 50_000, 100_000, 200_000)),
@@ -166,7 +166,9 @@ FIGURES = (
         for threads in (1, 2)
     ),
     _solver("solver-cuda", "cuda", "--loads 4", "1e-4", "tled"),
-    Figure("robust-cuda", f"robust --batch 1024 {LINEAR}", "cuda", robust(*TOOLS, "seed", "brutal"), "--count 12"),
+    Figure(
+        "robust-cuda", f"robust --batch 1024 {LINEAR}", "cuda", list_robustness(*TOOLS, "seed", "brutal"), "--count 12"
+    ),
     _skull("5300", 5300, "bonded", "slide"),
     _skull("17000", 17_000, "bonded", "slide"),
     _skull("40000", 40_000, "bonded"),
@@ -175,22 +177,22 @@ FIGURES = (
         "elements-cpu",
         "elements --coarse",
         "cpu",
-        elements(("p1", "smoothed", "p2"), (0.30, 0.45, 0.49, 0.495)),
-        body="",
+        list_element_motions(("p1", "smoothed", "p2"), (0.30, 0.45, 0.49, 0.495)),
+        anatomy_option="",
     ),
-    Figure("elements-limit-cpu", "elements --poisson 0.495", "cpu", LIMIT, body=""),
+    Figure("elements-limit-cpu", "elements --poisson 0.495", "cpu", LIMIT, anatomy_option=""),
 )
 """Figures of docs/notes/figures.md and docs/notes/solver_speed.md, by measurement."""
 NAMED = {figure.name: figure for figure in FIGURES}
 
 
-def words_of(figure: Figure, quick: bool = False, anatomy: str | None = None) -> tuple[str, ...]:
+def build_arguments(figure: Figure, is_quick: bool = False, anatomy: str | None = None) -> tuple[str, ...]:
     """Return the arguments after `PROGRAM`; the anatomy follows the first, where no list option can absorb it."""
     first, *rest = figure.command.split()
-    body = () if anatomy is None or figure.body is None else (*filter(None, [figure.body]), anatomy)
-    return (first, *body, *rest, *(figure.quick.split() if quick else ()), "--device", figure.device)
+    body = () if anatomy is None or figure.anatomy_option is None else (*filter(None, [figure.anatomy_option]), anatomy)
+    return (first, *body, *rest, *(figure.quick_options.split() if is_quick else ()), "--device", figure.device)
 
 
-def command_of(figure: Figure, quick: bool = False) -> str:
+def format_command(figure: Figure, is_quick: bool = False) -> str:
     """Return the command line with which a reader can measure a figure."""
-    return shlex.join((*PROGRAM, *words_of(figure, quick)))
+    return shlex.join((*PROGRAM, *build_arguments(figure, is_quick)))

@@ -17,24 +17,24 @@ POLL = 0.5
 
 
 @dataclass(frozen=True)
-class Ended:
+class ProcessResult:
     """Ended process: exit code, output, last line of its standard error, and duration [s]."""
 
     code: int
     output: str
-    complaint: str
+    error: str
     seconds: float
 
 
-def package_environment(more: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Build the environment of a process that imports this copy of the package, with `more` variables."""
+def build_environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Build the environment of a process that imports this copy of the package, with `variables` variables."""
     paths = [str(HOUSE), *filter(None, [os.environ.get("PYTHONPATH")])]
-    return {**os.environ, **(more or {}), "PYTHONPATH": os.pathsep.join(paths)}
+    return {**os.environ, **(variables or {}), "PYTHONPATH": os.pathsep.join(paths)}
 
 
 def start_program(command: Sequence[str], variables: Mapping[str, str], **streams: Any) -> subprocess.Popen[str]:
     """Start a program in a separate session, so that `stop_program` also ends its children."""
-    environment = package_environment(variables)
+    environment = build_environment(variables)
     return subprocess.Popen(command, env=environment, start_new_session=True, text=True, **streams)
 
 
@@ -45,12 +45,12 @@ def stop_program(child: subprocess.Popen[str]) -> None:
     child.communicate()
 
 
-def run_to_end(command: Sequence[str], folder: Path, heard: Callable[[str], object]) -> Ended:
+def run_command(command: Sequence[str], folder: Path, on_line: Callable[[str], object]) -> ProcessResult:
     """Run a command in a folder to its end, then end its children.
 
     Parameters
     ----------
-    heard
+    on_line
         Receives each line that the command writes to its standard error; an empty line: the command still runs.
     """
     begun, complaint, left = time.perf_counter(), "", ""
@@ -66,8 +66,8 @@ def run_to_end(command: Sequence[str], folder: Path, heard: Callable[[str], obje
                     running = False
                 *lines, left = re.split(r"[\r\n]", left + said.read() + "\n" * (not running))
                 for line in ["", *filter(str.strip, lines)]:
-                    heard(line)
+                    on_line(line)
                     complaint = line.strip() or complaint
         finally:
             stop_program(child)
-    return Ended(child.returncode, output.read_text(errors="replace"), complaint, time.perf_counter() - begun)
+    return ProcessResult(child.returncode, output.read_text(errors="replace"), complaint, time.perf_counter() - begun)

@@ -27,8 +27,8 @@ from sim.runtime.optional_packages import install_hint
 from surrogate.data.tool_loads import draw
 
 from .child_process import HOUSE, start_program, stop_program
-from .engine_process import READY, Case, answer_path, write_case
-from .engine_sulcus import fem_of
+from .engine_process import READY, Case, to_result_path, write_case
+from .engine_sulcus import build_fem
 
 TISSUE = Material("neo-hookean", 3000.0, 0.45)
 TOLERANCE = 1e-6
@@ -44,18 +44,18 @@ class Engine:
     name: str
     setting: str
     modules: tuple[str, ...]
-    words: tuple[str, ...]
-    cards: bool = False
+    arguments: tuple[str, ...]
+    supports_cuda: bool = False
     """True if the engine also runs on CUDA."""
 
-    def on(self, device: str) -> Engine:
+    def select_device(self, device: str) -> Engine:
         """Return the engine on "cpu" or "cuda", if it supports the device."""
-        if device == "cpu" or not self.cards:
+        if device == "cpu" or not self.supports_cuda:
             return self
-        return replace(self, setting=f"{self.setting}; CUDA", words=(*self.words, device))
+        return replace(self, setting=f"{self.setting}; CUDA", arguments=(*self.arguments, device))
 
     @property
-    def missing(self) -> str:
+    def missing_reason(self) -> str:
         """Reason why the engine cannot be started here; empty if it can."""
         if any(find_spec(module) is None for module in self.modules):
             return f"not installed. {install_hint('peers')}"
@@ -76,7 +76,7 @@ def _peer(name: str, setting: str, *modules: str, cards: bool = False) -> Engine
 
 
 OWN = Engine(
-    "sulcus", "float64; rest stiffness factorised once", (), ("-m", f"{__package__}.engine_sulcus"), cards=True
+    "sulcus", "float64; rest stiffness factorised once", (), ("-m", f"{__package__}.engine_sulcus"), supports_cuda=True
 )
 PEERS = (
     _peer("tled", "explicit, dynamic relaxation; float64, Warp", "warp", cards=True),
@@ -88,7 +88,7 @@ PEERS = (
 
 
 @dataclass(frozen=True)
-class Answer:
+class LoadResult:
     """Result of one load: seconds, residual (inf: none), maximum error [mm], and the reason if it failed.
 
     The residual is that of `Fem.residual`, the error that relative to the reference.
@@ -107,7 +107,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Row:
+class EngineRow:
     """Results of one engine on one mesh to one tolerance: times of first results [s] and the result of each load.
 
     `first_ratio` and `ratio` are times relative to sulcus; `ratio` is the median over further loads that both solved.
@@ -117,7 +117,7 @@ class Row:
     setting: str
     tolerance: float
     firsts: tuple[float, ...] = ()
-    answers: tuple[Answer, ...] = ()
+    answers: tuple[LoadResult, ...] = ()
     missing: str = ""
     first_ratio: float = np.nan
     ratio: float = np.nan
@@ -133,29 +133,31 @@ class Row:
         seconds = [answer.seconds for answer in self.answers[1:] if answer.good]
         return float(np.median(seconds)) if seconds else np.nan
 
-    def beside(self, ours: Row) -> Row:
+    def add_ratios(self, reference: EngineRow) -> EngineRow:
         """Return this row with its ratios to another row."""
-        pairs = zip(self.answers[1:], ours.answers[1:], strict=False)
+        pairs = zip(self.answers[1:], reference.answers[1:], strict=False)
         ratios = [mine.seconds / own.seconds for mine, own in pairs if mine.good and own.good]
-        return replace(self, first_ratio=self.first / ours.first, ratio=float(np.median(ratios)) if ratios else np.nan)
+        return replace(
+            self, first_ratio=self.first / reference.first, ratio=float(np.median(ratios)) if ratios else np.nan
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Judge:
+class Reference:
     """Reference of all engines: residual of sulcus in double precision, and its solutions (L, V, 3) [m] to `FINEST`."""
 
     fem: Fem
-    fields: np.ndarray
+    solutions: np.ndarray
 
 
-def build_judge(case: Case) -> Judge:
+def build_reference_solver(case: Case) -> Reference:
     """Build the reference of a case, for any tolerance; loads that it cannot solve to `FINEST` have NaN."""
-    fem = fem_of(replace(case, tolerance=FINEST))
+    fem = build_fem(replace(case, tolerance=FINEST))
     found = fem.deform(Loads((Nodal(case.force),)))
-    return Judge(fem, np.where((found.residual <= FINEST)[:, None, None], found.displacement, np.nan))
+    return Reference(fem, np.where((found.residual <= FINEST)[:, None, None], found.displacement, np.nan))
 
 
-def case_of(anatomy: Anatomy, loads: int, seed: int) -> Case:
+def build_case(anatomy: Anatomy, load_count: int, seed: int) -> Case:
     """Build a case that all engines support: sliding nodes are fixed, pushes are nodal forces.
 
     Raises
@@ -164,22 +166,25 @@ def case_of(anatomy: Anatomy, loads: int, seed: int) -> Case:
         An anatomy without open cortex, or fewer loads than one.
     """
     held = np.asarray((anatomy.fixed | (anatomy.slide_normal != 0.0)).any(axis=1))
-    (pushed,) = draw("palpation", anatomy, loads, seed).get_all(Pushed)
+    (pushed,) = draw("palpation", anatomy, load_count, seed).get_all(Pushed)
     mesh = anatomy.mesh
     weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint).toarray()
     force = weights[:, :, None] * pushed.force[:, None, :]
     return Case(mesh.nodes, mesh.tets, held, TISSUE.young, TISSUE.poisson, *TISSUE.lame, force, TOLERANCE)
 
 
-def compare(
-    case: Case, judge: Judge, engines: Sequence[Engine], starts: int, threads: int, done: Callable[[], object]
-) -> list[Row]:
-    """Measure a row for each engine, sulcus first; `done` is called after every result.
+def compare_engines(
+    case: Case, reference: Reference, engines: Sequence[Engine], start_count: int, threads: int,
+    on_result: Callable[[], object],
+) -> list[EngineRow]:  # fmt: skip
+    """Measure a row for each engine, sulcus first; `on_result` is called after every result.
 
     Every engine is started once to warm up, so that it compiles its code and reads its files. It is then started
-    `starts` times (>= 0) for the first result. The last process also solves the further loads.
+    `start_count` times (>= 0) for the first result. The last process also solves the further loads.
     """
-    rows = [Row(engine.label, engine.setting, case.tolerance, missing=engine.missing) for engine in engines]
+    rows = [
+        EngineRow(engine.label, engine.setting, case.tolerance, missing=engine.missing_reason) for engine in engines
+    ]
     here = [number for number, row in enumerate(rows) if not row.missing]
     with TemporaryDirectory() as folder:
         places = {number: Path(folder) / str(number) for number in here}
@@ -187,7 +192,7 @@ def compare(
         firsts: dict[int, list[float]] = {number: [] for number in here}
         said: dict[int, list[tuple[float, str]]] = {number: [] for number in here}
         try:
-            for start in range(starts + 1):
+            for start in range(start_count + 1):
                 for number in here:
                     if start == 0:
                         places[number].mkdir()
@@ -198,35 +203,37 @@ def compare(
                     last = running[number].solve(0)
                     firsts[number] += [last[0]] if start else []
                     said[number] = [last]
-                    done()
+                    on_result()
             for load in range(1, len(case.force)):
                 for number in here:
                     said[number].append(running[number].solve(load))
-                    done()
+                    on_result()
         finally:
             for process in running.values():
                 process.close()
         for number in here:
-            judged = _judged(judge, case, _fields(places[number], case), said[number])
+            judged = _judged(reference, case, _fields(places[number], case), said[number])
             rows[number] = replace(rows[number], firsts=tuple(firsts[number]), answers=judged)
-    return [row.beside(rows[0]) if number else row for number, row in enumerate(rows)]
+    return [row.add_ratios(rows[0]) if number else row for number, row in enumerate(rows)]
 
 
 def _fields(folder: Path, case: Case) -> np.ndarray:
     """Read the displacements (L, V, 3) [m] that an engine wrote; NaN for missing ones."""
-    paths = [answer_path(folder, load) for load in range(len(case.force))]
+    paths = [to_result_path(folder, load) for load in range(len(case.force))]
     return np.stack([np.load(path) if path.exists() else np.full(case.nodes.shape, np.nan) for path in paths])
 
 
-def _judged(judge: Judge, case: Case, fields: np.ndarray, said: Sequence[tuple[float, str]]) -> tuple[Answer, ...]:
+def _judged(
+    judge: Reference, case: Case, fields: np.ndarray, said: Sequence[tuple[float, str]]
+) -> tuple[LoadResult, ...]:
     """Build the result of every load, with its residual by `Fem.residual` and its error."""
     there = np.isfinite(fields).all(axis=(1, 2))
     residual, apart = np.full(len(fields), np.inf), np.full(len(fields), np.nan)
     if there.any():
         residual[there] = judge.fem.residual(Loads((Nodal(case.force[there]),)), build_start(fields[there]))
-        apart[there] = 1e3 * np.linalg.norm(fields[there] - judge.fields[there], axis=2).max(axis=1)
+        apart[there] = 1e3 * np.linalg.norm(fields[there] - judge.solutions[there], axis=2).max(axis=1)
     return tuple(
-        Answer(seconds, float(left), float(far), reason, case.tolerance)
+        LoadResult(seconds, float(left), float(far), reason, case.tolerance)
         for (seconds, reason), left, far in zip(said, residual, apart, strict=True)
     )
 
@@ -238,7 +245,7 @@ class _Process:
         self._complaints = folder / "complaints.txt"
         with open(self._complaints, "w") as complaints:
             self._child = start_program(
-                [sys.executable, *engine.words, str(folder), str(threads)],
+                [sys.executable, *engine.arguments, str(folder), str(threads)],
                 dict.fromkeys(THREADS, str(threads)),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,

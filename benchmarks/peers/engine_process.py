@@ -53,12 +53,12 @@ def write_case(folder: Path, case: Case) -> None:
     np.savez(folder / "case.npz", **asdict(case))
 
 
-def answer_path(folder: Path, number: int) -> Path:
+def to_result_path(folder: Path, number: int) -> Path:
     """Return the path of an engine's displacements (V, 3) [m] under a load."""
     return folder / f"answer{number}.npy"
 
 
-def serve(set_up: Callable[[Case], Solve]) -> None:
+def serve_loads(set_up: Callable[[Case], Solve]) -> None:
     """Solve the loads whose numbers are read, one a line; the last arguments are the folder and the number of threads.
 
     Prints `READY` after imports and reading, then for each load a line of JSON: its seconds, and the reason if
@@ -76,7 +76,7 @@ def serve(set_up: Callable[[Case], Solve]) -> None:
     solve = None
     for line in sys.stdin:
         number = int(line)
-        answer_path(folder, number).unlink(missing_ok=True)
+        to_result_path(folder, number).unlink(missing_ok=True)
         begun, reason = time.perf_counter(), ""
         try:
             solve = solve or set_up(case)
@@ -85,5 +85,5 @@ def serve(set_up: Callable[[Case], Solve]) -> None:
             displacement, reason = None, f"{type(error).__name__}: {error}"
         seconds = time.perf_counter() - begun
         if displacement is not None:
-            np.save(answer_path(folder, number), displacement)
+            np.save(to_result_path(folder, number), displacement)
         print(json.dumps({"seconds": seconds, "reason": reason}), file=said)

@@ -13,10 +13,10 @@ from sim.geometry.tetmesh import TetMesh
 from sim.loads import Loads, Nodal
 from sim.material import Material
 
-from .engine_process import Case, Solve, serve
+from .engine_process import Case, Solve, serve_loads
 
 
-def fem_of(case: Case, device: str = "cpu") -> Fem:
+def build_fem(case: Case, device: str = "cpu") -> Fem:
     """Build the FEM solver of a case, in double precision."""
     mesh = TetMesh(case.nodes, case.tets, np.zeros(len(case.tets), int))
     held = np.repeat(case.held[:, None], 3, axis=1)
@@ -27,11 +27,11 @@ def fem_of(case: Case, device: str = "cpu") -> Fem:
     return Fem(anatomy, effects, Accuracy(case.tolerance), device, element="p1")
 
 
-def set_up(case: Case, device: str = "cpu") -> Solve:
+def set_up_solver(case: Case, device: str = "cpu") -> Solve:
     """Prepare kernels and the factor for all loads."""
-    fem = fem_of(case, device)
+    fem = build_fem(case, device)
     return lambda force: fem.deform(Loads((Nodal(force[None]),))).displacement[0]
 
 
 if __name__ == "__main__":
-    serve(partial(set_up, device="cuda" if "cuda" in sys.argv else "cpu"))
+    serve_loads(partial(set_up_solver, device="cuda" if "cuda" in sys.argv else "cpu"))

@@ -4,10 +4,10 @@ import felupe
 import numpy as np
 from symmetric import solve as solve_symmetric
 
-from benchmarks.peers.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve_loads
 
 
-def set_up(case: Case) -> Solve:
+def set_up_solver(case: Case) -> Solve:
     """Build a solid body with a point load on every node, for all loads."""
     mesh = felupe.Mesh(case.nodes, case.tets, "tetra")
     field = felupe.FieldContainer([felupe.Field(felupe.RegionTetra(mesh), dim=3)])
@@ -44,4 +44,4 @@ def set_up(case: Case) -> Solve:
 
 
 if __name__ == "__main__":
-    serve(set_up)
+    serve_loads(set_up_solver)

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from symmetric import Factor
 
-from benchmarks.peers.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve_loads
 
 STEPS, TRIALS = 500, 8
 SLOPE_LEFT = 0.5
@@ -15,7 +15,7 @@ SLOPE_LEFT = 0.5
 WORTH = 20
 
 
-class Body:
+class NeoHookeanBody:
     """Forces and stiffness of linear tetrahedra at the free components of the displacement."""
 
     def __init__(self, case: Case):
@@ -36,7 +36,7 @@ class Body:
         self.free = np.flatnonzero(~np.repeat(case.held, 3))
         self.narrow = sp.csr_array(self.gradient[:, self.free])
 
-    def at(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def compute_deformation(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute F (T, 3, 3), F^-T and ln J, which is not finite where the law is undefined."""
         F = (self.gradient @ u).reshape(-1, 3, 3) + np.eye(3)
         cofactor = np.stack([np.cross(F[:, (i + 1) % 3], F[:, (i + 2) % 3]) for i in range(3)], axis=1)
@@ -44,15 +44,15 @@ class Body:
         with np.errstate(invalid="ignore", divide="ignore"):
             return F, cofactor / J[:, None, None], np.log(J)
 
-    def forces(self, u: np.ndarray) -> np.ndarray:
+    def compute_forces(self, u: np.ndarray) -> np.ndarray:
         """Compute internal forces [N], not finite where the law is undefined."""
-        F, inverse, log_J = self.at(u)
+        F, inverse, log_J = self.compute_deformation(u)
         stress = self.case.mu * F + (self.case.lam * log_J - self.case.mu)[:, None, None] * inverse
         return self.spread @ (self.volume[:, None, None] * stress).ravel()
 
-    def stiffness(self, u: np.ndarray) -> sp.csr_array:
+    def assemble_stiffness(self, u: np.ndarray) -> sp.csr_array:
         """Assemble the tangent stiffness [N/m] of the free components."""
-        _, inverse, log_J = self.at(u)
+        _, inverse, log_J = self.compute_deformation(u)
         shear = self.case.mu - self.case.lam * log_J
         moduli = np.einsum("tij,tkl->tijkl", self.case.lam * inverse, inverse)
         moduli += np.einsum("t,til,tkj->tijkl", shear, inverse, inverse)
@@ -71,10 +71,10 @@ def _steps_left(kept: list[float], tolerance: float) -> float:
     return float(np.log(tolerance / kept[-1]) / np.log(rate)) if rate < 1.0 else np.inf
 
 
-def set_up(case: Case) -> Solve:
+def set_up_solver(case: Case) -> Solve:
     """Factorise the undeformed stiffness for all loads, and allocate a factor of a deformed body."""
-    body, at_rest, later = Body(case), Factor(), Factor()
-    at_rest.renew(body.stiffness(np.zeros(3 * len(case.nodes))))
+    body, at_rest, later = NeoHookeanBody(case), Factor(), Factor()
+    at_rest.factorise(body.assemble_stiffness(np.zeros(3 * len(case.nodes))))
     free = body.free
 
     def solve(force: np.ndarray) -> np.ndarray:
@@ -82,7 +82,7 @@ def set_up(case: Case) -> Solve:
 
         def state(u: np.ndarray) -> tuple[np.ndarray, float]:
             """Compute the free residual [N], and the relative one: inf where the law is undefined."""
-            inner = body.forces(u)
+            inner = body.compute_forces(u)
             residual = inner - load
             reaction = residual.copy()
             reaction[free] = 0.0
@@ -99,7 +99,7 @@ def set_up(case: Case) -> Solve:
             if left <= case.tolerance:
                 return u.reshape(-1, 3)
             if _steps_left(kept, case.tolerance) > WORTH:
-                later.renew(body.stiffness(u))
+                later.factorise(body.assemble_stiffness(u))
                 factor, kept = later, [left]
             step = factor.solve(-residual)
             start, share, trial = residual @ step, 1.0, u.copy()
@@ -119,4 +119,4 @@ def set_up(case: Case) -> Solve:
 
 
 if __name__ == "__main__":
-    serve(set_up)
+    serve_loads(set_up_solver)

@@ -6,12 +6,12 @@ from skfem import solve as solve_linear
 from skfem.helpers import ddot, det, grad, inv, mul, trace, transpose
 from symmetric import solve as solve_symmetric
 
-from benchmarks.peers.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve_loads
 
 STEPS, HALVINGS = 30, 10
 
 
-def set_up(case: Case) -> Solve:
+def set_up_solver(case: Case) -> Solve:
     """Build the basis, the forms on it, and Newton's method, which scikit-fem leaves to the user."""
     mesh = MeshTet(np.ascontiguousarray(case.nodes.T), np.ascontiguousarray(case.tets.T))
     basis = Basis(mesh, ElementVector(ElementTetP1()), intorder=1)
@@ -65,4 +65,4 @@ def set_up(case: Case) -> Solve:
 
 
 if __name__ == "__main__":
-    serve(set_up)
+    serve_loads(set_up_solver)

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from benchmarks.peers.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve_loads
 
 wp.config.enable_backward = False
 wp.config.log_level = wp.LOG_ERROR
@@ -25,16 +25,12 @@ LOWEST = 1e-3
 
 
 @wp.kernel
-def pull(
-    u: wp.array(dtype=wp.vec3d),
-    tets: wp.array(dtype=wp.vec4i),
-    gradients: wp.array(dtype=wp.mat33d),
-    volume: wp.array(dtype=wp.float64),
-    mu: wp.float64,
-    lam: wp.float64,
+def compute_element_forces(
+    u: wp.array(dtype=wp.vec3d), tets: wp.array(dtype=wp.vec4i), gradients: wp.array(dtype=wp.mat33d),
+    volume: wp.array(dtype=wp.float64), mu: wp.float64, lam: wp.float64,
     # outputs
-    out: wp.array2d(dtype=wp.vec3d),
-):
+    forces: wp.array2d(dtype=wp.vec3d),
+):  # fmt: skip
     """Compute forces [N] of a tetrahedron on its nodes: f_a = -V P grad N_a, P = mu F + (lam ln J - mu) F^-T."""
     t = wp.tid()
     nodes = tets[t]
@@ -48,66 +44,55 @@ def pull(
     P = mu * F + ((lam * wp.log(J) - mu) / J) * cofactor
     Q = -volume[t] * P
     first, second, third = Q * G[0], Q * G[1], Q * G[2]
-    out[t, 0] = -(first + second + third)
-    out[t, 1] = first
-    out[t, 2] = second
-    out[t, 3] = third
+    forces[t, 0] = -(first + second + third)
+    forces[t, 1] = first
+    forces[t, 2] = second
+    forces[t, 3] = third
 
 
 @wp.kernel
-def move(
-    pulls: wp.array(dtype=wp.vec3d),
-    starts: wp.array(dtype=wp.int32),
-    places: wp.array(dtype=wp.int32),
-    load: wp.array(dtype=wp.vec3d),
-    mass: wp.array(dtype=wp.float64),
-    held: wp.array(dtype=wp.bool),
+def step_nodes(
+    element_forces: wp.array(dtype=wp.vec3d), node_starts: wp.array(dtype=wp.int32), entries: wp.array(dtype=wp.int32),
+    load: wp.array(dtype=wp.vec3d), mass: wp.array(dtype=wp.float64), fixed: wp.array(dtype=wp.bool),
     factors: wp.array(dtype=wp.float64),
     # outputs
-    u: wp.array(dtype=wp.vec3d),
-    before: wp.array(dtype=wp.vec3d),
-    inner: wp.array(dtype=wp.vec3d),
-):
+    u: wp.array(dtype=wp.vec3d), u_previous: wp.array(dtype=wp.vec3d), internal_force: wp.array(dtype=wp.vec3d),
+):  # fmt: skip
     """Move a node by one step: u+ = u + beta (u - u-) + alpha M^-1 (f - P(u))."""
     v = wp.tid()
     force = wp.vec3d()
-    for i in range(starts[v], starts[v + 1]):
-        force += pulls[places[i]]
-    inner[v] = -force
-    if not held[v]:
+    for i in range(node_starts[v], node_starts[v + 1]):
+        force += element_forces[entries[i]]
+    internal_force[v] = -force
+    if not fixed[v]:
         now = u[v]
-        u[v] = now + factors[1] * (now - before[v]) + (factors[0] / mass[v]) * (load[v] + force)
-        before[v] = now
+        u[v] = now + factors[1] * (now - u_previous[v]) + (factors[0] / mass[v]) * (load[v] + force)
+        u_previous[v] = now
 
 
 @wp.kernel
-def measure(
-    place: wp.array(dtype=wp.vec3d),
-    inner: wp.array(dtype=wp.vec3d),
-    load: wp.array(dtype=wp.vec3d),
-    mass: wp.array(dtype=wp.float64),
-    held: wp.array(dtype=wp.bool),
+def sum_squares(
+    u: wp.array(dtype=wp.vec3d), internal_force: wp.array(dtype=wp.vec3d), load: wp.array(dtype=wp.vec3d),
+    mass: wp.array(dtype=wp.float64), fixed: wp.array(dtype=wp.bool),
     # outputs
-    last_place: wp.array(dtype=wp.vec3d),
-    last_force: wp.array(dtype=wp.vec3d),
-    sums: wp.array(dtype=wp.float64),
-):
+    u_last: wp.array(dtype=wp.vec3d), last_force: wp.array(dtype=wp.vec3d), sums: wp.array(dtype=wp.float64),
+):  # fmt: skip
     """Sum squares of free residual r, reaction, internal force; -q.dr and qMq of the motion q since the last call."""
     v = wp.tid()
-    force = load[v] - inner[v]
-    wp.atomic_add(sums, 2, wp.dot(inner[v], inner[v]))
-    if held[v]:
+    force = load[v] - internal_force[v]
+    wp.atomic_add(sums, 2, wp.dot(internal_force[v], internal_force[v]))
+    if fixed[v]:
         wp.atomic_add(sums, 1, wp.dot(force, force))
     else:
-        q = place[v] - last_place[v]
+        q = u[v] - u_last[v]
         wp.atomic_add(sums, 0, wp.dot(force, force))
         wp.atomic_add(sums, 3, wp.dot(q, last_force[v] - force))
         wp.atomic_add(sums, 4, mass[v] * wp.dot(q, q))
-        last_place[v] = place[v]
+        u_last[v] = u[v]
         last_force[v] = force
 
 
-def set_up(case: Case, device: str = "cpu") -> Solve:
+def set_up_solver(case: Case, device: str = "cpu") -> Solve:
     """Compute undeformed gradients, masses and the tetrahedra around each node, for all loads."""
     count, size = len(case.tets), len(case.nodes)
     edges = np.swapaxes(case.nodes[case.tets[:, 1:]] - case.nodes[case.tets[:, :1]], 1, 2)
@@ -129,9 +114,9 @@ def set_up(case: Case, device: str = "cpu") -> Solve:
     u, before, inner, load, *last = (wp.zeros(size, dtype=wp.vec3d, device=device) for _ in range(6))
     pulls = wp.zeros((count, 4), dtype=wp.vec3d, device=device)
     factors, sums = (wp.zeros(length, dtype=wp.float64, device=device) for length in (2, 5))
-    pulling = command(pull, count, [u, *shape, wp.float64(case.mu), wp.float64(case.lam)], [pulls])
-    moving = command(move, size, [pulls.flatten(), *around, load, *fixed, factors], [u, before, inner])
-    measuring = command(measure, size, [before, inner, load, *fixed], [*last, sums])
+    pulling = command(compute_element_forces, count, [u, *shape, wp.float64(case.mu), wp.float64(case.lam)], [pulls])
+    moving = command(step_nodes, size, [pulls.flatten(), *around, load, *fixed, factors], [u, before, inner])
+    measuring = command(sum_squares, size, [before, inner, load, *fixed], [*last, sums])
 
     def steps() -> None:
         """Run several steps, and compute the sums at the state before the last step."""
@@ -187,4 +172,4 @@ def _captured(steps: Callable[[], None], device: str) -> Callable[[], None]:
 
 
 if __name__ == "__main__":
-    serve(partial(set_up, device="cuda" if "cuda" in sys.argv else "cpu"))
+    serve_loads(partial(set_up_solver, device="cuda" if "cuda" in sys.argv else "cpu"))

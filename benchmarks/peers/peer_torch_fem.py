@@ -5,20 +5,20 @@ import torch
 from torchfem import Solid
 from torchfem.materials import Hyperelastic3D
 
-from benchmarks.peers.engine_process import Case, Solve, serve
+from benchmarks.peers.engine_process import Case, Solve, serve_loads
 
 
-def psi(F: torch.Tensor, lame: torch.Tensor) -> torch.Tensor:
+def compute_energy_density(F: torch.Tensor, lame: torch.Tensor) -> torch.Tensor:
     """Compute the energy density [Pa] of the log neo-Hookean law, as in torch-fem's own benchmark."""
     C = F.transpose(-1, -2) @ F
     log_J = 0.5 * torch.logdet(C)
     return lame[0] / 2 * (torch.trace(C) - 3.0) - lame[0] * log_J + lame[1] / 2 * log_J**2
 
 
-def set_up(case: Case) -> Solve:
+def set_up_solver(case: Case) -> Solve:
     """Build a solid with its assembly maps, for all loads."""
     torch.set_default_dtype(torch.float64)
-    law = Hyperelastic3D(psi, [case.mu, case.lam])
+    law = Hyperelastic3D(compute_energy_density, [case.mu, case.lam])
     body = Solid(torch.tensor(case.nodes), torch.tensor(case.tets, dtype=torch.int64), law)
     body.constraints = torch.tensor(np.repeat(case.held[:, None], 3, axis=1))
 
@@ -33,4 +33,4 @@ def set_up(case: Case) -> Solve:
 
 
 if __name__ == "__main__":
-    serve(set_up)
+    serve_loads(set_up_solver)

@@ -19,7 +19,7 @@ class Factor:
         self._pardiso.set_phase(phase)
         return self._pardiso._call_pardiso(self._upper, right)
 
-    def renew(self, matrix: sp.spmatrix) -> None:
+    def factorise(self, matrix: sp.spmatrix) -> None:
         """Factorise a matrix (n, n); the symbolic analysis is reused if the pattern is that of the last one."""
         before, self._upper = self._upper, sp.csr_matrix(sp.triu(matrix, format="csr"))
         self._upper.sort_indices()
@@ -29,15 +29,15 @@ class Factor:
             self._call(ANALYSE, nothing)
         self._call(FACTORISE, nothing)
 
-    def solve(self, right: np.ndarray) -> np.ndarray:
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Solve for a right-hand side (n,): (n,)."""
-        return self._call(SOLVE, right)
+        return self._call(SOLVE, rhs)
 
 
 KEPT = Factor()
 
 
-def solve(matrix: sp.spmatrix, right: np.ndarray) -> np.ndarray:
+def solve(matrix: sp.spmatrix, rhs: np.ndarray) -> np.ndarray:
     """Solve a symmetric system (n, n) for (n,), with one factor object for all calls."""
-    KEPT.renew(matrix)
-    return KEPT.solve(np.ascontiguousarray(right, float).ravel())
+    KEPT.factorise(matrix)
+    return KEPT.solve(np.ascontiguousarray(rhs, float).ravel())

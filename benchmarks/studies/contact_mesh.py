@@ -14,16 +14,16 @@ from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.material import Tissue
 from sim.tools import Ball
-from surrogate.data.tool_loads import build_axes_about
+from surrogate.data.tool_loads import build_rotations_about
 
-from .elements import above_tumour
+from .elements import find_point_above_tumour
 
 # Positions of the ball along one long edge of the surface, as shares of the edge's length.
 PLACES = np.linspace(0.0, 1.0, 5)
 
 
 @dataclass(frozen=True)
-class Row:
+class ContactMeshRow:
     """Forces on a ball [N] at its positions; NaN where the solution is not good.
 
     Parameters
@@ -49,19 +49,19 @@ class Row:
     fine_seconds: float
 
     @property
-    def share(self) -> float:
+    def relative_excess(self) -> float:
         """Mean excess of the force over that on the finer mesh, as a share of the finer mesh's force."""
         return float(np.mean(self.along / self.fine - 1.0))
 
     @property
-    def scatter(self) -> float:
+    def relative_range(self) -> float:
         """Range of the force over the positions, as a share of the mean force."""
         return float(np.ptp(self.along) / self.along.mean())
 
 
-def rows(
+def measure_forces(
     anatomy: Anatomy, elements: Sequence[str], depths: Sequence[float], radius: float, tissue: Tissue, device: str
-) -> Iterator[Row]:
+) -> Iterator[ContactMeshRow]:
     """Yield a row for each element and depth [m] of a ball of a radius [m].
 
     Raises
@@ -71,7 +71,7 @@ def rows(
     """
     normal, places = _line(anatomy)
     T = np.zeros((len(places), 1, 4, 4))
-    T[..., :3, :3], T[..., 3, 3] = build_axes_about(normal[None]), 1.0
+    T[..., :3, :3], T[..., 3, 3] = build_rotations_about(normal[None]), 1.0
     fine = refine(anatomy, near_opening=True)
     for element in elements:
         solvers = [_solver(body, element, radius, tissue, device) for body in (anatomy, fine)]
@@ -85,12 +85,12 @@ def rows(
                 forces.append(np.where(good[:, None], found.reaction[:, 0, :3], np.nan))
             along, finer = (np.abs(force @ normal) for force in forces)
             sideways = np.sqrt(np.maximum((forces[0] ** 2).sum(axis=1) - along**2, 0.0))
-            yield Row(element, depth, along, sideways, finer, *seconds)
+            yield ContactMeshRow(element, depth, along, sideways, finer, *seconds)
 
 
 def _line(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     """Return the outward normal (3,) over the tumour, and positions (p, 3) [m] along the longest edge there."""
-    point, _ = above_tumour(anatomy)
+    point, _ = find_point_above_tumour(anatomy)
     corners = anatomy.mesh.nodes[anatomy.open_surface]
     a, b, c = corners[np.linalg.norm(corners.mean(axis=1) - point, axis=1).argmin()]
     normal = np.cross(b - a, c - a)

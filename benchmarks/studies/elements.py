@@ -20,7 +20,7 @@ ACCURACY = Accuracy(tolerance=1e-5)
 
 
 @dataclass(frozen=True)
-class Press:
+class PressCase:
     """One press on the cortex above the tumour: law, E [Pa], force [N] and footprint radius [m]."""
 
     law: str = "neo-hookean"
@@ -30,7 +30,7 @@ class Press:
 
 
 @dataclass(frozen=True)
-class Row:
+class ElementRow:
     """Mean motion of the tumour [mm] on one mesh; time of set-up and of the solve [s]; True if converged."""
 
     poisson: float
@@ -44,9 +44,9 @@ class Row:
     good: bool
 
 
-def rows(
-    anatomies: Sequence[Anatomy], elements: Sequence[str], poissons: Sequence[float], press: Press, device: str
-) -> Iterator[Row]:
+def measure_motions(
+    anatomies: Sequence[Anatomy], elements: Sequence[str], poissons: Sequence[float], press: PressCase, device: str
+) -> Iterator[ElementRow]:
     """Yield a row for each Poisson's ratio, element and anatomy.
 
     Raises
@@ -62,16 +62,16 @@ def rows(
                 yield _measured(anatomy, element, poisson, press, device)
 
 
-def limits(found: Sequence[Row]) -> dict[float, float]:
+def extrapolate_motions(rows: Sequence[ElementRow]) -> dict[float, float]:
     """Extrapolate the tumour's motion [mm] to an infinitely fine mesh, for each Poisson's ratio.
 
     Richardson's extrapolation of the quadratic element on the two finest meshes. Its error is taken as second order in
     h = vertices^(-1/3): at the rim of the opening the solution is not smooth enough for more.
     """
     out = {}
-    for poisson in {row.poisson for row in found}:
+    for poisson in {row.poisson for row in rows}:
         mine = sorted(
-            (row for row in found if row.poisson == poisson and row.element == "p2" and row.good),
+            (row for row in rows if row.poisson == poisson and row.element == "p2" and row.good),
             key=lambda row: row.vertices,
         )
         if len(mine) >= 2 and mine[-1].vertices > mine[-2].vertices:
@@ -80,14 +80,14 @@ def limits(found: Sequence[Row]) -> dict[float, float]:
     return out
 
 
-def _loads(anatomy: Anatomy, press: Press) -> Loads:
+def _loads(anatomy: Anatomy, press: PressCase) -> Loads:
     """Build a push towards the tumour's centre at the nearest point of the open cortex."""
-    point, centre = above_tumour(anatomy)
+    point, centre = find_point_above_tumour(anatomy)
     inward = (centre - point) / np.linalg.norm(centre - point)
     return push(point, press.force * inward, press.footprint)
 
 
-def above_tumour(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
+def find_point_above_tumour(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     """Return the point (3,) [m] of the open cortex nearest to the tumour's centre, and the centre (3,) [m].
 
     Raises
@@ -102,22 +102,22 @@ def above_tumour(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
     return find_nearest_on(nodes[anatomy.open_surface], centre), centre
 
 
-def _measured(anatomy: Anatomy, element: str, poisson: float, press: Press, device: str) -> Row:
+def _measured(anatomy: Anatomy, element: str, poisson: float, press: PressCase, device: str) -> ElementRow:
     mesh = anatomy.mesh
     effects = build_push_effects(anatomy, Material(press.law, press.young, poisson))
     fem, set_up = time_work(Fem, anatomy, effects, ACCURACY, device, element=element)
     loads = _loads(anatomy, press)
     fem.deform(loads.scale(1e-3))  # kernels are compiled or loaded at their first launch
     answer, seconds = time_work(fem.deform, loads)
-    motion = np.linalg.norm(tumour_motion(anatomy, answer.displacement)[0])
-    return Row(
+    motion = np.linalg.norm(compute_tumour_motion(anatomy, answer.displacement)[0])
+    return ElementRow(
         poisson=poisson, element=element, vertices=len(mesh.nodes), nodes=fem.space.count,
         motion=1e3 * float(motion), set_up=set_up, solve=seconds,
         outer=int(answer.iterations[0]), good=answer.outcome[0].good,
     )  # fmt: skip
 
 
-def tumour_motion(anatomy: Anatomy, displacement: np.ndarray) -> np.ndarray:
+def compute_tumour_motion(anatomy: Anatomy, displacement: np.ndarray) -> np.ndarray:
     """Compute the volume mean (B, 3) [m] of the tumour's motion from displacements (B, V, 3) [m]."""
     mesh = anatomy.mesh
     inside = anatomy.in_tumour

@@ -7,22 +7,22 @@ from pathlib import Path
 import numpy as np
 
 from sim.loads import Pushed
-from surrogate.fitting.fit import fit_from_evidence
+from surrogate.fitting.fit import fit_tissue_from_responses
 from surrogate.fitting.observed_frame import ObservedFrame, Tool
-from surrogate.fitting.responses import Responses, build_drained_loads, build_force_loads, solve_responses
+from surrogate.fitting.responses import Responses, build_drainage_loads, build_force_loads, solve_responses
 from surrogate.fitting.tissue import CLASSES, FittedTissue
 from surrogate.locating.locator import Locator
 
-from .fit_twins import Patient, Seen, places
-from .locate_study import PointsSeen, observed
-from .locate_twins import ogden
+from .fit_twins import Patient, PatientMotions, sample_positions
+from .locate_study import PointModel, sample_observation
+from .locate_twins import build_ogden_tissue
 
 NEAR, NEAR_YOUNG = 1.5, 1.2
 """Target factors on the errors of the tumour's stiffness, and of Young's modulus."""
 
 
 @dataclass(frozen=True)
-class Row:
+class FitRow:
     """Results of all patients at one level of noise; shares in percent.
 
     Parameters
@@ -54,37 +54,40 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class Library:
+class ResponseLibrary:
     """Responses computed once for a body: motions by drained fluid, and by tools at every position."""
 
     tools: Pushed
-    drained: Responses
-    pressed: Responses
+    drainage: Responses
+    pressing: Responses
 
-    def pressed_on(self, chosen: Sequence[int]) -> Responses:
+    def select_positions(self, positions: Sequence[int]) -> Responses:
         """Return the responses to tools at some positions alone."""
-        columns = (3 * np.array(chosen)[:, None] + np.arange(3)).ravel()
-        return replace(self.pressed, motion={name: each[:, :, columns] for name, each in self.pressed.motion.items()})
+        columns = (3 * np.array(positions)[:, None] + np.arange(3)).ravel()
+        return replace(self.pressing, motion={name: each[:, :, columns] for name, each in self.pressing.motion.items()})
 
 
-def library_of(locator: Locator, device: str, folder: Path | None, progress: Callable[[int, int], object]) -> Library:
+def solve_library(
+    locator: Locator, device: str, folder: Path | None, progress: Callable[[int, int], object]
+) -> ResponseLibrary:
     """Solve the library of a locator's anatomy; results in `folder` are read."""
-    body, tools = locator.anatomy, places(locator.anatomy)
-    drained = solve_responses(body, build_drained_loads(body), device, folder, progress)
+    body, tools = locator.anatomy, sample_positions(locator.anatomy)
+    drained = solve_responses(body, build_drainage_loads(body), device, folder, progress)
     pressed = solve_responses(body, build_force_loads(body, tools.point, tools.footprint), device, folder, progress)
-    return Library(tools, drained, pressed)
+    return ResponseLibrary(tools, drained, pressed)
 
 
-def fitted_to(
-    locator: Locator, library: Library, seen: Seen, sight: PointsSeen, seed: int, read: bool, device: str
-) -> FittedTissue:
-    """Fit the tissue of one patient; the first tool's force is measured if `read`."""
+def fit_patient(
+    locator: Locator, library: ResponseLibrary, seen: PatientMotions, observation_model: PointModel, seed: int,
+    with_force: bool, device: str,
+) -> FittedTissue:  # fmt: skip
+    """Fit the tissue of one patient; the first tool's force is measured if `with_force`."""
     patient, frames = seen.patient, []
     for number, motion in enumerate(seen.motion):
-        observation = observed(locator.anatomy, motion, sight, (seed, patient.number, number))
-        frames.append(ObservedFrame(observation, _tools(library.tools, patient, number, read and not number)))
-    pressed = library.pressed_on(patient.places) if patient.places else None
-    return fit_from_evidence(locator, frames, library.drained, pressed, device)
+        observation = sample_observation(locator.anatomy, motion, observation_model, (seed, patient.number, number))
+        frames.append(ObservedFrame(observation, _tools(library.tools, patient, number, with_force and not number)))
+    pressed = library.select_positions(patient.places) if patient.places else None
+    return fit_tissue_from_responses(locator, frames, library.drainage, pressed, device)
 
 
 def _tools(tools: Pushed, patient: Patient, number: int, read: bool) -> tuple[Tool, ...]:
@@ -96,27 +99,27 @@ def _tools(tools: Pushed, patient: Patient, number: int, read: bool) -> tuple[To
     return (Tool((x, y, z), float(tools.footprint[place]), force),)
 
 
-def row(noise: int, said: Sequence[tuple[Patient, FittedTissue]]) -> Row:
+def summarise_fits(noise: int, fits: Sequence[tuple[Patient, FittedTissue]]) -> FitRow:
     """Summarise the fits at one level of noise."""
-    ratio = [(patient.ratio, tissue.ratio) for patient, tissue in said]
-    young = [(young_of(patient), tissue.stiffness) for patient, tissue in said if tissue.stiffness is not None]
-    held = [(patient.skull == "bonded") == (tissue.skulls["bonded"] > 0.5) for patient, tissue in said]
-    named = [max(tissue.skulls, key=lambda name: tissue.skulls[name]) == patient.skull for patient, tissue in said]
+    ratio = [(patient.ratio, tissue.ratio) for patient, tissue in fits]
+    young = [(get_young_modulus(patient), tissue.stiffness) for patient, tissue in fits if tissue.stiffness is not None]
+    held = [(patient.skull == "bonded") == (tissue.skulls["bonded"] > 0.5) for patient, tissue in fits]
+    named = [max(tissue.skulls, key=lambda name: tissue.skulls[name]) == patient.skull for patient, tissue in fits]
     edge = CLASSES["compressible"][1]
-    classes = [(patient.poisson < edge) == (tissue.classes["compressible"] > 0.5) for patient, tissue in said]
+    classes = [(patient.poisson < edge) == (tissue.classes["compressible"] > 0.5) for patient, tissue in fits]
     share = [100.0 * float(np.mean(each)) for each in (held, named, classes)]
     factor, within, inside = _off(ratio, NEAR)
     moduli = _off(young, NEAR_YOUNG) if young else (None, None, None)
-    return Row(
-        noise=noise, patients=len(said), factor=factor, within=within, held=inside, sliding=share[0], skull=share[1],
+    return FitRow(
+        noise=noise, patients=len(fits), factor=factor, within=within, held=inside, sliding=share[0], skull=share[1],
         poisson=share[2],
         young=moduli[0], young_within=moduli[1], young_held=moduli[2], forces=len(young),
     )  # fmt: skip
 
 
-def young_of(patient: Patient) -> float:
+def get_young_modulus(patient: Patient) -> float:
     """Return Young's modulus [Pa] of a patient's brain at small strain."""
-    tissue = ogden(patient.stiffness, patient.poisson)
+    tissue = build_ogden_tissue(patient.stiffness, patient.poisson)
     (c, _), *_ = tissue.terms
     return c * (1.0 + patient.poisson)
 

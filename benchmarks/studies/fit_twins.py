@@ -16,9 +16,9 @@ from sim.fem import Fem
 from sim.geometry.locate import locate
 from sim.loads import Loads, Posture, Pushed
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.kept_arrays import find_kept_path, keep_arrays
+from surrogate.model.kept_arrays import get_cache_path, load_cached_arrays
 
-from .locate_twins import LEFT, PROBABLE, RATIO, SKULLS, STIFFNESS, TILT, check_same, ogden
+from .locate_twins import LEFT, PROBABLE, RATIO, SKULLS, STIFFNESS, TILT, build_ogden_tissue, check_same_brain
 
 POISSON = (0.45, 0.4945)
 """Range of Poisson's ratio of a patient's brain and tumour; uniform."""
@@ -61,31 +61,31 @@ class Patient:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class PatientMotions:
     """Patient, and motions (frames, V, 3) [m] of the vertices of the mesh for which tissue is estimated."""
 
     patient: Patient
     motion: np.ndarray
 
 
-def places(anatomy: Anatomy, seed: int = 0) -> Pushed:
+def sample_positions(anatomy: Anatomy, seed: int = 0) -> Pushed:
     """Sample a push at each tool position: point, radius, and a force that gives the direction."""
     found = drawn_loads("palpation", anatomy, PLACES, 1000 + seed).get(Pushed)
     assert found is not None
     return found
 
 
-def patient(tools: Pushed, seed: int, number: int, presses: int, drainages: int) -> Patient:
+def sample_patient(tools: Pushed, seed: int, number: int, press_count: int, drainage_count: int) -> Patient:
     """Sample patient `number`, for some presses and postures; the result depends on their numbers and the seed."""
     random = np.random.default_rng([seed, number, 7])
     stiffness, ratio = (float(np.exp(random.uniform(*np.log(limits)))) for limits in (STIFFNESS, RATIO))
     skull, poisson = str(random.choice(list(SKULLS), p=PROBABLE)), float(random.uniform(*POISSON))
-    chosen = random.permutation(PLACES)[:presses]
-    pressure = np.exp(random.uniform(*np.log(PRESSURE), size=presses))
+    chosen = random.permutation(PLACES)[:press_count]
+    pressure = np.exp(random.uniform(*np.log(PRESSURE), size=press_count))
     # Directions near the sampled force's: within the tool's cone nearly everywhere.
     way = np.stack([_leaning(tools.force[place], random) for place in chosen])
     force = way * (pressure * np.pi * tools.footprint[chosen] ** 2)[:, None]
-    left, tilt = random.uniform(LEFT[0], LEFT[1], drainages), TILT * random.standard_normal((drainages, 3))
+    left, tilt = random.uniform(LEFT[0], LEFT[1], drainage_count), TILT * random.standard_normal((drainage_count, 3))
     return Patient(
         number=number, skull=skull, stiffness=stiffness, ratio=ratio, poisson=poisson,
         places=tuple(chosen.tolist()), force=tuple(map(tuple, force.tolist())),
@@ -99,13 +99,15 @@ def _leaning(force: np.ndarray, random: np.random.Generator) -> np.ndarray:
     return way / np.linalg.norm(way)
 
 
-def effects_of(patient: Patient) -> tuple[Effect, ...]:
+def build_effects(patient: Patient) -> tuple[Effect, ...]:
     """Build the effects of a patient's FEM."""
-    brain, tumour = (ogden(share, patient.poisson) for share in (patient.stiffness, patient.stiffness * patient.ratio))
+    brain, tumour = (
+        build_ogden_tissue(share, patient.poisson) for share in (patient.stiffness, patient.stiffness * patient.ratio)
+    )
     return Elasticity(brain, {TUMOUR_LABEL: tumour}), Held(), SKULLS[patient.skull], ToolForce(), Gravity()
 
 
-def loads_of(anatomy: Anatomy, tools: Pushed, patient: Patient) -> Loads:
+def build_loads(anatomy: Anatomy, tools: Pushed, patient: Patient) -> Loads:
     """Build the loads: a press in each of the first frames, at these positions; drained fluid in the others."""
     idle, drained = len(patient.left), np.array(patient.tilt).reshape(-1, 3) + open_cortex(anatomy).axis
     chosen = np.array([*patient.places, *[patient.places[0]] * idle])
@@ -118,18 +120,12 @@ def loads_of(anatomy: Anatomy, tools: Pushed, patient: Patient) -> Loads:
     return Loads((pushed, Posture(down, level, np.ones(len(chosen)))))
 
 
-def patients(
-    body: Anatomy,
-    finer: Anatomy,
-    count: int,
-    presses: int,
-    drainages: int,
-    seed: int = 0,
-    device: str = "auto",
-    folder: Path | None = None,
+def solve_patients(
+    anatomy: Anatomy, finer_mesh: Anatomy, count: int, press_count: int, drainage_count: int, seed: int = 0,
+    device: str = "auto", folder: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
-) -> Iterator[Seen | None]:
-    """Solve patients on the mesh `finer`, interpolated at the vertices of `body`; None for one without equilibrium.
+) -> Iterator[PatientMotions | None]:  # fmt: skip
+    """Solve patients on `finer_mesh`, interpolated at the vertices of `anatomy`; None for one without equilibrium.
 
     Patients in `folder`, from an interrupted run, are read. `progress` receives the number done and the total.
 
@@ -138,23 +134,23 @@ def patients(
     InputError
         Meshes of two brains; meshes without tumour or open cortex.
     """
-    check_same(body, finer)
-    place, tools = locate(finer.mesh, body.mesh.nodes), places(body)
+    check_same_brain(anatomy, finer_mesh)
+    place, tools = locate(finer_mesh.mesh, anatomy.mesh.nodes), sample_positions(anatomy)
     for number in range(count):
-        one = patient(tools, seed, number, presses, drainages)
-        motion = _kept(finer, loads_of(finer, tools, one), one, device, folder)
+        one = sample_patient(tools, seed, number, press_count, drainage_count)
+        motion = _kept(finer_mesh, build_loads(finer_mesh, tools, one), one, device, folder)
         progress(number + 1, count)
-        yield Seen(one, place.interpolate(motion.astype(float))) if len(motion) else None
+        yield PatientMotions(one, place.interpolate(motion.astype(float))) if len(motion) else None
 
 
 def _kept(finer: Anatomy, loads: Loads, patient: Patient, device: str, folder: Path | None) -> np.ndarray:
     """Read or solve the motions (frames, V, 3) [m] of a patient's own mesh; (0, V, 3): no equilibrium."""
     stated = finer.digest, recommend_element(finer.mesh), patient, ACCURACY
-    path = find_kept_path(folder, f"patient-{patient.number:04d}-", device, *stated)
+    path = get_cache_path(folder, f"patient-{patient.number:04d}-", device, *stated)
 
     def solved() -> dict[str, np.ndarray]:
-        answer = Fem(finer, effects_of(patient), ACCURACY, device).deform(loads)
+        answer = Fem(finer, build_effects(patient), ACCURACY, device).deform(loads)
         good = all(outcome.good for outcome in answer.outcome)
         return {"motion": (answer.displacement if good else answer.displacement[:0]).astype(np.float32)}
 
-    return keep_arrays(path, "a patient's motions", ["motion"], solved)["motion"]
+    return load_cached_arrays(path, "a patient's motions", ["motion"], solved)["motion"]

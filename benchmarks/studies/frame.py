@@ -22,7 +22,7 @@ WARM_UP = 10
 
 
 @dataclass(frozen=True)
-class Spent:
+class StageTime:
     """Time of a stage over all frames [ms]: median, 95th percentile and mean."""
 
     stage: str
@@ -32,7 +32,7 @@ class Spent:
     mean: float
 
 
-def measure_size(text: str) -> tuple[int, int]:
+def parse_image_size(text: str) -> tuple[int, int]:
     """Parse width and height [pixel] from a text such as 640x480.
 
     Raises
@@ -46,7 +46,7 @@ def measure_size(text: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
-def frames_of(player: Player, count: int) -> Iterator[tuple[float, ...]]:
+def time_frames(player: Player, count: int) -> Iterator[tuple[float, ...]]:
     """Yield the times [s] of `STAGES`, frame by frame: the scene is played in order, repeatedly.
 
     The page is open on this machine only, without clients.
@@ -82,7 +82,7 @@ def frames_of(player: Player, count: int) -> Iterator[tuple[float, ...]]:
         page.close()
 
 
-def batch_rate(player: Player, count: int, seconds: float = 2.0) -> float:
+def measure_batch_rate(player: Player, count: int, duration: float = 2.0) -> float:
     """Measure images per second, rendered in one batch with a separate camera each: colour, depth, segmentation.
 
     Vertices are copied from the host; images stay on the device.
@@ -101,7 +101,7 @@ def batch_rate(player: Player, count: int, seconds: float = 2.0) -> float:
     renderer.render_batch(moved, cameras)
     wp.synchronize()
     done, begun = 0, clock.perf_counter()
-    while clock.perf_counter() - begun < seconds:
+    while clock.perf_counter() - begun < duration:
         renderer.render_batch(moved, cameras)
         wp.synchronize()
         done += count
@@ -122,11 +122,11 @@ def open_page(player: Player) -> Browser:
     return Browser(bodies, view, Playback(2, lambda playing: None, lambda number: None))
 
 
-def table(seconds: Sequence[tuple[float, ...]]) -> list[Spent]:
+def summarise_stages(seconds: Sequence[tuple[float, ...]]) -> list[StageTime]:
     """Summarise the times of `STAGES` and of the whole frame; `seconds` has a row for each frame."""
     each = 1e3 * np.array(seconds)
     columns = dict(zip(STAGES, each.T, strict=True)) | {"frame": each.sum(axis=1)}
     return [
-        Spent(stage, len(each), float(np.median(spent)), float(np.percentile(spent, 95.0)), float(spent.mean()))
+        StageTime(stage, len(each), float(np.median(spent)), float(np.percentile(spent, 95.0)), float(spent.mean()))
         for stage, spent in columns.items()
     ]

@@ -11,7 +11,7 @@ from scenes.gym.scripted import compute_scripted_actions
 
 
 @dataclass(frozen=True)
-class Rate:
+class StepRate:
     """Steps per second of a task, summed over its environments.
 
     Parameters
@@ -34,13 +34,9 @@ class Rate:
 
 
 def measure_rate(
-    environment: VectorEnv,
-    task: str,
-    observation: str,
-    steps: int,
-    repeats: int,
+    environment: VectorEnv, task: str, observation: str, steps: int, repeats: int,
     progress: Callable[[], object] = lambda: None,
-) -> Rate:
+) -> StepRate:  # fmt: skip
     """Measure a task under its scripted policy; the first repeat, with compilation and cached solves, does not count.
 
     Parameters
@@ -65,7 +61,7 @@ def measure_rate(
         progress()
     kept = np.array(rates[1:])
     touching = float(np.mean(touched[steps:]))
-    return Rate(
+    return StepRate(
         task, observation, environment.num_envs, float(np.median(kept)), float(kept.min()),
         float(kept.max()), touching,
     )  # fmt: skip

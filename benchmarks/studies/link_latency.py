@@ -37,14 +37,14 @@ class Latency:
     answered: float
 
 
-class Moved:
+class ShiftResponder:
     """Responder that shifts a surface by the pose: all work of a link without the time of a deformation model."""
 
-    def __init__(self, points: int) -> None:
+    def __init__(self, point_count: int) -> None:
         """Build a strip of triangles between random points."""
-        self._points = 0.05 * np.random.default_rng(0).normal(size=(points, 3))
-        corners = np.arange(2 * points)[:, None] + np.arange(3)
-        self._mesh = EncodedMesh.from_triangles(corners % points)
+        self._points = 0.05 * np.random.default_rng(0).normal(size=(point_count, 3))
+        corners = np.arange(2 * point_count)[:, None] + np.arange(3)
+        self._mesh = EncodedMesh.from_triangles(corners % point_count)
 
     def compute_result(
         self, transforms: ReceivedTransforms, time: float, wall_time: float, previous: TrackingResult | None = None
@@ -80,7 +80,7 @@ class Moved:
         raise BadMessageError("no places are followed")
 
 
-def measured(points: int, rate: float, seconds: float) -> Latency:
+def measure_latency(point_count: int, rate: float, duration: float) -> Latency:
     """Send poses at a rate [1/s] for a duration [s]; the server and three clients run in separate processes.
 
     Raises
@@ -88,8 +88,8 @@ def measured(points: int, rate: float, seconds: float) -> Latency:
     LostError
         A process that was killed.
     """
-    count = WARM_UP + max(1, round(rate * seconds))
-    with process_pool(["cpu"], _serve, points) as server, process_pool(["cpu"] * CLIENTS, _nothing) as clients:
+    count = WARM_UP + max(1, round(rate * duration))
+    with process_pool(["cpu"], _serve, point_count) as server, process_pool(["cpu"] * CLIENTS, _nothing) as clients:
         port = run_on_each(server, _port, [0])[0]
         sender = threading.Thread(target=_send, args=(port, rate, count), daemon=True)
         sender.start()
@@ -111,7 +111,7 @@ def _serve(device: str, points: int) -> int:
     ready = threading.Event()
 
     async def work() -> None:
-        moved = Moved(points)
+        moved = ShiftResponder(points)
         session = LinkSession(moved, moved, ReceivedTransforms(TransformNames(), PATIENCE))
         port = asyncio.get_running_loop().create_future()
         port.add_done_callback(lambda port: (found.append(port.result()), ready.set()))

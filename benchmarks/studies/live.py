@@ -24,7 +24,7 @@ CONVERGED = Accuracy(tolerance=1e-6)
 
 
 @dataclass(frozen=True)
-class Ride:
+class ToolRide:
     """Tool with a footprint of `radius` [m] that presses with `force` [N] while it moves over the open cortex."""
 
     name: str
@@ -32,20 +32,20 @@ class Ride:
     radius: float
 
 
-RIDES = (Ride("palpation", 0.25, 7e-3), Ride("spatula", 0.5, 10e-3))
+RIDES = (ToolRide("palpation", 0.25, 7e-3), ToolRide("spatula", 0.5, 10e-3))
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class LiveFrame:
     """Frame: loads, their result and the wall time [s]."""
 
     loads: Loads
-    answer: Deformation
+    result: Deformation
     seconds: float
 
 
 @dataclass(frozen=True)
-class Tally:
+class RideStatistics:
     """Statistics of a trajectory: time per frame [ms], outer steps, outcomes by name; errors of `checked` frames."""
 
     ride: str
@@ -62,7 +62,7 @@ class Tally:
     error: float
 
 
-def loads_of(ride: Ride, scene: Scene, site: CraniotomyFrame, frames: int) -> list[Loads]:
+def build_loads(ride: ToolRide, scene: Scene, site: CraniotomyFrame, frame_count: int) -> list[Loads]:
     """Build the loads of each frame, warm-up frames first.
 
     Raises
@@ -77,39 +77,39 @@ def loads_of(ride: Ride, scene: Scene, site: CraniotomyFrame, frames: int) -> li
             f"{1e3 * site.clearance:.3g} mm: choose a body with a larger craniotomy."
         )
     wandering = replace(scene, tool=Probe(radius=ride.radius), path=stroke_cortex(ride.force, room, SPEED))
-    times = np.arange(WARM_UP + frames) / scene.frames_per_second
+    times = np.arange(WARM_UP + frame_count) / scene.frames_per_second
     return [wandering.build_loads(site, wandering.path(time), time) for time in times.tolist()]
 
 
-def frames_of(fem: Fem, loads: Sequence[Loads]) -> Iterator[Frame]:
+def solve_frames(fem: Fem, loads: Sequence[Loads]) -> Iterator[LiveFrame]:
     """Yield the frames, each started from the last result; times include synchronisation with the device."""
     last = None
     for number, load in enumerate(loads):
         last, seconds = time_work(fem.deform, load, start=last)
         if number >= WARM_UP:
-            yield Frame(load, replace(last, memory={}, warm={}), seconds)
+            yield LiveFrame(load, replace(last, memory={}, warm={}), seconds)
 
 
-def live_fem(scene: Scene, site: CraniotomyFrame, device: str, element: str) -> Fem:
+def build_live_fem(scene: Scene, site: CraniotomyFrame, device: str, element: str) -> Fem:
     """Build the FEM solver for live frames."""
     return Fem(site.anatomy, scene.effects, LIVE, device, element=element, live=True)
 
 
-def errors(frames: Sequence[Frame], scene: Scene, site: CraniotomyFrame, element: str) -> np.ndarray:
+def compute_errors(frames: Sequence[LiveFrame], scene: Scene, site: CraniotomyFrame, element: str) -> np.ndarray:
     """Compute the maximum distance (n,) [m] over all nodes between each frame's result and the converged solution."""
     exact = Fem(site.anatomy, scene.effects, CONVERGED, "cpu", element=element)
     converged = exact.deform(stack([frame.loads for frame in frames])).displacement
-    found = np.concatenate([frame.answer.displacement for frame in frames])
+    found = np.concatenate([frame.result.displacement for frame in frames])
     return np.linalg.norm(found - converged, axis=2).max(axis=1)
 
 
-def tally(ride: Ride, frames: Sequence[Frame], off: np.ndarray) -> Tally:
-    """Summarise a trajectory's frames; `off` (n,) [m] are the errors of the checked ones."""
+def summarise_ride(ride: ToolRide, frames: Sequence[LiveFrame], errors: np.ndarray) -> RideStatistics:
+    """Summarise a trajectory's frames; `errors` (n,) [m] are the errors of the checked ones."""
     milliseconds = 1e3 * np.array([frame.seconds for frame in frames])
-    steps = np.array([frame.answer.iterations[0] for frame in frames])
-    outcomes = [frame.answer.outcome[0] for frame in frames]
+    steps = np.array([frame.result.iterations[0] for frame in frames])
+    outcomes = [frame.result.outcome[0] for frame in frames]
     median, p95, p99, worst = np.percentile(milliseconds, [50.0, 95.0, 99.0, 100.0]).tolist()
-    return Tally(
+    return RideStatistics(
         ride=ride.name,
         frames=len(frames),
         median=median,
@@ -120,6 +120,6 @@ def tally(ride: Ride, frames: Sequence[Frame], off: np.ndarray) -> Tally:
         most_steps=int(steps.max()),
         outcomes=dict(Counter(outcome.name for outcome in outcomes)),
         good=all(outcome.good for outcome in outcomes),
-        checked=len(off),
-        error=1e3 * float(off.max()),
+        checked=len(errors),
+        error=1e3 * float(errors.max()),
     )

@@ -35,23 +35,23 @@ YOUNG, POISSON, STIFFER = 3000.0, 0.45, 2.0
 SKULL, POINT = 3e3, 30.0
 
 
-def nothing(at: np.ndarray) -> Rival:
-    """Return zero motion at positions `at` (q, 3) [m]: the tumour is where the scan shows it."""
-    return lambda rest, motion: np.zeros_like(at)
+def predict_no_motion(positions: np.ndarray) -> Rival:
+    """Return zero motion at positions `positions` (q, 3) [m]: the tumour is where the scan shows it."""
+    return lambda rest, motion: np.zeros_like(positions)
 
 
-def rigid(at: np.ndarray) -> Rival:
+def fit_rigid_motion(positions: np.ndarray) -> Rival:
     """Fit the rigid motion of the points, at positions (q, 3) [m]: Kabsch 1976, Acta Cryst. A 32:922-923."""
 
     def moved(rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
         middle, now = rest.mean(axis=0), rest + motion
         turn = Rotation.align_vectors(now - now.mean(axis=0), rest - middle)[0]
-        return turn.apply(at - middle) + now.mean(axis=0) - at
+        return turn.apply(positions - middle) + now.mean(axis=0) - positions
 
     return moved
 
 
-def thin_plates(at: np.ndarray) -> Rival:
+def fit_thin_plates(positions: np.ndarray) -> Rival:
     """Fit thin-plate splines, at positions (q, 3) [m], with the smoothing of least leave-one-out error.
 
     The error at a left-out point is its coefficient over the diagonal of the inverse: Wahba 1990, "Spline Models for
@@ -60,7 +60,7 @@ def thin_plates(at: np.ndarray) -> Rival:
 
     def moved(rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
         middle, spread = rest.mean(axis=0), rest.std()
-        own, there = (rest - middle) / spread, (at - middle) / spread
+        own, there = (rest - middle) / spread, (positions - middle) / spread
         smoothing = min(SMOOTHINGS, key=lambda each: _left_out(own, motion, each))
         return RBFInterpolator(own, motion, smoothing=smoothing, kernel="thin_plate_spline")(there)
 
@@ -78,12 +78,12 @@ def _left_out(points: np.ndarray, values: np.ndarray, smoothing: float) -> float
     return float(((inverse @ values / np.diagonal(inverse)[:, None]) ** 2).sum())
 
 
-def kelvin_forces(at: np.ndarray) -> Rival:
+def fit_kelvinlets(positions: np.ndarray) -> Rival:
     """Fit regularised Kelvinlets of forces at the points, by ridge regression, at positions (q, 3) [m]."""
 
     def moved(rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
         size = 3 * len(rest)
-        blocks = (compute_kelvinlets(places, rest, SPREAD, BRAIN.poisson) for places in (rest, at))
+        blocks = (compute_kelvinlets(places, rest, SPREAD, BRAIN.poisson) for places in (rest, positions))
         own, there = (block.reshape(size, -1).T for block in blocks)
         ridge = RIDGE * np.trace(own) / size
         force = np.linalg.solve(own.T @ own + ridge**2 * np.eye(size), own.T @ motion.ravel())
@@ -93,7 +93,7 @@ def kelvin_forces(at: np.ndarray) -> Rival:
 
 
 @dataclass(frozen=True, eq=False)
-class Springs:
+class SpringBody:
     """Linear finite elements on springs, condensed to the open cortex and the tumour.
 
     Parameters
@@ -102,13 +102,13 @@ class Springs:
         The body.
     compliance
         (m, 3, m + q, 3) [m/N]: motion of the open cortex's m and the tumour's q vertices by unit forces at the former.
-    point
+    point_stiffness
         Stiffness [N/m] of the spring at each point.
     """
 
     anatomy: Anatomy
     compliance: np.ndarray
-    point: float = POINT
+    point_stiffness: float = POINT
 
     def __call__(self, rest: np.ndarray, motion: np.ndarray) -> np.ndarray:
         """Compute as `Rival`, with forces f (n, 3) at the points that solve (C + 1/k) f = motion."""
@@ -116,12 +116,12 @@ class Springs:
         weights = _on_surface(self.anatomy, rest)
         pulled = np.einsum("nm,miva->niva", weights, self.compliance, optimize=True)
         seen = np.einsum("niva,kv->nika", pulled[:, :, :count], weights, optimize=True).reshape(size, size)
-        force = cho_solve(cho_factor(seen + np.eye(size) / self.point), motion.ravel())
+        force = cho_solve(cho_factor(seen + np.eye(size) / self.point_stiffness), motion.ravel())
         return (force @ pulled[:, :, count:].reshape(size, -1)).reshape(-1, 3)
 
 
-def springs(anatomy: Anatomy, skull: float = SKULL, point: float = POINT) -> Springs:
-    """Assemble linear tetrahedra on springs (`skull` [Pa/m], `point` [N/m]), and solve for forces on the open cortex.
+def build_spring_body(anatomy: Anatomy, skull_stiffness: float = SKULL, point_stiffness: float = POINT) -> SpringBody:
+    """Assemble linear tetrahedra on springs (skull [Pa/m], point [N/m]), and solve for forces on the open cortex.
 
     Fixed nodes and nodes under the skull are on springs in all directions. A node's spring has the area of
     the surface that is nearest to it.
@@ -133,7 +133,7 @@ def springs(anatomy: Anatomy, skull: float = SKULL, point: float = POINT) -> Spr
     covered = anatomy.slide_normal.any(axis=1) | anatomy.fixed.any(axis=1)
     area = np.zeros(len(mesh.nodes))
     np.add.at(area, mesh.surface, np.repeat(compute_areas(mesh.nodes[mesh.surface])[:, None] / 3.0, 3, axis=1))
-    spring = np.repeat(np.where(covered, skull * area, 0.0), 3)
+    spring = np.repeat(np.where(covered, skull_stiffness * area, 0.0), 3)
     factor = splu(sp.csc_matrix(stiffness + sp.diags_array(spring)), "MMD_AT_PLUS_A", options={"SymmetricMode": True})
     cortex = np.unique(anatomy.open_surface)
     unknowns = (3 * cortex[:, None] + np.arange(3)).ravel()
@@ -141,7 +141,7 @@ def springs(anatomy: Anatomy, skull: float = SKULL, point: float = POINT) -> Spr
     unit[unknowns, np.arange(len(unknowns))] = 1.0
     asked = np.concatenate([cortex, anatomy.tumour_nodes])
     moved = factor.solve(unit).reshape(len(mesh.nodes), 3, -1)[asked]
-    return Springs(anatomy, np.moveaxis(moved, 2, 0).reshape(len(cortex), 3, len(asked), 3), point)
+    return SpringBody(anatomy, np.moveaxis(moved, 2, 0).reshape(len(cortex), 3, len(asked), 3), point_stiffness)
 
 
 def _on_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
@@ -154,19 +154,19 @@ def _on_surface(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     return weights
 
 
-def rivals(anatomy: Anatomy) -> dict[str, Rival]:
+def build_baselines(anatomy: Anatomy) -> dict[str, Rival]:
     """Build every baseline, by name, with its set-up for a body."""
     at = anatomy.mesh.nodes[anatomy.tumour_nodes]
     return {
-        "nothing moved": nothing(at),
-        "best rigid": rigid(at),
-        "thin-plate spline": thin_plates(at),
-        "Kelvinlets": kelvin_forces(at),
-        "finite elements on springs": springs(anatomy),
+        "nothing moved": predict_no_motion(at),
+        "best rigid": fit_rigid_motion(at),
+        "thin-plate spline": fit_thin_plates(at),
+        "Kelvinlets": fit_kelvinlets(at),
+        "finite elements on springs": build_spring_body(anatomy),
     }
 
 
-def oracle(prior: MotionPrior, motion: np.ndarray) -> np.ndarray:
+def fit_oracle(prior: MotionPrior, motion: np.ndarray) -> np.ndarray:
     """Compute the best motion (q, 3) [m] of the tumour's vertices that a sum of a prior's shapes can give.
 
     It is the least-squares fit to the true motion (V, 3) [m] at the open cortex and the tumour.

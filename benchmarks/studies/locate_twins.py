@@ -18,7 +18,7 @@ from sim.geometry.locate import locate
 from sim.loads import Loads, Posture, Pushed
 from sim.material import MATERIALS, Ogden
 from surrogate.data.tool_loads import draw as drawn_loads
-from surrogate.model.kept_arrays import find_kept_path, keep_arrays
+from surrogate.model.kept_arrays import get_cache_path, load_cached_arrays
 
 CAUSES = ("tool", "drainage", "swelling", "drainage and tool")
 """Causes of motion, used in turn: each one acts in a quarter or in half of the test cases."""
@@ -72,14 +72,14 @@ class Draw:
 
 
 @dataclass(frozen=True, eq=False)
-class Twin:
+class SyntheticCase:
     """Test case: its parameters, and the motion (V, 3) [m] of the vertices of the estimator's mesh."""
 
-    draw: Draw
+    parameters: Draw
     motion: np.ndarray
 
 
-def drawn(seed: int, number: int) -> Draw:
+def sample_parameters(seed: int, number: int) -> Draw:
     """Sample the parameters of a test case; they depend on its number and the seed alone."""
     random = np.random.default_rng([seed, number])
     cause = CAUSES[number % len(CAUSES)]
@@ -102,24 +102,24 @@ def drawn(seed: int, number: int) -> Draw:
     )
 
 
-def effects_of(draw: Draw) -> tuple[Effect, ...]:
+def build_effects(draw: Draw) -> tuple[Effect, ...]:
     """Build the effects of a test case's FEM."""
-    tumour = {TUMOUR_LABEL: ogden(draw.stiffness * draw.ratio)}
+    tumour = {TUMOUR_LABEL: build_ogden_tissue(draw.stiffness * draw.ratio)}
     swells = Pulsation(Wave(0.25, abs(draw.swelling)), Wave(0.25, 0.0))
     skull = SKULLS[draw.skull]
-    return Elasticity(ogden(draw.stiffness), tumour), Held(), skull, ToolForce(), Gravity(), swells
+    return Elasticity(build_ogden_tissue(draw.stiffness), tumour), Held(), skull, ToolForce(), Gravity(), swells
 
 
-def ogden(share: float, poisson: float = POISSON) -> Ogden:
-    """Build Ogden tissue of one exponent, `share` times as stiff as `MATERIALS["minutes"]`."""
+def build_ogden_tissue(stiffness_ratio: float, poisson: float = POISSON) -> Ogden:
+    """Build Ogden tissue of one exponent, `stiffness_ratio` times as stiff as `MATERIALS["minutes"]`."""
     minutes = MATERIALS["minutes"].tissue
     assert isinstance(minutes, Ogden)
     (c, m), *_ = minutes.terms
-    bulk = share * c * (1.0 + poisson) / (3.0 * (1.0 - 2.0 * poisson))
-    return Ogden(((share * c, m),), bulk)
+    bulk = stiffness_ratio * c * (1.0 + poisson) / (3.0 * (1.0 - 2.0 * poisson))
+    return Ogden(((stiffness_ratio * c, m),), bulk)
 
 
-def loads_of(anatomy: Anatomy, draw: Draw) -> Loads:
+def build_loads(anatomy: Anatomy, draw: Draw) -> Loads:
     """Build the loads of a test case on this body."""
     pushed = drawn_loads(draw.tool, anatomy, 1, draw.push).get(Pushed)
     assert pushed is not None
@@ -136,23 +136,17 @@ def loads_of(anatomy: Anatomy, draw: Draw) -> Loads:
     return Loads((pushed, Posture(down[None], np.array([level]), np.ones(1))), np.array([time]))
 
 
-def solved(anatomy: Anatomy, draw: Draw, device: str = "auto", element: str = RECOMMENDED) -> np.ndarray | None:
+def solve_case(anatomy: Anatomy, draw: Draw, device: str = "auto", element: str = RECOMMENDED) -> np.ndarray | None:
     """Solve for the motion (V, 3) [m] of a test case's own mesh; None without equilibrium."""
-    answer = Fem(anatomy, effects_of(draw), ACCURACY, device, element=element).deform(loads_of(anatomy, draw))
+    answer = Fem(anatomy, build_effects(draw), ACCURACY, device, element=element).deform(build_loads(anatomy, draw))
     return answer.displacement[0] if answer.outcome[0].good else None
 
 
-def twins(
-    body: Anatomy,
-    finer: Anatomy,
-    count: int,
-    seed: int = 0,
-    device: str = "auto",
-    element: str = RECOMMENDED,
-    folder: Path | None = None,
-    progress: Callable[[int, int], object] = lambda done, total: None,
-) -> Iterator[Twin | None]:
-    """Solve test cases on the mesh `finer`, interpolated at the vertices of `body`; None for one without equilibrium.
+def solve_cases(
+    anatomy: Anatomy, finer_mesh: Anatomy, count: int, seed: int = 0, device: str = "auto", element: str = RECOMMENDED,
+    folder: Path | None = None, progress: Callable[[int, int], object] = lambda done, total: None,
+) -> Iterator[SyntheticCase | None]:  # fmt: skip
+    """Solve test cases on `finer_mesh`, interpolated at the vertices of `anatomy`; None for one without equilibrium.
 
     Cases in `folder`, from an interrupted run, are read. `progress` receives the number done and the total.
 
@@ -161,16 +155,16 @@ def twins(
     InputError
         Meshes of two brains; meshes without tumour or open cortex.
     """
-    check_same(body, finer)
-    place = locate(finer.mesh, body.mesh.nodes)
+    check_same_brain(anatomy, finer_mesh)
+    place = locate(finer_mesh.mesh, anatomy.mesh.nodes)
     for number in range(count):
-        draw = drawn(seed, number)
-        motion = _kept(finer, draw, device, element, folder)
+        draw = sample_parameters(seed, number)
+        motion = _kept(finer_mesh, draw, device, element, folder)
         progress(number + 1, count)
-        yield None if motion is None else Twin(draw, place.interpolate(motion[None].astype(float))[0])
+        yield None if motion is None else SyntheticCase(draw, place.interpolate(motion[None].astype(float))[0])
 
 
-def check_same(body: Anatomy, finer: Anatomy) -> None:
+def check_same_brain(anatomy: Anatomy, finer_mesh: Anatomy) -> None:
     """Check that two meshes are of one brain.
 
     Raises
@@ -178,11 +172,11 @@ def check_same(body: Anatomy, finer: Anatomy) -> None:
     InputError
         A mesh without a tumour; tumours at different positions.
     """
-    for one in (body, finer):
+    for one in (anatomy, finer_mesh):
         if not len(one.tumour_nodes):
             raise InputError("an anatomy has no tumour to locate: make one that has.")
         open_cortex(one)
-    middles = [one.mesh.nodes[one.tumour_nodes].mean(axis=0) for one in (body, finer)]
+    middles = [one.mesh.nodes[one.tumour_nodes].mean(axis=0) for one in (anatomy, finer_mesh)]
     apart = float(np.linalg.norm(middles[0] - middles[1]))
     if apart > SAME:
         raise InputError(
@@ -193,10 +187,10 @@ def check_same(body: Anatomy, finer: Anatomy) -> None:
 
 def _kept(anatomy: Anatomy, draw: Draw, device: str, element: str, folder: Path | None) -> np.ndarray | None:
     """Read the motion of a test case's own mesh from the folder, or solve and store it."""
-    path = find_kept_path(folder, f"twin-{draw.number:04d}-", device, anatomy.digest, element, draw)
+    path = get_cache_path(folder, f"twin-{draw.number:04d}-", device, anatomy.digest, element, draw)
 
     def made() -> dict[str, np.ndarray]:
-        found = solved(anatomy, draw, device, element)
+        found = solve_case(anatomy, draw, device, element)
         return {"motion": np.zeros((0, 3)) if found is None else found}
 
     def check(arrays: Mapping[str, np.ndarray]) -> None:
@@ -204,5 +198,5 @@ def _kept(anatomy: Anatomy, draw: Draw, device: str, element: str, folder: Path 
         if (count, *rest) not in (anatomy.mesh.nodes.shape, (0, 3)):
             raise InputError(f"holds motions of {count} vertices: delete it, and it is made anew.")
 
-    motion = keep_arrays(path, "a twin", ["motion"], made, check)["motion"]
+    motion = load_cached_arrays(path, "a twin", ["motion"], made, check)["motion"]
     return motion if len(motion) else None

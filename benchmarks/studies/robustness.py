@@ -20,7 +20,7 @@ CHECKED = 100
 
 
 @dataclass(frozen=True)
-class Record:
+class LoadRecord:
     """Load and its outcome; `double` is the residual in double precision, NaN if not computed."""
 
     preset: str
@@ -35,7 +35,7 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Trial:
+class SolverTrial:
     """Solver under test: body, effects, element, device and batch size."""
 
     anatomy: Anatomy
@@ -44,26 +44,26 @@ class Trial:
     device: str
     batch: int
 
-    def fem(self, accuracy: Accuracy) -> Fem:
+    def build_fem(self, accuracy: Accuracy) -> Fem:
         """Build the FEM solver under test."""
         return Fem(self.anatomy, self.effects, accuracy, self.device, self.batch, self.element)
 
 
-def shares(count: int) -> dict[str, int]:
+def divide_loads(count: int) -> dict[str, int]:
     """Divide `count` loads among the sets: half are brutal, the tools and the published protocol share the others."""
     gentle = [name for name in SETS if name != BRUTAL.name]
     whole, left = divmod(count - count // 2, len(gentle))
     return {**{name: whole + (place < left) for place, name in enumerate(gentle)}, BRUTAL.name: count // 2}
 
 
-def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iterator[list[Record]]:
-    """Solve those of `count` loads that are not `done`, to 1e-4 in single precision, in the batches of a whole run.
+def solve_loads(trial: SolverTrial, count: int, seed: int, solved: Sequence[LoadRecord]) -> Iterator[list[LoadRecord]]:
+    """Solve those of `count` loads that are not `solved`, to 1e-4 in single precision, in the batches of a whole run.
 
     Strains are not limited, since the solver is tested, not the tissue.
     """
-    fem, double = trial.fem(NO_STRAIN_LIMIT), trial.fem(REFERENCE)
-    for preset, wanted in shares(count).items():
-        first = sum(record.preset == preset for record in done)
+    fem, double = trial.build_fem(NO_STRAIN_LIMIT), trial.build_fem(REFERENCE)
+    for preset, wanted in divide_loads(count).items():
+        first = sum(record.preset == preset for record in solved)
         if first >= wanted:
             continue
         loads = draw(preset, trial.anatomy, wanted, seed)
@@ -80,11 +80,11 @@ def records(trial: Trial, count: int, seed: int, done: Sequence[Record]) -> Iter
 
 def _written(
     preset: str, index: np.ndarray, loads: Loads, answer: Deformation, again: np.ndarray, seconds: float
-) -> list[Record]:
+) -> list[LoadRecord]:
     (pushed,) = loads.get_all(Pushed)
     force = np.linalg.norm(pushed.force, axis=1)
     return [
-        Record(
+        LoadRecord(
             preset=preset, number=int(number), force=float(force[row]), footprint=float(pushed.footprint[row]),
             outcome=answer.outcome[row].name,
             outer=int(answer.iterations[row]), residual=float(answer.residual[row]), double=float(again[row]),
@@ -95,7 +95,7 @@ def _written(
 
 
 @dataclass(frozen=True)
-class Tally:
+class SetStatistics:
     """Statistics of a set of loads: number converged, of these by load steps; outer steps; ms per load; hardest load.
 
     `double` is the largest residual in double precision among the `checked` loads.
@@ -110,14 +110,14 @@ class Tally:
     milliseconds: float
     checked: int
     double: float
-    hardest: Record
+    hardest: LoadRecord
 
 
-def tallies(found: Sequence[Record]) -> list[Tally]:
+def summarise_sets(records: Sequence[LoadRecord]) -> list[SetStatistics]:
     """Summarise the sets, in order. The hardest load failed with the largest residual, or took the most steps."""
     out = []
     for preset in SETS:
-        mine = [record for record in found if record.preset == preset]
+        mine = [record for record in records if record.preset == preset]
         if not mine:
             continue
         good = [record for record in mine if Outcome[record.outcome].good]
@@ -126,7 +126,7 @@ def tallies(found: Sequence[Record]) -> list[Tally]:
         hardest = max(mine, key=lambda r: (not Outcome[r.outcome].good, r.residual if r not in good else 0.0, r.outer))
         rescued = sum(record.outcome != Outcome.CONVERGED.name for record in good)
         out.append(
-            Tally(
+            SetStatistics(
                 preset=preset, loads=len(mine), converged=len(good), rescued=rescued,
                 outer_median=float(np.median(outer)), outer_p99=float(np.percentile(outer, 99)),
                 milliseconds=1e3 * float(np.mean([record.seconds for record in mine])), checked=len(double),

@@ -29,7 +29,7 @@ SEED = 4
 
 
 @dataclass(frozen=True)
-class Row:
+class ScalingRow:
     """Time and memory of loads on one mesh, in batches of one size.
 
     Parameters
@@ -67,7 +67,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Trial:
+class MeshTrial:
     """Solver under test: element, device, and folder of stored meshes."""
 
     element: str
@@ -75,7 +75,7 @@ class Trial:
     folder: Path
 
 
-def measured(trial: Trial, size: int, batch: int) -> Row:
+def measure_mesh(trial: MeshTrial, node_count: int, batch_size: int) -> ScalingRow:
     """Solve palpation loads on one mesh, to 1e-4 in single precision, in this process.
 
     Raises
@@ -83,36 +83,37 @@ def measured(trial: Trial, size: int, batch: int) -> Row:
     InputError
         See `Fem`; a GPU with too little memory.
     """
-    anatomy = read_anatomy(build_template_mesh(trial.folder, size))
-    needed = estimate_fem_memory(anatomy, trial.element, TRAIN, trial.device, batch, batch)
+    anatomy = read_anatomy(build_template_mesh(trial.folder, node_count))
+    needed = estimate_fem_memory(anatomy, trial.element, TRAIN, trial.device, batch_size, batch_size)
     if needed is not None:
         print(f"{needed}.", file=sys.stderr)
         needed.check_fits()
     with watch_gpu_memory(trial.device) as card:
         effects = build_push_effects(anatomy, BRAIN)
-        fem, made = time_work(Fem, anatomy, effects, TRAIN, trial.device, batch, trial.element)
-        loads = draw("palpation", anatomy, max(LOADS, batch) + 1, SEED)
+        fem, made = time_work(Fem, anatomy, effects, TRAIN, trial.device, batch_size, trial.element)
+        loads = draw("palpation", anatomy, max(LOADS, batch_size) + 1, SEED)
         fem.deform(loads.select(np.array([-1])).scale(1e-3))  # kernels are compiled or loaded at their first launch
         seconds, outer, good = [], [], 0
-        while sum(seconds) < PATIENCE and len(outer) + batch <= max(LOADS, batch):
-            some = loads.select(np.arange(len(outer), len(outer) + batch))
+        while sum(seconds) < PATIENCE and len(outer) + batch_size <= max(LOADS, batch_size):
+            some = loads.select(np.arange(len(outer), len(outer) + batch_size))
             answer, spent = time_work(fem.deform, some)
             seconds.append(spent)
             outer += list(answer.iterations)
             good += sum(outcome.good for outcome in answer.outcome)
-    return Row(
-        size=size, asked=batch, nodes=len(anatomy.mesh.nodes), tets=len(anatomy.mesh.tets),
-        preconditioner=fem.plan.preconditioner, batch=batch, set_up=made,
-        load=float(np.median(seconds)) / batch, outer=float(np.median(outer)), loads=len(outer), converged=good,
+    return ScalingRow(
+        size=node_count, asked=batch_size, nodes=len(anatomy.mesh.nodes), tets=len(anatomy.mesh.tets),
+        preconditioner=fem.plan.preconditioner, batch=batch_size, set_up=made,
+        load=float(np.median(seconds)) / batch_size, outer=float(np.median(outer)), loads=len(outer), converged=good,
         memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, card=max(card) / 2**30,
         foreseen=0.0 if needed is None else needed.peak / 2**30,
     )  # fmt: skip
 
 
-def rows(
-    trial: Trial, sizes: Sequence[int], batches: Sequence[int], done: Sequence[Row], said: Callable[[str], object]
-) -> Iterator[Row]:
-    """Measure a row for each size and batch that is not `done`, in a new process each; `said` receives the progress.
+def measure_meshes(
+    trial: MeshTrial, node_counts: Sequence[int], batch_sizes: Sequence[int], done: Sequence[ScalingRow],
+    report: Callable[[str], object],
+) -> Iterator[ScalingRow]:  # fmt: skip
+    """Measure a row for each size and batch that is not `done`, in a new process each; `report` receives the progress.
 
     Raises
     ------
@@ -120,15 +121,15 @@ def rows(
         Invalid meshes or devices, too little memory; a process that was killed, most likely out of memory.
     """
     known = {(row.size, row.asked) for row in done}
-    for size in sizes:
-        for batch in batches:
+    for size in node_counts:
+        for batch in batch_sizes:
             if (size, batch) in known:
                 continue
-            said(f"{size} nodes, the mesh")
+            report(f"{size} nodes, the mesh")
             build_template_mesh(trial.folder, size)
-            said(f"{size} nodes, batch of {batch}")
+            report(f"{size} nodes, batch of {batch}")
             try:
-                yield from (row for _, row in map_parallel(partial(measured, trial, size), [batch]))
+                yield from (row for _, row in map_parallel(partial(measure_mesh, trial, size), [batch]))
             except LostProcessError:
                 raise InputError(
                     f"{size} nodes with --batch {batch}: the process was ended, for want of memory most likely; "
@@ -136,18 +137,18 @@ def rows(
                 ) from None
 
 
-def panels(found: Sequence[Row]) -> tuple[ChartPanel, ...]:
+def build_panels(rows: Sequence[ScalingRow]) -> tuple[ChartPanel, ...]:
     """Build the plots of time and memory over nodes, with a mark between sizes of different preconditioners."""
-    batches = sorted({row.asked for row in found})
-    by_size = sorted({row.nodes: row.preconditioner for row in found}.items())
+    batches = sorted({row.asked for row in rows})
+    by_size = sorted({row.nodes: row.preconditioner for row in rows}.items())
     marks = tuple(((a * b) ** 0.5, _kind(two)) for (a, one), (b, two) in pairwise(by_size) if _kind(one) != _kind(two))
 
     def curve(name: str, value: str, batch: int) -> Curve:
-        return Curve(name, tuple((row.nodes, getattr(row, value)) for row in found if row.asked == batch))
+        return Curve(name, tuple((row.nodes, getattr(row, value)) for row in rows if row.asked == batch))
 
     seconds = [curve("one load" if batch == 1 else f"one of {batch} together", "load", batch) for batch in batches]
     memory = [curve(f"host, batch of {batch}", "memory", batch) for batch in batches]
-    if any(row.card for row in found):
+    if any(row.card for row in rows):
         memory += [curve(f"card, batch of {batch}", "card", batch) for batch in batches]
     first = f"left of the first mark: {by_size[0][1]}" if marks else by_size[0][1]
     seconds.append(curve("set-up", "set_up", batches[0]))

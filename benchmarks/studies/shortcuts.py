@@ -22,7 +22,7 @@ BATCH, BATCH_ON_CUDA, POSES = 32, 2048, 16
 
 
 @dataclass(frozen=True, eq=False)
-class Work:
+class ShortcutCase:
     """Typical loads, and the acceleration that they test.
 
     Parameters
@@ -53,7 +53,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Row:
+class ShortcutRow:
     """Median and 95th percentile [ms] of a load or batch with and without an acceleration; number of timings."""
 
     shortcut: str
@@ -77,24 +77,26 @@ class Row:
         return self.total_without / self.total
 
 
-def works(site: CraniotomyFrame, runs: int, on_cuda: bool) -> Iterator[Work]:
+def list_cases(site: CraniotomyFrame, run_count: int, on_cuda: bool) -> Iterator[ShortcutCase]:
     """Yield the loads to be measured; the first load of each is a warm-up."""
     anatomy, some = site.anatomy, BATCH_ON_CUDA if on_cuda else BATCH
     pushed = build_push_effects(anatomy, BRAIN)
-    loads = draw("palpation", anatomy, runs + 1, SEED)
+    loads = draw("palpation", anatomy, run_count + 1, SEED)
     single = [loads.select(np.array([row])) for row in range(len(loads))]
-    many = draw("palpation", anatomy, some * (runs + 1), SEED)
+    many = draw("palpation", anatomy, some * (run_count + 1), SEED)
     batches = [many.select(np.arange(first, first + some)) for first in range(0, len(many), some)]
     for element in ("smoothed", "p1"):
         name = f"{some} palpation loads together, {element}"
-        yield Work("nonlinear elimination near the opening", name, SolverStep.NEAR, batches, pushed, element=element)
+        yield ShortcutCase(
+            "nonlinear elimination near the opening", name, SolverStep.NEAR, batches, pushed, element=element
+        )
     name = "a palpation load from rest, quadratic"
-    yield Work("nonlinear elimination, clamped", name, SolverStep.CLAMPED, single, pushed, element="p2")
-    yield Work("L-BFGS before Newton", "a palpation load from rest", SolverStep.LBFGS, single, pushed)
-    poses = draw_poses("palpation", anatomy, POSES * (runs + 1), SEED)
+    yield ShortcutCase("nonlinear elimination, clamped", name, SolverStep.CLAMPED, single, pushed, element="p2")
+    yield ShortcutCase("L-BFGS before Newton", "a palpation load from rest", SolverStep.LBFGS, single, pushed)
+    poses = draw_poses("palpation", anatomy, POSES * (run_count + 1), SEED)
     together = [poses.select(np.arange(first, first + POSES)) for first in range(0, len(poses), POSES)]
     tool = (*pushed, ToolContact((choose_ball("palpation"),)))
-    yield Work("contact solved apart", f"{POSES} poses of a ball together", SolverStep.CONTACT, together, tool)
+    yield ShortcutCase("contact solved apart", f"{POSES} poses of a ball together", SolverStep.CONTACT, together, tool)
     for scene, step, shortcut in (
         ("press", SolverStep.STRAINED, "a stiffness that knows strained tissue"),
         ("palpate", SolverStep.CONTACT, "contact solved apart"),
@@ -105,13 +107,13 @@ def works(site: CraniotomyFrame, runs: int, on_cuda: bool) -> Iterator[Work]:
         effects, first = played.get_effects_on(anatomy), len(played.times) // 3  # frames with the tool in contact
         frames = [
             played.build_loads(site, played.path(time), time)
-            for time in played.times[first : first + runs + 1].tolist()
+            for time in played.times[first : first + run_count + 1].tolist()
         ]
         name = f"frames of `{scene}`, smoothed"
-        yield Work(shortcut, name, step, frames, effects, LIVE, live=True, follows=True)
+        yield ShortcutCase(shortcut, name, step, frames, effects, LIVE, live=True, follows=True)
 
 
-def tried(fem: Fem, step: SolverStep | None) -> bool:
+def is_shortcut_used(fem: Fem, step: SolverStep | None) -> bool:
     """Return True if a solver uses an acceleration on its device, with its element and effects."""
     plan = fem.plan
     own = {plan.batched, plan.single, plan.contact_solver}
@@ -123,25 +125,25 @@ def tried(fem: Fem, step: SolverStep | None) -> bool:
     )
 
 
-def measure(work: Work, site: CraniotomyFrame, device: str) -> Row | None:
+def measure_case(case: ShortcutCase, site: CraniotomyFrame, device: str) -> ShortcutRow | None:
     """Time loads with and without an acceleration, alternately; None if the solver does not use it."""
-    avoid = () if work.step is None else (work.step,)
-    batch = len(work.loads[0])
+    avoid = () if case.step is None else (case.step,)
+    batch = len(case.loads[0])
     fem, without = (
-        Fem(site.anatomy, work.effects, work.accuracy, device, batch, work.element, work.live, out)
+        Fem(site.anatomy, case.effects, case.accuracy, device, batch, case.element, case.live, out)
         for out in ((), avoid)
     )
-    if not tried(fem, work.step):
+    if not is_shortcut_used(fem, case.step):
         return None
-    both = zip(_timed(fem, work, True), _timed(without, work, work.step is not None), strict=True)
+    both = zip(_timed(fem, case, True), _timed(without, case, case.step is not None), strict=True)
     seconds = 1e3 * np.array(list(both)[1:]).T
     (median, other), (p95, other_p95) = np.median(seconds, axis=1), np.percentile(seconds, 95, axis=1)
-    return Row(
-        work.shortcut, work.name, seconds.shape[1], *map(float, (median, p95, other, other_p95, *seconds.sum(1)))
+    return ShortcutRow(
+        case.shortcut, case.name, seconds.shape[1], *map(float, (median, p95, other, other_p95, *seconds.sum(1)))
     )
 
 
-def _timed(fem: Fem, work: Work, warm: bool) -> Iterator[float]:
+def _timed(fem: Fem, work: ShortcutCase, warm: bool) -> Iterator[float]:
     """Measure the time [s] of each load."""
     last = None
     for loads in work.loads:

@@ -15,14 +15,14 @@ from sim.fem import Fem
 from sim.loads import Loads
 from sim.material import Material
 
-from .elements import tumour_motion
+from .elements import compute_tumour_motion
 
 # A bond that fails above its strength, and one without strength: a skull that only presses, without a gap.
 TORN = {"tearing": Bonded(), "pressing": Bonded(1e-6, 1e-6)}
 
 
 @dataclass(frozen=True)
-class Row:
+class SkullRow:
     """Results of one skull on one mesh at one Poisson's ratio.
 
     Parameters
@@ -48,14 +48,10 @@ class Row:
     failed: int
 
 
-def rows(
-    anatomies: Sequence[Anatomy],
-    skulls: Sequence[str],
-    poissons: Sequence[float],
-    loads: Loads,
-    device: str,
+def measure_skulls(
+    anatomies: Sequence[Anatomy], skulls: Sequence[str], poissons: Sequence[float], loads: Loads, device: str,
     tearing: Debonding = TEARING,
-) -> Iterator[Row]:
+) -> Iterator[SkullRow]:  # fmt: skip
     """Yield a row for each mesh, Poisson's ratio and skull, of the same loads; 3 kPa, neo-Hookean, default element."""
     for poisson in poissons:
         for skull in skulls:
@@ -63,16 +59,16 @@ def rows(
                 yield _measured(anatomy, skull, poisson, loads, device, tearing)
 
 
-def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device: str, tearing: Debonding) -> Row:
+def _measured(anatomy: Anatomy, skull: str, poisson: float, loads: Loads, device: str, tearing: Debonding) -> SkullRow:
     mesh, tissue = anatomy.mesh, Material("neo-hookean", 3000.0, poisson)
     weak = loads.select(slice(0, 1)).scale(1e-3)
     _answered(anatomy, skull, tissue, weak, device, tearing)  # kernels are compiled or loaded
     answer, good, seconds = _answered(anatomy, skull, tissue, loads, device, tearing)
     if not good.any():
-        return Row(skull, poisson, len(mesh.nodes), float("nan"), None, None, seconds, len(good))
-    moved = tumour_motion(anatomy, answer.displacement[good])
+        return SkullRow(skull, poisson, len(mesh.nodes), float("nan"), None, None, seconds, len(good))
+    moved = compute_tumour_motion(anatomy, answer.displacement[good])
     leaked, bond = (float(values[good].max()) for values in (answer.leaked, answer.bond))
-    return Row(
+    return SkullRow(
         skull, poisson, len(mesh.nodes), 1e3 * float(np.linalg.norm(moved, axis=1).mean()),
         None if skull in TORN else leaked, bond if np.isfinite(bond) else None, seconds, int((~good).sum()),
     )  # fmt: skip

@@ -13,7 +13,7 @@ from sim.errors import InputError
 
 
 @dataclass(frozen=True)
-class Row:
+class StereoRow:
     """Results of the frames of a scene by one seed, or by several.
 
     Parameters
@@ -51,13 +51,10 @@ class Row:
     slowest_ms: float
 
 
-def rows(
-    theatre: PatientSetup,
-    scene: Scene,
-    seeds: Sequence[int],
-    every: int,
+def measure_scene(
+    patient: PatientSetup, scene: Scene, seeds: Sequence[int], frame_step: int,
     progress: Callable[[int, int], object] = lambda done, total: None,
-) -> Iterator[Row]:
+) -> Iterator[StereoRow]:  # fmt: skip
     """Measure a row for each seed, and one for all; FEM is solved once for all seeds.
 
     Raises
@@ -67,7 +64,7 @@ def rows(
     """
     if not isinstance(scene.observation_model, StereoObservation):
         raise InputError(f"no pair of eyes sees the scene {scene.name}: choose one with a StereoSight, as microscope.")
-    player, numbers = theatre.build_player("fem", scene), range(0, len(scene.times), every)
+    player, numbers = patient.build_player("fem", scene), range(0, len(scene.times), frame_step)
     seen, last, total, done = [], None, len(numbers) * (1 + len(seeds)), 0
     for number in numbers:
         touch = player.get_touch(number)
@@ -79,7 +76,7 @@ def rows(
         progress(done, total)
     found: list[TumourEstimate] = []
     for seed in seeds:
-        observer = theatre.build_stage(
+        observer = patient.build_stage(
             replace(scene, observation_model=replace(scene.observation_model, seed=seed))
         ).observer
         assert observer is not None
@@ -89,11 +86,11 @@ def rows(
             done += 1
             progress(done, total)
         found += own
-        yield row(seed, own)
-    yield row(-1, found)
+        yield summarise_seed(seed, own)
+    yield summarise_seed(-1, found)
 
 
-def row(seed: int, estimates: Sequence[TumourEstimate]) -> Row:
+def summarise_seed(seed: int, estimates: Sequence[TumourEstimate]) -> StereoRow:
     """Summarise estimates."""
     off = 1e3 * np.array([each.error for each in estimates])
     true = 1e3 * np.array([np.linalg.norm(each.true_motion) for each in estimates])
@@ -101,7 +98,7 @@ def row(seed: int, estimates: Sequence[TumourEstimate]) -> Row:
     radius = [1e3 * each.location.p95 for each in seen if each.location is not None]
     spent = 1e3 * np.array([each.seconds for each in estimates])
     points = [len(each.observation.now) for each in seen]
-    return Row(
+    return StereoRow(
         seed=seed, frames=len(estimates), refused=len(estimates) - len(seen),
         points=float(np.median(points)) if seen else 0.0,
         moved_mm=float(true.max()), off_mm=float(np.median(off)), p95_mm=float(np.quantile(off, 0.95)),

@@ -22,7 +22,7 @@ from sim.runtime.processes import process_pool, run_on_each
 from surrogate.data.tool_loads import TOOLS, draw
 from surrogate.data.tool_poses import draw_poses
 
-from .robustness import CHECKED, Trial
+from .robustness import CHECKED, SolverTrial
 
 SEED = 0
 # Minimum number of loads whose residual is computed again in double precision.
@@ -34,7 +34,7 @@ Drawn = tuple[Loads, float]
 
 
 @dataclass(frozen=True)
-class Row:
+class ThroughputRow:
     """Results of one set of loads on one tissue.
 
     Parameters
@@ -85,7 +85,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Together:
+class ToolsRow:
     """Surgical tools on one tissue: their names, number of loads, time for all, and time to sample them [s]."""
 
     law: str
@@ -102,7 +102,7 @@ class Together:
         return self.loads / self.seconds if self.loads else None
 
 
-def drawn(anatomy: Anatomy, presets: Sequence[str], count: int, posed: bool = False) -> dict[str, Drawn]:
+def sample_loads(anatomy: Anatomy, presets: Sequence[str], count: int, with_poses: bool = False) -> dict[str, Drawn]:
     """Sample `count` loads of each preset, or poses of its ball; the published protocol may have fewer.
 
     Raises
@@ -110,7 +110,7 @@ def drawn(anatomy: Anatomy, presets: Sequence[str], count: int, posed: bool = Fa
     InputError
         See `draw` and `draw_poses`.
     """
-    out, by = {}, draw_poses if posed else draw
+    out, by = {}, draw_poses if with_poses else draw
     for preset in presets:
         by(preset, anatomy, 1, SEED)  # exclude the first call, which prepares the cortex
         out[preset] = time_work(by, preset, anatomy, count, SEED)
@@ -118,7 +118,7 @@ def drawn(anatomy: Anatomy, presets: Sequence[str], count: int, posed: bool = Fa
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class BuiltFem:
     """FEM solver of a trial, and its set-up time [s]."""
 
     fem: Fem
@@ -129,18 +129,18 @@ class Made:
 class Repeat:
     """Times at which all loads of a set were begun and solved, on a clock common to all processes [s]; outcomes."""
 
-    begun: float
-    ended: float
+    start_time: float
+    end_time: float
     converged: int
     steps: np.ndarray
 
 
 # Function from work and task to the result of each device.
-Asked = Callable[[Callable[[Made, Any], Any], Any], list[Any]]
+Asked = Callable[[Callable[[BuiltFem, Any], Any], Any], list[Any]]
 
 
 @contextmanager
-def on_each(devices: Sequence[str], trial: Trial) -> Iterator[Asked]:
+def open_solvers(devices: Sequence[str], trial: SolverTrial) -> Iterator[Asked]:
     """Open a FEM solver on each device for simultaneous work; with one device, the solver is in this process.
 
     Raises
@@ -151,84 +151,79 @@ def on_each(devices: Sequence[str], trial: Trial) -> Iterator[Asked]:
         A process that was killed.
     """
     if len(devices) == 1:
-        own = made(devices[0], trial)
+        own = build_trial_fem(devices[0], trial)
         yield lambda work, task: [work(own, task)]
         return
-    with process_pool(devices, made, trial) as children:
+    with process_pool(devices, build_trial_fem, trial) as children:
         yield lambda work, task: run_on_each(children, work, [task] * len(children))
 
 
-def made(device: str, trial: Trial) -> Made:
+def build_trial_fem(device: str, trial: SolverTrial) -> BuiltFem:
     """Build the FEM solver of a trial on a device, in single precision."""
     find_device(device, NO_STRAIN_LIMIT.precision)  # starts Warp, not timed
-    return Made(*time_work(replace(trial, device=device).fem, NO_STRAIN_LIMIT))
+    return BuiltFem(*time_work(replace(trial, device=device).build_fem, NO_STRAIN_LIMIT))
 
 
-def facts(made: Made, task: None) -> tuple[int, str, float]:
+def describe_solver(built: BuiltFem, task: None) -> tuple[int, str, float]:
     """Return the number of nodes, the preconditioner, and the set-up time [s]."""
-    return made.fem.space.count, made.fem.plan.preconditioner, made.set_up
+    return built.fem.space.count, built.fem.plan.preconditioner, built.set_up
 
 
-def warmed(made: Made, loads: Loads) -> None:
+def prepare_solver(built: BuiltFem, loads: Loads) -> None:
     """Solve once as a warm-up, not timed."""
-    made.fem.deform(loads, at=made.fem.anatomy.tumour_nodes)
+    built.fem.deform(loads, at=built.fem.anatomy.tumour_nodes)
 
 
-def repeated(made: Made, loads: Loads) -> Repeat:
+def solve_all(built: BuiltFem, loads: Loads) -> Repeat:
     """Solve all loads, and fetch the tumour's vertices."""
     wp.synchronize()
     begun = time.monotonic()
-    answer = made.fem.deform(loads, at=made.fem.anatomy.tumour_nodes)
+    answer = built.fem.deform(loads, at=built.fem.anatomy.tumour_nodes)
     wp.synchronize()
     good = sum(outcome.good for outcome in answer.outcome)
     return Repeat(begun, time.monotonic(), good, answer.iterations)
 
 
-def solved(made: Made, loads: Loads) -> Deformation:
+def solve_full(built: BuiltFem, loads: Loads) -> Deformation:
     """Solve for every vertex."""
-    return made.fem.deform(loads)
+    return built.fem.deform(loads)
 
 
-def rows(
-    trial: Trial,
-    material: Material,
-    sets: Mapping[str, Drawn],
-    repeats: int,
-    done: Callable[[], object],
-    tools: tuple[Effect, ...] = (),
-    devices: Sequence[str] = (),
-) -> Iterator[Row]:
+def measure_rates(
+    trial: SolverTrial, material: Material, load_sets: Mapping[str, Drawn], repeat_count: int,
+    on_step: Callable[[], object], tools: tuple[Effect, ...] = (), devices: Sequence[str] = (),
+) -> Iterator[ThroughputRow]:  # fmt: skip
     """Measure a row for each set of loads on one tissue under `tools`, to 1e-4 in single precision.
 
-    Each of the `devices`, by default the trial's, has a process and solves all loads of a set. `done` is called
-    `repeats` + 2 times a row: after the warm-up, after each repeat, and after the check.
+    Each of the `devices`, by default the trial's, has a process and solves all loads of a set. `on_step` is called
+    `repeat_count` + 2 times a row: after the warm-up, after each repeat, and after the check.
 
     Raises
     ------
     InputError
-        See `on_each`.
+        See `open_solvers`.
     """
     trial = replace(trial, effects=(*build_push_effects(trial.anatomy, material), *tools))
-    with on_each(devices or (trial.device,), trial) as asked:
-        known = asked(facts, None)
+    with open_solvers(devices or (trial.device,), trial) as asked:
+        known = asked(describe_solver, None)
         nodes, preconditioner, _ = known[0]
         # Residuals are computed on the host for every device: with kernels and arithmetic other than the measured ones.
-        judge = replace(trial, device="cpu", batch=CHECKED).fem(REFERENCE)
-        for preset, (loads, drawing) in sets.items():
-            asked(warmed, loads.select(slice(trial.batch)))
-            done()
+        judge = replace(trial, device="cpu", batch=CHECKED).build_fem(REFERENCE)
+        for preset, (loads, drawing) in load_sets.items():
+            asked(prepare_solver, loads.select(slice(trial.batch)))
+            on_step()
             seconds, converged = [], []
             steps = np.zeros(0)
-            for _ in range(repeats):
-                found: list[Repeat] = asked(repeated, loads)
-                seconds.append(max(each.ended for each in found) - min(each.begun for each in found))
+            for _ in range(repeat_count):
+                found: list[Repeat] = asked(solve_all, loads)
+                seconds.append(max(each.end_time for each in found) - min(each.start_time for each in found))
                 converged.append(sum(each.converged for each in found))
                 steps = np.concatenate([each.steps for each in found])
-                done()
-            chosen = loads.select(checked(len(loads)))
-            again = np.concatenate([judge.residual(chosen, answer) for answer in asked(solved, chosen)])
-            done()
-            yield Row(
+                on_step()
+            chosen = loads.select(select_checked(len(loads)))
+            again = np.concatenate([judge.residual(chosen, answer) for answer in asked(solve_full, chosen)])
+            on_step()
+            yield ThroughputRow(
                 law=material.law, poisson=material.poisson, element=trial.element, nodes=nodes,
                 preconditioner=preconditioner,
                 set_up=max(set_up for _, _, set_up in known), preset=preset, loads=len(known) * len(loads),
@@ -239,18 +234,18 @@ def rows(
             )  # fmt: skip
 
 
-def together(found: Sequence[Row]) -> list[Together]:
+def combine_rows(rows: Sequence[ThroughputRow]) -> list[ToolsRow]:
     """Combine the rows of surgical tools, tissue by tissue."""
     out = []
-    for law, poisson in dict.fromkeys((row.law, row.poisson) for row in found):
-        mine = [row for row in found if (row.law, row.poisson) == (law, poisson)]
+    for law, poisson in dict.fromkeys((row.law, row.poisson) for row in rows):
+        mine = [row for row in rows if (row.law, row.poisson) == (law, poisson)]
         tools = [row for row in mine if row.preset in TOOLS]
         loads, seconds = sum(row.loads for row in tools), sum(row.median for row in tools)
         drawing = sum(row.draw_seconds for row in tools)
-        out.append(Together(law, poisson, mine[0].set_up, tuple(row.preset for row in tools), loads, seconds, drawing))
+        out.append(ToolsRow(law, poisson, mine[0].set_up, tuple(row.preset for row in tools), loads, seconds, drawing))
     return out
 
 
-def checked(count: int) -> np.ndarray:
+def select_checked(count: int) -> np.ndarray:
     """Select the numbers (k,) of the loads that are checked: one in a hundred, evenly spaced."""
     return np.linspace(0, count - 1, min(count, max(LEAST_CHECKED, -(-count // CHECKED)))).astype(int)

@@ -15,7 +15,7 @@ from scipy.stats import chi2, qmc
 
 from ar.optics.camera import Camera
 from ar.optics.lens import Lens
-from ar.tracking.pose import Pose, Tracker, Verdict
+from ar.tracking.pose import Pose, PoseStatus, Tracker
 from ar.tracking.synthetic_images import render_targets
 from ar.tracking.targets import MARKER_RATIO, TIP_DISTANCE, build_tool_cube
 
@@ -31,7 +31,7 @@ TOUCHED, LEANING = 0.03, 30.0
 
 
 @dataclass(frozen=True)
-class Row:
+class TrackRow:
     """Results of one protocol; errors of the tip [mm].
 
     Parameters
@@ -60,28 +60,30 @@ class Row:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class TrackedImage:
     """Image: true tip; tip and covariance of a certain pose; and the computing time."""
 
-    tip: np.ndarray
+    true_tip: np.ndarray
     markers: float
-    found: np.ndarray | None
+    estimate: np.ndarray | None
     covariance: np.ndarray | None
     seconds: float
 
 
-def trial_camera() -> Camera:
+def build_trial_camera() -> Camera:
     """Build the camera of the trials, at the world's origin."""
     K = np.array([[FOCAL, 0.0, 0.5 * WIDTH - 20.0], [0.0, FOCAL, 0.5 * HEIGHT + 12.0], [0.0, 0.0, 1.0]])
     return Camera(K, np.eye(4), WIDTH, HEIGHT, LENS)
 
 
-def studied(count: int, seed: int = 0, progress: Callable[[int, int], object] = lambda done, total: None) -> list[Row]:
+def measure_protocols(
+    count: int, seed: int = 0, progress: Callable[[int, int], object] = lambda done, total: None
+) -> list[TrackRow]:
     """Measure all protocols, with `count` images each."""
     plans = {
-        "FMAC: all six freedoms": (spread(count, seed), _off),
+        "FMAC: all six freedoms": (sample_poses(count, seed), _off),
         "F2554: one point": (build_pivot_poses(count, seed, np.zeros(3)), _from_mean),
-        "F2554: between points": (build_pivot_poses(count, seed, None), between),
+        "F2554: between points": (build_pivot_poses(count, seed, None), compute_distance_errors),
     }
     rows, done, total = [], 0, count * len(plans)
     for name, (poses, measure) in plans.items():
@@ -94,53 +96,53 @@ def studied(count: int, seed: int = 0, progress: Callable[[int, int], object] = 
     return rows
 
 
-def build_row(name: str, shots: list[Shot], measure: Callable[[list[Shot]], np.ndarray]) -> Row:
+def build_row(name: str, images: list[TrackedImage], measure: Callable[[list[TrackedImage]], np.ndarray]) -> TrackRow:
     """Build a protocol's row from errors (n,) [m] of its images with certain poses."""
-    certain = [shot for shot in shots if shot.found is not None]
-    fair = [shot for shot in shots if shot.markers >= SEEN]
+    certain = [shot for shot in images if shot.estimate is not None]
+    fair = [shot for shot in images if shot.markers >= SEEN]
     error = 1e3 * measure(certain)
     far = [_in_deviations(shot) for shot in certain]
     off = 1e3 * _off(certain)
     median, p95, most = np.percentile(error, [50, 95, 100]).tolist()
-    return Row(
+    return TrackRow(
         protocol=name,
-        pictures=len(shots),
+        pictures=len(images),
         median=median,
         p95=p95,
         most=most,
-        certain=100.0 * float(np.mean([shot.found is not None for shot in fair])) if fair else None,
+        certain=100.0 * float(np.mean([shot.estimate is not None for shot in fair])) if fair else None,
         wrong=int(sum(each > 5.0**2 and here > 1.0 for each, here in zip(far, off, strict=True))),
         held=100.0 * float(np.mean(np.array(far) <= chi2.ppf(0.95, 3))),
-        milliseconds=1e3 * float(np.median([shot.seconds for shot in shots])),
+        milliseconds=1e3 * float(np.median([shot.seconds for shot in images])),
     )
 
 
-def _in_deviations(shot: Shot) -> float:
+def _in_deviations(shot: TrackedImage) -> float:
     """Compute the squared Mahalanobis distance of the estimated tip from the true one."""
-    assert shot.found is not None and shot.covariance is not None
-    error = shot.found - shot.tip
+    assert shot.estimate is not None and shot.covariance is not None
+    error = shot.estimate - shot.true_tip
     return float(error @ np.linalg.solve(shot.covariance, error))
 
 
-def _off(shots: list[Shot]) -> np.ndarray:
+def _off(shots: list[TrackedImage]) -> np.ndarray:
     """Compute distances (n,) [m] from the true tips."""
-    return np.array([np.linalg.norm(shot.found - shot.tip) for shot in shots if shot.found is not None])
+    return np.array([np.linalg.norm(shot.estimate - shot.true_tip) for shot in shots if shot.estimate is not None])
 
 
-def _from_mean(shots: list[Shot]) -> np.ndarray:
+def _from_mean(shots: list[TrackedImage]) -> np.ndarray:
     """Compute distances (n,) [m] of repeated touches from their mean."""
-    found = np.array([shot.found for shot in shots])
+    found = np.array([shot.estimate for shot in shots])
     return np.linalg.norm(found - found.mean(axis=0), axis=1)
 
 
-def between(shots: list[Shot]) -> np.ndarray:
+def compute_distance_errors(images: list[TrackedImage]) -> np.ndarray:
     """Compute errors (n - 1,) [m] of the distances between successive points."""
-    found, true = (np.array([getattr(shot, name) for shot in shots]) for name in ("found", "tip"))
+    found, true = (np.array([getattr(shot, name) for shot in images]) for name in ("estimate", "true_tip"))
     lengths = [np.linalg.norm(np.diff(each, axis=0), axis=1) for each in (found, true)]
     return np.abs(lengths[0] - lengths[1])
 
 
-def spread(count: int, seed: int) -> Iterator[np.ndarray]:
+def sample_poses(count: int, seed: int) -> Iterator[np.ndarray]:
     """Yield poses (4, 4) of the cube, uniform over its volume and rotations."""
     for u in _numbers(count, seed):
         axis = _direction(u[0], u[1])
@@ -182,8 +184,8 @@ def _facing(turn: Rotation) -> np.ndarray:
     return T
 
 
-def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[Shot]:
-    camera, cube, rng = trial_camera(), build_tool_cube(), np.random.default_rng(seed)
+def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[TrackedImage]:
+    camera, cube, rng = build_trial_camera(), build_tool_cube(), np.random.default_rng(seed)
     tracker = Tracker(camera, (cube,))
     for T in poses:
         sharp = render_targets(np.full((HEIGHT, WIDTH), 120, np.uint8), camera, [(cube, T)])
@@ -194,9 +196,9 @@ def _shots(poses: Iterable[np.ndarray], seed: int) -> Iterator[Shot]:
         again = tracker.track(picture, first)  # as in tracking
         seconds = time.perf_counter() - begun
         tip = np.array([0.0, 0.0, -TIP_DISTANCE])
-        pose: Pose | None = again.poses.get(cube.name) if again.verdicts[cube.name] is Verdict.GOOD else None
-        found, covariance = (None, None) if pose is None else pose.point(tip)
-        yield Shot(T[:3, :3] @ tip + T[:3, 3], _markers(camera, T), found, covariance, seconds)
+        pose: Pose | None = again.poses.get(cube.name) if again.statuses[cube.name] is PoseStatus.GOOD else None
+        found, covariance = (None, None) if pose is None else pose.transform_point(tip)
+        yield TrackedImage(T[:3, :3] @ tip + T[:3, 3], _markers(camera, T), found, covariance, seconds)
 
 
 def _markers(camera: Camera, T: np.ndarray) -> float:

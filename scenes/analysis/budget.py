@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.deformation import Deformer
 from sim.errors import InputError
-from surrogate.evaluation.choose import ModelChoice, Offer, choose
+from surrogate.evaluation.choose import ModelCandidate, ModelChoice, choose_model
 from surrogate.model.guarded import Guarded
 from surrogate.model.learned import Learned
 
@@ -41,17 +41,17 @@ def choose_within(
         player = patient.build_player_of(stage, patient.build_deformer(name, scene), name)
         error_mm = 1e3 * _get_reported_error(player.deformer) if error_mm is None else error_mm
         if not np.isnan(error_mm):
-            offers.append(Offer(name, error_mm, _time_frames(player), of))
+            offers.append(ModelCandidate(name, error_mm, _time_frames(player), of))
 
     for name in patient.list_deformers(scene):
         offer(name, None, f"; error relative to {'converged ' * (name == 'fem')}FEM")
     of = {name: f"; error relative to p2 in 95 % of {one.loads} recorded pushes" for name, one in recorded.items()}
     waiting = {
-        name: Offer(name, one.p95_mm, one.median_ms, f"{of[name]}; time of {one.machine.partition(',')[0]}")
+        name: ModelCandidate(name, one.p95_mm, one.median_ms, f"{of[name]}; time of {one.machine.partition(',')[0]}")
         for name, one in recorded.items()
     }
-    while (choice := choose([*offers, *waiting.values()], *budget)).offer.name in waiting:
-        name = choice.offer.name
+    while (choice := choose_model([*offers, *waiting.values()], *budget)).candidate.name in waiting:
+        name = choice.candidate.name
         notify(f"timing {waiting.pop(name)}, where its preparation took {recorded[name].preparation_s:.2g} s")
         try:
             offer(name, recorded[name].p95_mm, of[name])

@@ -98,22 +98,22 @@ def _calibrate_camera(args: argparse.Namespace) -> int:
         "pictures": str(args.pictures),
         "looked_at": seen.image_count,
         "seen": len(seen.views),
-        "used": found.used,
-        "left_out": found.excluded,
-        "covered": found.covered,
+        "used": found.used_views,
+        "left_out": found.excluded_views,
+        "covered": found.covered_share,
     }
     write_calibration(out, found.calibration)
     _write_json(table, report)
     if args.json:
         print(to_json_line(report))
         return 0
-    print(f"{seen.image_count} images, the board in {len(seen.views)}, {len(found.used)} views used")
-    if found.excluded:
-        print(f"held out because of a large residual: {', '.join(found.excluded)}")
-    print(f"rms {found.rms:.3f} px; corners covered {100.0 * found.covered:.0f} % of the image")
-    for name, value, deviation in zip(report["parameters"], found.values, found.deviations, strict=True):
+    print(f"{seen.image_count} images, the board in {len(seen.views)}, {len(found.used_views)} views used")
+    if found.excluded_views:
+        print(f"held out because of a large residual: {', '.join(found.excluded_views)}")
+    print(f"rms {found.rms:.3f} px; corners covered {100.0 * found.covered_share:.0f} % of the image")
+    for name, value, deviation in zip(report["parameters"], found.parameters, found.deviations, strict=True):
         print(f"{name} {value:.6g} +- {deviation:.2g}{' px' if name[0] in 'fc' else ''}")
-    if found.covered < MIN_COVER:
+    if found.covered_share < MIN_COVER:
         print(f"Less than {100.0 * MIN_COVER:.0f} % is covered: the lens is not known well outside. Add views there.")
     print(f"written: {out}, with its covariance in {table}")
     return 0
@@ -168,7 +168,7 @@ def _format_values(values: np.ndarray, deviations: np.ndarray) -> str:
 
 def _fit_poses(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray], rows: np.ndarray) -> Found:
     """Fit a calibration to poses of files by `fit`; InputError if this fails, or if residuals exceed their limits."""
-    from ar.tracking.rigid import read_conventions
+    from ar.tracking.rigid import list_conventions
 
     names = " and ".join(map(str, files))
     try:
@@ -183,7 +183,7 @@ def _fit_poses(fit: Callable[..., Found], files: list[Path], poses: list[np.ndar
         return found
     worst = int(found.distances.argmax())
     hint = "Leave out wrong rows, and"
-    for forms in islice(product(*(read_conventions(each).items() for each in poses)), 1, None):  # the first is as read
+    for forms in islice(product(*(list_conventions(each).items() for each in poses)), 1, None):  # the first is as read
         with suppress(ValueError):  # Poses of this form may turn too little.
             if not fit(*(form for _, form in forms)).misfit:
                 fitting = [f"{how} in {file}" for file, (how, _) in zip(files, forms, strict=True) if how]
@@ -210,15 +210,16 @@ def _calibrate_hand_eye(args: argparse.Namespace) -> int:
         report = {
             "rotation": found.X[:3, :3].tolist(),
             "shift_mm": (1e3 * found.X[:3, 3]).tolist(),
-            "rms_degrees": float(np.degrees(found.turn)),
-            "rms_mm": 1e3 * found.shift,
-            "motions": found.motions,
-            "spread_degrees": float(np.degrees(found.spread)),
+            "rms_degrees": float(np.degrees(found.rotation_error)),
+            "rms_mm": 1e3 * found.translation_error,
+            "motions": found.motion_count,
+            "spread_degrees": float(np.degrees(found.axis_spread)),
         }
         print(to_json_line(report))
         return 0
     print("X, where x_A = X x_B [mm]:")
     for row in found.X[:3] * [1.0, 1.0, 1.0, 1e3]:
         print("  " + "".join(f"{value:12.6f}" for value in row[:3]) + f"{row[3]:12.3f}")
-    print(f"rms {np.degrees(found.turn):.3f} degrees and {1e3 * found.shift:.3f} mm over {found.motions} motions")
+    angle, distance = np.degrees(found.rotation_error), 1e3 * found.translation_error
+    print(f"rms {angle:.3f} degrees and {distance:.3f} mm over {found.motion_count} motions")
     return 0

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 def play_demo(args: argparse.Namespace, kernel_loader: ThreadPoolExecutor, exit_stack: ExitStack) -> int:
     """Open the page, and play once `kernel_loader` has loaded the first kernels; `exit_stack` closes the page."""
-    from ar.page.access_guard import UnguardedError
+    from ar.page.access_guard import ViserError
 
     from ..page.demo import Demo
 
@@ -90,7 +90,7 @@ def play_demo(args: argparse.Namespace, kernel_loader: ThreadPoolExecutor, exit_
             patient, scene, name, args.host, args.port,
             anatomy=anatomy, get_scene=asked, style=args.style, origins=list_addresses(args),
         )  # fmt: skip
-    except UnguardedError as error:
+    except ViserError as error:
         raise InputError(str(error)) from error
     exit_stack.callback(demo.close)
     print(f"sulcus: open {demo.browser.address} (Ctrl-C ends)", flush=True)

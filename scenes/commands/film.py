@@ -162,7 +162,7 @@ def _write_film(args: argparse.Namespace, taken: Iterator[VideoFrame], shots: li
     """Write the images, and append the ground truth of each to `shots`; return the path of the video or folder."""
     from tqdm import tqdm
 
-    from ar.screen import Film, write_film
+    from ar.screen import FrameFolder, write_movie
 
     def noted() -> Iterator[np.ndarray]:
         total = len(range(0, len(player.scene.times), args.every))
@@ -174,12 +174,12 @@ def _write_film(args: argparse.Namespace, taken: Iterator[VideoFrame], shots: li
         if not args.png:
             args.out.mkdir(parents=True, exist_ok=True)
             film = check_output_path(args.out / "film.mp4", ".mp4", args.force)
-            write_film(film, noted(), player.scene.frames_per_second / args.every)
+            write_movie(film, noted(), player.scene.frames_per_second / args.every)
             return film
         frames = check_output_folder(args.out / "frames", "pictures")
         for path in check_output_frames(frames, args.force):
             path.unlink()
-        screen = Film(frames)
+        screen = FrameFolder(frames)
         for number, colour in enumerate(noted()):
             screen.show(number, colour)
         return frames

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     from sim.bodies.meshfile import read_anatomy
     from sim.runtime.device import find_device
     from surrogate.fitting.fit import fit_tissue
-    from surrogate.fitting.frame_likelihood import find_unsupported
+    from surrogate.fitting.frame_likelihood import find_unsupported_points
     from surrogate.fitting.observed_frame import check_frames
     from surrogate.fitting.tissue import save_tissue, to_tissue_path
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     if TUMOUR_LABEL in parse_region_tissues(args.region, BRAIN, anatomy.mesh):
         raise InputError("--region tumour: its stiffness is what `sulcus fit` finds. Give other regions alone.")
     locator = find_locator(args, anatomy, allow_small=True)
-    excluded = find_unsupported(locator, frames)
+    excluded = find_unsupported_points(locator, frames)
     with tqdm(file=sys.stderr) as bar:
 
         def progress(stage: str, done: int, total: int) -> None:

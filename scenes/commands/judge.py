@@ -90,6 +90,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _get_physics(stated: Mapping[str, str]) -> dict[str, object]:
     """Return the properties that two bodies must share to be compared: tissue, tissue of regions, and element."""
-    from surrogate.data.solution_rows import TISSUE_KEY, read_tissue_statement
+    from surrogate.data.solution_rows import TISSUE_KEY, read_tissue_text
 
-    return {"tissue": read_tissue_statement(stated) if TISSUE_KEY in stated else None, "element": stated.get("element")}
+    return {"tissue": read_tissue_text(stated) if TISSUE_KEY in stated else None, "element": stated.get("element")}

@@ -241,7 +241,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
         if registration is None
         else describe_other_mesh(registration, patient.anatomy, str(args.registration))
     )
-    if registration is None or registration.scanned is None:
+    if registration is None or registration.scan is None:
         warning += ". All results are unreliable: give --registration with a file of `sulcus register --anatomy`"
     if warning:
         print(f"sulcus link: {warning}", file=sys.stderr)

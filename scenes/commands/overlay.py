@@ -145,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
     """Show a video or a live camera on a page, until the time is over or a signal arrives."""
-    from ar.page.access_guard import UnguardedError, check_address
+    from ar.page.access_guard import ViserError, check_address
 
     from ..tracked.run import write_tracking_table
 
@@ -161,7 +161,7 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
         check_address(HOST, args.port)
         parts = _read_parts(args, film=not camera)
         shown = (_show_camera if camera else _show_video)(args, parts, closing)
-    except (ValueError, OSError, UnguardedError) as error:
+    except (ValueError, OSError, ViserError) as error:
         raise InputError(str(error)) from error
     if table is not None:
         write_tracking_table(table, shown, [None] * len(shown))
@@ -171,7 +171,7 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
 
 
 def _show_camera(args: argparse.Namespace, parts: Pipeline, closing: ExitStack) -> list[Overlay]:
-    from ar.tracking.live_camera import open_camera, read_camera_images, read_newest
+    from ar.tracking.live_camera import open_camera, read_camera_images, read_newest_images
 
     from ..tracked.follower import FollowerSettings
 
@@ -179,7 +179,7 @@ def _show_camera(args: argparse.Namespace, parts: Pipeline, closing: ExitStack) 
     name, source = f"camera {args.pictures}", again()
     if not source.isOpened():
         raise InputError(f"{name} cannot be opened: plug it in, see that no other program has it, and give its number.")
-    images = read_newest(read_camera_images(source, name, again), FollowerSettings().max_gap)
+    images = read_newest_images(read_camera_images(source, name, again), FollowerSettings().max_gap)
     return _build_page(args, parts, closing, name).watch(images, args.seconds)
 
 
@@ -261,7 +261,7 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Pipeline:
 
 def _draw_video(args: argparse.Namespace, parts: Pipeline, out: Path | None) -> list[Overlay]:
     """Draw the overlay on all frames, and write a video if requested; return the results without images."""
-    from ar.screen import write_film
+    from ar.screen import write_movie
     from ar.tracking.image_sequences import read_frame_rate, read_video
 
     from ..tracked.run import draw_overlays, read_timed_images
@@ -270,7 +270,7 @@ def _draw_video(args: argparse.Namespace, parts: Pipeline, out: Path | None) -> 
 
     def pictures() -> Iterator[np.ndarray]:
         masks = None if args.covered is None else read_video(args.covered, args.rate)
-        film = read_timed_images(read_video(Path(args.pictures), args.rate, colour=True), masks)
+        film = read_timed_images(read_video(Path(args.pictures), args.rate, with_colour=True), masks)
         for each in draw_overlays(film, parts.follower, parts.painter, args.live):
             shown.append(each.drop_image())
             yield each.image
@@ -280,7 +280,7 @@ def _draw_video(args: argparse.Namespace, parts: Pipeline, out: Path | None) -> 
             for _ in pictures():
                 pass
         else:
-            write_film(out, pictures(), read_frame_rate(Path(args.pictures)) or args.rate)
+            write_movie(out, pictures(), read_frame_rate(Path(args.pictures)) or args.rate)
     except ValueError as error:
         raise InputError(str(error)) from error
     except OSError as error:

@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     for path, suffix in ((data, ".h5"), (model, ".npz")):
         check_output_path(path, suffix, args.force, _list_inputs(args), resumed)
     parse_device_names(args.device)
-    check_learners(parse_learners(args.learners), of_poses=False, where=str(data))
+    check_learners(parse_learners(args.learners), has_poses=False, source=str(data))
     if args.count - args.count // CALIBRATION_STRIDE < DiscSettings.min_discs + 1:
         raise InputError(
             f"--count {args.count} is too few to learn from and to leave {DiscSettings.min_discs} discs out: give more."

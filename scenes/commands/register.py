@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         fits = compute_pair_residuals(scan, patient)
     except ValueError as error:
         raise InputError(f"{source}: {error}") from error
-    found = found if anatomy is None else replace(found, scanned=describe_scan(anatomy))
+    found = found if anatomy is None else replace(found, scan=describe_scan(anatomy))
     write_registration(out, found)
     target = None if anatomy is None else _compute_tumour_error(found, anatomy)
     if args.json:
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         print(to_json_line({"out": str(out), **to_json(found), **figures, **_summarise_residuals(fits)}))
         return 0
     print("\n".join(_format_table(fits)))
-    print(f"{found.pairs} pairs fit to {1e3 * found.rms:.2f} mm (rms); that is not the error at the tumour")
+    print(f"{found.pair_count} pairs fit to {1e3 * found.rms:.2f} mm (rms); that is not the error at the tumour")
     if target is None:
         print("give --anatomy for that error")
     if target is not None:
@@ -87,28 +87,28 @@ def run(args: argparse.Namespace) -> int:
 def _summarise_residuals(fits: PairResiduals) -> dict[str, object]:
     """Summarise the residuals of the pairs for JSON."""
     return {
-        "residuals_mm": (1e3 * fits.off).tolist(),
+        "residuals_mm": (1e3 * fits.residuals).tolist(),
         "left_out_mm": (1e3 * fits.held_out).tolist(),
         "studentised": fits.studentised.tolist(),
-        "worst_pair": fits.worst + 1,
-        "chance": fits.chance,
-        "suspect": fits.suspect,
+        "worst_pair": fits.worst_pair + 1,
+        "chance": fits.p_value,
+        "suspect": fits.has_outlier,
     }
 
 
 def _format_table(fits: PairResiduals) -> list[str]:
     """Format the residuals: a row for each pair, and a warning about the worst one."""
-    if np.isnan(fits.chance):
-        rows = [f"{row + 1:4d} {1e3 * off:7.2f} mm" for row, off in enumerate(fits.off)]
+    if np.isnan(fits.p_value):
+        rows = [f"{row + 1:4d} {1e3 * off:7.2f} mm" for row, off in enumerate(fits.residuals)]
         return ["pair    error", *rows, "three pairs cannot show an outlier: touch a fourth, better six"]
     lines = ["pair    error      held-out error   studentised error"]
-    for row, (off, left, times) in enumerate(zip(fits.off, fits.held_out, fits.studentised, strict=True)):
+    for row, (off, left, times) in enumerate(zip(fits.residuals, fits.held_out, fits.studentised, strict=True)):
         lines.append(f"{row + 1:4d} {1e3 * off:5.2f} mm {1e3 * left:16.2f} mm {times:17.1f} x")
-    worst = fits.worst
-    if fits.suspect:
+    worst = fits.worst_pair
+    if fits.has_outlier:
         lines.append(
             f"pair {worst + 1} may be an outlier: it is {1e3 * fits.held_out[worst]:.1f} mm from the others' fit. "
-            f"{100.0 * fits.chance:.2g} % of sets without outliers have this residual. Touch it again, or leave it out"
+            f"{100.0 * fits.p_value:.2g} % of sets without outliers have this residual. Touch it again, or leave it out"
         )
     return lines
 
@@ -130,9 +130,9 @@ def _build_nearest(anatomy: Anatomy) -> Nearest:
 
 def _compute_tumour_error(found: Registration, anatomy: Anatomy) -> tuple[np.ndarray, float]:
     """Compute the error at the tumour's centre: deviations (3,) [mm] by axis of the reference, and 95 % radius [m]."""
-    from surrogate.locating.locator import compute_radius
+    from surrogate.locating.locator import compute_confidence_radius
 
     if not len(anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour: leave out --anatomy, or give one with a tumour.")
-    _, covariance = found.point(anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0))
-    return 1e3 * np.sqrt(np.diag(covariance)), compute_radius(covariance)
+    _, covariance = found.transform_point(anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0))
+    return 1e3 * np.sqrt(np.diag(covariance)), compute_confidence_radius(covariance)

@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ar.screen import Film, read_png, write_film
+from ar.screen import FrameFolder, read_png, write_movie
 from sim.arguments import check_integer
 from sim.errors import InputError
 from sim.runtime.atomic_files import REMEDY, explain_error
@@ -52,14 +52,14 @@ def run(args: argparse.Namespace) -> int:
     try:
         for path in others:
             path.unlink()
-        film = Film(args.out)
+        film = FrameFolder(args.out)
         for frame in tqdm(player.play_frames(every=args.every), total=len(scene.times[:: args.every]), file=sys.stderr):
             film.show(frame.number, frame.shown if args.plain else draw_cost_panel(frame, name))
             written.append(args.out / f"frame_{frame.number:04d}.png")
             bad += not frame.deformation.outcome[0].good
         if args.film is not None:
             args.film.parent.mkdir(parents=True, exist_ok=True)
-            write_film(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
+            write_movie(args.film, (read_png(path) for path in written), scene.frames_per_second / args.every)
     except OSError as error:
         raise InputError(f"{args.out}: the frames cannot be written ({explain_error(error)}). {REMEDY}") from error
     film, who = None if args.film is None else str(args.film), patient.describe_deformer(name, scene)

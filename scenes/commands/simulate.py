@@ -145,7 +145,7 @@ def run(args: argparse.Namespace) -> int:
             show_progress(bar, done, total)
 
         try:
-            solved = simulate(out, solver.deformer, loads, provenance, solver.batch, progress)
+            solved = simulate(out, solver.deformer, loads, provenance, solver.batch_size, progress)
         except KeyboardInterrupt:
             bar.close()  # ends the line of the progress bar
             print(f"stopped; run the same command again to resume from {to_unfinished_path(out)}", file=sys.stderr)
@@ -207,14 +207,14 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
         outcomes, units = read_outcomes(file, "answers"), len(read_outcomes(file, "unit"))
     counts = {outcome.name.lower(): outcomes.count(outcome) for outcome in Outcome if outcome in outcomes}
     failed = int(np.sum([not outcome.good for outcome in outcomes]))
-    rate = solved.loads / solved.load_seconds if solved.loads else None
+    rate = solved.load_count / solved.load_seconds if solved.load_count else None
     if args.json:
         report = {
             "out": args.out,
             "solver": solver,
             "loads": len(outcomes),
             "unit": units,
-            "solved_now": solved.rows,
+            "solved_now": solved.total,
             "outcome": counts,
             "seconds": {"unit responses": solved.unit_seconds, "loads": solved.load_seconds},
             "loads_per_second": rate,
@@ -229,7 +229,9 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
             f"{args.out} already holds {len(outcomes)} loads, more than the {asked} asked for: nothing was taken away."
         )
     listed = ", ".join(f"{number} {name}" for name, number in counts.items())
-    print(f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved.rows} solved in this run.")
+    print(
+        f"{args.out}: {len(outcomes)} loads ({listed}) and {units} unit responses; {solved.total} solved in this run."
+    )
     print(f"Solved by {solver}.")
     if rate is not None:
         print(f"{rate:.3g} loads per second, with sampling and writing.")

@@ -16,7 +16,7 @@ from sim.runtime.timing import time_stage
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.splits import CALIBRATION_STRIDE
 from surrogate.data.tool_loads import compute_rejected_share, describe_rejected
-from surrogate.evaluation.score import find_best, format_scores
+from surrogate.evaluation.score import find_best_score, format_scores
 from surrogate.model.guarded import describe_error, get_reported_errors
 from surrogate.model.learned import Learned
 from surrogate.model.store import save
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
             data,
             device,
             lambda done, total: bar.set_postfix_str(f"series: {done} of {total} positions"),
-            begun=to_unfinished_path(out),
+            journal_path=to_unfinished_path(out),
         )
         trained = train(data, learners, lambda learner: bar.update(), most=args.most, expansion=expansion)
     with time_stage("save"):
@@ -135,7 +135,7 @@ def _describe_error(model: Learned) -> dict[str, object]:
     """Describe the errors that the model reports, next to its score."""
     reported = get_reported_errors(model)
     discs = None if reported.held_out is None else asdict(reported.held_out)
-    return {"bound_mm": 1e3 * reported.bound, "discs": discs, "weak": reported.weak}
+    return {"bound_mm": 1e3 * reported.bound, "discs": discs, "weak": reported.is_weak}
 
 
 def _format_json(trained: Trained, out: str, failed: int, preset: str) -> str:
@@ -144,13 +144,13 @@ def _format_json(trained: Trained, out: str, failed: int, preset: str) -> str:
         {
             "out": out,
             "scores": [{**asdict(row), **_describe_error(trained.models[row.name])} for row in trained.scores],
-            "winner": find_best(trained.scores).name,
+            "winner": find_best_score(trained.scores).name,
             "motion_mm": 1e3 * trained.motion,
             "discs": len(split.centres),
             "disc_radius_mm": 1e3 * split.radius,
-            "share_of_patch": split.share,
-            "training_loads": int(split.train.sum()),
-            "held_out": int(split.test.sum()),
+            "share_of_patch": split.area_share,
+            "training_loads": int(split.training_mask.sum()),
+            "held_out": int(split.test_mask.sum()),
             "calibrated": trained.calibrated,
             "left_out": {name: asdict(found) for name, found in trained.held_out_coverage.items()},
             "distance_left_out": {name: asdict(found) for name, found in trained.held_out_distance_coverage.items()},

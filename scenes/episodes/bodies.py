@@ -218,7 +218,7 @@ def _train(
     simulate(data, fem, draw_loads(PRESET, anatomy, learner.loads, first), stated)
     known = read_dataset(data)
     batch = BATCH_SIZE if fem.problem.device.on_cuda else None
-    expansion = Expansion(known, device, kept=data.with_suffix(TABLE), batch=batch)
+    expansion = Expansion(known, device, table_path=data.with_suffix(TABLE), batch=batch)
     trained = train(known, [learner.name], expansion=expansion)
     save(to_model_path(body.anatomy), {name: _remove_training_dates(model) for name, model in trained.models.items()})
     remove_data_set(data)
@@ -247,7 +247,9 @@ def list_model_errors(folder: Path) -> dict[int, ReportedErrors]:
 
 def select_weak(models: Mapping[int, ReportedErrors]) -> dict[int, ReportedErrors]:
     """Select the weak models, the largest error bound first."""
-    return dict(sorted(((number, one) for number, one in models.items() if one.weak), key=lambda each: -each[1].bound))
+    return dict(
+        sorted(((number, one) for number, one in models.items() if one.is_weak), key=lambda each: -each[1].bound)
+    )
 
 
 def describe_weak(models: Mapping[int, ReportedErrors]) -> list[str]:

@@ -104,7 +104,7 @@ class FamilyMotions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     slide: SlideMotion | None = None
     draw: DrawMotion | None = None
     reach: Reach | None = None
-    sample_walk_scenario: Walk | None = None
+    walk: Walk | None = None
     palpate: Palpate | None = None
     retract: Retract | None = None
     drain: Drain | None = None

@@ -19,7 +19,7 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.versions import get_version
 from surrogate.model.learned import Learned
 from surrogate.onnx_export.export import build_graph
-from surrogate.onnx_export.graph import Sheet
+from surrogate.onnx_export.graph import GraphBuilder
 
 from ..episodes.reading.bodies import is_template
 from ..page.text import RESEARCH_ONLY, format_legend, to_svg_stroke
@@ -47,7 +47,7 @@ class ExportedModel:
 
     name: str
     model: Learned
-    sheet: Sheet
+    sheet: GraphBuilder
     cortex: bool
 
 
@@ -122,7 +122,7 @@ def build_exported_model(name: str, model: Learned, with_cortex: bool) -> Export
     return ExportedModel(name, model, sheet, with_cortex)
 
 
-def _count_bytes(sheet: Sheet) -> int:
+def _count_bytes(sheet: GraphBuilder) -> int:
     return sum(array.nbytes for array in sheet.constants.values())
 
 

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ar.overlay.hud import bound_words, format_millimetres
+from ar.overlay.hud import format_bound, format_millimetres
 from sim.geometry.closest_point import find_closest_points
 from sim.geometry.locate import LocatedPoints, locate
 
@@ -167,7 +167,7 @@ class ResultEncoder:
         known, gauge = result.tracking, result.gauge
         if gauge is None:
             return f"not known: {known.warning}"
-        inside = "inside the tumour, its edge " if gauge.inside else ""
+        inside = "inside the tumour, its edge " if gauge.is_inside else ""
         return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._source}){_format_doubt(known)}"
 
     def _format_motion(self, known: TrackingResult) -> str:
@@ -175,7 +175,7 @@ class ResultEncoder:
         if known.bound is None:
             return f"not known: {known.warning}"
         moved = format_millimetres(known.motion.distance, known.motion.error)
-        within = bound_words(known.bound, 1)
+        within = format_bound(known.bound, 1)
         return f"moved {moved}, placed within {within} (95 %; {self._source}){_format_doubt(known)}"
 
     @property

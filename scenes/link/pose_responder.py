@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from ar.overlay.gauge import Gauge
+from ar.overlay.gauge import DistanceGauge
 from ar.tracking.pose import Pose, TrackedTargets
 from ar.tracking.pose_stream import MAX_GAP, PoseStream
 from ar.tracking.registration import Registration
@@ -91,7 +91,7 @@ class PoseResult:
 
     stamp: int
     tracking: TrackingResult
-    gauge: Gauge | None = None
+    gauge: DistanceGauge | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ class PoseResponder:
         if known.state is TumourState.UNKNOWN:
             return PoseResult(stamp, known)
         known = self._add_band(known, registration)
-        if known.is_reliable and registration.scanned is None:
+        if known.is_reliable and registration.scan is None:
             known = replace(known, state=TumourState.UNSURE, warning=UNCHECKED_WARNING)
         stage = self.motion.stage
         gauge = Painter(stage, self.tool).measure_tip_distance(known, stage.build_tumour(motion.positions))
@@ -202,7 +202,7 @@ class PoseResponder:
         if not known.is_reliable:
             return known
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
-        _, covariance = registration.point(middle)
+        _, covariance = registration.transform_point(middle)
         registered = float(np.sqrt(chi2.ppf(LEVEL, 3) * max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
         parts = {"registration": registered, "tool": known.motion.tool_error, "model": known.motion.model_error}
         band = float(np.hypot(registered, known.motion.error))

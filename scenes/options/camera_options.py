@@ -69,7 +69,7 @@ def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
         calibration = read_calibration(args.camera)
         if args.size is not None:
             try:
-                calibration = calibration.resize_calibration(*args.size, scale=True)
+                calibration = calibration.resize_calibration(*args.size, allow_scaling=True)
             except ValueError as error:
                 raise InputError(f"{args.camera}: {error}") from error
         view = view.calibrate(calibration)

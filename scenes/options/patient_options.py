@@ -162,7 +162,7 @@ def choose_deformer(args: argparse.Namespace, patient: PatientSetup, scene: Scen
             from surrogate.model.guarded import describe_error, get_reported_errors
 
             model = patient.models[best]
-            if get_reported_errors(model).weak:
+            if get_reported_errors(model).is_weak:
                 print(f"{args.program}: on held-out cortex, {best}: {describe_error(model)}", file=sys.stderr)
         return usual
     if args.deformer not in (None, "auto"):
@@ -171,4 +171,4 @@ def choose_deformer(args: argparse.Namespace, patient: PatientSetup, scene: Scen
 
     choice = choose_within(patient, scene, budget, lambda words: print(f"{args.program}: {words}", file=sys.stderr))
     print(f"{args.program}: {choice.reason}", file=sys.stderr)
-    return choice.offer.name
+    return choice.candidate.name

@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ar.overlay.hud import name_bearings
+from ar.overlay.hud import name_edge_directions
 from ar.overlay.styles import STYLES, Style
 from ar.page.elements import STYLE_KEY
-from ar.page.parts import Dropdown, Fold, Note, Slider, Toggle
+from ar.page.parts import Dropdown, Folder, Note, Slider, Toggle
 from sim.effects import Elasticity, Gravity, Inertia, Pulsation, Resection, has_history
 
 from ..script.camera_paths import PATHS
@@ -48,9 +48,9 @@ def build_controls(
     requests: Requests,
     set_mode: Callable[[str], None],
     move: Callable[..., None],
-    effect_switches: Fold,
+    effect_switches: Folder,
     refine_error: Callable[[], None],
-) -> list[Slider | Dropdown | Toggle | Fold | Note]:
+) -> list[Slider | Dropdown | Toggle | Folder | Note]:
     """Build all controls of a scene that these deformers support.
 
     `set_mode` receives the control mode of the tool, `move` values of its touch, see `Requests.take_over`;
@@ -82,7 +82,7 @@ def build_controls(
         build_registration_control(scene, requests),
         Toggle("refine the error", False, lambda on: refine_error() if on else None, hint=REFINE_HINT),
         Note(REFINED_ERROR),
-        Fold("camera position", build_camera_sliders(scene, site, requests)),
+        Folder("camera position", build_camera_sliders(scene, site, requests)),
         Note(PLAN),
         Note(OWN_FILM, OWN_VIDEO_NOTE),
     ]
@@ -125,11 +125,11 @@ def build_camera_sliders(scene: Scene, site: CraniotomyFrame, requests: Requests
     return (
         Slider(
             "camera tilt [deg]", -60.0, 60.0, 1.0, round(float(tilt)), lambda deg: requests.set(tilt=-np.radians(deg)),
-            words="tilt [deg]", hint="angle between the line of sight and the axis of the craniotomy",
+            text="tilt [deg]", hint="angle between the line of sight and the axis of the craniotomy",
         ),
         Slider(
             "camera distance [mm]", 150.0, 600.0, 10.0, round(1e3 * distance, -1),
-            lambda mm: requests.set(distance=1e-3 * mm), words="distance [mm]", hint="a smaller distance magnifies",
+            lambda mm: requests.set(distance=1e-3 * mm), text="distance [mm]", hint="a smaller distance magnifies",
         ),
     )  # fmt: skip
 
@@ -147,7 +147,7 @@ def build_tool_controls(
     """Build the controls of the tool (control mode, position, direction) and of the slices, in patient directions."""
     assert scene.tool is not None
     limit = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
-    sides = name_bearings(scene.viewpoint.build_camera(site).T_camera_world[:3, :3])
+    sides = name_edge_directions(scene.viewpoint.build_camera(site).T_camera_world[:3, :3])
     limit_hint = "limited by the edge of the craniotomy"
     tilt_hint = "direction of the push: tilt from the surface normal"
     directions = (("right", "x", sides["right"]), ("up", "y", sides["top"]))

@@ -1,6 +1,5 @@
 """Main loop of the page: a scripted or manual tool, any deformer, and comparison with FEM in the background."""
 
-import os
 import sys
 import threading
 import time as clock
@@ -37,7 +36,7 @@ from .comparison import (
 )
 from .controls import PLAN, build_controls, is_animated, to_slider_values
 from .effect_costs import build_effect_switches
-from .fem_worker import FemResult, FemWorker
+from .fem_worker import COMPARISON_REST, FemResult, FemWorker
 from .requests import HAND, SCRIPT, Display, Requests, describe_tool_control
 from .scene_solvers import SceneSolvers
 from .side_panels import build_history_sample, list_plot_lines, render_slices
@@ -56,8 +55,6 @@ from .view import (
 WAITING_TEXT = "The finite elements are working on this load."  # Text while FEM solves.
 UNDEFORMED_TEXT = '<p class="stale">The undeformed body, as in the scan. The first result is being computed.</p>'
 MIN_REST = 0.007  # Shortest pause after an image, for FEM in the background [s].
-# Pause between comparisons with FEM while playing, relative to the duration of one: leaves few CPU cores to the images.
-COMPARISON_REST = 2.0 if (os.cpu_count() or 1) < 4 else 0.0
 MESSAGE_TIME = 2.0  # Time for which a playing page shows why a frame is skipped [s].
 
 
@@ -399,4 +396,4 @@ class Demo:
 
     def _get_user(self) -> int | None:
         """Return the user whose change is processed now."""
-        return None if self.browser.deed is None else self.browser.deed.visitor
+        return None if self.browser.deed is None else self.browser.deed.client

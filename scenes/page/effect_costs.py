@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from html import escape
 
-from ar.page.parts import Fold, Note, Toggle
+from ar.page.parts import Folder, Note, Toggle
 
 from ..play.deformers import PatientSetup
 from ..play.effect_ablation import ALL, build_record, list_switchable_effects, measure_effects
@@ -29,7 +29,9 @@ Figures = Mapping[str, tuple[float | None, float | None]]
 """Time [ms] and motion [mm] of the effects by class name, as in `EffectRecord`."""
 
 
-def build_effect_switches(patient: PatientSetup, scene: Scene, requests: Requests, measure: Callable[[], None]) -> Fold:
+def build_effect_switches(
+    patient: PatientSetup, scene: Scene, requests: Requests, measure: Callable[[], None]
+) -> Folder:
     """Build the switches of a scene's effects with their recorded costs; `measure` starts a measurement."""
     record = patient.find_effect_record(scene)
     figures: Figures = {} if record is None else record.effects
@@ -42,7 +44,7 @@ def build_effect_switches(patient: PatientSetup, scene: Scene, requests: Request
     measure_switch = Toggle(
         "measure costs", False, lambda on: measure() if on else None, "measure on this machine", MEASURE_HINT
     )
-    return Fold(EFFECT_FOLD, (*switches, measure_switch, Note(EFFECT_COSTS, note, plain=True)), opened=True)
+    return Folder(EFFECT_FOLD, (*switches, measure_switch, Note(EFFECT_COSTS, note, is_plain=True)), is_open=True)
 
 
 def measure_costs(patient: PatientSetup, scene: Scene) -> Iterator[dict[str, str]]:

@@ -1,5 +1,6 @@
 """FEM thread of a page: it solves the newest frame, to show it or to compare a model with it."""
 
+import os
 import threading
 import time as clock
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from ..script.tool_paths import Touch
 
 FrameRequest = tuple[int, Touch | None]
 """Number of a frame, and the touch under manual control, else None."""
+# Pause between comparisons with FEM while playing, relative to the duration of one: leaves few CPU cores to the images.
+COMPARISON_REST = 2.0 if (os.cpu_count() or 1) < 4 else 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ar.page.history import Line, Sample
-from ar.page.slices import Cut, draw_slices
+from ar.page.history import Sample, Trace
+from ar.page.slices import SlicedSurfaces, draw_slices
 from ar.rendering.layer import Layer
 from sim.deformation import Deformation
 from sim.loads import Loads, Pushed
@@ -17,14 +17,14 @@ from ..script.scene import Scene
 TUMOUR_MIDDLE, TIP = "the tumour's middle", "the tool's tip"
 """Labels of the positions of the slices."""
 # Chart of the distance from tip to tumour.
-DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of the model (95 %); dotted: error unknown")
-FORCE = Line("force", "N", "#ffa94d", "band: error of the model (95 %); dotted: error unknown")  # Chart of the force.
-SET_FORCE = Line("force", "N", "#ffa94d", "as it is set")  # Chart of the prescribed force.
+DISTANCE = Trace("tip to tumour", "mm", "#f4f4f0", "band: error of the model (95 %); dotted: error unknown")
+FORCE = Trace("force", "N", "#ffa94d", "band: error of the model (95 %); dotted: error unknown")  # Chart of the force.
+SET_FORCE = Trace("force", "N", "#ffa94d", "as it is set")  # Chart of the prescribed force.
 # Chart of the tumour's motion.
-TUMOUR_MOTION = Line("tumour moved", "mm", "#4cf28c", "band: motion error (95 %); dotted: not known")
+TUMOUR_MOTION = Trace("tumour moved", "mm", "#4cf28c", "band: motion error (95 %); dotted: not known")
 
 
-def list_plot_lines(scene: Scene) -> tuple[Line, ...]:
+def list_plot_lines(scene: Scene) -> tuple[Trace, ...]:
     """Return the plotted quantities of a scene: without a tool, the displacement of the tumour."""
     if scene.tool is None:
         return (TUMOUR_MOTION,)
@@ -64,13 +64,13 @@ def render_slices(frame: Frame, player: Player, position: str) -> np.ndarray:
     if frame.estimate is not None:
         other_layers.append(replace(stage.build_fem_tumour(player.compute_positions(frame.deformation)), name="truth"))
     tumour, scan_tumour = stage.build_tumour(positions), stage.tumour_at_rest
-    cut = Cut(tumour, scan_tumour, frame.tumour_error.bound, bool(frame.doubt), other_layers, frame.tip)
+    cut = SlicedSurfaces(tumour, scan_tumour, frame.tumour_error.bound, bool(frame.doubt), other_layers, frame.tip)
     return draw_slices_through(player.stage, cut, position)
 
 
-def draw_slices_through(stage: Stage, cut: Cut, position: str) -> np.ndarray:
+def draw_slices_through(stage: Stage, cut: SlicedSurfaces, position: str) -> np.ndarray:
     """Draw three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above (no tip: the centre)."""
-    tumour = cut.now if len(cut.now.vertices) else stage.tumour_at_rest
+    tumour = cut.current if len(cut.current.vertices) else stage.tumour_at_rest
     centre = 0.5 * (tumour.vertices.min(axis=0) + tumour.vertices.max(axis=0))
     return draw_slices(stage.head_scan_texture, cut.tip if position == TIP and cut.tip is not None else centre, cut)
 

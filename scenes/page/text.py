@@ -172,7 +172,7 @@ def describe_result(deformation: Deformation, deformer: str) -> str:
     if not np.isfinite(bound):
         return f"<p>{source}: {state}.</p>"
     return (
-        f"<p>{source}: {state}. Surrogate error (95 %): at most {hud.bound_words(bound, 2)} at any point of the "
+        f"<p>{source}: {state}. Surrogate error (95 %): at most {hud.format_bound(bound, 2)} at any point of the "
         "tumour, relative to FEM.</p>"
     )
 
@@ -190,7 +190,7 @@ def format_position_error(error: TumourError) -> str:
             "<p>Tumour position error: not known. <code>sulcus uncertainty SCENE</code> estimates it for a scripted "
             "scene.</p>"
         )
-    bound = hud.bound_words(error.bound, 1)
+    bound = hud.format_bound(error.bound, 1)
     text = f"Tumour position error (95 %): at most {bound} at any point of its surface"
     caveat = ": rough estimate (few samples, load outside the tissue model, or by the size of the motion)"
     caveat = caveat if error.is_rough else ""
@@ -198,7 +198,7 @@ def format_position_error(error: TumourError) -> str:
         text += f" ({error.registration_text})"
     if error.observed is None:
         return f"<p>{text}{caveat or f'; the largest part is {escape(error.main_source)}'}.</p>"
-    prior = "" if error.prior is None else f"; without cortex observation: {hud.bound_words(error.prior, 1)}{caveat}"
+    prior = "" if error.prior is None else f"; without cortex observation: {hud.format_bound(error.prior, 1)}{caveat}"
     return f"<p>{text}{prior}.</p>"
 
 
@@ -215,9 +215,8 @@ def format_report(
     remaining = stage.select_stage(frame.loads).remaining_body
     facts = [f"frame {frame.number} of {frame_count - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
     if frame.distance_error is not None and frame.distance_error < np.inf:
-        facts += [
-            f"error of the tip-to-tumour distance <= {hud.bound_words(frame.distance_error, 1)} (95 %, relative to FEM)"
-        ]
+        bound = hud.format_bound(frame.distance_error, 1)
+        facts += [f"error of the tip-to-tumour distance <= {bound} (95 %, relative to FEM)"]
     error = None if frame.doubt else frame.tumour_error.bound
     parts = [] if frame.distance is None else [format_tip_distance(frame.distance, error, frame.inside)]
     headline, *estimate_texts = [""] if frame.estimate is None else describe_estimate(frame.estimate)
@@ -242,11 +241,11 @@ def format_motion(frame: Frame) -> str:
     """Describe the tumour's displacement with its errors: of the model, and of the tumour in the patient."""
     motion = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' (estimate)'}"
     if frame.moved_error is not None:
-        error = f"motion error {hud.bound_words(frame.moved_error, 1)}"
+        error = f"motion error {hud.format_bound(frame.moved_error, 1)}"
     else:
         error = f"{'error' if frame.doubt else 'motion error'} not known"
     if frame.model_error is not None and frame.estimate is None:
-        error = f"surrogate error {hud.bound_words(frame.model_error, 2)}, {error}"
+        error = f"surrogate error {hud.format_bound(frame.model_error, 2)}, {error}"
     return f"{motion} ({error})"
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from ar.overlay.hud import draw_orientation_labels
 from ar.page.browser import Browser
-from ar.page.parts import ScenePicture, SceneSurface, SceneViewpoint, Sign
+from ar.page.parts import SceneImage, SceneLabel, SceneSurface, SceneViewpoint
 from ar.page.slices import HALF_VIEW, OUTSIDE_GREY, PLANES, VIEW_SIDE, resample_view
 
 from ..play.drape import cut_hole
@@ -58,7 +58,7 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
 
 def split_cortex(stage: Stage, positions: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
     """Split the open cortex at `positions` (V, 3) [m] into bright crowns and dark sulci: name, vertices, triangles."""
-    points = stage.coarse_gyri.surface.place(positions[stage.coarse_gyri.vertices])
+    points = stage.coarse_gyri.surface.compute_vertices(positions[stage.coarse_gyri.vertices])
     return [(name, points[used], faces) for name, (used, faces) in zip(CORTEX_COLOURS, stage.gyri_parts, strict=True)]
 
 
@@ -74,9 +74,9 @@ def build_craniotomy_edge(stage: Stage) -> SceneSurface:
     return SceneSurface("edge", vertices, triangles, EDGE_COLOUR, meaning="edge of the craniotomy")
 
 
-def build_static_bodies(stage: Stage) -> list[Sign | ScenePicture]:
+def build_static_bodies(stage: Stage) -> list[SceneLabel | SceneImage]:
     """Build the static bodies: orientation letters round the brain, and planes of the scan behind the tumour."""
-    surroundings: list[Sign | ScenePicture] = [*list_orientation_labels(stage.site)]
+    surroundings: list[SceneLabel | SceneImage] = [*list_orientation_labels(stage.site)]
     scan, centre = stage.head_scan_texture, stage.tumour_at_rest.vertices.mean(axis=0)
     for plane in PLANES if scan is not None else ():
         assert scan is not None
@@ -84,16 +84,16 @@ def build_static_bodies(stage: Stage) -> list[Sign | ScenePicture]:
         behind = (plane.compute_points(centre, VIEW_SIDE) - centre) @ stage.site.axis > 0.0
         colour = np.stack([grey, grey, grey, 255 * (behind & (grey != OUTSIDE_GREY)).astype(np.uint8)], axis=2)
         edges = (2.0 * HALF_VIEW * np.array(edge) for edge in (plane.right, plane.down))
-        surroundings.append(ScenePicture(plane.name, colour, centre, *edges))
+        surroundings.append(SceneImage(plane.name, colour, centre, *edges))
     return surroundings
 
 
-def list_orientation_labels(site: CraniotomyFrame) -> list[Sign]:
+def list_orientation_labels(site: CraniotomyFrame) -> list[SceneLabel]:
     """Return the labels of the patient's sides around the brain."""
     nodes = site.anatomy.mesh.nodes
     centre, half_size = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + LETTER_DISTANCE
     offsets = np.kron(np.diag(half_size), [[1.0], [-1.0]])
-    return [Sign(letter, centre + offset) for letter, offset in zip("RLAPSI", offsets, strict=True)]
+    return [SceneLabel(letter, centre + offset) for letter, offset in zip("RLAPSI", offsets, strict=True)]
 
 
 def choose_viewpoint(site: CraniotomyFrame) -> SceneViewpoint:

@@ -9,7 +9,7 @@ from ar.optics.camera import Camera, project_cv2
 from ar.overlay.outlines import compute_iou, compute_silhouette
 from ar.rendering.layer import Layer, compute_vertex_normals
 from sim.deformation import Deformation
-from surrogate.locating.prior import compute_middle
+from surrogate.locating.prior import compute_centroid_motion
 
 from ..script.scene import Bounds
 from .image_checks import (
@@ -170,7 +170,7 @@ def _compute_coverage(player: Player, frames: Sequence[Frame], truth: Deformatio
     anatomy, held = player.site.anatomy, []
     for row, frame in enumerate(frames):
         ellipsoid = None if frame.estimate is None else frame.estimate.build_ellipsoid()
-        middle = compute_middle(anatomy, player.compute_positions(truth, row)[None])[0]
+        middle = compute_centroid_motion(anatomy, player.compute_positions(truth, row)[None])[0]
         held.append(ellipsoid is not None and is_within_surface(ellipsoid, middle))
     return float(np.mean(held))
 
@@ -235,7 +235,7 @@ def _is_cortex_embedded(player: Player, frame: Frame) -> bool:
     if not stage.scene.look.natural:
         return True
     surface, at = stage.fine_cortex.surface, player.compute_positions(frame.deformation)[stage.fine_cortex.vertices]
-    away = surface.place(at) - surface.interpolate(at)
+    away = surface.compute_vertices(at) - surface.interpolate(at)
     normal = surface.interpolate(compute_vertex_normals(at, surface.coarse))
     aside = away - np.einsum("mi,mi->m", away, normal)[:, None] * normal / np.square(normal).sum(axis=1, keepdims=True)
     return float(np.abs(aside).max()) < MAX_ASIDE and float(np.einsum("mi,mi->m", away, normal).max()) < MAX_ASIDE

@@ -182,7 +182,7 @@ class PatientSetup:
         name = self.select_best(scene)
         if scene.deformer in (*self.select_models(scene), *FAMILIES):
             return scene.deformer
-        return GUARDED if self._can_guard(scene) and get_reported_errors(self.models[name]).weak else name
+        return GUARDED if self._can_guard(scene) and get_reported_errors(self.models[name]).is_weak else name
 
     def _can_guard(self, scene: Scene) -> bool:
         """Return True if FEM can serve as fallback of the best model.

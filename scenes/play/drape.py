@@ -72,7 +72,7 @@ def fold_cloth(
     fine = build_embedded_surface(corners, triangles.reshape(-1, 3), target)
     arm = fine.interpolate(corners) - site.origin
     height = compute_fold_heights(np.linalg.norm(arm, axis=1) - hole, np.arctan2(arm @ site.up, arm @ site.right))
-    at = replace(fine, depth=-FOLD_HEIGHT * height, highest=1.1 * FOLD_HEIGHT).place(corners)
+    at = replace(fine, depth=-FOLD_HEIGHT * height, max_height=1.1 * FOLD_HEIGHT).compute_vertices(corners)
     return at, fine.triangles, list_border_edges(fine.triangles), (0.9 + 0.35 * height[:, None]) * DRAPE_COLOUR
 
 

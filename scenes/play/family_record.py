@@ -5,7 +5,7 @@ from typing import Annotated
 
 import msgspec
 
-from ar.overlay.hud import bound_words
+from ar.overlay.hud import format_bound
 from sim.families.registry import FAMILIES
 from sim.runtime.outside_files import wrap_errors
 
@@ -30,7 +30,7 @@ class FamilyFigures(msgspec.Struct, array_like=True, frozen=True):
 
     def describe_error(self, brief: bool) -> str:
         """Describe the error for an image."""
-        bound = bound_words(1e-3 * self.p95_mm, 2)
+        bound = format_bound(1e-3 * self.p95_mm, 2)
         return f"model <= {bound}" if brief else f"model error <= {bound} (95 % of {self.loads} pushes, relative to p2)"
 
 

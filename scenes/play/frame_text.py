@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ar.overlay.composite import Overlaid
-from ar.overlay.hud import MAX_BOTTOM_WIDTH, bound_words, lay, round_up, wrap_line
+from ar.overlay.hud import MAX_BOTTOM_WIDTH, format_bound, place_text, round_up, wrap_line
 from sim.deformation import Deformation, Outcome
 from sim.elements import OTHER_METHODS
 from sim.families.registry import FAMILIES
@@ -124,7 +124,7 @@ def format_model_error(bound: float | None, is_surrogate: bool, brief: bool = Fa
         return "FEM reference" if brief else "FEM reference (no surrogate)"
     if bound is None:
         return "model: not known" if brief else "model error relative to FEM: not known"
-    within = bound_words(bound, 2)
+    within = format_bound(bound, 2)
     return f"model <= {within}" if brief else f"surrogate error <= {within} (95 %, relative to FEM)"
 
 
@@ -132,7 +132,7 @@ def format_tumour_error(error: TumourError, brief: bool = False) -> str:
     """Describe the error of the drawn tumour position relative to the patient."""
     if error.bound is None:
         return "tumour: not known" if brief else NOT_KNOWN_WORDS
-    within, guess = bound_words(error.bound, 1), ", rough estimate" if error.is_rough else ""
+    within, guess = format_bound(error.bound, 1), ", rough estimate" if error.is_rough else ""
     if brief:
         return f"tumour <= {within}{guess if error.observed is None else ''}"
     said = f"tumour position error <= {within} (95 %)"
@@ -142,7 +142,7 @@ def format_tumour_error(error: TumourError, brief: bool = False) -> str:
             return f"{said}, {of}"
         return f"{said}{guess or f', mainly {error.main_source}'}{f'; {of}' * bool(of)}"
     said += f", {of}" * bool(of)
-    return said if error.prior is None else f"{said}; without cortex observation: {bound_words(error.prior, 1)}{guess}"
+    return said if error.prior is None else f"{said}; without cortex observation: {format_bound(error.prior, 1)}{guess}"
 
 
 def find_largest(errors: Sequence[TumourError]) -> TumourError:
@@ -156,8 +156,8 @@ def find_largest(errors: Sequence[TumourError]) -> TumourError:
 def annotate_image(overlaid: Overlaid, frame_number: int, remark: str) -> None:
     """Write a remark at the bottom of a composite image and a frame's number, in place."""
     height, width = overlaid.taken.shape
-    lay(overlaid.colour, overlaid.taken, wrap_line(remark, MAX_BOTTOM_WIDTH * width), (0, height))
-    lay(overlaid.colour, overlaid.taken, label_frame(frame_number), (width, height))
+    place_text(overlaid.colour, overlaid.taken, wrap_line(remark, MAX_BOTTOM_WIDTH * width), (0, height))
+    place_text(overlaid.colour, overlaid.taken, label_frame(frame_number), (width, height))
 
 
 def label_frame(frame_number: int) -> list[str]:

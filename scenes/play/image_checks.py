@@ -3,23 +3,23 @@
 import numpy as np
 
 from ar.optics.camera import Camera
-from ar.overlay.composite import BROKEN_STROKES, DOUBTFUL_COLOUR, HIDDEN_STROKES, format_ground
-from ar.overlay.gauge import NUMBER_SCALE, format_gauge
+from ar.overlay.composite import BROKEN_STROKES, DOUBTFUL_COLOUR, HIDDEN_STROKES, wrap_label
+from ar.overlay.gauge import NUMBER_SCALE, format_tip_distance
 from ar.overlay.hud import MAX_BOTTOM_WIDTH, TEXT_SCALE, WHITE, format_millimetres, wrap_line
 from ar.overlay.outlines import (
+    average_colour,
     compute_changed_share,
-    compute_ink,
-    compute_inked_share,
-    find_ink,
+    compute_drawn_share,
+    find_colour,
     find_text,
     has_text,
-    measure_outline_gap,
+    measure_outline_distance,
 )
 from ar.overlay.styles import MIN_REPORTED_SHARE, WHOLE_SHARE
 from ar.rendering.layer import Layer
 from ar.rendering.raycast import raycast
 from sim.geometry.surface import is_enclosing
-from surrogate.locating.prior import compute_middle
+from surrogate.locating.prior import compute_centroid_motion
 from surrogate.model.guarded import find_first_model
 
 from .frame_text import label_frame
@@ -50,12 +50,12 @@ def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
 
     Outlines drawn broken, because they are occluded or unreliable, may have gaps.
     """
-    ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), mask_covered_pixels(frame)
+    ink, shut = average_colour(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), mask_covered_pixels(frame)
     above = _mask_foreground(frame)
     gap = BROKEN_STROKES[1] + SOFT_LENGTH if frame.doubt else 0
     return max(
-        measure_outline_gap(frame.shown, ink, mask, above | shut, gap=gap),
-        measure_outline_gap(
+        measure_outline_distance(frame.shown, ink, mask, above | shut, gap_length=gap),
+        measure_outline_distance(
             frame.shown, ink, mask, above | ~shut, sum(HIDDEN_STROKES), HIDDEN_STROKES[1] + SOFT_LENGTH
         ),
     )
@@ -63,13 +63,13 @@ def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
 
 def measure_true_outline_error(frame: Frame, mask: np.ndarray) -> float:
     """Compute the distance of the truth's outline [pixel]; the estimate's outline, drawn over it, is masked out."""
-    above = _mask_foreground(frame) | find_ink(frame.shown, compute_ink(TUMOUR_COLOUR))
-    return measure_outline_gap(frame.shown, compute_ink(TRUTH_COLOUR), mask, above, 2 * sum(TRUE_STROKES))
+    above = _mask_foreground(frame) | find_colour(frame.shown, average_colour(TUMOUR_COLOUR))
+    return measure_outline_distance(frame.shown, average_colour(TRUTH_COLOUR), mask, above, 2 * sum(TRUE_STROKES))
 
 
 def _mask_foreground(frame: Frame) -> np.ndarray:
     """Return the mask (H, W) bool of text and tools."""
-    return find_ink(frame.shown, WHITE, 0) | (frame.picture.segmentation == TOOL)
+    return find_colour(frame.shown, WHITE, 0) | (frame.picture.segmentation == TOOL)
 
 
 def mask_covered_pixels(frame: Frame) -> np.ndarray:
@@ -82,9 +82,9 @@ def has_hidden_mark(frame: Frame, mask: np.ndarray) -> bool:
 
     In this part the outline must be broken, without shading, and the image must name the occluder.
     """
-    ink, shut = compute_ink(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), mask_covered_pixels(frame)
+    ink, shut = average_colour(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), mask_covered_pixels(frame)
     least, most = BROKEN_SHARES
-    inked = compute_inked_share(frame.shown, ink, mask, _mask_foreground(frame) | ~shut)
+    inked = compute_drawn_share(frame.shown, ink, mask, _mask_foreground(frame) | ~shut)
     changed = compute_changed_share(frame.picture.colour, frame.shown, mask & shut & (frame.taken == 0))
     return _is_ground_labelled(frame, mask) and not (
         inked < least or inked > most or changed > MAX_CHANGED_SHARE
@@ -101,7 +101,7 @@ def _is_ground_labelled(frame: Frame, mask: np.ndarray) -> bool:
     allowed = [words] * (share > WHOLE_SHARE - MASK_TOLERANCE) + [f"partly {words}"] * (
         share < WHOLE_SHARE + MASK_TOLERANCE
     )
-    return any(all(has_text(frame.shown, line, TEXT_SCALE) for line in format_ground(text)) for text in allowed)
+    return any(all(has_text(frame.shown, line, TEXT_SCALE) for line in wrap_label(text)) for text in allowed)
 
 
 def has_printed_numbers(player: Player, frame: Frame) -> bool:
@@ -132,7 +132,7 @@ def _find_number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, in
     distance, inside = _compute_distance(player, frame, corners, tip), is_enclosing(corners, tip)
     error = None if frame.doubt else frame.tumour_error.bound
     for off in (0.0, 0.5e-4, 1e-4):  # samples are never nearer than the surface: by less than what is printed
-        text = format_gauge(distance - off, error, inside)
+        text = format_tip_distance(distance - off, error, inside)
         at = find_text(frame.shown, text, NUMBER_SCALE)
         if at is not None:
             return at
@@ -145,7 +145,7 @@ def _has_printed_estimate(player: Player, frame: Frame) -> bool:
     if found is None or found.location is None:
         return True
     anatomy, rest = player.site.anatomy, player.site.anatomy.mesh.nodes
-    true, moved = compute_middle(
+    true, moved = compute_centroid_motion(
         anatomy, np.stack([player.compute_positions(frame.deformation) - rest, player.estimate_positions(frame) - rest])
     )
     off, length = float(np.linalg.norm(moved - true)), float(np.linalg.norm(moved))
@@ -170,4 +170,4 @@ def _compute_distance(player: Player, frame: Frame, corners: np.ndarray, tip: np
     model = find_first_model(player.deformer, frame.deformation)
     if model is None:
         return apart
-    return float(model.predict_distance(frame.loads, frame.deformation, np.array([apart])).value[0])
+    return float(model.predict_distance(frame.loads, frame.deformation, np.array([apart])).distance[0])

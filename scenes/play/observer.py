@@ -18,10 +18,10 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.geometry.closest_point import find_closest_points
 from surrogate.locating.calibration import RADIUS_SQUARED
-from surrogate.locating.evidence import smooth_root
+from surrogate.locating.evidence import compute_correlation_root
 from surrogate.locating.locator import Location, Locator
 from surrogate.locating.observation import Observation
-from surrogate.locating.prior import compute_middle
+from surrogate.locating.prior import compute_centroid_motion
 
 from ..script.craniotomy_frame import HOLE_RATIO, CraniotomyFrame
 from ..script.observation_models import PointObservation, StereoObservation
@@ -215,7 +215,7 @@ class PointObserver:
     def _smooth(self) -> np.ndarray:
         """Spatially correlated noise (n, 3) [m]."""
         at, random = self._interpolate_points(self._rest), np.random.default_rng([self.observation_model.seed, 0, 1])
-        return self.observation_model.smooth * smooth_root(at) @ random.standard_normal(at.shape)
+        return self.observation_model.smooth * compute_correlation_root(at) @ random.standard_normal(at.shape)
 
     @cached_property
     def _rigid(self) -> RigidError:
@@ -266,5 +266,5 @@ def locate_tumour(
     except InputError as error:
         refusal = str(error)
     seconds, rest = clock.perf_counter() - start_time, anatomy.mesh.nodes
-    middle, true = compute_middle(anatomy, np.stack([rest, positions - rest]))
+    middle, true = compute_centroid_motion(anatomy, np.stack([rest, positions - rest]))
     return TumourEstimate(anatomy, observation, location, refusal, middle, true, seconds)

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from ar.optics.camera import Camera
-from ar.overlay.composite import Overlaid, composite, draw_points, format_head_lines
-from ar.overlay.gauge import Gauge
+from ar.overlay.composite import Overlaid, composite, draw_points, wrap_header
+from ar.overlay.gauge import DistanceGauge
 from ar.overlay.legend import LegendNames
-from ar.overlay.marks import Cover, Marks, Trace, Words
+from ar.overlay.marks import ImageText, MarkOutline, Marks, Occluders
 from ar.overlay.styles import Style
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Picture
@@ -250,13 +250,13 @@ class Player:
         band = 0.0 if estimate is not None else error.bound or 0.0
         trained = find_first_model(self.deformer, deformation) is not None or is_by_other_family(deformation)
         lines = format_errors(promised, error, trained, doubt, camera.width < NARROW_IMAGE_WIDTH, self.recorded)
-        head = format_head_lines(lines, picture.segmentation == TOOL)
+        head = wrap_header(lines, picture.segmentation == TOOL)
         remarks = self.scene.describe_stop(self.site, touch), "" if estimate is None else estimate.remark
         remark = "; ".join(words for words in remarks if words)
         if self.composed:
             marks = Marks(band, shown, stage.smooth_tumour_at_rest, traces)
-            words = Words(doubt, head, get_legend_names(estimate), moved, error.bound)
-            outline, cover = stage.smooth_tumour(tumour), Cover(OCCLUDER_LABELS, OPENING)
+            words = ImageText(doubt, head, get_legend_names(estimate), moved, error.bound)
+            outline, cover = stage.smooth_tumour(tumour), Occluders(OCCLUDER_LABELS, OPENING)
             over = composite(picture, camera, outline, self.style, cover, marks, words)
             if estimate is not None and self.style != "none":
                 draw_points(over, camera, estimate.observation.now, picture.segmentation == CORTEX)
@@ -269,13 +269,13 @@ class Player:
             number=number, time=float(loads.times[0]), touch=touch, loads=loads, deformation=deformation, camera=camera,
             pose=pose, tip=None if held is None else held.tip, picture=picture, shown=over.colour, taken=over.taken,
             distance=None if gauge is None else gauge.distance, distance_error=None if gauge is None else gauge.error,
-            named=over.named, inside=gauge is not None and gauge.inside, moved=moved[0], moved_error=moved[1],
+            named=over.named, inside=gauge is not None and gauge.is_inside, moved=moved[0], moved_error=moved[1],
             model_error=promised, tumour_error=error, doubt=doubt,
             acts=format_active_loads(loads, deformation, self.site.anatomy.mesh.nodes), head=tuple(head), remark=remark,
             seconds=took, estimate=estimate,
         )  # fmt: skip
 
-    def _measure_tip_gauge(self, held: PlacedTool, loads: Loads, answer: Deformation, tumour: Layer) -> Gauge:
+    def _measure_tip_gauge(self, held: PlacedTool, loads: Loads, answer: Deformation, tumour: Layer) -> DistanceGauge:
         """Measure from the tip to the tumour, with the error bound of the deformer, if known."""
         gauge = measure_tip_gauge(held.tip, tumour)
         read = (
@@ -283,7 +283,7 @@ class Player:
             if held.bone_penetration > CARRIED_DEPTH
             else predict_tip_distance(self.deformer, loads, answer, self.scene.tool, gauge.distance)
         )
-        return gauge if read is None else replace(gauge, read=read.distance, error=read.bound)
+        return gauge if read is None else replace(gauge, reading=read.distance, error=read.bound)
 
     def _get_model_error(self, answer: Deformation) -> float | None:
         """Return a model's guaranteed error relative to FEM [m], of this load if available; None if unknown."""
@@ -379,22 +379,25 @@ def _estimate_positions(positions: np.ndarray, estimate: TumourEstimate | None) 
     return positions if estimate is None else estimate.place_tumour(positions)
 
 
-def list_estimate_traces(estimate: TumourEstimate, tumour: Layer) -> tuple[Trace, ...]:
+def list_estimate_traces(estimate: TumourEstimate, tumour: Layer) -> tuple[MarkOutline, ...]:
     """Build the traces of an estimate: its ellipsoid, and the true tumour surface with its centroid."""
-    ellipsoid, true = estimate.build_ellipsoid(), Trace(tumour, TRUE_STROKES, estimate.centroid + estimate.true_motion)
+    ellipsoid, true = (
+        estimate.build_ellipsoid(),
+        MarkOutline(tumour, TRUE_STROKES, estimate.centroid + estimate.true_motion),
+    )
     if ellipsoid is None:
         return (true,)
-    return Trace(ellipsoid, ELLIPSOID_STROKES, estimate.centroid + estimate.motion), true
+    return MarkOutline(ellipsoid, ELLIPSOID_STROKES, estimate.centroid + estimate.motion), true
 
 
 def get_legend_names(estimate: TumourEstimate | None) -> LegendNames:
     """Return the names of the lines of an image; a rejected estimate has no ellipsoid."""
     if estimate is None:
         return PREDICTED_LINES
-    return ESTIMATED_LINES if estimate.location is not None else replace(ESTIMATED_LINES, traces=(SIMULATED,))
+    return ESTIMATED_LINES if estimate.location is not None else replace(ESTIMATED_LINES, outlines=(SIMULATED,))
 
 
-def measure_tip_gauge(tip: np.ndarray, surface: Layer) -> Gauge:
+def measure_tip_gauge(tip: np.ndarray, surface: Layer) -> DistanceGauge:
     """Measure from a tip (3,) [m] to the nearest point of a hidden surface, and whether the tip is inside."""
     corners = surface.vertices[surface.triangles]
-    return Gauge(tip, find_closest_points(tip[None], corners).point[0], inside=is_enclosing(corners, tip))
+    return DistanceGauge(tip, find_closest_points(tip[None], corners).point[0], is_inside=is_enclosing(corners, tip))

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ar.overlay.hud import HEAD_ROW, LINE_SPACING, bound_words, draw_text_panel
+from ar.overlay.hud import HEAD_ROW, LINE_SPACING, draw_text_panel, format_bound
 from ar.screen import shrink_image
 
 from .frame_text import shorten_source
@@ -35,7 +35,7 @@ def list_cost_lines(frame: Frame, deformer: str) -> list[str]:
 
 def _format_length(length: float, error: float | None) -> str:
     """Format a length and its error [m] in millimetres; an unknown error is given at the image's top."""
-    return f"{1e3 * length:.2f} {'mm' if error is None else f'+- {bound_words(error, 1)}'}"
+    return f"{1e3 * length:.2f} {'mm' if error is None else f'+- {format_bound(error, 1)}'}"
 
 
 def draw_cost_panel(frame: Frame, deformer: str) -> np.ndarray:
@@ -45,7 +45,10 @@ def draw_cost_panel(frame: Frame, deformer: str) -> np.ndarray:
     hides = (frame.taken > 0) | (seen != DRAPE), (frame.taken > 0) | (seen == TOOL)
     sights = [each.view(np.uint8) for each in hides]
     return draw_text_panel(
-        frame.shown, list_cost_lines(frame, deformer), below=HEAD_ROW + LINE_SPACING * len(frame.head), sights=sights
+        frame.shown,
+        list_cost_lines(frame, deformer),
+        first_row=HEAD_ROW + LINE_SPACING * len(frame.head),
+        obstacles=sights,
     )
 
 
@@ -70,7 +73,7 @@ def render_thumbnail(player: Player, deformer: str) -> Thumbnail:
     best = max(frames, key=lambda frame: (_count_cuts(player, frame), frame.moved))
     labelled = draw_cost_panel(best, deformer)
     taken = best.taken | (labelled != best.shown).any(axis=2).view(np.uint8)
-    picture = draw_text_panel(labelled, [player.scene.name], "top right", 0.9, sights=[taken])
+    picture = draw_text_panel(labelled, [player.scene.name], "top right", 0.9, obstacles=[taken])
     return Thumbnail(
         shrink_image(picture, *IMAGE_SIZE),
         _compute_medians(frames[1:] or frames),

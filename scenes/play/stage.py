@@ -15,7 +15,7 @@ from ar.overlay.styles import Opening
 from ar.rendering.camera_effects import add_camera_effects
 from ar.rendering.embedding import EmbeddedSurface, build_embedded_surface
 from ar.rendering.layer import Layer, Solid, compute_vertex_normals
-from ar.rendering.real_image import add_vignette, scale_picture
+from ar.rendering.real_image import add_vignette, scale_image
 from ar.rendering.renderer import Lamp, Picture, Renderer, build_lamp
 from sim.anatomy import Anatomy
 from sim.bodies.intensity import Intensity
@@ -156,7 +156,7 @@ class Stage:
 
     def _build_fine(self, positions: np.ndarray) -> Layer:
         fine, tint = self.fine_cortex, self.scene.look.tint
-        at = fine.surface.place(positions[fine.vertices])
+        at = fine.surface.compute_vertices(positions[fine.vertices])
         return Layer("cortex", CORTEX, at, fine.surface.triangles, fine.colour * tint, gloss=0.7, shininess=110.0)
 
     @cached_property
@@ -224,7 +224,7 @@ class Stage:
         picture = add_camera_effects(picture, seen_by, self.site.origin, look.aperture, look.noise, frame_number)
         if self.scene.viewpoint.field is not None:
             picture = add_vignette(picture, self.scene.viewpoint.field)
-        return scale_picture(picture, camera.width, camera.height) if coarse else picture
+        return scale_image(picture, camera.width, camera.height) if coarse else picture
 
     def render_with_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
         """Render as `render`, with the tool given by its corners (t, 3) [m]; None: without a tool."""
@@ -258,7 +258,10 @@ class Stage:
         """Return a layer of the tumour's surface with rounded facets: for its outline, not for measurements."""
         surface = self.rounded_tumour
         return replace(
-            tumour, vertices=surface.place(tumour.vertices), triangles=surface.triangles, colour=tumour.colour[0]
+            tumour,
+            vertices=surface.compute_vertices(tumour.vertices),
+            triangles=surface.triangles,
+            colour=tumour.colour[0],
         )
 
     def build_fem_tumour(self, positions: np.ndarray) -> Layer:
@@ -294,7 +297,7 @@ class Stage:
         """Fine surface with rounded facets on the tumour's surface."""
         at, triangles = self.site.anatomy.mesh.nodes[self._tumour[0]], self._tumour[1]
         fine = build_embedded_surface(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
-        return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, highest=TUMOUR_HEIGHT)
+        return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, max_height=TUMOUR_HEIGHT)
 
     @cached_property
     def _visible(self) -> CortexSurface:

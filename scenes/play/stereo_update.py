@@ -8,8 +8,15 @@ import numpy as np
 
 from ar.optics.camera import Camera
 from ar.overlay.outlines import compute_silhouette
-from ar.stereo.disparity import Cloud, StereoView, compute_stereo_view, find_supported, follow_pixels, triangulate_cloud
-from ar.stereo.rectified import rectify
+from ar.stereo.disparity import (
+    StereoCloud,
+    StereoView,
+    compute_stereo_view,
+    find_consistent_motions,
+    track_pixels,
+    triangulate_cloud,
+)
+from ar.stereo.rectified import build_rectification
 from sim.errors import InputError
 from sim.geometry.closest_point import find_closest_points
 from surrogate.locating.evidence import NOISE, SIGMA
@@ -75,7 +82,9 @@ class StereoPair:
         masks = None if self.tool is None else tuple(compute_silhouette(camera, *self.tool) for camera in self.cameras)
         target = cast(tuple[float, float, float], tuple(site.origin.tolist()))
         try:
-            geometry = rectify(*self.cameras, target, STEREO.half_width_ratio * site.radius, STEREO.resolution)
+            geometry = build_rectification(
+                *self.cameras, target, STEREO.half_width_ratio * site.radius, STEREO.resolution
+            )
             return compute_stereo_view(geometry, *self.images, cast(tuple[np.ndarray, np.ndarray] | None, masks))
         except ValueError as error:
             raise InputError(str(error)) from error
@@ -121,10 +130,10 @@ def observe_first_pair(site: CraniotomyFrame, pair: StereoPair, count: int, add_
             f"the first image pair shows a cortex {1e3 * np.median(off):.1f} mm from the scan's: check that eyes "
             "are not swapped, or calibrate them again."
         )
-    good = find_supported(rest, points - rest)
+    good = find_consistent_motions(rest, points - rest)
     require_points(int(good.sum()), len(pixels))
     around, still = find_static_points(site, view)
-    return FirstView(view, pixels[found.which[good]], rest[good], len(pixels), around, add_rigid_error(still))
+    return FirstView(view, pixels[found.indices[good]], rest[good], len(pixels), around, add_rigid_error(still))
 
 
 def observe_points(
@@ -139,10 +148,10 @@ def observe_points(
     """
     view = pair.rectify(site)
     check_surroundings_static(first_view, view, add_rigid_error)
-    which, there = follow_pixels(first_view.stereo_view, view, first_view.pixels)
+    which, there = track_pixels(first_view.stereo_view, view, first_view.pixels)
     found = triangulate_pixels(site, view, there)
-    now, rest = add_rigid_error(found.points), first_view.rest_positions[which[found.which]]
-    good = find_supported(rest, now - rest)
+    now, rest = add_rigid_error(found.points), first_view.rest_positions[which[found.indices]]
+    good = find_consistent_motions(rest, now - rest)
     require_points(int(good.sum()), first_view.requested_count, LARGE_MOTION_HINT)
     motion = float(np.median(np.linalg.norm(now - rest, axis=1)))
     if motion > STEREO.max_motion:
@@ -165,7 +174,7 @@ def observe_point_cloud(
     found = triangulate_pixels(site, view, pixels)
     points = add_rigid_error(found.points)
     rest, _ = find_nearest_on_cortex(site, points)
-    good = find_supported(rest, points - rest)
+    good = find_consistent_motions(rest, points - rest)
     require_points(int(good.sum()), len(pixels))
     return Observation(points[good], None, scale_deviations(found.sigma[good]), add_rigid_error(contact_points))
 
@@ -178,10 +187,10 @@ def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.
     x, y = (each.ravel() for each in np.meshgrid(ticks, ticks))
     inside = np.hypot(x, y) < reach
     places = site.origin + x[inside, None] * site.right + y[inside, None] * site.up
-    return view.geometry.place(places)[0]
+    return view.geometry.project_points(places)[0]
 
 
-def triangulate_pixels(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> Cloud:
+def triangulate_pixels(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> StereoCloud:
     """Triangulate pixels (n, 2), and keep the points inside the drape's hole.
 
     Raises
@@ -194,7 +203,7 @@ def triangulate_pixels(site: CraniotomyFrame, view: StereoView, pixels: np.ndarr
     except ValueError as error:
         raise InputError(str(error)) from error
     inside = site.compute_axis_distance(found.points) < HOLE_RATIO * site.clearance - STEREO.min_drape_distance
-    return Cloud(found.which[inside], found.points[inside], found.sigma[inside])
+    return StereoCloud(found.indices[inside], found.points[inside], found.sigma[inside])
 
 
 def find_static_points(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
@@ -204,19 +213,19 @@ def find_static_points(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndar
     found = triangulate_cloud(view, pixels)
     outside = np.flatnonzero(site.compute_axis_distance(found.points) > HOLE_RATIO * site.clearance)
     some = outside[np.linspace(0, len(outside) - 1, min(STEREO.max_static_points, len(outside))).astype(int)]
-    return pixels[found.which[some]], found.points[some]
+    return pixels[found.indices[some]], found.points[some]
 
 
 def check_surroundings_static(first_view: FirstView, view: StereoView, add_rigid_error: Rigid) -> None:
     """Raise InputError if the surroundings of the opening seem to have moved since the first pair."""
-    which, there = follow_pixels(first_view.stereo_view, view, first_view.static_pixels)
+    which, there = track_pixels(first_view.stereo_view, view, first_view.static_pixels)
     try:
         found = triangulate_cloud(view, there)
     except ValueError as error:
         raise InputError(str(error)) from error
-    if len(found.which) < STEREO.min_static_points:
+    if len(found.indices) < STEREO.min_static_points:
         return
-    motion = np.linalg.norm(add_rigid_error(found.points) - first_view.static_positions[which[found.which]], axis=1)
+    motion = np.linalg.norm(add_rigid_error(found.points) - first_view.static_positions[which[found.indices]], axis=1)
     moved = float(np.quantile(motion, 0.25))
     if moved > STEREO.static_tolerance:
         raise InputError(

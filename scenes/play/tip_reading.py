@@ -53,7 +53,7 @@ def predict_tip_distance(
     found = model.predict_distance(loads, solution, np.array([drawn_distance]))
     promised = float(found.bound[0, 0])
     kept = solution.outcome[0].good and promised < float("inf")
-    return TipDistance(float(found.value[0]), promised if kept else None)
+    return TipDistance(float(found.distance[0]), promised if kept else None)
 
 
 def measure_tip_distance(

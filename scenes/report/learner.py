@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
-from surrogate.data.splits import DiscSplit, leave_sectors_out
+from surrogate.data.splits import DiscSplit, hold_out_sectors
 from surrogate.evaluation.coverage import FORCE_CLASSES, compute_coverage
 from surrogate.evaluation.score import SolveCounts, time_model_alone, time_single_loads
 from surrogate.training.train import train
@@ -39,16 +39,16 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
 
     def judged(model: Deformer, split: DiscSplit) -> tuple[ErrorFigures | None, float]:
         """Return the errors relative to the data's own solutions of held-out loads."""
-        rows = np.flatnonzero(split.test)
+        rows = np.flatnonzero(split.test_mask)
         return _compute_errors(model, study.converged.select(rows), truth[rows], nodes)
 
-    discs, sectors = study.disc_split, leave_sectors_out(study.pushed, study.patch)
+    discs, sectors = study.disc_split, hold_out_sectors(study.pushed, study.patch)
     (model, solves), learning = time_work(_train_model, study, spec, discs)
-    order = np.flatnonzero(discs.train)
+    order = np.flatnonzero(discs.training_mask)
     curve = []
     for count in list_counts(len(order)):
-        left_aside = np.isin(np.arange(len(discs.disc)), order[count:])
-        fewer = replace(discs, disc=np.where(left_aside, -2, discs.disc))
+        left_aside = np.isin(np.arange(len(discs.disc_index)), order[count:])
+        fewer = replace(discs, disc_index=np.where(left_aside, -2, discs.disc_index))
         curve.append((count, judged(_train_model(study, spec, fewer)[0], discs)[0]))
     of_discs, of_sectors = judged(model, discs), judged(_train_model(study, spec, sectors)[0], sectors)
     beyond = get_solutions_beyond(study)
@@ -61,7 +61,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
     field, together = time_work(lambda: model.deform(study.test_loads, at=nodes).displacement)
     covered = compute_coverage_beyond(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _measure_adaptation(study, spec)
-    held_out = study.converged.select(np.flatnonzero(discs.test))
+    held_out = study.converged.select(np.flatnonzero(discs.test_mask))
     bare = time_model_alone(model, held_out)
     return ReportRow(
         spec.name,
@@ -111,7 +111,7 @@ def _measure_adaptation(study: ReportStudy, spec: LearnerSpec) -> tuple[float | 
         return None, None
     after = build_debulked_study(study)
     (model, _), learning = time_work(_train_model, after, spec, after.disc_split)
-    rows = np.flatnonzero(after.disc_split.test)
+    rows = np.flatnonzero(after.disc_split.test_mask)
     seconds += learning + measure_series_seconds(after, spec.name)
     return seconds, _compute_errors(
         model, after.converged.select(rows), after.data_displacement[rows], after.anatomy.tumour_nodes

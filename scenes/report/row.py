@@ -8,7 +8,7 @@ import numpy as np
 
 from sim.loads import Loads, Pushed
 from surrogate.data.encode import split_forces
-from surrogate.evaluation.score import compute_spread
+from surrogate.evaluation.score import compute_statistics
 
 from .reference import get_reference
 from .study import ReportStudy
@@ -74,9 +74,9 @@ def compute_distance_figures(distance: np.ndarray, reference: np.ndarray, force:
         len(distance),
         distance.size,
         1e3 * float(motion.mean()),
-        ErrorSpread(*compute_spread(mm)),
-        ErrorSpread(*compute_spread(mm.max(axis=1))),
-        ErrorSpread(*compute_spread(percent)),
+        ErrorSpread(*compute_statistics(mm)),
+        ErrorSpread(*compute_statistics(mm.max(axis=1))),
+        ErrorSpread(*compute_statistics(percent)),
         tuple(tenths),
     )
 

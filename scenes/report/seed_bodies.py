@@ -65,7 +65,7 @@ def read_seed_mesh(path: Path, count: int) -> tuple[Anatomy, Loads]:
         body = Anatomy(mesh, np.repeat(fixed[:, None], 3, axis=1), np.zeros((len(vertices), 3)), free)
         if not len(body.tumour_nodes):
             raise InputError(f"region has no tumour, label 2. {REMEDY}")
-        settings = replace(PublishedSettings(), footprint=POINT_FOOTPRINT)
+        settings = replace(PublishedSettings(), radius=POINT_FOOTPRINT)
         return body, build_published_loads(open_patch(body), mesh.nodes[loaded], count, 0, settings)
 
 

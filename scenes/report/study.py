@@ -21,8 +21,8 @@ from sim.runtime.versions import get_version
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.encode import split_forces
-from surrogate.data.solution_rows import TISSUE_KEY, read_tissue_statement
-from surrogate.data.splits import DiscSplit, leave_discs_out
+from surrogate.data.solution_rows import TISSUE_KEY, read_tissue_text
+from surrogate.data.splits import DiscSplit, hold_out_discs
 from surrogate.training.expansion import SERIES_MODELS, Expansion
 
 from ..script.shipped_files import get_template_path
@@ -74,7 +74,7 @@ class ReportStudy:
     @cached_property
     def expansion(self) -> Expansion:
         """Power series of the FEM model, shared by all training on the data."""
-        return Expansion(self.dataset, self.device, kept=self.folder / "answers" / f"series-{self.digest}.npz")
+        return Expansion(self.dataset, self.device, table_path=self.folder / "answers" / f"series-{self.digest}.npz")
 
     @property
     def anatomy(self) -> Anatomy:
@@ -90,7 +90,7 @@ class ReportStudy:
     def tissue(self) -> Elasticity:
         """Tissue of the data set, with that of regions."""
         stated = self.dataset.provenance
-        return read_tissue_statement(stated) if TISSUE_KEY in stated else Elasticity()
+        return read_tissue_text(stated) if TISSUE_KEY in stated else Elasticity()
 
     def get_tissue_on(self, body: Anatomy) -> Elasticity:
         """Return the tissue for a body that may lack some of the regions."""
@@ -138,12 +138,12 @@ class ReportStudy:
     @cached_property
     def disc_split(self) -> DiscSplit:
         """Discs of cortex left out."""
-        return leave_discs_out(self.pushed.point, self.patch)
+        return hold_out_discs(self.pushed.point, self.patch)
 
     @cached_property
     def test_loads(self) -> Loads:
         """Loads of the left-out discs, spread evenly over their forces."""
-        rows = np.flatnonzero(self.disc_split.test)
+        rows = np.flatnonzero(self.disc_split.test_mask)
         rows = rows[np.argsort(split_forces(self.pushed)[0][rows], kind="stable")]
         chosen = np.unique(np.linspace(0, len(rows) - 1, min(self.loads, len(rows))).round().astype(int))
         return self.converged.select(rows[chosen])
@@ -151,8 +151,8 @@ class ReportStudy:
     @cached_property
     def loads_beyond(self) -> Loads:
         """Loads beyond the training range: stronger, more oblique, nearer to the rim, in equal parts."""
-        pushed = self.converged.select(np.flatnonzero(self.disc_split.test)).get(Pushed)
-        training = self.converged.select(np.flatnonzero(self.disc_split.train)).get(Pushed)
+        pushed = self.converged.select(np.flatnonzero(self.disc_split.test_mask)).get(Pushed)
+        training = self.converged.select(np.flatnonzero(self.disc_split.training_mask)).get(Pushed)
         assert pushed is not None and training is not None
         return draw_loads_beyond(self.patch, training, pushed, self.beyond)
 
@@ -205,7 +205,7 @@ def _turn_from_normal(direction: np.ndarray, normal: np.ndarray, angle: float, m
 
 def _sample_near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Sample points (B, 3) [m] whose footprints (B,) [m] extend beyond the rim by a tenth to half of their radius."""
-    points = patch.place(random.random((4096, 3)))[0]
+    points = patch.place_points(random.random((4096, 3)))[0]
     ratio = patch.compute_edge_distance(points)[None] / footprint[:, None]
     wanted = random.uniform(*EDGE_DISTANCES, len(footprint))[:, None]
     return points[np.abs(ratio - wanted).argmin(axis=1)]
@@ -232,9 +232,9 @@ def _to_json_path(made: Path) -> Path:
 def tabulate_series(study: ReportStudy, progress: Callable[[int, int], object]) -> None:
     """Compute the series table if the tissue is recorded; `progress` receives the numbers of places done and in all."""
     if "tissue" in study.dataset.provenance:
-        replace(study.expansion, progress=progress).tabulated  # noqa: B018 (asking makes it)
+        replace(study.expansion, progress=progress).table  # noqa: B018 (asking makes it)
 
 
 def measure_series_seconds(study: ReportStudy, learner: str) -> float:
     """Return the seconds spent on the table, if this learner uses it."""
-    return study.expansion.tabulated.seconds if learner in SERIES_MODELS else 0.0
+    return study.expansion.table.seconds if learner in SERIES_MODELS else 0.0

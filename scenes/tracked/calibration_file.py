@@ -67,14 +67,14 @@ def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
 
 def build_intrinsics_header(calibration: Calibration, covariance: np.ndarray) -> dict[str, object]:
     """Build the K.json of a calibration: its values (9,) and their covariance (9, 9), 0 where they are exact."""
-    from ar.tracking.intrinsics import PARAMETERS, to_values
+    from ar.tracking.intrinsics import PARAMETERS, to_parameters
 
     return {
         "format": f"{INTRINSICS} 1",
         "image_width": calibration.width,
         "image_height": calibration.height,
         "parameters": PARAMETERS,
-        "values": to_values(calibration).tolist(),
+        "values": to_parameters(calibration).tolist(),
         "standard_deviations": np.sqrt(np.diag(covariance)).tolist(),
         "covariance": covariance.tolist(),
     }

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from ar.optics.calibration import Calibration
-from ar.tracking.image_sequences import REMEDY, Named, read_video
-from ar.tracking.pose import Pose, TrackedTargets, Tracker, Verdict
-from ar.tracking.pose_stream import Clock, PoseStream, estimate_clock_by_motion
-from ar.tracking.rigid import build_cross_matrices, turn_vectors
-from ar.tracking.synthetic_images import read_stamp
+from ar.tracking.image_sequences import REMEDY, NamedImage, read_video
+from ar.tracking.pose import Pose, PoseStatus, TrackedTargets, Tracker
+from ar.tracking.pose_stream import Clock, PoseStream, estimate_clock_offset
+from ar.tracking.rigid import build_cross_matrices, to_rotation_vectors
+from ar.tracking.synthetic_images import read_time_stamp
 from ar.tracking.targets import build_patient_reference, build_tool_cube, list_targets
 from sim.errors import InputError
 from sim.runtime.outside_files import wrap_errors
@@ -28,7 +28,9 @@ REST_POSE = Pose(np.eye(4), np.zeros((6, 6)), 0.0, 1 << 16)
 MAX_TIME_GAP = 1.0
 
 
-def track_images(images: Iterable[Named], calibration: Calibration, body: str, reference: str) -> Iterator[TrackedPose]:
+def track_images(
+    images: Iterable[NamedImage], calibration: Calibration, body: str, reference: str
+) -> Iterator[TrackedPose]:
     """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `reference` of a visible one of them.
 
     Raises
@@ -71,19 +73,19 @@ def track_video(path: Path, calibration: Calibration, body: str, reference: str,
         raise InputError(f"{path}: holds no image. {REMEDY}")
 
 
-def _set_stamped_time(picture: Named) -> Named:
+def _set_stamped_time(picture: NamedImage) -> NamedImage:
     """Return an image with the time of its stamp, if it has one."""
-    stamp = read_stamp(picture.grey)
+    stamp = read_time_stamp(picture.grey)
     return picture if stamp is None else replace(picture, time=stamp)
 
 
-def _select_pose(state: TrackedTargets, wanted: list[str]) -> tuple[Verdict, Pose | None, str]:
+def _select_pose(state: TrackedTargets, wanted: list[str]) -> tuple[PoseStatus, Pose | None, str]:
     """Return the pose of the first target, relative to the second if given; else the verdict on the missing target."""
     for name in wanted:
         if name not in state.poses:
-            return state.verdicts[name], None, name
+            return state.statuses[name], None, name
     pose, *others = (state.poses[name] for name in wanted)
-    return Verdict.GOOD, pose.transform_to(others[0]) if others else pose, ""
+    return PoseStatus.GOOD, pose.transform_to(others[0]) if others else pose, ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +165,7 @@ class ExternalTracker:
     def describe_mismatch(self, time: float) -> str:
         """Describe the body whose poses are all far from the image of a time [s], and by how much; empty: none."""
         for name, stream in self.pose_streams.items():
-            at = stream.to_stream_day(time + self.clock.offset)
+            at = stream.to_stream_time(time + self.clock.offset)
             first, last = stream.times[[0, -1]].tolist()
             if at < first - MAX_TIME_GAP:
                 return f"the {name}'s poses begin {first - at:.1f} s after this image"
@@ -187,7 +189,7 @@ class ExternalTracker:
         if other is None:
             return None
         T, U = pose.T_camera_target, other.T_camera_target
-        step = np.concatenate([U[:3, 3] - T[:3, 3], turn_vectors(U[None, :3, :3] @ T[:3, :3].T)[0]])
+        step = np.concatenate([U[:3, 3] - T[:3, 3], to_rotation_vectors(U[None, :3, :3] @ T[:3, :3].T)[0]])
         return Pose(T, pose.covariance + np.outer(step, step), pose.residual, pose.corners)
 
     def _interpolate_tool(self, time: float) -> Pose | None:
@@ -210,14 +212,14 @@ class ExternalTracker:
 
 
 def estimate_video_clock(
-    images: Iterable[Named], calibration: Calibration, tool_poses: PoseStream, reference_poses: PoseStream
+    images: Iterable[NamedImage], calibration: Calibration, tool_poses: PoseStream, reference_poses: PoseStream
 ) -> Clock:
     """Estimate the clock offset between the tracker and a video that shows the printed cube and reference.
 
     Raises
     ------
     ValueError
-        See `estimate_clock_by_motion` and `track_images`.
+        See `estimate_clock_offset` and `track_images`.
     """
     film_rows = track_images(images, calibration, build_tool_cube().name, build_patient_reference().name)
     seen = [(row.time, row.pose) for row in film_rows if row.pose is not None]
@@ -230,6 +232,6 @@ def estimate_video_clock(
     others = [pose.T_camera_target[:3, 3] for _, pose in both]
     if not both:
         raise ValueError("tool and reference have poses at no common time: record both at once.")
-    return estimate_clock_by_motion(
+    return estimate_clock_offset(
         np.array(times), np.array(places), np.array([time for time, _ in both]), np.array(others)
     )

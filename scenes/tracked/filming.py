@@ -14,7 +14,7 @@ from ar.optics.lens import Lens
 from ar.rendering.layer import Layer
 from ar.rendering.renderer import Renderer
 from ar.tracking.registration import Registration
-from ar.tracking.rigid import move_about
+from ar.tracking.rigid import move_rigidly
 from ar.tracking.synthetic_images import render_targets, stamp_time
 from ar.tracking.targets import Target, build_patient_reference, build_tool_cube, find_window
 from sim.errors import InputError
@@ -169,8 +169,8 @@ def register_with_error(
     deviations = np.repeat([1e-3 * shift_mm, np.radians(angle_deg)], 3)
     error = deviations * np.random.default_rng([seed, 1]).standard_normal(6)
     centre = site.origin
-    T = move_about(np.linalg.inv(targets.T_scan_patient), centre, error)
-    return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scanned=describe_scan(site.anatomy))
+    T = move_rigidly(np.linalg.inv(targets.T_scan_patient), centre, error)
+    return Registration(T, np.diag(deviations**2), centre, 0.0, 0, scan=describe_scan(site.anatomy))
 
 
 def render_frames(player: Player, mounts: Mounts, artefacts: Artefacts, step: int = 1) -> Iterator[VideoFrame]:

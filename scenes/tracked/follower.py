@@ -206,7 +206,7 @@ class Follower:
         known = replace(known, was_near=near)
         if known.is_reliable and pace is None and self.calibration.readout > 0.0:
             known = replace(known, state=TumourState.UNSURE, warning=NO_PACE_WARNING)
-        if known.is_reliable and self.registration.scanned is None:
+        if known.is_reliable and self.registration.scan is None:
             known = replace(known, state=TumourState.UNSURE, warning=UNCHECKED_WARNING)
         if doubt:
             known = replace(known, state=TumourState.UNSURE, warning=doubt)
@@ -302,8 +302,8 @@ class Follower:
         self, reference: Pose, middle: np.ndarray, motion: BrainMotion, shutter: float
     ) -> tuple[float, dict[str, float]]:
         """Compute the error bound of the tumour's `middle` (3,) [m] across the line of sight, and its parts."""
-        place, beside = self.registration.point(middle)
-        at, tracked = reference.point(place)
+        place, beside = self.registration.transform_point(middle)
+        at, tracked = reference.transform_point(place)
         turned = reference.T_camera_target[:3, :3]
         registered = turned @ beside @ turned.T
         camera = None
@@ -332,9 +332,9 @@ def describe_large_error(error_bound: float) -> str:
 def compute_tip_covariance(registration: Registration, tool: TrackedTool, tool_pose: Pose) -> np.ndarray:
     """Compute a tool tip's covariance (3, 3) [m^2] in the scan: by pose, tool calibration and registration."""
     T = registration.T_patient_scan
-    arm, tracked = tool_pose.point(tool.T_cube_tool[:3, 3])
+    arm, tracked = tool_pose.transform_point(tool.T_cube_tool[:3, 3])
     turned = tool_pose.T_camera_target[:3, :3]
-    _, registered = registration.point((arm - T[:3, 3]) @ T[:3, :3])
+    _, registered = registration.transform_point((arm - T[:3, 3]) @ T[:3, :3])
     whole = tracked + turned @ tool.tip_covariance @ turned.T + registered
     return T[:3, :3].T @ whole @ T[:3, :3]
 

@@ -6,11 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from ar.optics.camera import Camera
-from ar.overlay.composite import HEAD_WIDTHS, Overlaid, composite, write_doubt, write_head
-from ar.overlay.gauge import Gauge
-from ar.overlay.hud import bound_words, wrap_line
-from ar.overlay.marks import BEFORE_COLOUR, BEFORE_STROKES, Cover, Marks, Words
-from ar.overlay.outlines import compute_ink, compute_silhouette, draw_dashes, find_outlines, find_pixel_box, join_boxes
+from ar.overlay.composite import HEAD_WIDTHS, Overlaid, composite, write_header, write_warning
+from ar.overlay.gauge import DistanceGauge
+from ar.overlay.hud import format_bound, wrap_line
+from ar.overlay.marks import BEFORE_COLOUR, BEFORE_STROKES, ImageText, Marks, Occluders
+from ar.overlay.outlines import (
+    average_colour,
+    compute_silhouette,
+    draw_dashes,
+    find_outlines,
+    find_pixel_box,
+    join_boxes,
+)
 from ar.overlay.styles import MIN_REPORTED_SHARE, Opening, Style
 from ar.rendering.layer import Layer
 from ar.rendering.real_image import build_real_image
@@ -65,14 +72,16 @@ class Painter:
         band = 0.0 if tracking.bound is None else tracking.bound
         box = find_pixel_box(camera, tumour.vertices)
         if gauge is not None:
-            box = join_boxes(box, find_pixel_box(camera, np.stack([gauge.tip, gauge.nearest])))
+            box = join_boxes(box, find_pixel_box(camera, np.stack([gauge.tip, gauge.nearest_point])))
         layers = [] if box is None else self._build_layers(tracking)
         whole = slice(0, camera.height), slice(0, camera.width)
         picture = build_real_image(image, camera, layers, box or whole, self.device)
         lines = [*format_top_lines(tracking), *self._describe_hidden(camera, tumour, occlusion_mask)]
         head = [part for line in lines for part in wrap_line(line, HEAD_WIDTHS[0] * camera.width)]
-        cover = Cover((TOOL,), SEEN_THROUGH, occlusion_mask)
-        words = Words(doubt, head, PREDICTED_LINES, (tracking.motion.distance, tracking.motion.error), tracking.bound)
+        cover = Occluders((TOOL,), SEEN_THROUGH, occlusion_mask)
+        words = ImageText(
+            doubt, head, PREDICTED_LINES, (tracking.motion.distance, tracking.motion.error), tracking.bound
+        )
         return composite(picture, camera, tumour, self.style, cover, Marks(band, gauge, before), words)
 
     def _describe_hidden(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
@@ -97,14 +106,14 @@ class Painter:
             return None
         return Layer("tool", TOOL, *self.tool.build_surface(pose, with_cube), TOOL_COLOUR)
 
-    def measure_tip_distance(self, tracking: TrackingResult, tumour: Layer) -> Gauge | None:
+    def measure_tip_distance(self, tracking: TrackingResult, tumour: Layer) -> DistanceGauge | None:
         """Measure from the tool's tip to the tumour, with the error of both; None if a position is unknown."""
         if tracking.T_scan_tool is None or tracking.tip_covariance is None or tracking.bound is None:
             return None
         gauge = measure_tip_gauge(tracking.T_scan_tool[:3, 3], tumour)
-        along = (gauge.nearest - gauge.tip) / max(gauge.distance, np.finfo(float).tiny)
+        along = (gauge.nearest_point - gauge.tip) / max(gauge.distance, np.finfo(float).tiny)
         spread = BOUND_DEVIATIONS * float(np.sqrt(along @ tracking.tip_covariance @ along))
-        return Gauge(gauge.tip, gauge.nearest, error=float(np.hypot(spread, tracking.motion.error)))
+        return DistanceGauge(gauge.tip, gauge.nearest_point, error=float(np.hypot(spread, tracking.motion.error)))
 
     def _draw_grey(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None) -> Overlaid:
         """Draw the outline in grey at the last position, if there is one, with the reason."""
@@ -113,8 +122,8 @@ class Painter:
             self._draw_dotted(over, known.camera, self.stage.build_tumour(known.motion.positions))
             if covered is not None:
                 over.colour[covered] = colour[covered]
-        write_head(over, [])
-        write_doubt(over, known.warning)
+        write_header(over, [])
+        write_warning(over, known.warning)
         return over
 
     def _draw_dotted(self, over: Overlaid, camera: Camera, tumour: Layer) -> None:
@@ -122,7 +131,7 @@ class Painter:
         if box is None:
             return
         mask = compute_silhouette(camera.crop_to(*box), tumour.vertices, tumour.triangles)
-        draw_dashes(over.colour[box], find_outlines(mask), compute_ink(BEFORE_COLOUR), BEFORE_STROKES)
+        draw_dashes(over.colour[box], find_outlines(mask), average_colour(BEFORE_COLOUR), BEFORE_STROKES)
 
 
 def format_top_lines(tracking: TrackingResult) -> Sequence[str]:
@@ -132,7 +141,7 @@ def format_top_lines(tracking: TrackingResult) -> Sequence[str]:
     largest = max(tracking.sources, key=lambda name: tracking.sources[name])
     lines = [NO_CONTACT_TEXT] if tracking.state is TumourState.REST else []
     if tracking.is_reliable:
-        lines.append(f"overlay error <= {bound_words(tracking.bound, 1)} across the view (95 %), mainly {largest}")
+        lines.append(f"overlay error <= {format_bound(tracking.bound, 1)} across the view (95 %), mainly {largest}")
     motion = "; of motion: not known" if not tracking.motion.supported else ""
     camera = "" if "camera" in tracking.sources else ", camera"
     return (*lines, f"error by tissue{camera} and segmentation: not known{motion}")

@@ -2,26 +2,28 @@
 
 import numpy as np
 
-from ar.overlay.gauge import Gauge
-from ar.page.history import Line, Sample
-from ar.page.slices import Cut
+from ar.overlay.gauge import DistanceGauge
+from ar.page.history import Sample, Trace
+from ar.page.slices import SlicedSurfaces
 
 from ..page.side_panels import draw_slices_through
 from .follower import TrackingResult
 from .overlay_painter import Painter
 
 # Chart of the distance from tip to tumour.
-DISTANCE = Line("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion (95 %); dotted: not to be relied on")
+DISTANCE = Trace("tip to tumour", "mm", "#f4f4f0", "band: error of tip and motion (95 %); dotted: not to be relied on")
 # Chart of the overlay's error.
-OVERLAY_ERROR = Line("error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation")
+OVERLAY_ERROR = Trace(
+    "error of the overlay", "mm", "#4cf28c", "across the view (95 %), without tissue and segmentation"
+)
 
 
-def list_plot_lines(has_tool: bool) -> tuple[Line, ...]:
+def list_plot_lines(has_tool: bool) -> tuple[Trace, ...]:
     """Return the plotted quantities of each image."""
     return (DISTANCE, OVERLAY_ERROR) if has_tool else (OVERLAY_ERROR,)
 
 
-def build_history_sample(tracking: TrackingResult, gauge: Gauge | None, has_tool: bool, time: float) -> Sample:
+def build_history_sample(tracking: TrackingResult, gauge: DistanceGauge | None, has_tool: bool, time: float) -> Sample:
     """Build the readings of an image that is shown at a time [s], in the order of `list_plot_lines`."""
     within = 1e3 * tracking.bound if tracking.is_reliable and tracking.bound is not None else None
     if not has_tool:
@@ -42,5 +44,7 @@ def render_slices(tracking: TrackingResult, painter: Painter, position: str) -> 
     error = tracking.motion.error if tracking.is_reliable and tracking.motion.supported else None
     now = stage.build_tumour(tracking.motion.positions)
     return draw_slices_through(
-        stage, Cut(now, stage.tumour_at_rest, error, not tracking.is_reliable, others, tip, "motion"), position
+        stage,
+        SlicedSurfaces(now, stage.tumour_at_rest, error, not tracking.is_reliable, others, tip, "motion"),
+        position,
     )

@@ -3,8 +3,8 @@
 from html import escape
 
 from ar.overlay.composite import DOUBTFUL_COLOUR
-from ar.overlay.gauge import Gauge
-from ar.overlay.hud import bound_words
+from ar.overlay.gauge import DistanceGauge
+from ar.overlay.hud import format_bound
 
 from ..page.text import RESEARCH_ONLY, format_legend, format_length, format_tip_distance, to_svg_stroke
 from ..play.stage import TUMOUR_COLOUR
@@ -39,7 +39,7 @@ def describe_overlay(name: str, model: str, has_tool: bool) -> str:
     )
 
 
-def format_report(overlay: Overlay, tip_gauge: Gauge | None, has_tool: bool, image_name: str) -> str:
+def format_report(overlay: Overlay, tip_gauge: DistanceGauge | None, has_tool: bool, image_name: str) -> str:
     """Build the report of an image: distance first, then state, both errors, and processing time.
 
     `image_name` names the image.
@@ -60,21 +60,21 @@ def format_report(overlay: Overlay, tip_gauge: Gauge | None, has_tool: bool, ima
     return "".join([*parts, f"<p>{'; '.join(facts)}</p>", f'<p class="dim">{took}</p>'])
 
 
-def format_distance(tip_gauge: Gauge | None, is_reliable: bool) -> str:
+def format_distance(tip_gauge: DistanceGauge | None, is_reliable: bool) -> str:
     """Return the distance from tip to tumour with its error, where there is one that may be relied on."""
     if tip_gauge is None:
         return '<p class="number">tip to tumour: not known</p>'
-    return format_tip_distance(tip_gauge.distance, tip_gauge.error if is_reliable else None, tip_gauge.inside)
+    return format_tip_distance(tip_gauge.distance, tip_gauge.error if is_reliable else None, tip_gauge.is_inside)
 
 
 def format_overlay_error(tracking: TrackingResult) -> str:
     """Describe the error of the outline across the view, by source."""
     if not tracking.is_reliable or tracking.bound is None:
         return "<p>Overlay error: not known.</p>"
-    stated = [f"{name} {bound_words(length, 2)}" for name, length in tracking.sources.items() if length > 0.0]
+    stated = [f"{name} {format_bound(length, 2)}" for name, length in tracking.sources.items() if length > 0.0]
     none = ", ".join(name for name, length in tracking.sources.items() if not length > 0.0 and name != "camera")
     off = tracking.sources.get("camera")
     camera = " What the camera's calibration adds is not known." if off is None else ""
     camera = " The camera is reported to be exactly known." if off == 0.0 else camera
     parts = ", ".join([*stated, *([f"not given: {none}"] if none else [])])
-    return f"<p>Overlay error (95 %): at most {bound_words(tracking.bound, 1)} across the view ({parts}).{camera}</p>"
+    return f"<p>Overlay error (95 %): at most {format_bound(tracking.bound, 1)} across the view ({parts}).{camera}</p>"

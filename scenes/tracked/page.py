@@ -10,12 +10,12 @@ from html import escape
 import numpy as np
 
 from ar.overlay.composite import DOUBTFUL_COLOUR
-from ar.overlay.gauge import Gauge
+from ar.overlay.gauge import DistanceGauge
 from ar.overlay.styles import Style
 from ar.page.browser import Browser
 from ar.page.history import History
 from ar.page.parts import Playback, SceneSurface
-from ar.tracking.image_sequences import Named
+from ar.tracking.image_sequences import NamedImage
 
 from ..page.controls import build_slice_control, build_style_controls
 from ..page.view import STALE_COLOUR, build_brain, choose_viewpoint, list_orientation_labels
@@ -165,7 +165,7 @@ class OverlayPage:
             wanted = (self.number + 1) % max(count, 1)
         return None if wanted == self.number else wanted
 
-    def watch(self, images: Iterator[Named | None], seconds: float = np.inf) -> list[Overlay]:
+    def watch(self, images: Iterator[NamedImage | None], seconds: float = np.inf) -> list[Overlay]:
         """Show a camera's images until it ends, or the time is over; None stands for a missing image.
 
         Return the last results, without colours. An outdated image is dimmed, and marked as old.
@@ -223,11 +223,11 @@ class OverlayPage:
         self.overlays.append(one.drop_mesh())
         now = clock.monotonic()
         if number not in (before, before + 1):
-            self.history.break_off(now)
+            self.history.interrupt_lines(now)
         self.history.add(build_history_sample(one.result, self._measure_gauge(one.result), self.has_tool, now))
         self._draw(one)
 
-    def _measure_gauge(self, known: TrackingResult) -> Gauge | None:
+    def _measure_gauge(self, known: TrackingResult) -> DistanceGauge | None:
         """Measure from tip to tumour; None if the tumour is drawn in grey or not at all."""
         if known.state in GREY_STATES:
             return None

@@ -21,7 +21,7 @@ def describe_implausible_registration(registration: Registration, stage: Stage, 
     """Describe why the opening's position in a registration is implausible for a camera; empty: plausible."""
     opening = stage.site.origin
     middle = 0.5 * np.array([*build_patient_reference().faces[0].size, 0.0])
-    away = float(np.linalg.norm(registration.point(opening)[0] - middle))
+    away = float(np.linalg.norm(registration.transform_point(opening)[0] - middle))
     if away > MAX_REFERENCE_DISTANCE:
         return f"the registration has the opening {1e3 * away:.0f} mm from the reference: is it another patient's?"
     if camera.to_camera_frame(opening[None])[0, 2] <= 0.0:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ar.tracking.pose import Pose, Verdict
+from ar.tracking.pose import Pose, PoseStatus
 from ar.tracking.pose_stream import PoseStream, build_pose_stream
 from sim.errors import InputError
 from sim.runtime.atomic_files import write_atomically
@@ -160,7 +160,7 @@ class TrackedPose:
     """
 
     time: float
-    verdict: Verdict
+    verdict: PoseStatus
     pose: Pose | None
     seconds: float
     missing_target: str = ""
@@ -186,7 +186,7 @@ def write_poses(path: Path, rows: Iterable[TrackedPose], tip: np.ndarray) -> Non
 def _format_pose(pose: Pose, tip: np.ndarray) -> list[str]:
     """Format position, rotation, tip with its root mean square error, and covariance."""
     T = pose.T_camera_target
-    at, spread = pose.point(tip)
+    at, spread = pose.transform_point(tip)
     covariance = (pose.covariance * np.outer(UNITS, UNITS))[np.triu_indices(6)]
     return [
         *(f"{each:.4f}" for each in 1e3 * T[:3, 3]),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ar.tracking.registration import Registration, Scanned
+from ar.tracking.registration import RegisteredScan, Registration
 from ar.tracking.rigid import is_rigid
 from sim.anatomy import Anatomy
 from sim.errors import InputError
@@ -57,19 +57,19 @@ def read_registration(path: str | Path) -> Registration:
         return Registration(T, covariance, centre, 1e-3 * float(stored["rms_mm"]), *counts, scanned)
 
 
-def _read_scanned(stored: dict) -> Scanned:
+def _read_scanned(stored: dict) -> RegisteredScan:
     bounds, target = 1e-3 * np.array(stored["bounds_mm"], float), 1e-3 * np.array(stored["tumour_mm"], float)
     if bounds.shape != (2, 3) or target.shape != (3,) or not (np.abs([*bounds, target]) <= MAX_COORDINATE).all():
         raise InputError("what it was made for has other numbers than bounds 2 x 3 and a tumour's middle of 3.")
-    return Scanned(str(stored["anatomy"]), bounds, target)
+    return RegisteredScan(str(stored["anatomy"]), bounds, target)
 
 
-def describe_scan(anatomy: Anatomy) -> Scanned:
+def describe_scan(anatomy: Anatomy) -> RegisteredScan:
     """Return the scan data of an anatomy for its registration; without a tumour the box's corners give the centre."""
     nodes = anatomy.mesh.nodes
     bounds = np.stack([nodes.min(axis=0), nodes.max(axis=0)])
     tumour = nodes[anatomy.tumour_nodes] if len(anatomy.tumour_nodes) else bounds
-    return Scanned(anatomy.digest, bounds, tumour.mean(axis=0))
+    return RegisteredScan(anatomy.digest, bounds, tumour.mean(axis=0))
 
 
 def describe_other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -> str:
@@ -82,7 +82,7 @@ def describe_other_mesh(registration: Registration, anatomy: Anatomy, path: str 
     InputError
         A registration for another anatomy: its bounds or its tumour differ by more than 5 mm from the anatomy's.
     """
-    made, here = registration.scanned, describe_scan(anatomy)
+    made, here = registration.scan, describe_scan(anatomy)
     if made is None:
         return (
             f"{path} does not say of which anatomy it is: whether it is this patient's is not checked. "
@@ -113,7 +113,7 @@ def to_json(registration: Registration) -> dict[str, object]:
     """Build the file content of a registration."""
     T = registration.T_patient_scan.copy()
     T[:3, 3] *= 1e3
-    made = registration.scanned
+    made = registration.scan
     scanned = (
         {}
         if made is None
@@ -130,8 +130,8 @@ def to_json(registration: Registration) -> dict[str, object]:
         "covariance": (registration.covariance * np.outer(_UNITS, _UNITS)).tolist(),
         "centre_mm": (1e3 * registration.centre).tolist(),
         "rms_mm": 1e3 * registration.rms,
-        "pairs": registration.pairs,
-        "surface": registration.surface,
+        "pairs": registration.pair_count,
+        "surface": registration.surface_count,
         **({} if made is None else {"scanned": scanned}),
     }
 

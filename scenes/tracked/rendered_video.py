@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ar.optics.calibration import Calibration
-from ar.tracking.image_sequences import Named, to_named_image
+from ar.tracking.image_sequences import NamedImage, to_named_image
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Deformer
 from sim.loads import Loads, Touching
@@ -33,7 +33,7 @@ from .filming import (
 
 SCENE = "palpate"
 """Scene of the video."""
-CAMERA = USUAL_CALIBRATION.resize_calibration(800, 600, scale=True)
+CAMERA = USUAL_CALIBRATION.resize_calibration(800, 600, allow_scaling=True)
 """Camera of the video: fewer pixels than usual, so that it takes seconds."""
 FRAME_RATE = 10.0  # Frame rate [1/s].
 DURATION = 1.7  # Length of the video [s].
@@ -89,7 +89,7 @@ class RenderedVideo:
     frames: tuple[VideoFrame, ...]
     degradation: Artefacts
 
-    def get_image(self, frame: VideoFrame) -> Named:
+    def get_image(self, frame: VideoFrame) -> NamedImage:
         """Return an image in the form that a video reader yields."""
         return to_named_image(f"{frame.time:.1f} s", frame.image, frame.time)
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ar.tracking.image_sequences import Named
+from ar.tracking.image_sequences import NamedImage
 from ar.tracking.pose_stream import DAY_SECONDS
-from ar.tracking.synthetic_images import read_stamp
+from ar.tracking.synthetic_images import read_time_stamp
 from sim.runtime.atomic_files import write_atomically
 
 from .follower import Follower, TrackingResult, TumourState
@@ -76,12 +76,12 @@ class TimedImage:
     `occluded` (H, W) bool is the foreground in front of the brain, such as a hand, if a mask is given.
     """
 
-    source: Named
+    source: NamedImage
     has_stamp: bool
     occluded: np.ndarray | None = None
 
 
-def read_timed_images(images: Iterator[Named], masks: Iterator[Named] | None = None) -> Iterator[TimedImage]:
+def read_timed_images(images: Iterator[NamedImage], masks: Iterator[NamedImage] | None = None) -> Iterator[TimedImage]:
     """Yield images with their time stamps, and with their masks, in which pixels that are not black are foreground.
 
     A 24-hour clock is continued at midnight.
@@ -94,7 +94,7 @@ def read_timed_images(images: Iterator[Named], masks: Iterator[Named] | None = N
     before, days = -np.inf, 0.0
     for number, picture in enumerate(images):
         covered = None if masks is None else _get_mask(masks, picture, number)
-        stamp = read_stamp(picture.grey)
+        stamp = read_time_stamp(picture.grey)
         time = days + (picture.time if stamp is None else stamp)
         if time < before - 0.5 * DAY_SECONDS:
             time, days = time + DAY_SECONDS, days + DAY_SECONDS
@@ -104,7 +104,7 @@ def read_timed_images(images: Iterator[Named], masks: Iterator[Named] | None = N
         raise ValueError("there are more masks than images. Give one for each image, in order.")
 
 
-def _get_mask(masks: Iterator[Named], picture: Named, number: int) -> np.ndarray:
+def _get_mask(masks: Iterator[NamedImage], picture: NamedImage, number: int) -> np.ndarray:
     """Return the foreground mask of image `number`."""
     mask = next(masks, None)
     if mask is None:

@@ -35,7 +35,7 @@ class SeekableVideo:
         self.images = self._read_from(0)
 
     def _read_from(self, number: int) -> Iterator[TimedImage]:
-        return read_timed_images(read_video(self.path, self.rate, colour=True, first=number))
+        return read_timed_images(read_video(self.path, self.rate, with_colour=True, first_frame=number))
 
     def read_image(self, number: int) -> TimedImage | None:
         """Return an image by its number; None if the video ends before this image; `count` is then corrected."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from ar.overlay.composite import HIDDEN_STROKES, WARNING_COLOUR, format_warning
 from ar.overlay.hud import TEXT_SCALE, WHITE
-from ar.overlay.outlines import compute_ink, compute_silhouette, find_ink, has_text, measure_outline_gap
+from ar.overlay.outlines import average_colour, compute_silhouette, find_colour, has_text, measure_outline_distance
 from ar.overlay.styles import Style
 
 from ..play.image_checks import SOFT_LENGTH
@@ -122,7 +122,7 @@ def measure_tracking(video: RenderedVideo, follower: Follower, painter: Painter)
         begun = clock.perf_counter() - event.frame.time - event.age if event.age else None
         shown = overlay_image(TimedImage(video.get_image(event.frame), True), begun, known, follower, painter)
         known = shown.result
-        drawn = bool(np.count_nonzero(find_ink(shown.image, compute_ink(TUMOUR_COLOUR))) >= CHECK.min_line_pixels)
+        drawn = bool(np.count_nonzero(find_colour(shown.image, average_colour(TUMOUR_COLOUR))) >= CHECK.min_line_pixels)
         if event.required_text:
             confident += drawn
             unsaid += not _has_warning(shown.image, known.warning, event.required_text)
@@ -141,7 +141,7 @@ def _has_warning(colour: np.ndarray, words: str, wanted: str) -> bool:
     """Return True if the image contains text with the wanted beginning."""
     lines = format_warning(words, colour.shape[1])
     return words.startswith(wanted) and all(
-        has_text(colour, line, TEXT_SCALE, compute_ink(WARNING_COLOUR)) for line in lines
+        has_text(colour, line, TEXT_SCALE, average_colour(WARNING_COLOUR)) for line in lines
     )
 
 
@@ -150,7 +150,7 @@ def _measure_outline_error(film: RenderedVideo, shot: VideoFrame, colour: np.nda
     camera, rest = film.calibration.build_camera(shot.T_camera_scan), film.stage.tumour_at_rest
     mask = compute_silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
     tool = compute_silhouette(camera, *film.targets.tool.build_surface(shot.T_scan_tool))
-    words = find_ink(colour, WHITE, 0)
-    return measure_outline_gap(
-        colour, compute_ink(TUMOUR_COLOUR), mask, tool | words, gap=HIDDEN_STROKES[1] + SOFT_LENGTH
+    words = find_colour(colour, WHITE, 0)
+    return measure_outline_distance(
+        colour, average_colour(TUMOUR_COLOUR), mask, tool | words, gap_length=HIDDEN_STROKES[1] + SOFT_LENGTH
     )

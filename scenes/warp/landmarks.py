@@ -9,7 +9,7 @@ from sim.bodies.open_cortex import open_cortex
 from sim.geometry.closest_point import find_closest_points
 from sim.geometry.locate import locate
 from sim.geometry.tetmesh import compute_signed_volumes
-from surrogate.locating.prior import compute_tumour_share
+from surrogate.locating.prior import compute_tumour_weights
 
 TUMOUR, NEAREST, CORTEX = "tumour", "tumour, nearest to its centroid", "open cortex"  # Names of the landmarks.
 CENTROID = "centroid of the tumour now"
@@ -40,7 +40,7 @@ def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, .
     """
     mesh, found = body.mesh, []
     if body.in_tumour.any():
-        point = compute_tumour_share(body) @ mesh.nodes
+        point = compute_tumour_weights(body) @ mesh.nodes
         at = locate(mesh, point[None])
         if np.linalg.norm(at.interpolate(mesh.nodes[None])[0, 0] - point) < INSIDE_TOLERANCE:
             found.append(Landmark(TUMOUR, point, point + at.interpolate(displacement[None])[0, 0]))

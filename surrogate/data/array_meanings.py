@@ -24,7 +24,7 @@ CHECKSUM_MEANING = (  # Meaning of the checksums.
 
 
 @dataclass(frozen=True)
-class Meaning:
+class ArrayInfo:
     """Unit, axes in order with ; between, and meaning of an array; vectors and points are in the frame RAS."""
 
     unit: str
@@ -39,57 +39,57 @@ class Meaning:
 
 
 _ROWS = {  # Meanings of the arrays that have one row per load case or unit force.
-    "outcome": Meaning("1", CASE, "outcome of the solver; rows with names that begin with CONVERGED are reliable"),
-    "iterations": Meaning("1", CASE, "steps that the solver took"),
-    "residual": Meaning(
+    "outcome": ArrayInfo("1", CASE, "outcome of the solver; rows with names that begin with CONVERGED are reliable"),
+    "iterations": ArrayInfo("1", CASE, "steps that the solver took"),
+    "residual": ArrayInfo(
         "1", CASE, "norm of the forces left over, over that of the largest of elasticity, load and hold"
     ),
-    "checksum": Meaning("1", CASE, CHECKSUM_MEANING),
+    "checksum": ArrayInfo("1", CASE, CHECKSUM_MEANING),
 }
 MEANINGS = {  # Meanings of all arrays, by their path in the file.
-    "anatomy/nodes": Meaning("m", f"vertex; {RAS}", "positions at rest"),
-    "anatomy/tets": Meaning("1", "tetrahedron; corner", "rows of anatomy/nodes, of positive volume"),
-    "anatomy/middles": Meaning(
+    "anatomy/nodes": ArrayInfo("m", f"vertex; {RAS}", "positions at rest"),
+    "anatomy/tets": ArrayInfo("1", "tetrahedron; corner", "rows of anatomy/nodes, of positive volume"),
+    "anatomy/middles": ArrayInfo(
         "1", "tetrahedron; edge 01, 12, 02, 03, 13, 23", "rows of anatomy/nodes on the edges of quadratic tetrahedra"
     ),
-    "anatomy/region": Meaning("1", "tetrahedron", "1 brain, 2 tumour"),
-    "anatomy/held": Meaning("1", f"vertex; {RAS}", "which components of the displacement are prescribed, as zero"),
-    "anatomy/slide_normal": Meaning(
+    "anatomy/region": ArrayInfo("1", "tetrahedron", "1 brain, 2 tumour"),
+    "anatomy/held": ArrayInfo("1", f"vertex; {RAS}", "which components of the displacement are prescribed, as zero"),
+    "anatomy/slide_normal": ArrayInfo(
         "1", f"vertex; {RAS}", "unit normal along which the vertex cannot move, as it slides along the skull; else zero"
     ),
-    "anatomy/craniotomy": Meaning("1", "vertex", "which vertices of the surface are free and may be touched"),
-    "loads/time": Meaning(
+    "anatomy/craniotomy": ArrayInfo("1", "vertex", "which vertices of the surface are free and may be touched"),
+    "loads/time": ArrayInfo(
         "s", CASE, "time of the result; in relaxing tissue, since the tool began to arrive; 0 without time dependence"
     ),
-    "loads/Pushed/point": Meaning("m", f"{CASE}; {RAS}", "centre of the tool's round footprint, on the body at rest"),
-    "loads/Pushed/force": Meaning("N", f"{CASE}; {RAS}", "total force on the body, of fixed direction"),
-    "loads/Pushed/footprint": Meaning(
+    "loads/Pushed/point": ArrayInfo("m", f"{CASE}; {RAS}", "centre of the tool's round footprint, on the body at rest"),
+    "loads/Pushed/force": ArrayInfo("N", f"{CASE}; {RAS}", "total force on the body, of fixed direction"),
+    "loads/Pushed/footprint": ArrayInfo(
         "m",
         CASE,
         "radius r of the footprint; the traction at a distance s r from the point is in proportion to sqrt(1 - s^2)",
     ),
-    "loads/Touching/pose": Meaning(
+    "loads/Touching/pose": ArrayInfo(
         "m",
         f"{CASE}; tool; row; column (RAS)",
         "T_world_tool, from the tool's frame to RAS: a rotation, and in the last column the tool's origin",
     ),
-    "answers/displacement": Meaning("m", f"{CASE}; {VERTEX}; {RAS}", "displacement from rest"),
-    "answers/reaction": Meaning(
+    "answers/displacement": ArrayInfo("m", f"{CASE}; {VERTEX}; {RAS}", "displacement from rest"),
+    "answers/reaction": ArrayInfo(
         "N, N m",
         f"{CASE}; tool; force along {RAS}, then moment about the tool's origin",
         "what each tool exerts on the body",
     ),
-    "unit/displacement": Meaning(
+    "unit/displacement": ArrayInfo(
         "m/N", f"node and axis of the force, as in unit/node; {VERTEX}; {RAS}", "response per newton"
     ),
-    "unit/node": Meaning(
+    "unit/node": ArrayInfo(
         "1", "row of the responses", "the vertex that the unit force acts on; rows 3 k, 3 k + 1, 3 k + 2 along x, y, z"
     ),
     **{f"{group}/{name}": meaning for group in ("answers", "unit") for name, meaning in _ROWS.items()},
 }
 
 
-def explain(file: h5py.File) -> None:
+def describe_arrays(file: h5py.File) -> None:
     """Write the description of every array and group to its attributes."""
     for name, text in GROUP_DESCRIPTIONS.items():
         file.require_group(name).attrs["meaning"] = text

@@ -13,17 +13,17 @@ from sim.bodies.open_cortex import compute_edge_distances, find_border_edges
 from sim.errors import InputError
 from sim.geometry.surface import compute_areas, compute_vertex_normals
 
-from ..array_functions import compute_squared_distances, take_rows_of
+from ..array_functions import compute_squared_distances, take_rows
 
 if TYPE_CHECKING:
     from sim.discretisation.footprint import ContactSurface
 
 
-def build_barycentric_lattice(rows: int) -> np.ndarray:
-    """Compute corner coordinates (rows^2, 3) of the centres of a triangle's equal pieces, `rows` along each edge."""
-    upright = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(rows) for j in range(rows - i)]
-    turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(rows - 1) for j in range(rows - 1 - i)]
-    share = np.array(upright + turned) / rows
+def build_barycentric_lattice(subdivisions: int) -> np.ndarray:
+    """Compute corner coordinates (n^2, 3) of the centres of a triangle's equal pieces, n `subdivisions` an edge."""
+    upright = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(subdivisions) for j in range(subdivisions - i)]
+    turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(subdivisions - 1) for j in range(subdivisions - 1 - i)]
+    share = np.array(upright + turned) / subdivisions
     return np.column_stack([1.0 - share.sum(axis=1), share])
 
 
@@ -51,12 +51,12 @@ class Patch:
         return compute_areas(self.points[self.triangles])
 
     @cached_property
-    def inward(self) -> np.ndarray:
+    def normals(self) -> np.ndarray:
         """Unit inward normals (m, 3) at the nodes, area-weighted."""
         return -compute_vertex_normals(self.points, self.triangles)
 
     @cached_property
-    def skin(self) -> ContactSurface:
+    def contact_surface(self) -> ContactSurface:
         """Contact surface of the patch."""
         # Warp is imported only for pressing tools, not for reading a model.
         from sim.discretisation.footprint import ContactSurface
@@ -65,28 +65,28 @@ class Patch:
         return ContactSurface(self.points, self.triangles, find_device("cpu", "float64"), "open cortex")
 
     @cached_property
-    def rim(self) -> np.ndarray:
+    def boundary_edges(self) -> np.ndarray:
         """Edges (E, 2, 3) [m] that belong to one triangle only."""
         return find_border_edges(self.points, self.triangles)
 
     def compute_edge_distance(self, points: np.ndarray) -> np.ndarray:
         """Compute distances (B,) [m] from `points` (B, 3) to the edge."""
-        return compute_edge_distances(self.rim, points)
+        return compute_edge_distances(self.boundary_edges, points)
 
-    def place(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def place_points(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Map uniform numbers (n, 3) to points (n, 3) [m], uniform by area, and their unit inward normals (n, 3)."""
         total = np.cumsum(self.areas)
         triangle = self.triangles[np.searchsorted(total, uniform[:, 0] * total[-1], side="right")]
         root = np.sqrt(uniform[:, 1])
         share = np.stack([1.0 - root, root * (1.0 - uniform[:, 2]), root * uniform[:, 2]], axis=1)
-        point, normal = (np.einsum("nc,nci->ni", share, field[triangle]) for field in (self.points, self.inward))
+        point, normal = (np.einsum("nc,nci->ni", share, field[triangle]) for field in (self.points, self.normals))
         return point, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def find_normals(self, points: np.ndarray) -> np.ndarray:
         """Return unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""
-        return take_rows_of(compute_squared_distances(points, self.points).argmin(axis=1), self.inward)
+        return take_rows(compute_squared_distances(points, self.points).argmin(axis=1), self.normals)
 
-    def compute_covered(self, centres: np.ndarray, radius: float) -> float:
+    def compute_coverage(self, centres: np.ndarray, radius: float) -> float:
         """Compute the area share within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
         share = build_barycentric_lattice(4)
         samples = np.einsum("qc,scx->sqx", share, self.points[self.triangles])

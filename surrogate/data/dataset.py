@@ -26,7 +26,7 @@ from sim.runtime.partial_files import to_unfinished_path
 from sim.tools import BuiltIn, read_tool_statement
 
 from .cortex_patch import open_patch
-from .solution_rows import compute_row_checksums, format_row_numbers, get_row_type
+from .solution_rows import compute_row_checksums, format_row_numbers, get_row_dtype
 
 CAUSES: dict[str, type[Cause]] = {  # Types of loads that a data set may contain, by name.
     kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture, Touching)
@@ -218,21 +218,21 @@ def read_dataset(path: str | Path) -> Dataset:
                 f"{path}: is HDF5, but not a data set that this version knows, {FORMAT!r}: make one with "
                 "`sulcus simulate`."
             )
-        anatomy, loads = read_embedded(file), read_loads(file)
+        anatomy, loads = read_embedded_anatomy(file), read_loads(file)
         nodes = open_patch(anatomy).nodes if loads.get(Touching) is None else np.zeros(0, int)
-        if not np.array_equal(read_stored(file, "unit/node", "iu", (3 * len(nodes),))[:], np.repeat(nodes, 3)):
+        if not np.array_equal(read_array(file, "unit/node", "iu", (3 * len(nodes),))[:], np.repeat(nodes, 3)):
             raise InputError(f"{path}: `unit/node` are not the open cortex's nodes: it is damaged. Simulate again.")
         for group, rows in (("answers", len(loads)), ("unit", 3 * len(nodes))):
-            read_stored(file, f"{group}/displacement", "f", (rows, len(anatomy.mesh.nodes), 3))
-            if stated["format"] == OLD_FORMAT and not read_stored(file, f"{group}/done", "b", (rows,))[:].all():
+            read_array(file, f"{group}/displacement", "f", (rows, len(anatomy.mesh.nodes), 3))
+            if stated["format"] == OLD_FORMAT and not read_array(file, f"{group}/done", "b", (rows,))[:].all():
                 raise InputError(f"{path}: rows of `{group}` are not done, so it was never finished. Simulate again.")
         return Dataset(
             path,
             anatomy,
             loads,
             read_outcomes(file, "answers"),
-            read_stored(file, "answers/iterations", "iu", (len(loads),))[:],
-            read_stored(file, "answers/residual", "f", (len(loads),))[:],
+            read_array(file, "answers/iterations", "iu", (len(loads),))[:],
+            read_array(file, "answers/residual", "f", (len(loads),))[:],
             np.array([outcome.good for outcome in read_outcomes(file, "unit")], bool),
             stated,
         )
@@ -252,34 +252,34 @@ def read_provenance(file: h5py.File) -> dict[str, str]:
     return stated
 
 
-def write_provenance(file: h5py.File, stated: Mapping[str, str]) -> None:
+def write_provenance(file: h5py.File, provenance: Mapping[str, str]) -> None:
     """Store the provenance in a file."""
-    file.attrs.update({**stated, SEAL_ATTRIBUTE: compute_texts_digest(stated)})
+    file.attrs.update({**provenance, SEAL_ATTRIBUTE: compute_texts_digest(provenance)})
 
 
-def compute_texts_digest(stated: Mapping[str, str]) -> str:
+def compute_texts_digest(texts: Mapping[str, str]) -> str:
     """Compute the hash of texts and their names."""
-    return compute_digest(np.frombuffer(repr(sorted(stated.items())).encode(), np.uint8))
+    return compute_digest(np.frombuffer(repr(sorted(texts.items())).encode(), np.uint8))
 
 
-def read_rows(file: h5py.File, group: str, vertices: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
+def read_rows(file: h5py.File, group: str, vertex_count: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
     """Read rows `first` to `last` (`get_row_type`) of `answers` or `unit`, and the mask (B,) of valid checksums."""
     here = slice(first, last)
-    displacement = read_stored(file, f"{group}/displacement", "f", (None, vertices, 3))
+    displacement = read_array(file, f"{group}/displacement", "f", (None, vertex_count, 3))
     known = f"{group}/reaction" in file
-    tools = read_stored(file, f"{group}/reaction", "f", (len(displacement), None, 6)).shape[1] if known else 0
-    rows = np.empty(len(range(*here.indices(len(displacement)))), get_row_type(vertices, tools))
+    tools = read_array(file, f"{group}/reaction", "f", (len(displacement), None, 6)).shape[1] if known else 0
+    rows = np.empty(len(range(*here.indices(len(displacement)))), get_row_dtype(vertex_count, tools))
     rows["displacement"] = displacement[here]
     for name, kinds in (("outcome", "S"), ("iterations", "iu"), ("residual", "f")):
-        rows[name] = read_stored(file, f"{group}/{name}", kinds, (len(displacement),))[here]
+        rows[name] = read_array(file, f"{group}/{name}", kinds, (len(displacement),))[here]
     if tools:
-        rows["reaction"] = read_stored(file, f"{group}/reaction", "f")[here]
+        rows["reaction"] = read_array(file, f"{group}/reaction", "f")[here]
     if file.attrs["format"] == OLD_FORMAT:
         return rows, np.ones(len(rows), bool)
-    return rows, compute_row_checksums(rows) == read_stored(file, f"{group}/checksum", "u", (len(displacement),))[here]
+    return rows, compute_row_checksums(rows) == read_array(file, f"{group}/checksum", "u", (len(displacement),))[here]
 
 
-def write_embedded(file: h5py.File, anatomy: Anatomy) -> None:
+def write_embedded_anatomy(file: h5py.File, anatomy: Anatomy) -> None:
     """Store the anatomy, so that training needs no other file."""
     group = file.create_group("anatomy")  # groups that HDF5 creates implicitly have a date
     for name, array in zip(MESH, anatomy.mesh.arrays, strict=False):
@@ -289,7 +289,7 @@ def write_embedded(file: h5py.File, anatomy: Anatomy) -> None:
     group.attrs["digest"] = anatomy.digest
 
 
-def read_embedded(file: h5py.File) -> Anatomy:
+def read_embedded_anatomy(file: h5py.File) -> Anatomy:
     """Read the anatomy that a data set embeds.
 
     Raises
@@ -297,8 +297,8 @@ def read_embedded(file: h5py.File) -> Anatomy:
     InputError
         Arrays that do not match the stored digest.
     """
-    array = {name: read_stored(file, f"anatomy/{name}", "fiu")[:] for name in MESH if f"anatomy/{name}" in file}
-    anatomy = Anatomy(TetMesh(**array), *(read_stored(file, f"anatomy/{name}", "fb")[:] for name in CONDITIONS))
+    array = {name: read_array(file, f"anatomy/{name}", "fiu")[:] for name in MESH if f"anatomy/{name}" in file}
+    anatomy = Anatomy(TetMesh(**array), *(read_array(file, f"anatomy/{name}", "fb")[:] for name in CONDITIONS))
     if anatomy.digest != file["anatomy"].attrs["digest"]:
         raise InputError(f"{file.filename}: the anatomy inside was changed after it was written: simulate again.")
     return anatomy
@@ -333,11 +333,11 @@ def read_loads(file: h5py.File) -> Loads:
         Loads that do not match the stored digest.
     """
     causes = tuple(
-        kind(**{item.name: read_stored(file, f"loads/{name}/{item.name}", "f")[:] for item in fields(kind)})
+        kind(**{item.name: read_array(file, f"loads/{name}/{item.name}", "f")[:] for item in fields(kind)})
         for name, kind in CAUSES.items()
         if f"loads/{name}" in file
     )
-    loads = Loads(causes, read_stored(file, "loads/time", "f")[:])
+    loads = Loads(causes, read_array(file, "loads/time", "f")[:])
     if file.attrs.get("format") != OLD_FORMAT and file["loads"].attrs["digest"] != compute_loads_digest(loads):
         raise InputError(f"{file.filename}: the loads inside were changed after they were written: simulate again.")
     return loads
@@ -353,15 +353,16 @@ def compute_loads_digest(loads: Loads) -> str:
 
 def read_outcomes(file: h5py.File, group: str) -> tuple[Outcome, ...]:
     """Read the solver outcomes of `answers` or `unit`."""
-    return tuple(Outcome[name.decode()] for name in read_stored(file, f"{group}/outcome", "S")[:])
+    return tuple(Outcome[name.decode()] for name in read_array(file, f"{group}/outcome", "S")[:])
 
 
-def read_stored(
-    file: h5py.File, name: str, kinds: str, shape: tuple[int | None, ...] | None = None, largest: int = MAX_ARRAY_BYTES
-) -> h5py.Dataset:
-    """Return an array in the file, of one of the NumPy `kinds`, and of a shape if given (None: any length).
+def read_array(
+    file: h5py.File, name: str, dtype_kinds: str, shape: tuple[int | None, ...] | None = None,
+    max_bytes: int = MAX_ARRAY_BYTES,
+) -> h5py.Dataset:  # fmt: skip
+    """Return an array in the file, of one of the NumPy `dtype_kinds`, and of a shape if given (None: any length).
 
-    Without a shape, its length is given by the file alone: then it has at most `largest` bytes.
+    Without a shape, its length is given by the file alone: then it has at most `max_bytes` bytes.
 
     Raises
     ------
@@ -376,7 +377,7 @@ def read_stored(
         or found.external
     ):
         raise InputError(f"{file.filename}: has no array `{name}`. {REMEDY}")
-    if found.dtype.kind not in kinds:
+    if found.dtype.kind not in dtype_kinds:
         raise InputError(f"{file.filename}: `{name}` holds {found.dtype}, which it cannot: it is damaged. {REMEDY}")
     expected = found.shape if shape is None else shape
     if len(expected) != len(found.shape) or any(
@@ -386,6 +387,6 @@ def read_stored(
         measured = " x ".join(map(str, found.shape))
         raise InputError(f"{file.filename}: `{name}` measures {measured}, not {want}: it is damaged. {REMEDY}")
     most = MAX_INFLATION * max(Path(file.filename).stat().st_size, 4096)  # a file that is being written has no size yet
-    if found.nbytes > most or (shape is None and found.nbytes > largest):
+    if found.nbytes > most or (shape is None and found.nbytes > max_bytes):
         raise InputError(f"{file.filename}: `{name}` declares more than such a file holds: it is damaged. {REMEDY}")
     return found

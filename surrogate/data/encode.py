@@ -14,35 +14,35 @@ from .indentation import Indented, get_relaxation
 Encoder = Callable[[Patch, Pushed], np.ndarray]
 
 
-def split_forces(pushed: Pushed) -> tuple[np.ndarray, np.ndarray]:
+def split_forces(pushes: Pushed) -> tuple[np.ndarray, np.ndarray]:
     """Return force magnitudes (B,) [N] and unit directions (B, 3); the direction of zero force is zero."""
-    magnitude = np.sqrt(np.einsum("bi,bi->b", pushed.force, pushed.force))
+    magnitude = np.sqrt(np.einsum("bi,bi->b", pushes.force, pushes.force))
     # The root of the smallest number: squares of smaller forces underflow.
-    return magnitude, pushed.force / np.maximum(magnitude, np.sqrt(np.finfo(float).tiny))[:, None]
+    return magnitude, pushes.force / np.maximum(magnitude, np.sqrt(np.finfo(float).tiny))[:, None]
 
 
-def compute_nodal_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
+def compute_unit_nodal_forces(patch: Patch, pushes: Pushed) -> np.ndarray:
     """Compute forces (B, 3 m) at the patch's nodes, for one newton, by the FEM's own integral over the footprint."""
-    weights = patch.skin.find_footprints(pushed.point, pushed.footprint).to_matrix(len(patch.points))
-    return distribute_forces(weights.toarray(), pushed)
+    weights = patch.contact_surface.find_footprints(pushes.point, pushes.footprint).to_matrix(len(patch.points))
+    return distribute_forces(weights.toarray(), pushes)
 
 
-def compute_rooted_shares(patch: Patch, pushed: Pushed) -> np.ndarray:
-    """Scale `compute_nodal_shares` by the root of the force: products of two are products of forces per newton."""
-    return scale_by_root_force(compute_nodal_shares(patch, pushed), pushed)
+def compute_root_scaled_forces(patch: Patch, pushes: Pushed) -> np.ndarray:
+    """Scale `compute_unit_nodal_forces` by the root of the force: products of two are products of forces per newton."""
+    return scale_by_root_force(compute_unit_nodal_forces(patch, pushes), pushes)
 
 
-def scale_by_root_force(shares: np.ndarray, pushed: Pushed) -> np.ndarray:
+def scale_by_root_force(nodal_forces: np.ndarray, pushes: Pushed) -> np.ndarray:
     """Multiply shares (B, 3 m) for one newton by the root of each load's force."""
-    return np.sqrt(split_forces(pushed)[0])[:, None] * shares
+    return np.sqrt(split_forces(pushes)[0])[:, None] * nodal_forces
 
 
-def distribute_forces(weights: np.ndarray, pushed: Pushed) -> np.ndarray:
+def distribute_forces(weights: np.ndarray, pushes: Pushed) -> np.ndarray:
     """Compute forces (B, 3 m) at m nodes, for one newton, distributed by weights (B, m)."""
-    return np.einsum("bm,bi->bmi", weights, split_forces(pushed)[1]).reshape(-1, 3 * weights.shape[1])
+    return np.einsum("bm,bi->bmi", weights, split_forces(pushes)[1]).reshape(-1, 3 * weights.shape[1])
 
 
-def compute_tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
+def compute_tool_features(patch: Patch, pushes: Pushed) -> np.ndarray:
     """Compute point [m], unit direction, force [N] and footprint radius [m]: (B, 8).
 
     A rod or a blade adds its shaft, and the products x_i x_j of its other axis, which do not depend on the axis's sign:
@@ -51,15 +51,15 @@ def compute_tool_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     The published 13 features describe the load relative to one node (its distance, its angles). A model of all nodes at
     once needs the load alone, because the basis holds the positions of the nodes.
     """
-    magnitude, direction = split_forces(pushed)
-    found = [pushed.point, direction, magnitude, pushed.footprint]
-    if isinstance(pushed, Indented):
-        x, first, second = pushed.axes[:, :, 0], *np.triu_indices(3)
-        found += [pushed.axes[:, :, 2], x[:, first] * x[:, second]]
-    return np.column_stack([*found, *_list_relaxation(pushed)])
+    magnitude, direction = split_forces(pushes)
+    found = [pushes.point, direction, magnitude, pushes.footprint]
+    if isinstance(pushes, Indented):
+        x, first, second = pushes.axes[:, :, 0], *np.triu_indices(3)
+        found += [pushes.axes[:, :, 2], x[:, first] * x[:, second]]
+    return np.column_stack([*found, *_list_relaxation(pushes)])
 
 
-def compute_core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
+def compute_core_features(patch: Patch, pushes: Pushed) -> np.ndarray:
     """Compute a rod's or blade's pose (B, 17): `compute_tool_features` of a ball, centre of its core [m], axes x and z.
 
     For relaxing tissue, the last feature is that of `compute_tool_features`.
@@ -69,13 +69,13 @@ def compute_core_features(patch: Patch, pushed: Pushed) -> np.ndarray:
     TypeError
         Loads that are not `Indented`.
     """
-    if not isinstance(pushed, Indented):
+    if not isinstance(pushes, Indented):
         raise TypeError("only rods and blades have a core that stands: give `Indented`.")
-    magnitude, direction = split_forces(pushed)
-    middle = pushed.point + pushed.force + pushed.offset
-    axes = pushed.axes[:, :, 0], pushed.axes[:, :, 2]
-    found = [pushed.point, direction, magnitude, pushed.footprint, middle, *axes]
-    return np.column_stack([*found, *_list_relaxation(pushed)])
+    magnitude, direction = split_forces(pushes)
+    middle = pushes.point + pushes.force + pushes.offset
+    axes = pushes.axes[:, :, 0], pushes.axes[:, :, 2]
+    found = [pushes.point, direction, magnitude, pushes.footprint, middle, *axes]
+    return np.column_stack([*found, *_list_relaxation(pushes)])
 
 
 def _list_relaxation(pushed: Pushed) -> list[np.ndarray]:
@@ -85,8 +85,8 @@ def _list_relaxation(pushed: Pushed) -> list[np.ndarray]:
 
 
 ENCODERS: dict[str, Encoder] = {  # Functions from loads to features, by name.
-    "nodal": compute_nodal_shares,
-    "rooted": compute_rooted_shares,
+    "nodal": compute_unit_nodal_forces,
+    "rooted": compute_root_scaled_forces,
     "tool": compute_tool_features,
     "core": compute_core_features,
 }
@@ -116,8 +116,8 @@ class Basis:
         return (coefficients @ self.modes).reshape(len(coefficients), len(self.nodes), 3)
 
 
-def reduce(nodes: np.ndarray, response: np.ndarray, tolerance: float, most: int) -> Basis:
-    """Compute the fewest modes, up to `most`, with a relative error <= `tolerance` of responses (B, n, 3).
+def fit_basis(nodes: np.ndarray, response: np.ndarray, tolerance: float, max_modes: int) -> Basis:
+    """Compute the fewest modes, up to `max_modes`, with a relative error <= `tolerance` of responses (B, n, 3).
 
     Errors are Frobenius norms. The mean is not subtracted: zero force must give zero motion. If as many modes as
     components are needed, the modes are the components.
@@ -125,6 +125,6 @@ def reduce(nodes: np.ndarray, response: np.ndarray, tolerance: float, most: int)
     matrix = response.reshape(len(response), -1).astype(np.float64)
     _, size, modes = np.linalg.svd(matrix, full_matrices=False)
     left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(size**2) / np.sum(size**2)))
-    rank = min(most, int(np.searchsorted(-left, -tolerance)) + 1, len(size))
+    rank = min(max_modes, int(np.searchsorted(-left, -tolerance)) + 1, len(size))
     complete = rank == matrix.shape[1]
     return Basis(nodes, np.eye(rank, dtype=np.float32) if complete else round_to_half(modes[:rank]))

@@ -13,7 +13,7 @@ from sim.loads import Loads, Pushed, Retracted, Touching
 from sim.tools import Ball, BuiltIn, Capsule, Core, compute_extent, get_core, name_tool
 
 from .cortex_patch import Patch
-from .tool_loads import build_axes_about
+from .tool_loads import build_rotations_about
 
 SURFACE_TOLERANCE = 1e-6  # Distance of a point from the surface below which the surface's normal is used [m].
 SAMPLE_SPACING = 1.0  # Spacing of a core's sample points [radii].
@@ -46,15 +46,15 @@ class RelaxingIndented(Indented):
     relaxed: np.ndarray
 
 
-def add_relaxation(pushed: Pushed, relaxed: np.ndarray) -> Pushed:
+def add_relaxation(pushes: Pushed, relaxed_share: np.ndarray) -> Pushed:
     """Return the same indentations in tissue relaxed by shares (B,)."""
-    kind = RelaxingIndented if isinstance(pushed, Indented) else Relaxing
-    return kind(**vars(pushed), relaxed=relaxed)
+    kind = RelaxingIndented if isinstance(pushes, Indented) else Relaxing
+    return kind(**vars(pushes), relaxed=relaxed_share)
 
 
-def get_relaxation(pushed: Pushed) -> np.ndarray | None:
+def get_relaxation(pushes: Pushed) -> np.ndarray | None:
     """Return the relaxed share of tissue (B,); None if it does not relax."""
-    return pushed.relaxed if isinstance(pushed, Relaxing | RelaxingIndented) else None
+    return pushes.relaxed if isinstance(pushes, Relaxing | RelaxingIndented) else None
 
 
 def get_poses(loads: Loads, tool: BuiltIn) -> np.ndarray:
@@ -104,7 +104,7 @@ def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     force = np.maximum(deepest, 0.0)[:, None] * direction
     axes = pose[:, :3, :3]
     if isinstance(tool, Capsule):  # a rod is round: its turn about the shaft does not matter
-        axes = build_axes_about(axes[:, :, 2])
+        axes = build_rotations_about(axes[:, :, 2])
     middle = pose[:, :3, 3] + pose[:, :3, :3] @ core.centre
     wide = np.full(len(pose), core.radius if isinstance(tool, Capsule) else compute_extent(tool))
     return Indented(point, force, wide, axes, middle - point - force)
@@ -112,7 +112,7 @@ def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
 
 def _compute_signed_distances(patch: Patch, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the nearest places (n, 3) on the undeformed cortex to points (n, 3), and their signed distances (n,) [m]."""
-    near = patch.skin.find_nearest(points, np.full(len(points), np.inf))[0]
+    near = patch.contact_surface.find_nearest(points, np.full(len(points), np.inf))[0]
     away = near - points
     return near, np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, patch.find_normals(near)))
 

@@ -55,7 +55,7 @@ def solve_histories(deformer: Deformer, loads: Loads) -> Deformation:
     return replace(join_deformations([first, last]).select(row), time=loads.times)
 
 
-def compute_unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
+def compute_decayed_coefficients(series: Pairs, times: np.ndarray) -> np.ndarray:
     """Compute the remainder (B, n) of each coefficient g of a Prony series after histories of B durations [s].
 
     As in the FEM, a load that arrives within a time step acts for half of the step.
@@ -65,10 +65,10 @@ def compute_unfaded(series: Pairs, times: np.ndarray) -> np.ndarray:
     return g * np.exp(-(times - 0.5 * coming)[:, None] / tau)
 
 
-def read_series(stated: Mapping[str, str]) -> Pairs:
+def read_prony_series(provenance: Mapping[str, str]) -> Pairs:
     """Read the Prony series of a data set of histories from its provenance; () for other data."""
-    if "history" not in stated or "tissue" not in stated:
+    if "history" not in provenance or "tissue" not in provenance:
         return ()
-    if stated["history"] != HISTORY:
-        raise InputError(f"unsupported histories ({stated['history']}): simulate again.")
-    return read_tissue_json(stated["tissue"]).prony
+    if provenance["history"] != HISTORY:
+        raise InputError(f"unsupported histories ({provenance['history']}): simulate again.")
+    return read_tissue_json(provenance["tissue"]).prony

@@ -23,22 +23,22 @@ from sim.runtime.processes import LostProcessError
 from sim.runtime.timing import listen_to_stages, time_stage
 from sim.runtime.versions import get_version
 
-from .array_meanings import FILE_DESCRIPTION, explain
+from .array_meanings import FILE_DESCRIPTION, describe_arrays
 from .cortex_patch import open_patch
 from .dataset import (
     FORMAT,
     OLD_FORMAT,
     compute_loads_digest,
-    read_embedded,
+    read_array,
+    read_embedded_anatomy,
     read_loads,
     read_provenance,
     read_rows,
-    read_stored,
-    write_embedded,
+    write_embedded_anatomy,
     write_loads,
     write_provenance,
 )
-from .solution_rows import CHECKSUM_TYPE, compute_row_checksums, get_row_type
+from .solution_rows import CHECKSUM_TYPE, compute_row_checksums, get_row_dtype
 from .tasks import LoadBatch, SolverPool, count_posed_tools, solve_batches
 
 STAGES = {"unit": "unit responses", "answers": "loads"}  # Names of the file's groups in reports of their seconds.
@@ -55,19 +55,19 @@ T = TypeVar("T")  # Type of the solved rows.
 class SimulatedRows:
     """Rows of unit responses and of loads that one call solved, and the seconds of each, with writing."""
 
-    units: int = 0
-    loads: int = 0
+    unit_count: int = 0
+    load_count: int = 0
     unit_seconds: float = 0.0
     load_seconds: float = 0.0
 
     @property
-    def rows(self) -> int:
+    def total(self) -> int:
         """Total number of rows."""
-        return self.units + self.loads
+        return self.unit_count + self.load_count
 
 
 @dataclass(frozen=True, eq=False)
-class SimulationWork:
+class SimulationPlan:
     """Requested unit responses and loads, in batches.
 
     Parameters
@@ -78,33 +78,33 @@ class SimulationWork:
         See `simulate`.
     nodes
         Vertices (m,) with a unit force; none if the loads are poses.
-    batch
+    batch_size
         Number of rows that are solved together.
     """
 
     anatomy: Anatomy
     loads: Loads
     nodes: np.ndarray
-    batch: int
+    batch_size: int
 
     def get_row_type(self, group: str) -> np.dtype:
         """Return the row type of a group."""
-        return get_row_type(len(self.anatomy.mesh.nodes), count_posed_tools(self.loads) if group == "answers" else 0)
+        return get_row_dtype(len(self.anatomy.mesh.nodes), count_posed_tools(self.loads) if group == "answers" else 0)
 
     @property
-    def counts(self) -> dict[str, int]:
+    def row_counts(self) -> dict[str, int]:
         """Number of rows of each group."""
         return {"unit": 3 * len(self.nodes), "answers": len(self.loads)}
 
     @property
     def batches(self) -> list[Batch]:
         """Group and first row of every batch."""
-        return [(name, first) for name, rows in self.counts.items() for first in range(0, rows, self.batch)]
+        return [(name, first) for name, rows in self.row_counts.items() for first in range(0, rows, self.batch_size)]
 
     def list_rows(self, batch: Batch) -> np.ndarray:
         """Return the numbers of a batch's rows."""
         name, first = batch
-        return np.arange(first, min(first + self.batch, self.counts[name]))
+        return np.arange(first, min(first + self.batch_size, self.row_counts[name]))
 
     def build_task(self, batch: Batch) -> LoadBatch:
         """Build the task that solves a batch."""
@@ -113,13 +113,9 @@ class SimulationWork:
 
 
 def simulate(
-    path: str | Path,
-    deformer: Deformer | SolverPool,
-    loads: Loads,
-    provenance: Mapping[str, str],
-    batch: int = 64,
+    path: str | Path, deformer: Deformer | SolverPool, loads: Loads, provenance: Mapping[str, str], batch: int = 64,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> SimulatedRows:
+) -> SimulatedRows:  # fmt: skip
     """Solve every load, and the unit forces on the open cortex unless the loads are poses, into an HDF5 file.
 
     Batches are written to `PATH.partial` (`journal`), where a kill at any moment loses at most one. The same call
@@ -157,15 +153,15 @@ def simulate(
     stated |= {"reactions": "kept"} if posed else {}
     partial = to_unfinished_path(path)
     finished: set[Batch] = set()
-    work = SimulationWork(deformer.anatomy, loads, nodes, batch)
+    work = SimulationPlan(deformer.anatomy, loads, nodes, batch)
     if path.exists():
         before = _read_earlier_loads(path, stated, loads)
         if len(before) > len(loads):
-            work = SimulationWork(deformer.anatomy, before, nodes, batch)
+            work = SimulationPlan(deformer.anatomy, before, nodes, batch)
         finished = _find_whole_batches(path, work)
         if not partial.exists() and not set(work.batches) - finished and _has_same_body(path, work):
             return SimulatedRows()
-    size = sum(work.get_row_type(group).itemsize * rows for group, rows in work.counts.items())
+    size = sum(work.get_row_type(group).itemsize * rows for group, rows in work.row_counts.items())
     held = partial.stat().st_size if partial.exists() else 0
     check_disk_space(path, max(size - held, 0) + size, size)
     run = {**stated, "number of loads": str(len(work.loads)), "hash of the loads": compute_loads_digest(work.loads)}
@@ -181,19 +177,16 @@ def simulate(
 
 
 def _fill(
-    journal: Journal,
-    work: SimulationWork,
-    deformer: Deformer | SolverPool,
-    finished: set[Batch],
+    journal: Journal, work: SimulationPlan, deformer: Deformer | SolverPool, finished: set[Batch],
     progress: Callable[[int, int], None],
-) -> dict[str, int]:
+) -> dict[str, int]:  # fmt: skip
     """Solve the batches that are in neither file. A second thread writes a batch while the next is solved."""
     known = [batch for batch in work.batches if batch in finished or batch in journal]
-    total, done = sum(work.counts.values()), sum(len(work.list_rows(batch)) for batch in known)
-    solved = dict.fromkeys(work.counts, 0)
+    total, done = sum(work.row_counts.values()), sum(len(work.list_rows(batch)) for batch in known)
+    solved = dict.fromkeys(work.row_counts, 0)
     progress(done, total)
     with ThreadPoolExecutor(1) as writer:
-        for name in work.counts:
+        for name in work.row_counts:
             written: Future[None] | None = None
             with time_stage(STAGES[name]):
                 left = [work.build_task(batch) for batch in work.batches if batch[0] == name and batch not in known]
@@ -227,7 +220,7 @@ def _compute_rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, 
     return rates
 
 
-def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal: Journal) -> None:
+def _write(path: Path, work: SimulationPlan, stated: Mapping[str, str], journal: Journal) -> None:
     """Write the data set: batches of the journal, and those of the finished file that it replaces."""
     with write_stream_atomically(path, path.suffix) as stream, h5py.File(stream, "w", libver=HDF5_VERSIONS) as file:
         facts = {
@@ -241,7 +234,7 @@ def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal:
             "sulcus version": get_version("sulcus"),
         }
         write_provenance(file, {**facts, **stated})
-        write_embedded(file, work.anatomy)
+        write_embedded_anatomy(file, work.anatomy)
         write_loads(file, work.loads)
 
         def kinds(group: str) -> list[tuple[str, np.dtype]]:
@@ -249,12 +242,12 @@ def _write(path: Path, work: SimulationWork, stated: Mapping[str, str], journal:
 
         arrays = {
             (name, item): group.create_dataset(item, (rows, *kind.shape), kind.base)
-            for name, rows in work.counts.items()
+            for name, rows in work.row_counts.items()
             for group in [file.create_group(name)]
             for item, kind in [*kinds(name), ("checksum", CHECKSUM_TYPE)]
         }
         file["unit/node"] = np.repeat(work.nodes, 3)
-        explain(file)
+        describe_arrays(file)
 
         def taken(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
             kind = work.get_row_type(batch[0])
@@ -279,7 +272,7 @@ def _compute_ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iter
             yield batch, ready
 
 
-def _read_kept_rows(path: Path, work: SimulationWork, batch: Batch) -> np.ndarray:
+def _read_kept_rows(path: Path, work: SimulationPlan, batch: Batch) -> np.ndarray:
     """Read a batch's rows from a finished file, checked again for damage."""
     with h5py.File(path, "r") as before:
         rows, good = _read_batch(before, work, batch)
@@ -295,7 +288,7 @@ def _describe_tool(loads: Loads, stated: Mapping[str, str]) -> str:
     return f"the rigid tool {stated.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
 
 
-def _read_batch(file: h5py.File, work: SimulationWork, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+def _read_batch(file: h5py.File, work: SimulationPlan, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
     """Read a batch's rows from a finished file, and the mask of undamaged rows."""
     rows = work.list_rows(batch)
     return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
@@ -315,26 +308,28 @@ def _read_earlier_loads(path: Path, stated: Mapping[str, str], loads: Loads) -> 
     return before
 
 
-def _has_same_body(path: Path, work: SimulationWork) -> bool:
+def _has_same_body(path: Path, work: SimulationPlan) -> bool:
     """Return True if the body in a finished file is undamaged."""
     with h5py.File(path, "r") as file:
         try:
-            return read_embedded(file).digest == work.anatomy.digest
+            return read_embedded_anatomy(file).digest == work.anatomy.digest
         except InputError:
             return False
 
 
-def _find_whole_batches(path: Path, work: SimulationWork) -> set[Batch]:
+def _find_whole_batches(path: Path, work: SimulationPlan) -> set[Batch]:
     """Return the batches that a finished file holds undamaged.
 
     A last short batch is excluded, unless it is the last again: it would have been solved in another batch.
     """
     held, damaged = set(), []
     with wrap_errors(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
-        rows = {name: len(read_stored(file, f"{name}/checksum", "u")) for name in work.counts}
+        rows = {name: len(read_array(file, f"{name}/checksum", "u")) for name in work.row_counts}
         for batch in work.batches:
             numbers = work.list_rows(batch)
-            if numbers[-1] < rows[batch[0]] and (rows[batch[0]] == work.counts[batch[0]] or len(numbers) == work.batch):
+            if numbers[-1] < rows[batch[0]] and (
+                rows[batch[0]] == work.row_counts[batch[0]] or len(numbers) == work.batch_size
+            ):
                 good = _read_batch(file, work, batch)[1]
                 damaged += [f"row {row} of `{batch[0]}`" for row in numbers[~good]]
                 held |= {batch} if good.all() else set()

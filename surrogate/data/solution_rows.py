@@ -26,7 +26,7 @@ def describe_tissue_source(tissue: Elasticity) -> dict[str, str]:
     return stated | {_to_key(label): to_tissue_json(tissue.regions[label]) for label in sorted(tissue.regions)}
 
 
-def read_tissue_statement(stated: Mapping[str, str]) -> Elasticity:
+def read_tissue_text(provenance: Mapping[str, str]) -> Elasticity:
     """Read the tissue from a provenance, which must contain the brain's.
 
     Raises
@@ -34,50 +34,52 @@ def read_tissue_statement(stated: Mapping[str, str]) -> Elasticity:
     InputError
         A text that is not a tissue.
     """
-    numbers = (key.removeprefix(REGION_KEY) for key in stated if key.startswith(REGION_KEY))
+    numbers = (key.removeprefix(REGION_KEY) for key in provenance if key.startswith(REGION_KEY))
     labels = {TUMOUR_LABEL, *(int(number) for number in numbers if number.lstrip("-").isdecimal())}
-    regions = {label: read_tissue_json(stated[_to_key(label)]) for label in sorted(labels) if _to_key(label) in stated}
-    return Elasticity(read_tissue_json(stated[TISSUE_KEY]), regions)
+    regions = {
+        label: read_tissue_json(provenance[_to_key(label)]) for label in sorted(labels) if _to_key(label) in provenance
+    }
+    return Elasticity(read_tissue_json(provenance[TISSUE_KEY]), regions)
 
 
-def find_first_tissue(statements: Iterable[Mapping[str, str]]) -> Elasticity | None:
-    """Return `read_tissue_statement` of the first provenance that contains the brain's; None without one."""
-    stated = next((one for one in statements if TISSUE_KEY in one), None)
-    return None if stated is None else read_tissue_statement(stated)
+def find_first_tissue(provenances: Iterable[Mapping[str, str]]) -> Elasticity | None:
+    """Return `read_tissue_text` of the first provenance that contains the brain's; None without one."""
+    stated = next((one for one in provenances if TISSUE_KEY in one), None)
+    return None if stated is None else read_tissue_text(stated)
 
 
 def _to_key(label: int) -> str:
     return TUMOUR_KEY if label == TUMOUR_LABEL else f"{REGION_KEY}{label}"
 
 
-def get_row_type(vertices: int, tools: int = 0) -> np.dtype:
+def get_row_dtype(vertex_count: int, tool_count: int = 0) -> np.dtype:
     """Return the type of one row: displacement (vertices, 3), outcome, and reaction (tools, 6) of posed tools."""
     # In the file's own number widths, 64 kB a load on a brain of 5,300 nodes: conversion by HDF5 takes three times as
     # long. It is not compressed: deflate, with its bytes in the best order, saves a sixth and takes longer than the
     # solve on a GPU.
     return np.dtype(
         [
-            ("displacement", "<f4", (vertices, 3)),
+            ("displacement", "<f4", (vertex_count, 3)),
             ("outcome", NAME_TYPE),
             ("iterations", "<i4"),
             ("residual", "<f8"),
-            *([("reaction", "<f8", (tools, 6))] if tools else []),
+            *([("reaction", "<f8", (tool_count, 6))] if tool_count else []),
         ]
     )
 
 
-def to_rows(result: Deformation, unit: float, tools: int = 0) -> np.ndarray:
+def to_rows(result: Deformation, unit: float, tool_count: int = 0) -> np.ndarray:
     """Convert results at every vertex to rows (B,), with displacements in units of `unit` [m].
 
-    The reactions of `tools` moved by pose are NaN if the result does not have them.
+    The reactions of `tool_count` moved by pose are NaN if the result does not have them.
     """
-    rows = np.empty(len(result), get_row_type(result.displacement.shape[1], tools))
+    rows = np.empty(len(result), get_row_dtype(result.displacement.shape[1], tool_count))
     rows["displacement"] = result.displacement / unit if unit != 1.0 else result.displacement
     rows["outcome"] = [outcome.name for outcome in result.outcome]
     rows["iterations"] = result.iterations
     rows["residual"] = result.residual
-    if tools:
-        rows["reaction"] = result.reaction if result.reaction.shape[1] == tools else np.nan
+    if tool_count:
+        rows["reaction"] = result.reaction if result.reaction.shape[1] == tool_count else np.nan
     return rows
 
 

@@ -29,9 +29,9 @@ class LazyFem:
     ----------
     anatomy, effects, accuracy, element, batch, device
         See `Fem`.
-    loads
+    load_count
         Number of loads that will be solved.
-    share
+    process_count
         Number of processes that share the device.
     """
 
@@ -40,9 +40,9 @@ class LazyFem:
     accuracy: Accuracy
     element: str | None
     batch: int | None
-    loads: int
+    load_count: int
     device: str = "auto"
-    share: int = 1
+    process_count: int = 1
 
     @cached_property
     def fem(self) -> Fem:
@@ -50,10 +50,10 @@ class LazyFem:
         return Fem(self.anatomy, self.effects, self.accuracy, self.device, self.batch, self.element)
 
     @property
-    def needed(self) -> MemoryEstimate | None:
+    def required_memory(self) -> MemoryEstimate | None:
         """Required GPU memory; None on the CPU."""
         return estimate_fem_memory(
-            self.anatomy, self.element, self.accuracy, self.device, self.batch, self.loads, self.share
+            self.anatomy, self.element, self.accuracy, self.device, self.batch, self.load_count, self.process_count
         )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
@@ -71,14 +71,14 @@ class Solver:
     deformer: Deformer | SolverPool
     element: str
     description: str
-    batch: int
+    batch_size: int
 
 
 @contextmanager
-def open_solvers(asked: LazyFem, devices: Sequence[str], said: Callable[[str], object]) -> Iterator[Solver]:
+def open_solvers(fem: LazyFem, devices: Sequence[str], report: Callable[[str], object]) -> Iterator[Solver]:
     """Open FEM solvers on each of the devices; with one device the solver is in this process.
 
-    Without `batch`, the largest size that fits is used. Several GPUs then get equal numbers of batches. `said` first
+    Without `batch`, the largest size that fits is used. Several GPUs then get equal numbers of batches. `report` first
     receives the required memory of each GPU.
 
     Raises
@@ -89,45 +89,45 @@ def open_solvers(asked: LazyFem, devices: Sequence[str], said: Callable[[str], o
         A process that was killed.
     """
     if len(devices) == 1:
-        own = replace(asked, device=devices[0])
-        _check_all_fit([own.needed], said)
+        own = replace(fem, device=devices[0])
+        _check_all_fit([own.required_memory], report)
         yield Solver(own, *describe_fem_task(own, None))
         return
-    most, own = max(devices.count(name) for name in devices), -(-asked.loads // len(devices))
-    with process_pool(devices, place_on_device, replace(asked, share=most, loads=own)) as children:
+    most, own = max(devices.count(name) for name in devices), -(-fem.load_count // len(devices))
+    with process_pool(devices, place_on_device, replace(fem, process_count=most, load_count=own)) as children:
         none = [None] * len(devices)
-        _check_all_fit(run_on_each(children, estimate_memory, none), said)
+        _check_all_fit(run_on_each(children, estimate_memory, none), report)
         elements, words, batches = zip(*run_on_each(children, describe_fem_task, none), strict=True)
         batch = min(batches)
-        if asked.batch is None and devices[0].startswith("cuda"):
-            batch = choose_even_batch(batch // most, asked.loads, len(devices))
-        yield Solver(SolverPool(asked.anatomy, children), elements[0], words[0], batch)
+        if fem.batch is None and devices[0].startswith("cuda"):
+            batch = choose_even_batch(batch // most, fem.load_count, len(devices))
+        yield Solver(SolverPool(fem.anatomy, children), elements[0], words[0], batch)
 
 
-def place_on_device(device: str, asked: LazyFem) -> LazyFem:
+def place_on_device(device: str, fem: LazyFem) -> LazyFem:
     """Return the FEM of a device."""
-    return replace(asked, device=device)
+    return replace(fem, device=device)
 
 
-def estimate_memory(asked: LazyFem, task: None) -> MemoryEstimate | None:
+def estimate_memory(fem: LazyFem, task: None) -> MemoryEstimate | None:
     """Return the GPU memory that the FEM needs."""
-    return asked.needed
+    return fem.required_memory
 
 
 def describe_fem_task(asked: LazyFem, task: None) -> tuple[str, str, int]:
     """Return the FEM's element, description and batch size, after a check that it fits in memory."""
-    if asked.needed is None:  # on the CPU: before a file is created that keeps its batch
+    if asked.required_memory is None:  # on the CPU: before a file is created that keeps its batch
         fem = asked.fem
         check_fits(
-            fem.problem.rows, fem.batch, min(fem.batch, asked.loads), fem.problem.device, fem.strategy.kept_bytes
+            fem.problem.rows, fem.batch, min(fem.batch, asked.load_count), fem.problem.device, fem.strategy.kept_bytes
         )
     return asked.fem.space.element, asked.fem.description, asked.fem.batch
 
 
-def choose_even_batch(most: int, loads: int, devices: int) -> int:
-    """Compute the batch size, at most `most`, for equal batches, equally many per device; the last may be smaller."""
-    rounds = -(-loads // (max(most, 1) * devices))
-    return max(1, -(-loads // (max(rounds, 1) * devices)))
+def choose_even_batch(max_batch: int, load_count: int, device_count: int) -> int:
+    """Compute the batch size, at most `max_batch`, of equally many batches per device; the last may be smaller."""
+    rounds = -(-load_count // (max(max_batch, 1) * device_count))
+    return max(1, -(-load_count // (max(rounds, 1) * device_count)))
 
 
 def _check_all_fit(needed: Sequence[MemoryEstimate | None], said: Callable[[str], object]) -> None:

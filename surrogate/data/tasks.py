@@ -33,13 +33,13 @@ class SolverPool:
     """Processes that each have a deformer of the same body."""
 
     anatomy: Anatomy
-    children: Sequence[ChildProcess]
+    processes: Sequence[ChildProcess]
 
 
 def solve_batches(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -> Iterator[tuple[LoadBatch, bytes]]:
     """Yield each task with its rows from `solve_batch`: in order in this process, in any order from a pool."""
     if isinstance(deformer, SolverPool):
-        yield from map_unordered(deformer.children, solve_batch, tasks)
+        yield from map_unordered(deformer.processes, solve_batch, tasks)
     else:
         for task in tasks:
             yield task, solve_batch(deformer, task)

@@ -22,52 +22,54 @@ LATTICE_SIZE = 200  # Number of radii and of forces of a tool at which its nomin
 
 
 @dataclass(frozen=True)
-class ToolLoads:
+class ToolLoadRange:
     """Range of a surgical tool's loads.
 
     Parameters
     ----------
     name
         Name for `--preset`.
-    footprint
+    radius_range
         Smallest and largest radius [m], uniform between; a plate counts as the disc of its area.
-    force
-        Smallest and largest force [N], log-uniform between unless `even`: then uniform.
-    pressure
+    force_range
+        Smallest and largest force [N], log-uniform between unless `is_uniform`: then uniform.
+    pressure_range
         Smallest and largest mean contact pressure F / (pi r^2) [Pa]; a sample outside is repeated.
-    depth
+    max_depth
         Largest depth by Hertz's formula [m]; a deeper sample is repeated.
-    cone
+    max_angle
         Largest angle [rad] between the force and the inward normal; uniform by solid angle.
     """
 
     name: str
-    footprint: tuple[float, float]
-    force: tuple[float, float]
-    pressure: tuple[float, float] = (0.0, MAX_PRESSURE)
-    depth: float = MAX_DEPTH
-    cone: float = np.pi / 4.0
-    even: bool = False
+    radius_range: tuple[float, float]
+    force_range: tuple[float, float]
+    pressure_range: tuple[float, float] = (0.0, MAX_PRESSURE)
+    max_depth: float = MAX_DEPTH
+    max_angle: float = np.pi / 4.0
+    is_uniform: bool = False
 
-    def is_surgical(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
+    def is_surgical(self, force: np.ndarray, radius: np.ndarray) -> np.ndarray:
         """Return the mask (n,) of surgical pressures and estimated depths; forces (n,) [N], radii (n,) [m]."""
-        pressure = force / (np.pi * footprint**2)
-        depth = 3.0 * force / (4.0 * PLANE_MODULUS * footprint)
-        return (self.pressure[0] <= pressure) & (pressure <= self.pressure[1]) & (depth <= self.depth)
+        pressure = force / (np.pi * radius**2)
+        depth = 3.0 * force / (4.0 * PLANE_MODULUS * radius)
+        return (self.pressure_range[0] <= pressure) & (pressure <= self.pressure_range[1]) & (depth <= self.max_depth)
 
 
 TOOLS = {  # Ranges of loads of common tools, by name.
     tool.name: tool
     for tool in (
-        ToolLoads("palpation", (5e-3, 7.5e-3), (0.05, 0.4), depth=10e-3),
-        ToolLoads("bipolar", (0.5e-3, 1e-3), (0.01, 0.05)),
-        ToolLoads("dissector", (1.5e-3, 2e-3), (0.02, 0.25)),
+        ToolLoadRange("palpation", (5e-3, 7.5e-3), (0.05, 0.4), max_depth=10e-3),
+        ToolLoadRange("bipolar", (0.5e-3, 1e-3), (0.01, 0.05)),
+        ToolLoadRange("dissector", (1.5e-3, 2e-3), (0.02, 0.25)),
         # 5-30 mmHg under plates of 10-20 x 20-40 mm.
-        ToolLoads("spatula", (8e-3, 16e-3), (0.13, 3.2), pressure=(700.0, 4000.0)),
+        ToolLoadRange("spatula", (8e-3, 16e-3), (0.13, 3.2), pressure_range=(700.0, 4000.0)),
     )
 }
 # Stress test of the solver, not surgery: 1 N on 3 mm would be a flat punch 40 mm deep.
-BRUTAL = ToolLoads("brutal", (3e-3, 10e-3), (0.02, 1.05), pressure=(0.0, np.inf), depth=np.inf, even=True)
+BRUTAL = ToolLoadRange(
+    "brutal", (3e-3, 10e-3), (0.02, 1.05), pressure_range=(0.0, np.inf), max_depth=np.inf, is_uniform=True
+)
 PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)  # Names of all presets.
 OVERLOAD_PRESETS = ("seed", BRUTAL.name)
 """Presets whose loads strain tissue beyond measurements on brain: their equilibria are stored all the same."""
@@ -106,14 +108,14 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
     return Loads((Pushed(rows[:, :3], rows[:, 3:6], rows[:, 6]),))
 
 
-def sample_pushes(tool: ToolLoads, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def sample_pushes(tool: ToolLoadRange, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample positions of a tool, and its unit directions, (count, 3) each: as `draw`, for any force."""
     free = replace(tool, pressure=(0.0, np.inf), depth=np.inf)
     rows = _sample_in_blocks([free], patch, count, seed)
     return rows[:, :3], rows[:, 3:6] / np.linalg.norm(rows[:, 3:6], axis=1, keepdims=True)
 
 
-def _sample_in_blocks(tools: list[ToolLoads], patch: Patch, count: int, seed: int) -> np.ndarray:
+def _sample_in_blocks(tools: list[ToolLoadRange], patch: Patch, count: int, seed: int) -> np.ndarray:
     """Sample point [m], force [N] and footprint [m] of each load: (count, 7)."""
     key = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
     blocks = [range(first, min(first + BLOCK_LOADS, count)) for first in range(0, count, BLOCK_LOADS)]
@@ -130,7 +132,10 @@ def compute_rejected_share(preset: str) -> float:
     first, second = (axis.ravel() for axis in np.meshgrid(middles, middles))
     shares = []
     for tool in tools:
-        force, footprint = np.exp(interpolate_ends(np.log(tool.force), first)), interpolate_ends(tool.footprint, second)
+        force, footprint = (
+            np.exp(interpolate_range(np.log(tool.force_range), first)),
+            interpolate_range(tool.radius_range, second),
+        )
         shares.append(1.0 - tool.is_surgical(force, footprint).mean())
     return float(np.mean(shares)) if shares else 0.0
 
@@ -146,7 +151,7 @@ def describe_rejected(preset: str) -> str:
     )
 
 
-def _sample_block(tools: list[ToolLoads], patch: Patch, key: int, block: range) -> np.ndarray:
+def _sample_block(tools: list[ToolLoadRange], patch: Patch, key: int, block: range) -> np.ndarray:
     """Sample point [m], force [N] and footprint [m] of each load of a block: (n, 7)."""
     kind = (len(tools) * _generate_uniform(key, 0, block)[:, -1]).astype(int)
     out = np.zeros((len(block), 7))
@@ -167,35 +172,36 @@ def _generate_uniform(key: int, attempt: int, block: range) -> np.ndarray:
     return np.random.Generator(source).random((len(block), NUMBERS_PER_LOAD))
 
 
-def _sample_tool(tool: ToolLoads, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
+def _sample_tool(tool: ToolLoadRange, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
     """Sample as `_sample_block`, for one tool and some rows (k,) of the block; rejected loads are sampled again."""
     out, waiting = np.zeros((len(block), 7)), rows
     for attempt in range(MAX_ATTEMPTS):
         if not len(waiting):
             return out[rows]
         uniform = _generate_uniform(key, attempt, block)[waiting]
-        footprint = interpolate_ends(tool.footprint, uniform[:, 0])
+        footprint = interpolate_range(tool.radius_range, uniform[:, 0])
         force = (
-            interpolate_ends(tool.force, uniform[:, 1])
-            if tool.even
-            else np.exp(interpolate_ends(np.log(tool.force), uniform[:, 1]))
+            interpolate_range(tool.force_range, uniform[:, 1])
+            if tool.is_uniform
+            else np.exp(interpolate_range(np.log(tool.force_range), uniform[:, 1]))
         )
         fits = np.flatnonzero(tool.is_surgical(force, footprint))
-        point, normal = patch.place(uniform[fits, 2:5])
+        point, normal = patch.place_points(uniform[fits, 2:5])
         inside = patch.compute_edge_distance(point) >= footprint[fits]
         fits, point, normal = fits[inside], point[inside], normal[inside]
-        direction = _sample_in_cone(normal, tool.cone, uniform[fits, 5:7])
+        direction = _sample_in_cone(normal, tool.max_angle, uniform[fits, 5:7])
         out[waiting[fits]] = np.column_stack([point, force[fits, None] * direction, footprint[fits]])
         waiting = np.delete(waiting, fits)
+    low, high = tool.radius_range
     raise InputError(
-        f"in {MAX_ATTEMPTS} draws no {tool.name} of radius {1e3 * tool.footprint[0]:g}-{1e3 * tool.footprint[1]:g} mm "
+        f"in {MAX_ATTEMPTS} draws no {tool.name} of radius {1e3 * low:g}-{1e3 * high:g} mm "
         "fitted into the open cortex: widen the --craniotomy, or choose a smaller tool with --preset."
     )
 
 
-def interpolate_ends(ends: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
+def interpolate_range(limits: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
     """Interpolate between two ends, by uniform numbers (n,) in [0, 1)."""
-    return ends[0] + (ends[1] - ends[0]) * uniform
+    return limits[0] + (limits[1] - limits[0]) * uniform
 
 
 def _sample_in_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
@@ -214,7 +220,7 @@ def find_perpendiculars(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, np.cross(axis, first)
 
 
-def build_axes_about(shaft: np.ndarray) -> np.ndarray:
+def build_rotations_about(shaft: np.ndarray) -> np.ndarray:
     """Build rotations (n, 3, 3) whose z are unit vectors `shaft` (n, 3), with arbitrary turns about them."""
     return np.stack([*find_perpendiculars(shaft), shaft], axis=2)
 
@@ -226,10 +232,10 @@ PUBLISHED_FORCES = np.linspace(0.10, 1.05, 20)  # Forces of the published loads 
 class PublishedSettings:
     """Settings of the published loads."""
 
-    positions: int = 11  # Number of positions of the published loads.
-    directions: int = 100  # Number of directions of the published loads.
-    footprint: float = 7e-3  # Radius of the area of one free surface node of the published mesh [m].
-    cone: float = np.pi / 3.0  # Largest angle between a published force and the inward normal [rad].
+    position_count: int = 11  # Number of positions of the published loads.
+    direction_count: int = 100  # Number of directions of the published loads.
+    radius: float = 7e-3  # Radius of the area of one free surface node of the published mesh [m].
+    max_angle: float = np.pi / 3.0  # Largest angle between a published force and the inward normal [rad].
 
 
 def _place_published_loads(
@@ -240,16 +246,16 @@ def _place_published_loads(
         raise InputError("the anatomy has no tumour, so no position is 20-28 mm from it: choose another --preset.")
     centre = anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0)
     distance = np.linalg.norm(patch.points - centre, axis=1)
-    inside = patch.compute_edge_distance(patch.points) >= settings.footprint
+    inside = patch.compute_edge_distance(patch.points) >= settings.radius
     near = np.flatnonzero((distance >= 20e-3) & (distance <= 28e-3) & inside)
     if not len(near):
         raise InputError(
             f"the open cortex is {1e3 * distance.min():.1f}-{1e3 * distance.max():.1f} mm from the tumour's centre. "
-            f"No node at 20-28 mm lies {1e3 * settings.footprint:g} mm inside its rim: make the anatomy with --preset "
+            f"No node at 20-28 mm lies {1e3 * settings.radius:g} mm inside its rim: make the anatomy with --preset "
             "seed, or choose another --preset here."
         )
     return build_published_loads(
-        patch, patch.points[near[spread(patch.points[near], settings.positions)]], count, seed, settings
+        patch, patch.points[near[select_spread(patch.points[near], settings.position_count)]], count, seed, settings
     )
 
 
@@ -261,19 +267,19 @@ def build_published_loads(
     The authors draw their directions at random: a spherical Fibonacci lattice within 60 degrees of the inward normal
     replaces them.
     """
-    golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(settings.directions) / (2.0 * np.pi)
-    lattice = np.column_stack([(np.arange(settings.directions) + 0.5) / settings.directions, golden % 1.0])
-    axes = [np.broadcast_to(inward, (settings.directions, 3)) for inward in patch.find_normals(positions)]
-    direction = np.array([_sample_in_cone(axis, settings.cone, lattice) for axis in axes])
-    whole = np.random.default_rng(seed).permutation(len(positions) * settings.directions * len(PUBLISHED_FORCES))
+    golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(settings.direction_count) / (2.0 * np.pi)
+    lattice = np.column_stack([(np.arange(settings.direction_count) + 0.5) / settings.direction_count, golden % 1.0])
+    axes = [np.broadcast_to(inward, (settings.direction_count, 3)) for inward in patch.find_normals(positions)]
+    direction = np.array([_sample_in_cone(axis, settings.max_angle, lattice) for axis in axes])
+    whole = np.random.default_rng(seed).permutation(len(positions) * settings.direction_count * len(PUBLISHED_FORCES))
     position, way, magnitude = np.unravel_index(
-        whole[:count], (len(positions), settings.directions, len(PUBLISHED_FORCES))
+        whole[:count], (len(positions), settings.direction_count, len(PUBLISHED_FORCES))
     )
     force = PUBLISHED_FORCES[magnitude, None] * direction[position, way]
-    return Loads((Pushed(positions[position], force, np.full(len(position), settings.footprint)),))
+    return Loads((Pushed(positions[position], force, np.full(len(position), settings.radius)),))
 
 
-def spread(points: np.ndarray, count: int) -> np.ndarray:
+def select_spread(points: np.ndarray, count: int) -> np.ndarray:
     """Select at most `count` of the `points` (n, 3) by farthest-point sampling; return their numbers (k,).
 
     The first one is nearest to the mean, so that the result depends on the points alone. Gonzalez 1985, Theor. Comput.

@@ -11,7 +11,7 @@ from sim.loads import Loads, Pushed, Touching
 from sim.tools import Ball, BuiltIn, Capsule, Spatula, compute_distances, compute_extent, get_core
 
 from .cortex_patch import Patch, build_barycentric_lattice, open_patch
-from .tool_loads import TOOLS, build_axes_about, draw, find_perpendiculars, interpolate_ends, sample_pushes
+from .tool_loads import TOOLS, build_rotations_about, draw, find_perpendiculars, interpolate_range, sample_pushes
 
 BALL_PRESETS = ("palpation", "bipolar", "dissector")  # Presets that a ball can represent.
 
@@ -45,17 +45,13 @@ def choose_ball(preset: str) -> Ball:
             f"no ball stands for the preset {preset}: choose one of {', '.join(BALL_PRESETS)}, or give --blade or "
             "--capsule."
         )
-    return Ball(0.5 * sum(TOOLS[preset].footprint))
+    return Ball(0.5 * sum(TOOLS[preset].radius_range))
 
 
 def draw_poses(
-    preset: str,
-    anatomy: Anatomy,
-    count: int,
-    seed: int,
-    tool: BuiltIn | None = None,
+    preset: str, anatomy: Anatomy, count: int, seed: int, tool: BuiltIn | None = None,
     settings: ToolPoseSettings = ToolPoseSettings(),
-) -> Loads:
+) -> Loads:  # fmt: skip
     """Sample `count` poses of a tool, pressed into the open cortex; load i is reproducible as in `surrogate.draw`.
 
     Positions are uniform by area, and the tool's end is inside the edge. For a ball, positions and directions are those
@@ -79,18 +75,18 @@ def draw_poses(
     if isinstance(tool, Ball):
         (pushed,) = draw(preset, anatomy, count, seed).get_all(Pushed)
         direction = pushed.force / np.linalg.norm(pushed.force, axis=1, keepdims=True)
-        deepest = min(settings.max_ball_depth * tool.radius, TOOLS[preset].depth)
-        depth = interpolate_ends((settings.min_depth_ratio * tool.radius, deepest), source.random(count))
+        deepest = min(settings.max_ball_depth * tool.radius, TOOLS[preset].max_depth)
+        depth = interpolate_range((settings.min_depth_ratio * tool.radius, deepest), source.random(count))
         return Loads((compute_poses(tool, pushed.point, patch.find_normals(pushed.point), depth[:, None] * direction),))
     if isinstance(tool, Capsule):
-        room, deepest, cone = tool.radius, settings.max_rod_depth * tool.radius, TOOLS[preset].cone
+        room, deepest, cone = tool.radius, settings.max_rod_depth * tool.radius, TOOLS[preset].max_angle
     else:
         room, deepest, cone = compute_extent(tool), settings.max_blade_depth * tool.width, settings.max_blade_tilt
     kind = replace(TOOLS[preset], name=type(tool).__name__, footprint=(room, room), cone=cone)
     point, direction = sample_pushes(kind, patch, count, seed)
     share = source.random((count, 2))
     shallowest = settings.min_depth_ratio * get_core(tool).radius
-    depth = interpolate_ends((shallowest, min(deepest, TOOLS[preset].depth)), share[:, 0])
+    depth = interpolate_range((shallowest, min(deepest, TOOLS[preset].max_depth)), share[:, 0])
     rotation = _build_rotations(-direction, 2.0 * np.pi * share[:, 1])
     return Loads((_move_to_contact(tool, patch, point, rotation, depth, settings),))
 
@@ -101,7 +97,7 @@ def compute_poses(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.
     pose = np.zeros((len(point), 1, 4, 4))
     pose[:, 0, 3, 3] = 1.0
     pose[:, 0, :3, 3] = point + motion - ball.radius * (normal + shaft)
-    pose[:, 0, :3, :3] = build_axes_about(shaft)
+    pose[:, 0, :3, :3] = build_rotations_about(shaft)
     return Touching(pose)
 
 

@@ -49,7 +49,7 @@ class Coverage:
     def __str__(self) -> str:
         tenths = " ".join(f"{100 * share:.0f}" for share in self.tenths)
         return (
-            f"{format_shares(self.shares)}; by decile of force {tenths}; median bound {self.bound_mm:.4f} mm, median "
+            f"{format_coverage(self.shares)}; by decile of force {tenths}; median bound {self.bound_mm:.4f} mm, median "
             f"error {self.error_mm:.4f} mm; {self.extrapolated} loads outside the training range"
         )
 
@@ -70,8 +70,8 @@ def compute_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverag
     return _measure_coverage(model, loads, result, worst, result.bound)
 
 
-def measure_distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
-    """Compute the coverage of the bound of a model's distance, by the FEM distances `truth` (B,) [m].
+def measure_distance_coverage(model: Learned, loads: Loads, reference: np.ndarray) -> Coverage:
+    """Compute the coverage of the bound of a model's distance, by the FEM distances `reference` (B,) [m].
 
     Raises
     ------
@@ -83,7 +83,7 @@ def measure_distance_coverage(model: Learned, loads: Loads, truth: np.ndarray) -
     _check_load_count(loads)
     result = model.deform(loads, at=model.nodes)
     found = model.predict_distance(loads, result)
-    return _measure_coverage(model, loads, result, np.abs(found.value - truth), found.bound)
+    return _measure_coverage(model, loads, result, np.abs(found.distance - reference), found.bound)
 
 
 def _check_load_count(loads: Loads) -> None:
@@ -91,7 +91,7 @@ def _check_load_count(loads: Loads) -> None:
         raise InputError(f"{len(loads)} loads have no tenths: simulate at least {FORCE_CLASSES}.")
 
 
-def measure_shares(error: np.ndarray, bound: np.ndarray) -> Shares:
+def measure_coverage_shares(error: np.ndarray, bound: np.ndarray) -> Shares:
     """Compute shares of errors (B,) within bounds (levels, B) of the same unit; None if all bounds are infinite."""
     promised = ~np.isposinf(bound)
     return tuple(
@@ -99,7 +99,7 @@ def measure_shares(error: np.ndarray, bound: np.ndarray) -> Shares:
     )
 
 
-def format_shares(covered: Shares) -> str:
+def format_coverage(covered: Shares) -> str:
     """Describe the coverage at each level."""
     shares = zip(covered, LEVELS, strict=True)
     return ", ".join(
@@ -108,13 +108,13 @@ def format_shares(covered: Shares) -> str:
     )
 
 
-def measure_covered(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
+def measure_coverage(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
     """Compute the coverage of errors (B,) [m] by bounds (2, B) [m], overall and by deciles of force (B,) [N]."""
     covered = error <= bound[0]
     by_force = np.array_split(np.argsort(force, kind="stable"), FORCE_CLASSES)
     return Coverage(
         len(error),
-        measure_shares(error, bound),
+        measure_coverage_shares(error, bound),
         tuple(float(covered[rows].mean()) for rows in by_force),
         1e3 * float(np.median(bound[0])),
         1e3 * float(np.median(error)),
@@ -126,4 +126,4 @@ def _measure_coverage(
     model: Learned, loads: Loads, result: Deformation, error: np.ndarray, bound: np.ndarray
 ) -> Coverage:
     force = split_forces(model.to_input(loads))[0]
-    return measure_covered(force, error, bound, result.outcome.count(Outcome.EXTRAPOLATED))
+    return measure_coverage(force, error, bound, result.outcome.count(Outcome.EXTRAPOLATED))

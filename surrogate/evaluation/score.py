@@ -14,7 +14,7 @@ from sim.runtime.threads import limit_to_one_thread
 
 from ..model.held_out import MIN_LOADS_FOR_P999
 from ..model.learned import Learned
-from .coverage import Shares, format_shares, measure_shares
+from .coverage import Shares, format_coverage, measure_coverage_shares
 
 
 @dataclass(frozen=True)
@@ -84,19 +84,19 @@ class ForceScore:
     def __str__(self) -> str:
         promised = "no bounds"
         if self.shares is not None and self.bound is not None:
-            promised = f"bounds cover {format_shares(self.shares)}; median bound {self.bound:.4f} N"
+            promised = f"bounds cover {format_coverage(self.shares)}; median bound {self.bound:.4f} N"
         return (
             f"mean error {self.mean:.4f} N of {self.force:.3f} N, {self.mean_percent:.2f} % of each load's force, "
             f"p95 {self.p95_percent:.2f} %; {promised}"
         )
 
 
-def compute_force_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def compute_force_errors(predicted: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Compute the norms (B,) [N] of the differences between forces (B, 3)."""
-    return np.linalg.norm(found - truth, axis=1)
+    return np.linalg.norm(predicted - reference, axis=1)
 
 
-def score_forces(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None = None) -> ForceScore:
+def score_forces(error: np.ndarray, reference: np.ndarray, bound: np.ndarray | None = None) -> ForceScore:
     """Score errors (B,) [N] of true forces (B, 3) [N], with bounds (2, B) [N] if there are any.
 
     Raises
@@ -104,7 +104,7 @@ def score_forces(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None 
     InputError
         Loads under which no tool presses.
     """
-    size = np.linalg.norm(truth, axis=1)
+    size = np.linalg.norm(reference, axis=1)
     some = size > 0.0
     if not some.any():
         raise InputError(
@@ -119,15 +119,15 @@ def score_forces(error: np.ndarray, truth: np.ndarray, bound: np.ndarray | None 
         float(error[some].mean()),
         float(share.mean()),
         float(np.percentile(share, 95.0)),
-        measure_shares(error[some], bound[:, some]) if bound is not None else None,
+        measure_coverage_shares(error[some], bound[:, some]) if bound is not None else None,
         float(np.median(bound[0, some])) if bound is not None else None,
     )
 
 
-def compare_forces(model: Learned, loads: Loads, truth: np.ndarray) -> ForceScore:
+def compare_forces(model: Learned, loads: Loads, reference: np.ndarray) -> ForceScore:
     """Score a model's forces relative to FEM forces (B, 3) [N]."""
     result = model.deform(loads, at=model.anatomy.tumour_nodes)
-    return score_forces(compute_force_errors(result.reaction[:, 0, :3], truth), truth, result.reaction_bound)
+    return score_forces(compute_force_errors(result.reaction[:, 0, :3], reference), reference, result.reaction_bound)
 
 
 @dataclass(frozen=True)
@@ -169,9 +169,9 @@ class Score:
     solves: SolveCounts | None = None
 
 
-def compute_point_errors(deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Compute errors (B, n) [m] of a deformer relative to `truth` (B, n, 3) [m] at `nodes` (n,)."""
-    return np.linalg.norm(deformer.deform(loads, at=nodes).displacement - truth, axis=2)
+def compute_point_errors(deformer: Deformer, loads: Loads, reference: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Compute errors (B, n) [m] of a deformer relative to `reference` (B, n, 3) [m] at `nodes` (n,)."""
+    return np.linalg.norm(deformer.deform(loads, at=nodes).displacement - reference, axis=2)
 
 
 def score(
@@ -182,9 +182,9 @@ def score(
     motion = np.linalg.norm(truth, axis=2).mean(axis=1, keepdims=True)
     return Score(
         name,
-        *compute_spread(1e3 * distance),
-        *compute_spread(100.0 * distance / motion),
-        *compute_spread(1e3 * distance.max(axis=1))[:3],
+        *compute_statistics(1e3 * distance),
+        *compute_statistics(100.0 * distance / motion),
+        *compute_statistics(1e3 * distance.max(axis=1))[:3],
         1e6 * float(np.median(time_single_loads(deformer, loads, nodes, TIMED_LOADS))),
         time_model_alone(deformer, loads),
         solves,
@@ -220,7 +220,7 @@ def _measure_times(result: Callable[[T], object], single: Iterable[T]) -> list[f
     return seconds[WARM_UP_LOADS:]
 
 
-def find_best(scores: Sequence[Score]) -> Score:
+def find_best_score(scores: Sequence[Score]) -> Score:
     """Return the score with the smallest mean error."""
     return min(scores, key=lambda row: row.mean_mm)
 
@@ -241,7 +241,7 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
         f"{'' if row.bare_microseconds is None else f'{row.bare_microseconds:.0f}':>5} |{row.microseconds:5.0f}"
         for row in scores
     ]
-    best = find_best(scores)
+    best = find_best_score(scores)
     fastest = min(scores, key=lambda row: row.microseconds)
     verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
     wins = f"{best.name} has the smallest error: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
@@ -272,7 +272,7 @@ def _solve_lines(scores: Sequence[Score]) -> list[str]:
     ]
 
 
-def compute_spread(values: np.ndarray) -> tuple[float, float, float | None, float]:
+def compute_statistics(values: np.ndarray) -> tuple[float, float, float | None, float]:
     """Compute mean, 95th and 99.9th percentile (None for too few loads), and maximum of values (B, ...) of B loads."""
     p95, p999 = np.percentile(values, (95.0, 99.9))
     return (

@@ -23,16 +23,16 @@ from ..locating.locator import Locator
 from ..locating.observation import to_evidence
 from ..locating.regions import Region
 from .frame_likelihood import (
+    compute_drainage_likelihood,
+    compute_pressing_likelihood,
     factorise_errors,
-    find_unsupported,
-    predict_seen,
+    find_unsupported_points,
+    predict_observation,
     remove_points,
-    weigh_drained,
-    weigh_pressed,
     whiten_columns,
 )
-from .observed_frame import FORCE_SIGMA, ObservedFrame, Tool, check_frames, find_foot
-from .responses import POISSONS, RATIOS, TOOL_FORCE, Responses, build_drained_loads, build_force_loads, solve_responses
+from .observed_frame import FORCE_SIGMA, ObservedFrame, Tool, check_frames, find_contact_point
+from .responses import POISSONS, RATIOS, TOOL_FORCE, Responses, build_drainage_loads, build_force_loads, solve_responses
 from .tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 
 EXPONENTS = (9.5, 19.0)
@@ -58,14 +58,10 @@ class ModulusSettings:
 
 
 def estimate_young_moduli(
-    anatomy: Anatomy,
-    frames: Sequence[ObservedFrame],
-    tissue: FittedTissue,
-    pressed: Responses | None,
-    device: str = "auto",
-    progress: Callable[[int, int], object] = lambda done, total: None,
+    anatomy: Anatomy, frames: Sequence[ObservedFrame], tissue: FittedTissue, pressing: Responses | None,
+    device: str = "auto", progress: Callable[[int, int], object] = lambda done, total: None,
     settings: ModulusSettings = ModulusSettings(),
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Sample Young's moduli (k,) [Pa] of the brain, equally probable; empty if no force was measured.
 
     Raises
@@ -75,14 +71,14 @@ def estimate_young_moduli(
     """
     columns = np.cumsum([0, *[3 * len(frame.tools) for frame in frames]])
     read = [number for number, frame in enumerate(frames) if any(tool.force is not None for tool in frame.tools)]
-    if pressed is None or not read:
+    if pressing is None or not read:
         return np.zeros(0)
     total = np.zeros(len(YOUNGS))
     for done, number in enumerate(read):
         progress(done, len(read))
         evidence, own = to_evidence(anatomy, frames[number].observation), slice(columns[number], columns[number] + 3)
         tool = frames[number].tools[0]
-        total += _compute_log_likelihood(anatomy, tool, evidence, tissue, pressed, own, device, settings)
+        total += _compute_log_likelihood(anatomy, tool, evidence, tissue, pressing, own, device, settings)
     progress(len(read), len(read))
     share = np.exp(total - total.max())
     step = float(np.log(YOUNGS[1] / YOUNGS[0]))
@@ -100,9 +96,9 @@ def _compute_log_likelihood(
     skull, (_, poisson, _), (_, ratio, _) = "slide" if name == SEPARATING_SKULL else name, tissue.poisson, tissue.ratio
     nearest = int(np.abs(POISSONS - poisson).argmin()), int(np.abs(np.log(RATIOS / ratio)).argmin())
     lower, _ = factorise_errors(evidence)
-    value = whiten_columns(lower, evidence.value)
+    value = whiten_columns(lower, evidence.motion)
     way = np.linalg.lstsq(
-        whiten_columns(lower, predict_seen(pressed, skull, evidence)[nearest][own].T), value, rcond=None
+        whiten_columns(lower, predict_observation(pressed, skull, evidence)[nearest][own].T), value, rcond=None
     )[0]
     force, direction = TOOL_FORCE * float(np.linalg.norm(way)), way / np.linalg.norm(way)
     reading = float(tool.force or 0.0)
@@ -118,7 +114,7 @@ def _compute_log_likelihood(
         shapes.append(CubicSpline(np.log(sizes), rows)(np.clip(asked, *np.log(sizes[[0, -1]]))))
     shape, logs = np.stack(shapes), np.zeros(0)
     for _ in range(settings.iterations):
-        off = whiten_columns(lower, (evidence.value - shape).reshape(-1, len(value)).T)
+        off = whiten_columns(lower, (evidence.motion - shape).reshape(-1, len(value)).T)
         logs = -0.5 * (off**2).sum(axis=0).reshape(shape.shape[:-1])
         logs = np.where(inside, logs, logs.min() - 50.0)
         # The model error is a share of the estimated dent.
@@ -132,62 +128,58 @@ def _solve_dents(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Solve forces in tissue of modulus `YOUNG`; return converged ones (k,) [N] and their observations (k, m) [m]."""
     loads = build_force_loads(
-        anatomy, find_foot(anatomy, tool)[None], np.array([tool.radius]), sizes[:, None] * direction
+        anatomy, find_contact_point(anatomy, tool)[None], np.array([tool.radius]), sizes[:, None] * direction
     )
     result = Fem(anatomy, group.build_effects((0.01,)), ACCURACY, device).deform(loads)
     good = np.array([outcome.good for outcome in result.outcome])
     if good.sum() < 3:
         raise InputError(f"a force of {tool.force:g} N cannot be what dents this brain so: check its unit and frame.")
     motion = Responses(pressed.nodes, {group.skull: result.displacement[good][None, None][..., pressed.nodes, :]})
-    return sizes[good], predict_seen(motion, group.skull, evidence)[0, 0]
+    return sizes[good], predict_observation(motion, group.skull, evidence)[0, 0]
 
 
 def fit_tissue(
-    locator: Locator,
-    frames: Sequence[ObservedFrame],
-    device: str = "auto",
-    folder: Path | None = None,
+    locator: Locator, frames: Sequence[ObservedFrame], device: str = "auto", folder: Path | None = None,
     progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
     left_out: Sequence[np.ndarray] | None = None,
-) -> FittedTissue:
+) -> FittedTissue:  # fmt: skip
     """Estimate the tissue of a locator's anatomy from some frames.
 
-    Points that no others support are removed: `left_out`, or by `find_unsupported`. FEM results in `folder` are read.
+    Points that no others support are removed: `left_out`, or by `find_unsupported_points`. Those in `folder` are read.
     `progress` receives a stage, the number of its parts done, and their total.
 
     Raises
     ------
     InputError
-        See `check_frames` and `find_unsupported`.
+        See `check_frames` and `find_unsupported_points`.
     """
     anatomy = locator.anatomy
     check_frames(anatomy, frames)
-    frames = remove_points(frames, find_unsupported(locator, frames) if left_out is None else left_out)
+    frames = remove_points(frames, find_unsupported_points(locator, frames) if left_out is None else left_out)
     drained, pressed, regions = None, None, list_fitted_regions(locator)
     if any(not frame.tools for frame in frames):
-        loads = build_drained_loads(anatomy)
+        loads = build_drainage_loads(anatomy)
         drained = solve_responses(anatomy, loads, device, folder, partial(progress, "drained fluid"), regions)
     tools = [tool for frame in frames for tool in frame.tools]
     if tools:
-        at, radius = np.array([find_foot(anatomy, tool) for tool in tools]), np.array([tool.radius for tool in tools])
+        at, radius = (
+            np.array([find_contact_point(anatomy, tool) for tool in tools]),
+            np.array([tool.radius for tool in tools]),
+        )
         loads = build_force_loads(anatomy, at, radius)
         pressed = solve_responses(anatomy, loads, device, folder, partial(progress, "tools"), regions)
-    return fit_from_evidence(locator, frames, drained, pressed, device, partial(progress, "forces"))
+    return fit_tissue_from_responses(locator, frames, drained, pressed, device, partial(progress, "forces"))
 
 
-def fit_from_evidence(
-    locator: Locator,
-    frames: Sequence[ObservedFrame],
-    drained: Responses | None,
-    pressed: Responses | None,
-    device: str = "auto",
-    progress: Callable[[int, int], object] = lambda done, total: None,
-) -> FittedTissue:
+def fit_tissue_from_responses(
+    locator: Locator, frames: Sequence[ObservedFrame], drainage: Responses | None, pressing: Responses | None,
+    device: str = "auto", progress: Callable[[int, int], object] = lambda done, total: None,
+) -> FittedTissue:  # fmt: skip
     """Estimate the tissue as `fit_tissue`, from solved responses; `progress` receives the number of forces done."""
     with limit_to_one_thread():  # matrix products are small
-        probability = compute_probability(weigh_tissues(locator, frames, drained, pressed))
+        probability = compute_probability(compute_tissue_likelihood(locator, frames, drainage, pressing))
     tissue = FittedTissue(locator.anatomy.digest, len(frames), probability, np.zeros(0))
-    return replace(tissue, young=estimate_young_moduli(locator.anatomy, frames, tissue, pressed, device, progress))
+    return replace(tissue, young=estimate_young_moduli(locator.anatomy, frames, tissue, pressing, device, progress))
 
 
 def list_fitted_regions(locator: Locator) -> tuple[Region, ...]:
@@ -195,24 +187,24 @@ def list_fitted_regions(locator: Locator) -> tuple[Region, ...]:
     return tuple(one for one in locator.regions if one.label != TUMOUR_LABEL)
 
 
-def weigh_tissues(
-    locator: Locator, frames: Sequence[ObservedFrame], drained: Responses | None, pressed: Responses | None
+def compute_tissue_likelihood(
+    locator: Locator, frames: Sequence[ObservedFrame], drainage: Responses | None, pressing: Responses | None
 ) -> np.ndarray:
     """Compute the log-likelihood (skulls, poissons, ratios) of all frames in the solved tissues."""
     total, first = np.zeros((1, len(POISSONS), len(RATIOS))), 0
     for frame in frames:
         evidence, last = to_evidence(locator.anatomy, frame.observation), first + 3 * len(frame.tools)
-        if pressed is not None and frame.tools:
-            total = total + weigh_pressed(pressed, np.arange(first, last), evidence)
-        elif drained is not None:
-            total = total + weigh_drained(drained, locator.prior, evidence)
+        if pressing is not None and frame.tools:
+            total = total + compute_pressing_likelihood(pressing, np.arange(first, last), evidence)
+        elif drainage is not None:
+            total = total + compute_drainage_likelihood(drainage, locator.prior, evidence)
         first = last
     return total
 
 
-def compute_probability(total: np.ndarray) -> np.ndarray:
+def compute_probability(log_likelihood: np.ndarray) -> np.ndarray:
     """Interpolate probabilities to the fine grid: logarithms are smooth in log ratio and in compressibility."""
-    fine = CubicSpline(np.log(RATIOS), total, axis=2)(np.log(FINE_RATIOS))
+    fine = CubicSpline(np.log(RATIOS), log_likelihood, axis=2)(np.log(FINE_RATIOS))
     order = np.argsort(1.0 - 2.0 * POISSONS)
     x, want = (1.0 - 2.0 * POISSONS)[order], 1.0 - 2.0 * FINE_POISSONS
     share = [np.prod([(want - x[k]) / (x[j] - x[k]) for k in range(3) if k != j], axis=0) for j in range(3)]

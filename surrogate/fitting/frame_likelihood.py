@@ -36,10 +36,10 @@ class LikelihoodSettings:
 LIKELIHOOD = LikelihoodSettings()
 
 
-def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
+def compute_drainage_likelihood(drainage: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
     """Compute the log-likelihood (skulls, poissons, ratios) of a frame with drained fluid."""
     lower, seen = factorise_errors(evidence)
-    rows = {name: predict_seen(drained, name, evidence) for name in SOLVED_SKULLS}
+    rows = {name: predict_observation(drainage, name, evidence) for name in SOLVED_SKULLS}
     own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
     lets_go = prior.project_shapes(*evidence.weights)[:, own].T
     size = np.mean([_compute_size(each) for each in rows.values()])
@@ -49,14 +49,14 @@ def weigh_drained(drained: Responses, prior: MotionPrior, evidence: Evidence) ->
     return np.stack([np.broadcast_to(found[name], shape) for name in SKULLS]) / LIKELIHOOD.evidence_divisor
 
 
-def weigh_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
+def compute_pressing_likelihood(pressing: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
     """Compute the log-likelihood (skulls, 1, 1) of a frame with tools: its `columns` (k,) of the responses.
 
     Dents of tools determine the skull only: their information on Poisson's ratio and stiffness ratio is mostly
     nonlinear stiffening, which linear responses lack.
     """
     lower, seen = factorise_errors(evidence)
-    rows = {name: predict_seen(pressed, name, evidence)[:, :, columns] for name in SOLVED_SKULLS}
+    rows = {name: predict_observation(pressing, name, evidence)[:, :, columns] for name in SOLVED_SKULLS}
     size = np.mean([_compute_size(each) for each in rows.values()])
     found = {name: _compute_log_evidence(each / size, evidence, lower, seen) for name, each in rows.items()}
     found = {name: logsumexp(each) - np.log(each.size) for name, each in found.items()}
@@ -64,44 +64,44 @@ def weigh_pressed(pressed: Responses, columns: np.ndarray, evidence: Evidence) -
     return np.array([found[name] for name in SKULLS])[:, None, None] / LIKELIHOOD.tool_evidence_divisor
 
 
-def predict_seen(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
+def predict_observation(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
     """Compute the observed displacements (poissons, ratios, loads, m) [m] of responses."""
-    column = np.searchsorted(responses.nodes, evidence.place.vertices)
+    column = np.searchsorted(responses.nodes, evidence.location.vertices)
     motion = responses.motion[skull][..., column, :]
-    return np.einsum("prlmki,mk,mi->prlm", motion, evidence.place.weights, evidence.axis, optimize=True)
+    return np.einsum("prlmki,mk,mi->prlm", motion, evidence.location.weights, evidence.axis, optimize=True)
 
 
 def _compute_size(rows: np.ndarray) -> float:
     return float(np.sqrt((rows**2).sum(axis=-2).mean()))
 
 
-def factorise_errors(evidence: Evidence, believed: np.ndarray | None = None) -> tuple[np.ndarray, float]:
+def factorise_errors(evidence: Evidence, expected_motion: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Compute the Cholesky factor (m, m) of the covariance of all errors, and the root mean square observation [m].
 
-    The model error is a share of the motion `believed` (m,) [m]; None: of the observation, noise included. Then
+    The model error is a share of the motion `expected_motion` (m,) [m]; None: of the observation, noise included. Then
     points that seem to move farther are down-weighted, so that motions are underestimated.
     """
-    value = evidence.value if believed is None else believed
+    value = evidence.motion if expected_motion is None else expected_motion
     length = np.sqrt(np.bincount(evidence.point, value**2))[evidence.point]
     seen = float(np.sqrt((value**2).mean()))
     off = LIKELIHOOD.model_error_share * np.maximum(length, LIKELIHOOD.min_motion_share * np.sqrt(3.0) * seen)
-    square = compute_squared_distances(evidence.at, evidence.at)
+    square = compute_squared_distances(evidence.positions, evidence.positions)
     correlation = compute_correlation(square, LIKELIHOOD.model_error_length)
-    noise = evidence.compute_noise() + np.outer(off, off) * correlation * (evidence.axis @ evidence.axis.T)
+    noise = evidence.compute_covariance() + np.outer(off, off) * correlation * (evidence.axis @ evidence.axis.T)
     noise[np.diag_indices(len(noise))] += off**2
-    rigid = evidence.rigid * evidence.rigid_scale
+    rigid = evidence.rigid_jacobian * evidence.rigid_scale
     return cholesky(noise + rigid @ rigid.T, lower=True), max(seen, 1e-6)
 
 
-def whiten_columns(lower: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Whiten columns (m,) or (m, k) by errors whose covariance has the Cholesky factor `lower` (m, m)."""
-    return solve_triangular(lower, columns, lower=True, check_finite=False)
+def whiten_columns(cholesky: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Whiten columns (m,) or (m, k) by errors whose covariance has the Cholesky factor `cholesky` (m, m)."""
+    return solve_triangular(cholesky, columns, lower=True, check_finite=False)
 
 
 def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
     """Compute log evidence (poissons, ratios) of motions (poissons, ratios, loads, m) of joint size 1."""
     motion = seen * whiten_columns(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
-    gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(lower, evidence.value)
+    gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(lower, evidence.motion)
     logs = []
     for times in LIKELIHOOD.motion_sizes:
         root = np.linalg.cholesky(np.eye(gram.shape[-1]) + times**2 * gram)
@@ -110,7 +110,7 @@ def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarra
     return logsumexp(logs, axis=0) - np.log(len(LIKELIHOOD.motion_sizes))
 
 
-def find_unsupported(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple[np.ndarray, ...]:
+def find_unsupported_points(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple[np.ndarray, ...]:
     """Return the point numbers (k,), from 0, that `Locator.locate` rejects in each frame.
 
     Raises
@@ -127,11 +127,11 @@ def find_unsupported(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple
     return tuple(found)
 
 
-def remove_points(frames: Sequence[ObservedFrame], excluded: Sequence[np.ndarray]) -> list[ObservedFrame]:
+def remove_points(frames: Sequence[ObservedFrame], point_numbers: Sequence[np.ndarray]) -> list[ObservedFrame]:
     """Remove points of given numbers (k,) from each frame of points with correspondences."""
     return [
         _remove_points(frame, numbers) if len(numbers) else frame
-        for frame, numbers in zip(frames, excluded, strict=True)
+        for frame, numbers in zip(frames, point_numbers, strict=True)
     ]
 
 

@@ -94,7 +94,7 @@ def check_frames(anatomy: Anatomy, frames: Sequence[ObservedFrame]) -> None:
             raise InputError(f"frames {first} and {second} are the same, which would count twice: leave one out.")
 
 
-def find_foot(anatomy: Anatomy, tool: Tool) -> np.ndarray:
+def find_contact_point(anatomy: Anatomy, tool: Tool) -> np.ndarray:
     """Return the point (3,) [m] of the undeformed open cortex nearest to a tool's tip."""
     return find_closest_points(np.array([tool.tip]), open_cortex(anatomy).corners).point[0]
 
@@ -103,7 +103,7 @@ def _check(anatomy: Anatomy, tool: Tool) -> None:
     numbers = [*tool.tip, tool.radius, tool.force or 0.0, tool.sigma or 0.0]
     if not np.isfinite(numbers).all():
         raise InputError("a tool has a number that is not finite: leave it out.")
-    away = float(np.linalg.norm(find_foot(anatomy, tool) - tool.tip))
+    away = float(np.linalg.norm(find_contact_point(anatomy, tool) - tool.tip))
     if away > LIMITS.far_distance_now:
         raise InputError(
             f"a tool is {1e3 * away:.0f} mm from the open cortex, so that it cannot press on it: give millimetres, "

@@ -17,10 +17,10 @@ from sim.fem import Fem
 from sim.geometry.tetmesh import compute_digest
 from sim.loads import Loads, Posture, Pushed
 
-from ..locating.causes import FORCE_RADIUS, SUPINE, USUAL_CAUSES, build_linear_tissue, sample_directions
+from ..locating.causes import FORCE_RADIUS, SUPINE, USUAL_CAUSES, build_linear_tissue, sample_gravity_directions
 from ..locating.locator import find_observed_nodes
 from ..locating.regions import Region, build_tissue
-from ..model.kept_arrays import find_kept_path, keep_arrays
+from ..model.kept_arrays import get_cache_path, load_cached_arrays
 
 RATIOS = np.geomspace(0.4, 3.2, 4)
 """Candidate ratios of tumour to brain stiffness, for which FEM is solved."""
@@ -55,9 +55,9 @@ class Responses:
     regions: tuple[Region, ...] = ()
 
 
-def build_drained_loads(anatomy: Anatomy) -> Loads:
+def build_drainage_loads(anatomy: Anatomy) -> Loads:
     """Build loads of drained fluid for sampled head positions."""
-    down = sample_directions(
+    down = sample_gravity_directions(
         np.random.default_rng(SEED), open_cortex(anatomy).axis, replace(USUAL_CAUSES, drainages=POSTURE_COUNT)
     )
     every = [(way, compute_fluid_level(anatomy.mesh.nodes, way, left)) for left in FLUID_LEVELS for way in down]
@@ -80,13 +80,9 @@ def build_force_loads(
 
 
 def solve_responses(
-    anatomy: Anatomy,
-    loads: Loads,
-    device: str = "auto",
-    folder: Path | None = None,
-    progress: Callable[[int, int], object] = lambda done, total: None,
-    regions: tuple[Region, ...] = (),
-) -> Responses:
+    anatomy: Anatomy, loads: Loads, device: str = "auto", folder: Path | None = None,
+    progress: Callable[[int, int], object] = lambda done, total: None, regions: tuple[Region, ...] = (),
+) -> Responses:  # fmt: skip
     """Solve each tissue, with known `regions`. Results for the same loads in `folder` are read.
 
     `progress` receives the number of tissues done and their total.
@@ -104,17 +100,13 @@ def solve_responses(
 
 
 def _get_motions(
-    anatomy: Anatomy,
-    nodes: np.ndarray,
-    loads: Loads,
-    tissue: tuple[str, float, float, tuple[Region, ...]],
-    device: str,
-    folder: Path | None,
-) -> np.ndarray:
+    anatomy: Anatomy, nodes: np.ndarray, loads: Loads, tissue: tuple[str, float, float, tuple[Region, ...]],
+    device: str, folder: Path | None,
+) -> np.ndarray:  # fmt: skip
     """Read motions (loads, n, 3) [m] of one tissue from the folder, or compute and store them."""
     numbers = [array for cause in loads.causes for array in vars(cause).values()]
     stated = anatomy.digest, recommend_element(anatomy.mesh), tissue, ACCURACY, compute_digest(*numbers)
-    path = find_kept_path(folder, "", device, *stated)
+    path = get_cache_path(folder, "", device, *stated)
     skull, poisson, ratio, regions = tissue
     law = build_tissue(build_linear_tissue, poisson, ratio, regions)
     effects = (law, Held(), SKULLS[skull], ToolForce(), Gravity())
@@ -123,4 +115,4 @@ def _get_motions(
         result = Fem(anatomy, effects, ACCURACY, device).deform(loads)
         return {"motion": result.displacement[:, nodes].astype(np.float32)}
 
-    return keep_arrays(path, "motions of one tissue", ["motion"], solved)["motion"]
+    return load_cached_arrays(path, "motions of one tissue", ["motion"], solved)["motion"]

@@ -10,20 +10,22 @@ from sim.anatomy import Anatomy
 from sim.errors import InputError
 from sim.geometry.locate import LocatedPoints
 
-from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, Presses
+from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, PressResponses
 from .ensemble import Ensemble, compute_surface_motion
 from .evidence import SIGMA, Evidence, build_motion_evidence
 from .iterated_conditioning import match_and_update
 from .observation import Observation
 from .posterior import Posterior
-from .prior import MotionPrior, build_prior, compute_middle
+from .prior import MotionPrior, build_prior, compute_centroid_motion
 
 LEVEL = 0.95
 """Nominal coverage of ellipsoids."""
 RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
 """Squared radius of the 95 % ellipsoid of a Gaussian [standard deviations^2]: chi-squared, 3 degrees of freedom."""
 TRIAL_COUNT = 960  # Number of trials.
-NEAREST_TRIALS = 120  # Number of trials, nearest by `compute_likeness`, that calibrate an observation's covariance.
+NEAREST_TRIALS = (
+    120  # Number of trials, nearest by `compute_similarity_features`, that calibrate an observation's covariance.
+)
 CLOUD_OFFSET = 1e3  # Feature offset that separates point clouds from corresponding points [log units].
 EXTENT_WEIGHT = 4.0  # Weight of the extent feature.
 # Tolerance beyond the largest trial features [log units], so that 400 points, the maximum used, are covered.
@@ -47,13 +49,10 @@ class TrialSettings:
 
 
 def run_trials(
-    ensemble: Ensemble,
-    presses: Presses,
-    progress: Callable[[int, int], object] = lambda done, total: None,
-    count: int = TRIAL_COUNT,
-    settings: TrialSettings = TrialSettings(),
-) -> np.ndarray:
-    """Run `count` trials: features (`compute_likeness`) and squared Mahalanobis error of each (k, 5).
+    ensemble: Ensemble, presses: PressResponses, progress: Callable[[int, int], object] = lambda done, total: None,
+    count: int = TRIAL_COUNT, settings: TrialSettings = TrialSettings(),
+) -> np.ndarray:  # fmt: skip
+    """Run `count` trials: features (`compute_similarity_features`) and squared Mahalanobis error of each (k, 5).
 
     Groups are held out one at a time, so that a trial's tissue, tumour and directions are not in its prior. One motion
     in three combines two causes. Rigid errors have exactly the reported size, from 0 to 3 mm. Half of the trials use
@@ -65,7 +64,7 @@ def run_trials(
     InputError
         No skull has two groups, of which one could be held out.
     """
-    fold, found = assign_held_out(ensemble), []
+    fold, found = assign_folds(ensemble), []
     if fold.max() < 0:
         raise InputError("no skull has two groups to try one by the other: give causes of several Poisson's ratios.")
     large = compute_surface_motion(ensemble.anatomy, ensemble.motion) > settings.min_motion
@@ -79,12 +78,12 @@ def run_trials(
                 posterior, _ = match_and_update(prior, observation)
             except InputError:
                 continue
-            found.append([*compute_likeness(posterior.evidence), _square(prior, posterior, middle)])
+            found.append([*compute_similarity_features(posterior.evidence), _square(prior, posterior, middle)])
     progress(count, count)
     return np.array(found)
 
 
-def assign_held_out(ensemble: Ensemble) -> np.ndarray:
+def assign_folds(ensemble: Ensemble) -> np.ndarray:
     """Compute the fold (N,), from 0, in which members are held out: one group per skull; -1: only group of a skull."""
     turn = np.full(len(ensemble.group), -1)
     for skull in np.unique(ensemble.skull):
@@ -95,23 +94,23 @@ def assign_held_out(ensemble: Ensemble) -> np.ndarray:
     return turn
 
 
-def compute_covering_factor(tried: np.ndarray, evidence: Evidence) -> float:
+def compute_coverage_factor(trials: np.ndarray, evidence: Evidence) -> float:
     """Compute the factor on covariances for tumour-centroid ellipsoids to cover 95 % of similar trials."""
-    away = ((tried[:, :-1] - compute_likeness(evidence)) ** 2).sum(axis=1)
-    square = np.sort(tried[np.argsort(away, kind="stable")[:NEAREST_TRIALS], -1])
+    away = ((trials[:, :-1] - compute_similarity_features(evidence)) ** 2).sum(axis=1)
+    square = np.sort(trials[np.argsort(away, kind="stable")[:NEAREST_TRIALS], -1])
     rank = min(int(np.ceil(LEVEL * (len(square) + 1))), len(square))
     return float(square[rank - 1] / RADIUS_SQUARED)
 
 
-def is_within_trials(tried: np.ndarray, evidence: Evidence) -> bool:
+def is_within_trials(trials: np.ndarray, evidence: Evidence) -> bool:
     """Return True if the features are in the range of the trials, which include the largest extent."""
-    own = compute_likeness(evidence)
-    alike = tried[tried[:, -2] == own[-1], :-1]
+    own = compute_similarity_features(evidence)
+    alike = trials[trials[:, -2] == own[-1], :-1]
     within = len(alike) and (own >= alike.min(axis=0)).all()
     return bool(within and (own[[0, 1, 3]] <= alike[:, [0, 1, 3]].max(axis=0) + FEATURE_TOLERANCE).all())
 
 
-def compute_likeness(evidence: Evidence) -> np.ndarray:
+def compute_similarity_features(evidence: Evidence) -> np.ndarray:
     """Compute the features (4,) by which trials are compared: three logarithms, then 0, or `CLOUD_OFFSET` for a cloud.
 
     Logarithms of the observed motion over its error (rigid error included), of the number of points, and of the extent
@@ -119,12 +118,12 @@ def compute_likeness(evidence: Evidence) -> np.ndarray:
     with a correspondence gives three numbers, a point of a cloud one.
     """
     first = np.unique(evidence.point, return_index=True)[1]
-    count, at = len(first), evidence.at[first]
-    seen = np.sqrt((evidence.value**2).sum() / count)
-    ratio = max(seen / np.hypot(np.median(evidence.sigma), evidence.shift), MIN_MOTION_RATIO)
+    count, at = len(first), evidence.positions[first]
+    seen = np.sqrt((evidence.motion**2).sum() / count)
+    ratio = max(seen / np.hypot(np.median(evidence.sigma), evidence.shift_sigma), MIN_MOTION_RATIO)
     extent = np.sqrt(((at - at.mean(axis=0)) ** 2).sum(axis=1).mean())
     logs = np.log([ratio, count, extent]) * [1.0, 1.0, EXTENT_WEIGHT]
-    return np.append(logs, CLOUD_OFFSET * (not evidence.named))
+    return np.append(logs, CLOUD_OFFSET * (not evidence.is_paired))
 
 
 def _simulate_trial(
@@ -139,31 +138,31 @@ def _simulate_trial(
     softer = np.exp(random.uniform(*np.log(settings.compliance_ratios)))
     motion = softer * ensemble.motion[chosen].sum(axis=0, dtype=float)
     count = int(np.exp(random.uniform(*np.log(settings.point_counts))))
-    evidence = sample_seen_patch(anatomy, motion, random, count, random.uniform(*settings.covered_shares))
+    evidence = sample_observed_patch(anatomy, motion, random, count, random.uniform(*settings.covered_shares))
     sigma = np.full(len(evidence), SIGMA * np.exp(random.uniform(*np.log(settings.error_ratios))))
     has_shift = random.uniform() >= settings.no_shift_probability
     shift = float(np.exp(random.uniform(*np.log(settings.shift_range)))) if has_shift else 0.0
-    evidence = replace(evidence, sigma=sigma, shift=shift)
-    off = np.linalg.cholesky(evidence.compute_noise()) @ random.standard_normal(len(evidence))
+    evidence = replace(evidence, sigma=sigma, shift_sigma=shift)
+    off = np.linalg.cholesky(evidence.compute_covariance()) @ random.standard_normal(len(evidence))
     way = random.standard_normal((2, 3))
     way *= np.sqrt(3.0) / np.linalg.norm(way, axis=1, keepdims=True)
     shifted, turned = evidence.rigid_scale.reshape(2, 3) * way
-    rest = evidence.at[::3]
-    now = rest + (evidence.value + off).reshape(-1, 3) + shifted + np.cross(turned, rest - evidence.middle)
+    rest = evidence.positions[::3]
+    now = rest + (evidence.motion + off).reshape(-1, 3) + shifted + np.cross(turned, rest - evidence.centroid)
     observation = Observation(now, rest if number % 2 else None, sigma[::3], rigid=shift)
-    return observation, compute_middle(anatomy, motion[None])[0]
+    return observation, compute_centroid_motion(anatomy, motion[None])[0]
 
 
-def sample_seen_patch(
-    anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator, count: int, cover: float
+def sample_observed_patch(
+    anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator, count: int, area_share: float
 ) -> Evidence:
-    """Sample `count` error-free points of a motion (V, 3) [m] on a round share `cover` of the open cortex."""
+    """Sample `count` error-free points of a motion (V, 3) [m] on a round share `area_share` of the open cortex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     corners = nodes[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     middles = corners.mean(axis=1)
     order = np.argsort(((middles - middles[random.choice(len(area), p=area / area.sum())]) ** 2).sum(axis=1))
-    within = np.cumsum(area[order]) <= cover * area.sum()
+    within = np.cumsum(area[order]) <= area_share * area.sum()
     some = order[: max(4, np.count_nonzero(within))]
     triangle = random.choice(some, count, p=area[some] / area[some].sum())
     weights = random.dirichlet(np.ones(3), count)
@@ -175,5 +174,5 @@ def sample_seen_patch(
 
 def _square(prior: MotionPrior, found: Posterior, middle: np.ndarray) -> float:
     """Squared Mahalanobis distance of an estimate's error (3,) [m] by its own covariance."""
-    off = found.weight @ prior.middle - middle
-    return float(off @ np.linalg.solve(found.compute_covariance(prior.middle[:, None])[0], off))
+    off = found.shape_weights @ prior.centroid_motion - middle
+    return float(off @ np.linalg.solve(found.compute_covariance(prior.centroid_motion[:, None])[0], off))

@@ -44,14 +44,14 @@ class CauseShare:
         return f"{named}{apart} {100 * self.share:.0f} % ({100 * self.low:.0f} to {100 * self.high:.0f} %)"
 
 
-def group_cause_shares(drawn: np.ndarray) -> tuple[CauseShare, ...]:
+def group_cause_shares(samples: np.ndarray) -> tuple[CauseShare, ...]:
     """Group `KINDS` as finely as sampled shares (n, kinds) determine; largest share first, negligible ones dropped.
 
     Among several finest groupings, the one with the smallest sum of interval widths is chosen.
     """
     ways = []
-    for groups in _generate_partitions(range(drawn.shape[1])):
-        joint = np.stack([drawn[:, group].sum(axis=1) for group in groups], axis=1)
+    for groups in _generate_partitions(range(samples.shape[1])):
+        joint = np.stack([samples[:, group].sum(axis=1) for group in groups], axis=1)
         low, high = np.quantile(joint, (TAIL_PROBABILITY, 1.0 - TAIL_PROBABILITY), axis=0)
         if (high - low <= MAX_INTERVAL_WIDTH).all():
             mean = joint.mean(axis=0)
@@ -77,7 +77,7 @@ def _generate_partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
 
 def compute_cause_shares(prior: MotionPrior, posterior: Posterior) -> np.ndarray:
     """Sample shares (n, kinds) of causes in the mean square motion of the open cortex from the posterior."""
-    ends = np.round(SAMPLE_COUNT * np.cumsum([result.share for result in posterior.results])).astype(int)
+    ends = np.round(SAMPLE_COUNT * np.cumsum([result.probability for result in posterior.results])).astype(int)
     normal = np.random.default_rng(0).standard_normal((SAMPLE_COUNT, len(prior.kind)))
     squares, begin = np.zeros((SAMPLE_COUNT, len(KINDS))), 0
     for result, end in zip(posterior.results, ends, strict=True):
@@ -88,6 +88,6 @@ def compute_cause_shares(prior: MotionPrior, posterior: Posterior) -> np.ndarray
             own = rows[kind == number]
             shapes = result.rows[own]
             part = weight[:, kind == number]
-            squares[begin:end, number] = ((part @ prior.on_cortex[shapes[:, None], shapes]) * part).sum(axis=1)
+            squares[begin:end, number] = ((part @ prior.cortex_products[shapes[:, None], shapes]) * part).sum(axis=1)
         begin = end
     return squares / squares.sum(axis=1, keepdims=True)

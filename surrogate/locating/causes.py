@@ -82,9 +82,9 @@ SEPARATING_SKULL = "contact"  # Skull model that separates from the brain.
 SUPINE = np.array(Gravity().direction)  # Direction of gravity in the scan, as in `Gravity`.
 
 
-def build_linear_tissue(times: float, poisson: float) -> Material:
-    """Build linear tissue `times` as stiff as the brain at small strain."""
-    return Material("linear", YOUNG * times, poisson)
+def build_linear_tissue(stiffness_ratio: float, poisson: float) -> Material:
+    """Build linear tissue `stiffness_ratio` as stiff as the brain at small strain."""
+    return Material("linear", YOUNG * stiffness_ratio, poisson)
 
 
 @dataclass(frozen=True)
@@ -113,9 +113,11 @@ class Group:
     regions: tuple[Region, ...] = ()
     reach: tuple[float, ...] = ()
 
-    def build_effects(self, swelling: tuple[float, ...], regions: tuple[int, ...] | None = None) -> tuple[Effect, ...]:
+    def build_effects(
+        self, volume_changes: tuple[float, ...], regions: tuple[int, ...] | None = None
+    ) -> tuple[Effect, ...]:
         """Build the effects of the FEM, with up to these volume changes in these regions (None: all)."""
-        swells = Pulsation(Wave(SWELLING_WAVE.frequency, max(map(abs, swelling))), SWELLING_WAVE, regions)
+        swells = Pulsation(Wave(SWELLING_WAVE.frequency, max(map(abs, volume_changes))), SWELLING_WAVE, regions)
         tissue = build_tissue(self._build_tissue, self.poisson, self.ratio, self.regions)
         return (tissue, Held(), SKULLS[self.skull], ToolForce(), Gravity(), swells)
 
@@ -159,17 +161,17 @@ def build_pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes =
     return Loads((pushed, _build_posture(anatomy, np.tile(SUPINE, (count, 1)), 1.0)), np.zeros(count))
 
 
-def build_swellings(anatomy: Anatomy, shares: tuple[float, ...]) -> Loads:
+def build_swellings(anatomy: Anatomy, volume_changes: tuple[float, ...]) -> Loads:
     """Build loads of these volume changes; pass the same changes to `Group.build_effects`."""
     # The wave gives the time at which each volume change is reached.
-    time = np.arcsin(np.array(shares) / max(map(abs, shares))) / (2.0 * np.pi * SWELLING_WAVE.frequency)
+    time = np.arcsin(np.array(volume_changes) / max(map(abs, volume_changes))) / (2.0 * np.pi * SWELLING_WAVE.frequency)
     return Loads((_build_idle(anatomy, len(time)), _build_posture(anatomy, np.tile(SUPINE, (len(time), 1)), 1.0)), time)
 
 
 def build_drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL_CAUSES) -> tuple[Loads, ...]:
     """Build loads of drained fluid, level by level, for sampled head directions."""
     random = np.random.default_rng([seed, group.number, 1])
-    down = sample_directions(random, open_cortex(anatomy).axis, causes)
+    down = sample_gravity_directions(random, open_cortex(anatomy).axis, causes)
     idle = _build_idle(anatomy, len(down))
     return tuple(Loads((idle, _build_posture(anatomy, down, left)), np.zeros(len(down))) for left in causes.levels)
 
@@ -185,7 +187,7 @@ def _build_posture(anatomy: Anatomy, down: np.ndarray, left: float) -> Posture:
     return Posture(down, level, np.ones(len(down)))
 
 
-def sample_directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
+def sample_gravity_directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
     """Sample directions of gravity (n, 3), uniform by solid angle in a cone round the inward axis."""
     cosine = random.uniform(np.cos(causes.cone), 1.0, causes.drainages)
     angle = random.uniform(0.0, 2.0 * np.pi, causes.drainages)
@@ -196,7 +198,7 @@ def sample_directions(random: np.random.Generator, axis: np.ndarray, causes: Cau
 
 
 @dataclass(frozen=True, eq=False)
-class Presses:
+class PressResponses:
     """Motions by forces of equal magnitude on the open cortex.
 
     Parameters
@@ -213,10 +215,10 @@ class Presses:
 
 def solve_presses(
     anatomy: Anatomy, skulls: tuple[str, ...], device: str = "auto", regions: tuple[Region, ...] = ()
-) -> Presses:
+) -> PressResponses:
     """Solve linear tissue under forces of 0.01 N on discs of 7 mm radius, for each of some skulls, with `regions`."""
     nodes = anatomy.mesh.nodes[np.unique(anatomy.open_surface)]
-    points = nodes[choose_spaced(nodes, TOOL_POINTS)]
+    points = nodes[select_spaced_points(nodes, TOOL_POINTS)]
     force = np.tile(0.01 * np.eye(3), (len(points), 1))
     loads = Loads((Pushed(np.repeat(points, 3, axis=0), force, np.full(len(force), FORCE_RADIUS)),))
     found: dict[str, list[np.ndarray]] = {name: [] for name in skulls}
@@ -224,10 +226,10 @@ def solve_presses(
         effects = (build_tissue(build_linear_tissue, poisson, ratio, regions), Held(), SKULLS[name], ToolForce())
         motion = Fem(anatomy, effects, ACCURACY, device).deform(loads).displacement
         found[name].append(motion.reshape(len(points), 3, -1, 3).astype(np.float32))
-    return Presses(points, {name: np.stack(parts) for name, parts in found.items()})
+    return PressResponses(points, {name: np.stack(parts) for name, parts in found.items()})
 
 
-def choose_spaced(points: np.ndarray, count: int) -> np.ndarray:
+def select_spaced_points(points: np.ndarray, count: int) -> np.ndarray:
     """Select `count` of the points (n, 3) by farthest-point sampling, starting next to the centroid; return indices."""
     found = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmin())]
     away = np.full(len(points), np.inf)

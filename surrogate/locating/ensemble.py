@@ -15,7 +15,7 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.fem import Fem
 
-from ..model.kept_arrays import find_kept_path, keep_arrays
+from ..model.kept_arrays import get_cache_path, load_cached_arrays
 from .causes import (
     DRAINAGE,
     OEDEMA,
@@ -35,8 +35,8 @@ ACCURACY = Accuracy(tolerance=3e-3)  # Relative solver tolerance far below obser
 MIN_MOTION = 2e-5  # Smallest RMS motion of the open cortex [m]: below it, a member is mainly round-off.
 
 
-def mark_tumour_surroundings(anatomy: Anatomy, reach: float) -> tuple[Anatomy, tuple[int, ...]]:
-    """Mark brain within `reach` [m] of the tumour as a separate region; return the body and the labels that swell.
+def mark_tumour_surroundings(anatomy: Anatomy, distance: float) -> tuple[Anatomy, tuple[int, ...]]:
+    """Mark brain within `distance` [m] of the tumour as a separate region; return the body and the labels that swell.
 
     These labels are the new region's, and the oedema's if the anatomy has one. Tissue is unchanged if the material
     laws name only regions of the anatomy.
@@ -45,7 +45,7 @@ def mark_tumour_surroundings(anatomy: Anatomy, reach: float) -> tuple[Anatomy, t
     tumour = KDTree(mesh.nodes[anatomy.tumour_nodes])
     away, _ = tumour.query(mesh.nodes[mesh.tets].mean(axis=1))
     own = int(mesh.region.max()) + 1
-    region = np.where((mesh.region == BRAIN_LABEL) & (away < reach), own, mesh.region)
+    region = np.where((mesh.region == BRAIN_LABEL) & (away < distance), own, mesh.region)
     swells = np.intersect1d(region, [own, PART_LABELS["oedema"]])
     return replace(anatomy, mesh=replace(mesh, region=region)), tuple(swells.tolist())
 
@@ -72,13 +72,9 @@ class Ensemble:
 
 
 def solve_groups(
-    anatomy: Anatomy,
-    seed: int = 0,
-    device: str = "auto",
-    causes: Causes = USUAL_CAUSES,
-    folder: Path | None = None,
+    anatomy: Anatomy, seed: int = 0, device: str = "auto", causes: Causes = USUAL_CAUSES, folder: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
-) -> Ensemble:
+) -> Ensemble:  # fmt: skip
     """Solve an ensemble, group by group. Finished groups of an interrupted run are read from `folder`.
 
     `progress` receives the number of groups done and their total.
@@ -110,9 +106,9 @@ def _get_motions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Read the motions and kinds of a group from the folder, or compute and keep them; the key holds all inputs."""
     stated = anatomy.digest, recommend_element(anatomy.mesh), group, seed, causes, ACCURACY
-    path = find_kept_path(folder, f"{group.number:03d}-", device, *stated)
+    path = get_cache_path(folder, f"{group.number:03d}-", device, *stated)
     names = "motion", "kind"
-    arrays = keep_arrays(
+    arrays = load_cached_arrays(
         path,
         "a group of an ensemble",
         names,

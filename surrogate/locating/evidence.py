@@ -44,72 +44,75 @@ class Evidence:
 
     Parameters
     ----------
-    place
+    location
         Material points of the rows, in the mesh.
-    at
+    positions
         Undeformed positions (m, 3) [m].
     axis
         Unit vectors (m, 3).
-    value
+    motion
         (m,) [m].
     sigma
         (m,) [m]: standard deviation of the non-rigid error.
     point
         Number (m,) of the observed point of each row.
-    shift
+    shift_sigma
         [m]: standard deviation of the rigid error's translation along each axis.
     """
 
-    place: LocatedPoints
-    at: np.ndarray
+    location: LocatedPoints
+    positions: np.ndarray
     axis: np.ndarray
-    value: np.ndarray
+    motion: np.ndarray
     sigma: np.ndarray
     point: np.ndarray
-    shift: float = SHIFT_ERROR
+    shift_sigma: float = SHIFT_ERROR
 
     def __len__(self) -> int:
-        return len(self.value)
+        return len(self.motion)
 
-    def select(self, chosen: np.ndarray) -> Evidence:
+    def select(self, rows: np.ndarray) -> Evidence:
         """Select rows by a mask (m,) or by numbers."""
-        place = LocatedPoints(self.place.vertices[chosen], self.place.weights[chosen])
-        arrays = {name: getattr(self, name)[chosen] for name in ("at", "axis", "value", "sigma", "point")}
-        return replace(self, place=place, **arrays)
+        place = LocatedPoints(self.location.vertices[rows], self.location.weights[rows])
+        arrays = {name: getattr(self, name)[rows] for name in ("positions", "axis", "motion", "sigma", "point")}
+        return replace(self, location=place, **arrays)
 
     @property
-    def middle(self) -> np.ndarray:
+    def centroid(self) -> np.ndarray:
         """(3,) [m]: centroid of the undeformed positions; centre of rotations."""
-        return self.at.mean(axis=0)
+        return self.positions.mean(axis=0)
 
     @property
-    def rigid(self) -> np.ndarray:
+    def rigid_jacobian(self) -> np.ndarray:
         """Matrix (m, 6) from a rigid error, translation [m] and rotation [rad] about the centroid, to rows."""
-        return np.concatenate([self.axis, np.cross(self.at - self.middle, self.axis)], axis=1)
+        return np.concatenate([self.axis, np.cross(self.positions - self.centroid, self.axis)], axis=1)
 
     @property
-    def rigid_alone(self) -> np.ndarray:
+    def rigid_fit(self) -> np.ndarray:
         """Rigid error (6,) [m, rad] that explains most of the observation by least squares, if nothing deformed."""
-        return np.linalg.lstsq(self.rigid, self.value, rcond=None)[0]
+        return np.linalg.lstsq(self.rigid_jacobian, self.motion, rcond=None)[0]
 
     @property
     def rigid_scale(self) -> np.ndarray:
         """Standard deviations (6,) of the prior of a rigid error: translation [m], rotation [rad]."""
-        return max(self.shift, MIN_SHIFT) * np.repeat([1.0, TURN_PER_SHIFT], 3)
+        return max(self.shift_sigma, MIN_SHIFT) * np.repeat([1.0, TURN_PER_SHIFT], 3)
 
     @property
-    def beyond(self) -> float:
+    def rigid_ratio(self) -> float:
         """Ratio of `rigid_alone` to the reported rigid error: the larger of translation and rotation."""
-        return float((np.linalg.norm(self.rigid_alone.reshape(2, 3), axis=1) / self.rigid_scale[[0, 3]]).max())
+        return float((np.linalg.norm(self.rigid_fit.reshape(2, 3), axis=1) / self.rigid_scale[[0, 3]]).max())
 
     @property
-    def slip(self) -> float:
+    def slip_ratio(self) -> float:
         """Standard deviation of the rigid error of a slipped registration, relative to the reported one."""
-        return max(SLIPPED_ERROR / max(self.shift, MIN_SHIFT), 1.0)
+        return max(SLIPPED_ERROR / max(self.shift_sigma, MIN_SHIFT), 1.0)
 
-    def compute_noise(self, scale: float = 0.0) -> np.ndarray:
+    def compute_covariance(self, scale: float = 0.0) -> np.ndarray:
         """Covariance (m, m) [m^2] of non-rigid errors, and of the shapes' model error for motions of `scale` [m]."""
-        share, square = (NOISE.independent_error / SIGMA) ** 2, compute_squared_distances(self.at, self.at)
+        share, square = (
+            (NOISE.independent_error / SIGMA) ** 2,
+            compute_squared_distances(self.positions, self.positions),
+        )
         out = compute_correlation(square, NOISE.correlation_length) * self.sigma * ((1.0 - share) * self.sigma)[:, None]
         out += compute_correlation(square, NOISE.model_error_length) * (NOISE.correlated_model_error * scale) ** 2
         out *= self.axis @ self.axis.T
@@ -117,12 +120,12 @@ class Evidence:
         return out
 
     @property
-    def named(self) -> bool:
+    def is_paired(self) -> bool:
         """True if points have correspondences: three rows each (a cloud's points, and tips, give one)."""
         return len(self) >= 2 * len(np.unique(self.point))
 
     @property
-    def copies(self) -> int:
+    def axis_count(self) -> int:
         """3 if rows are of motions along three axes, point after point; else 1."""
         threefold = len(self) % 3 == 0 and np.array_equal(self.axis, np.tile(np.eye(3), (len(self) // 3, 1)))
         return 3 if threefold else 1
@@ -133,8 +136,8 @@ class Evidence:
 
         (m / 3, v) if rows are of three axes, one after the other, else (m, 3 v): of all axes of a vertex.
         """
-        copies = self.copies
-        place = LocatedPoints(self.place.vertices[::copies], self.place.weights[::copies])
+        copies = self.axis_count
+        place = LocatedPoints(self.location.vertices[::copies], self.location.weights[::copies])
         row, corner = np.nonzero(place.weights)
         vertices, number = np.unique(place.vertices[row, corner], return_inverse=True)
         weights = np.zeros((len(place.weights), len(vertices)))
@@ -145,8 +148,8 @@ class Evidence:
 
     def build_whitening(self, scale: float) -> Whitening:
         """Build the transform to independent errors of variance 1, for observed motions of `scale` [m]."""
-        copies = self.copies
-        lower = cholesky(self.select(np.arange(0, len(self), copies)).compute_noise(scale), lower=True)
+        copies = self.axis_count
+        lower = cholesky(self.select(np.arange(0, len(self), copies)).compute_covariance(scale), lower=True)
         return Whitening(invert_triangular(lower), copies)
 
 
@@ -158,12 +161,12 @@ class Whitening:
     ----------
     root
         (m / copies, m / copies).
-    copies
+    axis_count
         3 if the errors along three axes are equally distributed and independent, row after row; else 1.
     """
 
     root: np.ndarray
-    copies: int
+    axis_count: int
 
     def whiten(self, rows: np.ndarray) -> np.ndarray:
         """Compute R rows, (m, k) or (m,)."""
@@ -174,15 +177,15 @@ class Whitening:
         return (self.root.T @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
     @property
-    def logarithm(self) -> float:
+    def log_determinant(self) -> float:
         """Logarithm of the determinant of R."""
-        return self.copies * float(np.log(np.diag(self.root)).sum())
+        return self.axis_count * float(np.log(np.diag(self.root)).sum())
 
-    def compute_precision(self, table: np.ndarray) -> np.ndarray:
+    def compute_precision(self, rows: np.ndarray) -> np.ndarray:
         """Compute blocks (n, c, c) of the inverse covariance for rows (n, c); all axes of points if `copies` is 3."""
-        columns = self.root.T[table[:, :: self.copies] // self.copies]
+        columns = self.root.T[rows[:, :: self.axis_count] // self.axis_count]
         alike = columns @ columns.transpose(0, 2, 1)
-        return np.kron(alike, np.eye(self.copies))
+        return np.kron(alike, np.eye(self.axis_count))
 
 
 def invert_triangular(lower: np.ndarray) -> np.ndarray:
@@ -197,22 +200,26 @@ def invert_triangular(lower: np.ndarray) -> np.ndarray:
     return found
 
 
-def compute_correlation(square: np.ndarray, length: float) -> np.ndarray:
+def compute_correlation(squared_distance: np.ndarray, length: float) -> np.ndarray:
     """Compute correlations (n, n) of smooth noise: Gaussian of squared distances (n, n) [m^2] and a length [m]."""
-    return np.exp(square * (-0.5 / length**2))
+    return np.exp(squared_distance * (-0.5 / length**2))
 
 
-def smooth_root(points: np.ndarray, length: float = NOISE.correlation_length) -> np.ndarray:
+def compute_correlation_root(points: np.ndarray, length: float = NOISE.correlation_length) -> np.ndarray:
     """Compute the factor (n, n) from independent noise at points (n, 3) [m] to smooth noise of variance 1."""
     value, vector = np.linalg.eigh(compute_correlation(compute_squared_distances(points, points), length))
     return vector * np.sqrt(np.maximum(value, 0.0))
 
 
 def build_motion_evidence(
-    place: LocatedPoints, at: np.ndarray, motion: np.ndarray, sigma: np.ndarray, shift: float = SHIFT_ERROR
+    location: LocatedPoints,
+    positions: np.ndarray,
+    motion: np.ndarray,
+    sigma: np.ndarray,
+    shift_sigma: float = SHIFT_ERROR,
 ) -> Evidence:
     """Build evidence from undeformed points (n, 3) [m] and their motions (n, 3) [m]; three rows a point."""
-    count = len(at)
+    count = len(positions)
     point = np.repeat(np.arange(count), 3)
-    place, axis = LocatedPoints(place.vertices[point], place.weights[point]), np.tile(np.eye(3), (count, 1))
-    return Evidence(place, at[point], axis, motion.ravel(), sigma[point], point, shift)
+    location, axis = LocatedPoints(location.vertices[point], location.weights[point]), np.tile(np.eye(3), (count, 1))
+    return Evidence(location, positions[point], axis, motion.ravel(), sigma[point], point, shift_sigma)

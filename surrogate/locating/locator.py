@@ -14,11 +14,11 @@ from sim.bodies.open_cortex import open_cortex
 from sim.errors import InputError
 from sim.runtime.threads import limit_to_one_thread
 
-from .calibration import compute_covering_factor, is_within_trials
+from .calibration import compute_coverage_factor, is_within_trials
 from .cause_shares import CauseShare, compute_cause_shares, group_cause_shares
 from .causes import KINDS
 from .iterated_conditioning import match_and_update
-from .observation import Observation, choose_points
+from .observation import Observation, choose_point_numbers
 from .posterior import Posterior, is_within_errors
 from .prior import MotionPrior
 from .regions import Region
@@ -50,7 +50,7 @@ LIMITS = LocationLimits()
 
 
 @dataclass(frozen=True)
-class RigidAlone:
+class RigidExplanation:
     """Rigid error that explains most of the observation by least squares, with the brain undeformed.
 
     Parameters
@@ -103,7 +103,7 @@ class Location:
 
     def compute_motion(self, nodes: np.ndarray) -> np.ndarray:
         """Compute the mean motion (n, 3) [m] of vertices (n,)."""
-        return np.tensordot(self.posterior.weight, self.prior.restrict_shapes(nodes), 1)
+        return np.tensordot(self.posterior.shape_weights, self.prior.restrict_shapes(nodes), 1)
 
     def compute_covariance(self, nodes: np.ndarray) -> np.ndarray:
         """Compute covariances (n, 3, 3) [m^2] of the motion of vertices (n,)."""
@@ -112,40 +112,40 @@ class Location:
     @property
     def centroid(self) -> np.ndarray:
         """(3,) [m]: mean motion of the centroid of the tumour's volume."""
-        return self.posterior.weight @ self.prior.middle
+        return self.posterior.shape_weights @ self.prior.centroid_motion
 
     @property
     def centroid_covariance(self) -> np.ndarray:
         """(3, 3) [m^2]: covariance of the motion `centroid`."""
-        return self.posterior.compute_covariance(self.prior.middle[:, None])[0]
+        return self.posterior.compute_covariance(self.prior.centroid_motion[:, None])[0]
 
     @property
     def bias(self) -> np.ndarray:
         """(3,) [m]: mean registration shift of the observation, at the centroid of its points."""
-        return self.posterior.rigid[:3]
+        return self.posterior.rigid_error[:3]
 
     @property
     def rotation(self) -> np.ndarray:
         """(3,) [rad]: mean registration rotation about the centroid of the points."""
-        return self.posterior.rigid[3:]
+        return self.posterior.rigid_error[3:]
 
     @property
     def explained(self) -> float:
         """Share of the observed motion, in mean square, that the mean motion and the rigid error explain."""
         evidence, found = self.posterior.evidence, self.posterior
-        left = evidence.value - self.prior.project_shapes(*evidence.weights) @ found.weight
-        left -= evidence.rigid @ found.rigid
-        whole = float(evidence.value @ evidence.value)
+        left = evidence.motion - self.prior.project_shapes(*evidence.weights) @ found.shape_weights
+        left -= evidence.rigid_jacobian @ found.rigid_error
+        whole = float(evidence.motion @ evidence.motion)
         return max(0.0, 1.0 - float(left @ left) / whole) if whole else 0.0
 
     @property
-    def rigid_alone(self) -> RigidAlone:
+    def rigid_alone(self) -> RigidExplanation:
         """Part of the observation that another rigid error would explain, with the brain undeformed."""
         evidence = self.posterior.evidence
-        found = evidence.rigid_alone
-        left, whole = evidence.value - evidence.rigid @ found, float(evidence.value @ evidence.value)
+        found = evidence.rigid_fit
+        left, whole = (evidence.motion - evidence.rigid_jacobian @ found, float(evidence.motion @ evidence.motion))
         shift, turn = np.linalg.norm(found.reshape(2, 3), axis=1)
-        return RigidAlone(1.0 - float(left @ left) / whole if whole else 0.0, float(shift), float(turn))
+        return RigidExplanation(1.0 - float(left @ left) / whole if whole else 0.0, float(shift), float(turn))
 
     @cached_property
     def within_errors(self) -> bool:
@@ -193,7 +193,9 @@ class Location:
         """Return True if a wrong registration explains the observation nearly as well as a motion does."""
         found, checked = self.posterior, self.checked
         return self.slipped or (
-            not checked and found.evidence.beyond > LIMITS.max_rigid_ratio and found.slipped >= LIMITS.warning_log_odds
+            not checked
+            and found.evidence.rigid_ratio > LIMITS.max_rigid_ratio
+            and found.slip_log_odds >= LIMITS.warning_log_odds
         )
 
     @property
@@ -278,15 +280,15 @@ class Locator:
         found, near = match_and_update(prior, observation)
         slipped = not observation.checked and _is_slip_likely(prior.anatomy, found)
         if slipped:
-            found, near = match_and_update(prior, observation, free=True)
-        some = choose_points(count)
+            found, near = match_and_update(prior, observation, allow_slip=True)
+        some = choose_point_numbers(count)
         outliers = np.union1d(np.setdiff1d(some, near), found.outliers[found.outliers < count])
         _check_explained(found, len(outliers), len(some))
-        found = replace(found, factor=compute_covering_factor(self.tried, found.evidence))
+        found = replace(found, covariance_factor=compute_coverage_factor(self.tried, found.evidence))
         return Location(
             prior=prior,
             posterior=found,
-            p95=compute_radius(found.compute_covariance(prior.middle[:, None])[0]),
+            p95=compute_confidence_radius(found.compute_covariance(prior.centroid_motion[:, None])[0]),
             outliers=outliers,
             outlier_tips=found.outliers[found.outliers >= count] - count,
             slipped=slipped,
@@ -305,7 +307,7 @@ def find_observed_nodes(anatomy: Anatomy) -> np.ndarray:
     return np.union1d(mesh.tets[at_cortex], anatomy.tumour_nodes)
 
 
-def compute_radius(covariance: np.ndarray) -> float:
+def compute_confidence_radius(covariance: np.ndarray) -> float:
     """Compute the radius [m] round the mean of a Gaussian, covariance (3, 3) [m^2], that holds 95 % of samples."""
     drawn = _sample_normal() @ np.linalg.cholesky(covariance).T
     return float(np.quantile(np.sqrt((drawn**2).sum(axis=1)), 0.95))
@@ -323,12 +325,12 @@ def _is_slip_likely(anatomy: Anatomy, found: Posterior) -> bool:
     A brain that sinks by a centimetre resembles a registration shift, but moves uniformly and mostly along the
     craniotomy's axis. A slip shifts the brain across this axis, or rotates it.
     """
-    if found.slipped < LIMITS.min_slip_log_odds or found.evidence.beyond <= LIMITS.max_rigid_ratio:
+    if found.slip_log_odds < LIMITS.min_slip_log_odds or found.evidence.rigid_ratio <= LIMITS.max_rigid_ratio:
         return False
     evidence, axis = found.evidence, open_cortex(anatomy).axis
-    shift, turn = np.split(evidence.rigid_alone, 2)
+    shift, turn = np.split(evidence.rigid_fit, 2)
     sunk = axis @ shift
-    other = shift - sunk * axis + np.cross(turn, evidence.at - evidence.middle)
+    other = shift - sunk * axis + np.cross(turn, evidence.positions - evidence.centroid)
     return bool((other**2).sum(axis=1).mean() > sunk**2)
 
 

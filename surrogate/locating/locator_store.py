@@ -98,14 +98,9 @@ def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) ->
 
 
 def make_locator(
-    anatomy: Anatomy,
-    seed: int = 0,
-    device: str = "auto",
-    causes: Causes = USUAL_CAUSES,
-    folder: Path | None = None,
-    progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
-    count: int = TRIAL_COUNT,
-) -> Locator:
+    anatomy: Anatomy, seed: int = 0, device: str = "auto", causes: Causes = USUAL_CAUSES, folder: Path | None = None,
+    progress: Callable[[str, int, int], object] = lambda stage, done, total: None, count: int = TRIAL_COUNT,
+) -> Locator:  # fmt: skip
     """Build a locator of one anatomy. Finished groups of an interrupted run are read from `folder`.
 
     Regions of the `causes` belong to the locator. `progress` receives a stage, the number of its parts done, and their

@@ -114,7 +114,7 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
         anatomy.
     """
     _check(observation)
-    some = choose_points(len(observation.now))
+    some = choose_point_numbers(len(observation.now))
     if observation.rest is None:
         where, near, far = observation.now[some], LIMITS.near_distance_now, LIMITS.far_distance_now
     else:
@@ -132,53 +132,50 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
                 "millimetres, RAS, or leave it out."
             )
     here = np.zeros_like(anatomy.mesh.nodes)
-    return to_moved_evidence(anatomy, observation, some[off <= far], here, lambda at: np.zeros_like(at))
+    return to_deformed_evidence(anatomy, observation, some[off <= far], here, lambda at: np.zeros_like(at))
 
 
-def choose_points(count: int) -> np.ndarray:
-    """Select the numbers (k,) of at most `MAX_POINTS` points, evenly spread over `count`."""
-    return np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(int))
+def choose_point_numbers(point_count: int) -> np.ndarray:
+    """Select the numbers (k,) of at most `MAX_POINTS` points, evenly spread over `point_count`."""
+    return np.unique(np.linspace(0, point_count - 1, min(point_count, MAX_POINTS)).round().astype(int))
 
 
-def to_moved_evidence(
-    anatomy: Anatomy,
-    observation: Observation,
-    near: np.ndarray,
-    motion: np.ndarray,
+def to_deformed_evidence(
+    anatomy: Anatomy, observation: Observation, point_numbers: np.ndarray, motion: np.ndarray,
     bias: Callable[[np.ndarray], np.ndarray],
-) -> Evidence:
+) -> Evidence:  # fmt: skip
     """Convert an observation to evidence, with the body deformed by `motion` (V, 3) [m].
 
-    Only the points with the numbers `near` (k,) are used. Points without an undeformed position, and tips, are matched
-    to the closest point of the surface and give its motion along its normal. `bias` gives the estimated rigid error
+    Only the points `point_numbers` (k,) are used. Points without an undeformed position, and tips, are matched to the
+    closest point of the surface and give its motion along its normal. `bias` gives the estimated rigid error
     (n, 3) [m] at positions (n, 3). Tips are numbered after the points.
     """
     parts, count = [], len(observation.now)
     cloud, number = observation.tips, count + np.arange(len(observation.tips))
     sigma = np.full(len(observation.tips), SIGMA)
     if observation.rest is not None:
-        here = observation.rest[near]
+        here = observation.rest[point_numbers]
         moved = build_motion_evidence(
-            locate(anatomy.mesh, here), here, observation.now[near] - here, observation.sigmas[near], observation.rigid
+            locate(anatomy.mesh, here),
+            here,
+            observation.now[point_numbers] - here,
+            observation.sigmas[point_numbers],
+            observation.rigid,
         )
-        parts.append(replace(moved, point=near[moved.point]))
+        parts.append(replace(moved, point=point_numbers[moved.point]))
     else:
-        cloud, number = np.concatenate([observation.now[near], cloud]), np.concatenate([near, number])
-        sigma = np.concatenate([observation.sigmas[near], sigma])
+        cloud, number = np.concatenate([observation.now[point_numbers], cloud]), np.concatenate([point_numbers, number])
+        sigma = np.concatenate([observation.sigmas[point_numbers], sigma])
     if len(cloud):
         along = _build_normal_rows(anatomy, cloud, sigma, number, motion, bias)
-        parts.append(replace(along, shift=observation.rigid))
+        parts.append(replace(along, shift_sigma=observation.rigid))
     return parts[0] if len(parts) == 1 else _join_evidence(parts)
 
 
 def _build_normal_rows(
-    anatomy: Anatomy,
-    cloud: np.ndarray,
-    sigma: np.ndarray,
-    number: np.ndarray,
-    motion: np.ndarray,
+    anatomy: Anatomy, cloud: np.ndarray, sigma: np.ndarray, number: np.ndarray, motion: np.ndarray,
     bias: Callable[[np.ndarray], np.ndarray],
-) -> Evidence:
+) -> Evidence:  # fmt: skip
     """Build one row a point, with its `number` (n,): displacement of the surface along its deformed normal."""
     triangles, nodes = anatomy.open_surface, anatomy.mesh.nodes
     corners = (nodes + motion)[triangles]
@@ -199,9 +196,9 @@ def _join_evidence(parts: list[Evidence]) -> Evidence:
     def joined(of, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         return {name: np.concatenate([getattr(of(part), name) for part in parts]) for name in names}
 
-    place = LocatedPoints(**joined(lambda part: part.place, ("vertices", "weights")))
-    arrays = joined(lambda part: part, ("at", "axis", "value", "sigma", "point"))
-    return Evidence(place=place, shift=parts[0].shift, **arrays)
+    place = LocatedPoints(**joined(lambda part: part.location, ("vertices", "weights")))
+    arrays = joined(lambda part: part, ("positions", "axis", "motion", "sigma", "point"))
+    return Evidence(location=place, shift_sigma=parts[0].shift_sigma, **arrays)
 
 
 def _check(observation: Observation) -> None:

@@ -47,14 +47,14 @@ def _to_points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.nda
 
 def read_columns(
     path: str | Path,
-    allowed: set[tuple[str, ...]],
-    empty: tuple[str, ...] = (),
-    blank: Callable[[Mapping[str, str]], bool] | None = None,
+    allowed_headers: set[tuple[str, ...]],
+    optional_columns: tuple[str, ...] = (),
+    is_blank: Callable[[Mapping[str, str]], bool] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Read columns of a table by name, with an allowed header; in `empty` columns cells may be empty (NaN).
+    """Read columns of a table by name, with an allowed header; in `optional_columns` columns cells may be empty (NaN).
 
-    With `blank`, further columns are allowed. It is called with all cells of a row by column; where it returns True,
-    the `empty` columns of that row are NaN.
+    With `is_blank`, further columns are allowed. It is called with all cells of a row by column; where it returns True,
+    the `optional_columns` columns of that row are NaN.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def read_columns(
         See `read_observation`.
     """
     path = to_path(path)
-    known = " or ".join(",".join(names) for names in sorted(allowed))
+    known = " or ".join(",".join(names) for names in sorted(allowed_headers))
     remedy = f"Give a CSV file with the header {known}."
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if path.is_dir() else 'no such file'}. {remedy}")
@@ -77,8 +77,10 @@ def read_columns(
         raise InputError(f"{path}: is empty: give a table with the header {known}.")
     first = rows.pop(0)[1]
     header = tuple(cell.strip().lower() for cell in first)
-    wanted = set(header).difference(NAME_COLUMNS) if blank is None else set().union(*allowed).intersection(header)
-    if wanted not in map(set, allowed) or len(set(header)) < len(header):
+    wanted = (
+        set(header).difference(NAME_COLUMNS) if is_blank is None else set().union(*allowed_headers).intersection(header)
+    )
+    if wanted not in map(set, allowed_headers) or len(set(header)) < len(header):
         raise InputError(
             f"{path}: its first line is {','.join(first)[:80]!r}: give the header {known}, with commas between."
         )
@@ -89,15 +91,16 @@ def read_columns(
     for value, (number, row) in zip(values, rows, strict=True):
         try:
             cells = dict(zip(header, row, strict=True))
-            gone = blank is not None and blank(cells)
+            gone = is_blank is not None and is_blank(cells)
             value[:] = [
-                np.nan if name in empty and (gone or not cells[name].strip()) else float(cells[name]) for name in names
+                np.nan if name in optional_columns and (gone or not cells[name].strip()) else float(cells[name])
+                for name in names
             ]
         except ValueError as error:
             raise InputError(
                 f"{path}: row {number} is {','.join(row)[:80]!r}, not {len(header)} numbers: mend or remove it."
             ) from error
-        given = [name not in empty or (not gone and bool(cells[name].strip())) for name in names]
+        given = [name not in optional_columns or (not gone and bool(cells[name].strip())) for name in names]
         if not (np.abs(value[given]) < MAX_VALUE).all():
             raise InputError(
                 f"{path}: row {number} has a number that is not finite, or above {MAX_VALUE:g}: remove it."

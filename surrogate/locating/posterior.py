@@ -21,7 +21,7 @@ from sim.errors import InputError
 from .causes import OEDEMA, TOOL
 from .evidence import SHIFT_ERROR, SLIPPED_ERROR, Evidence, invert_triangular
 from .prior import CAUSE_SETS, PLACE_SETS, RIGID_RATIOS, Hypothesis, MotionPrior
-from .whitened import Equations, WhitenedSystem, add_places, whiten
+from .whitened import NormalEquations, WhitenedSystem, add_place_unknowns, whiten_system
 
 NO_TIPS, NO_ROWS = np.zeros((0, 3)), np.zeros(0, int)  # Empty arrays: no tool tips (0, 3), no rows (0,).
 RIGID_KIND = -1  # Kind of the unknowns of the rigid error, next to the numbers of causes.
@@ -52,7 +52,7 @@ def is_within_errors(posterior: Posterior) -> bool:
     """
     evidence = posterior.evidence
     whitening, scale = evidence.build_whitening(0.0), evidence.rigid_scale
-    rigid, white = whitening.whiten(evidence.rigid * scale), whitening.whiten(evidence.value)
+    rigid, white = whitening.whiten(evidence.rigid_jacobian * scale), whitening.whiten(evidence.motion)
     precision, gain = rigid.T @ rigid, rigid.T @ white
     whole = np.eye(6) + precision
     found = np.linalg.lstsq(precision, gain, rcond=None)[0]
@@ -61,7 +61,7 @@ def is_within_errors(posterior: Posterior) -> bool:
     if min(chdtrc(6, together), chdtrc(len(white) - 6, rest)) <= POSTERIOR.motion_significance:
         return False
     still = 0.5 * (gain @ np.linalg.solve(whole, gain) - np.linalg.slogdet(whole)[1] - white @ white)
-    return bool(posterior.moving - still - whitening.logarithm < -np.log(POSTERIOR.motion_significance))
+    return bool(posterior.motion_evidence - still - whitening.log_determinant < -np.log(POSTERIOR.motion_significance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,26 +70,26 @@ class HypothesisResult:
 
     Parameters
     ----------
-    share
+    probability
         Probability of the hypothesis.
     rows, mean
         (k,): row numbers of the unknowns, and their posterior means.
-    size
+    prior_deviations
         (k,): their prior standard deviations.
-    lower
-        (k, k): Cholesky factor of the precision of the unknowns, each over `size`.
+    cholesky
+        (k, k): Cholesky factor of the precision of the unknowns, each over `prior_deviations`.
     """
 
-    share: float
+    probability: float
     rows: np.ndarray
     mean: np.ndarray
-    size: np.ndarray
-    lower: np.ndarray
+    prior_deviations: np.ndarray
+    cholesky: np.ndarray
 
     @cached_property
     def root(self) -> np.ndarray:
         """Factor R (k, k) of the covariance R^T R."""
-        return self.size * invert_triangular(self.lower)
+        return self.prior_deviations * invert_triangular(self.cholesky)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,53 +102,53 @@ class Posterior:
         Evidence without outliers.
     results
         Posteriors of hypotheses; their shares sum to 1.
-    unknown
+    unknowns
         Mean (r + 6,) of the shapes' weights, and of the rigid error in its prior's standard deviations.
     surprise
         Mean over rows of the leave-one-out square Mahalanobis distance: 1 if the observation fits.
     outliers
         Numbers of the points that were removed.
-    slipped
+    slip_log_odds
         Log-odds of a slipped registration against one that did not slip: of the best hypothesis of each.
-    moving
-        `moving` of the `ObservedPrior`.
-    factor
+    motion_evidence
+        `motion_evidence` of the `ObservedPrior`.
+    covariance_factor
         Calibration factor on the mixture's covariances.
     """
 
     evidence: Evidence
     results: list[HypothesisResult]
-    unknown: np.ndarray
+    unknowns: np.ndarray
     surprise: float
     outliers: np.ndarray
-    slipped: float
-    moving: float
-    factor: float = 1.0
+    slip_log_odds: float
+    motion_evidence: float
+    covariance_factor: float = 1.0
 
     @property
-    def weight(self) -> np.ndarray:
+    def shape_weights(self) -> np.ndarray:
         """Posterior mean (r,) of the weights of the shapes."""
-        return self.unknown[:-6]
+        return self.unknowns[:-6]
 
     @property
-    def rigid(self) -> np.ndarray:
+    def rigid_error(self) -> np.ndarray:
         """Mean (6,) of the rigid error: translation [m], rotation [rad]."""
-        return self.unknown[-6:] * self.evidence.rigid_scale
+        return self.unknowns[-6:] * self.evidence.rigid_scale
 
-    def compute_bias(self, places: np.ndarray) -> np.ndarray:
+    def compute_bias(self, positions: np.ndarray) -> np.ndarray:
         """Compute the mean rigid error (n, 3) [m] at positions (n, 3) [m]."""
-        return self.rigid[:3] + np.cross(self.rigid[3:], places - self.evidence.middle)
+        return self.rigid_error[:3] + np.cross(self.rigid_error[3:], positions - self.evidence.centroid)
 
-    def compute_covariance(self, shape: np.ndarray) -> np.ndarray:
+    def compute_covariance(self, shapes: np.ndarray) -> np.ndarray:
         """Compute covariances (q, 3, 3) [m^2] of motions from shapes (r, q, 3) [m]."""
-        flat = np.pad(shape.reshape(len(shape), -1), ((0, 6), (0, 0)))  # a rigid error moves no tissue
-        mean, found = self.unknown @ flat, np.zeros((shape.shape[1], 3, 3))
+        flat = np.pad(shapes.reshape(len(shapes), -1), ((0, 6), (0, 0)))  # a rigid error moves no tissue
+        mean, found = self.unknowns @ flat, np.zeros((shapes.shape[1], 3, 3))
         for result in self.results:
             part = flat[result.rows]
             off = np.concatenate([result.root @ part, [result.mean @ part - mean]])
             off = off.reshape(len(off), -1, 3).transpose(1, 2, 0)
-            found += result.share * off @ off.transpose(0, 2, 1)
-        return self.factor * found
+            found += result.probability * off @ off.transpose(0, 2, 1)
+        return self.covariance_factor * found
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,64 +159,64 @@ class ObservedPrior:
     ----------
     prior
         Prior of motions.
-    scale
+    motion_size
         Prior size of motions [mm], root mean square.
-    rows
+    system
         Whitened effect of unit weights, and of a rigid error of one standard deviation, on the observation.
-    odds
+    log_odds
         See `MotionPrior.compute_log_odds`.
-    slip
+    slip_ratio
         See `Evidence.slip`.
-    named
+    is_paired
         True if points have correspondences. Oedema is excluded for point clouds: their errors resemble it.
     """
 
     prior: MotionPrior
-    scale: float
-    rows: WhitenedSystem
-    odds: np.ndarray
-    slip: float = SLIPPED_ERROR / SHIFT_ERROR
-    named: bool = True
+    motion_size: float
+    system: WhitenedSystem
+    log_odds: np.ndarray
+    slip_ratio: float = SLIPPED_ERROR / SHIFT_ERROR
+    is_paired: bool = True
 
     @property
-    def slipped(self) -> float:
+    def slip_log_odds(self) -> float:
         """Log-odds of a slip, as in `Posterior`."""
-        best = self.logs.max(axis=1)
+        best = self.log_evidence.max(axis=1)
         return POSTERIOR.evidence_divisor * float(best[self._slips].max() - best[~self._slips].max())
 
     @property
-    def moving(self) -> float:
+    def motion_evidence(self) -> float:
         """Logarithm of the mean evidence of motions, for a registration within its reported error.
 
         Odds do not count: a tip gives no information on motion.
         """
-        logs = POSTERIOR.evidence_divisor * (self.logs - self.odds)[~self._slips]
-        logs, rows = logs[np.isfinite(logs)], self.rows
-        return float(logsumexp(logs) - np.log(len(logs)) - 0.5 * rows.products[-1, -1] + rows.whitening.logarithm)
+        logs = POSTERIOR.evidence_divisor * (self.log_evidence - self.log_odds)[~self._slips]
+        logs, rows = logs[np.isfinite(logs)], self.system
+        return float(logsumexp(logs) - np.log(len(logs)) - 0.5 * rows.products[-1, -1] + rows.whitening.log_determinant)
 
     @property
     def _slips(self) -> np.ndarray:
         """Mask of the hypotheses (h,) with a slipped registration."""
-        return np.isinf([hypothesis.rigid for hypothesis in self.prior.hypotheses])
+        return np.isinf([hypothesis.rigid_ratio for hypothesis in self.prior.hypotheses])
 
-    def compute_posteriors(self, free: bool = False) -> list[HypothesisResult]:
+    def compute_posteriors(self, allow_slip: bool = False) -> list[HypothesisResult]:
         """Compute the posteriors of the most probable hypotheses, the best first; their shares sum to 1.
 
-        Hypotheses of a slipped registration are included if it is `free`.
+        Hypotheses of a slipped registration are included if it is `allow_slip`.
         """
-        logs = self.logs if free else np.where(self._slips[:, None], -np.inf, self.logs)
+        logs = self.log_evidence if allow_slip else np.where(self._slips[:, None], -np.inf, self.log_evidence)
         best = np.argsort(-logs, axis=None, kind="stable")[: min(POSTERIOR.max_hypotheses, np.isfinite(logs).sum())]
         share = np.exp(logs.flat[best] - logs.flat[best[0]])
         share /= share.sum()
         found = []
         for own, number, place in zip(share, *np.unravel_index(best, logs.shape), strict=True):
             hypothesis = self.prior.hypotheses[number]
-            rows = hypothesis.places[place - 1] if place else NO_ROWS
+            rows = hypothesis.place_rows[place - 1] if place else NO_ROWS
             found.append(self.compute_posterior(hypothesis, rows, float(own)))
         return found
 
     @cached_property
-    def logs(self) -> np.ndarray:
+    def log_evidence(self) -> np.ndarray:
         """Logarithms (h, 1 + p) of odds and coarsened evidence of hypotheses, up to a common constant.
 
         First without a tool, then with one at each place; -inf where none may press.
@@ -225,73 +225,80 @@ class ObservedPrior:
         rigid = (
             self._build_equations()
             .eliminate_unknowns(TOOL)
-            .scale_unknowns(RIGID_KIND, np.minimum(RIGID_RATIOS, self.slip))
+            .scale_unknowns(RIGID_KIND, np.minimum(RIGID_RATIOS, self.slip_ratio))
             .eliminate_unknowns(RIGID_KIND)
         )
-        found: dict[tuple[int, ...], Equations] = {}
+        found: dict[tuple[int, ...], NormalEquations] = {}
         extended = {some[:-1] for some in CAUSE_SETS}
-        evidence = np.full((*rigid.evidence.shape, len(CAUSE_SETS), len(self.odds)), -np.inf)
+        evidence = np.full((*rigid.log_evidence.shape, len(CAUSE_SETS), len(self.log_odds)), -np.inf)
         for number, some in enumerate(CAUSE_SETS):
-            if OEDEMA in some and not self.named:
+            if OEDEMA in some and not self.is_paired:
                 continue
             last = some not in extended
             here = found[some] = found[some[:-1]].eliminate_unknowns(some[-1], last) if some else rigid
-            evidence[..., number, 0] = here.evidence
+            evidence[..., number, 0] = here.log_evidence
         pressed = [number for number, some in enumerate(CAUSE_SETS) if some in PLACE_SETS and some in found]
-        evidence[..., pressed, 1:] = np.moveaxis(add_places([found[CAUSE_SETS[number]] for number in pressed]), 0, -2)
-        return self.odds + evidence.swapaxes(1, 2).reshape(-1, len(self.odds)) / POSTERIOR.evidence_divisor
+        evidence[..., pressed, 1:] = np.moveaxis(
+            add_place_unknowns([found[CAUSE_SETS[number]] for number in pressed]), 0, -2
+        )
+        return self.log_odds + evidence.swapaxes(1, 2).reshape(-1, len(self.log_odds)) / POSTERIOR.evidence_divisor
 
-    def _build_equations(self) -> Equations:
+    def _build_equations(self) -> NormalEquations:
         """Build the normal equations of all unknowns in each skull, each over its prior standard deviation."""
-        shared, products = self.prior.together, self.rows.products
-        skulls, places = len(shared.rows), shared.places
+        shared, products = self.prior.tables, self.system.products
+        skulls, places = len(shared.rows), shared.place_rows
         rows = np.concatenate([shared.rows, np.tile(self._rigid, (skulls, 1))], axis=1)
-        size = np.concatenate([self.scale * shared.size, np.ones((skulls, 6))], axis=1)
+        size = np.concatenate([self.motion_size * shared.deviations, np.ones((skulls, 6))], axis=1)
         # Unknowns of each place, followed by the data.
         beside = np.concatenate([places, np.full((*places.shape[:2], 1), len(products) - 1)], axis=2)
-        beside_size = np.append(np.full(places.shape[2], self.scale), 1.0)
+        beside_size = np.append(np.full(places.shape[2], self.motion_size), 1.0)
         columns = np.concatenate([rows, beside.reshape(skulls, -1)], axis=1)
         wide = np.concatenate([size, np.tile(beside_size, (skulls, places.shape[1]))], axis=1)
         table = products[rows[:, :, None], columns[:, None]] * size[:, :, None] * wide[:, None]
         table[..., *np.diag_indices(rows.shape[1])] += 1.0
-        place = products[places[..., None], beside[:, :, None]] * self.scale * beside_size
+        place = products[places[..., None], beside[:, :, None]] * self.motion_size * beside_size
         place[..., *np.diag_indices(places.shape[2])] += 1.0
-        return Equations(np.append(shared.kind, np.full(6, RIGID_KIND)), table, place, np.zeros(skulls))
+        return NormalEquations(np.append(shared.kind, np.full(6, RIGID_KIND)), table, place, np.zeros(skulls))
 
     @property
     def _rigid(self) -> np.ndarray:
         """Row numbers (6,) of the rigid error."""
-        return np.arange(-7, -1) + len(self.rows.products)
+        return np.arange(-7, -1) + len(self.system.products)
 
-    def compute_posterior(self, hypothesis: Hypothesis, place: np.ndarray, share: float) -> HypothesisResult:
+    def compute_posterior(self, hypothesis: Hypothesis, place_rows: np.ndarray, probability: float) -> HypothesisResult:
         """Compute the posterior of a hypothesis with the additional rows (q,) of one place."""
-        own = np.concatenate([hypothesis.rows, self._rigid, place])
-        size = np.full(len(own), self.scale)
-        size[: len(hypothesis.rows)] *= hypothesis.size
-        size[len(hypothesis.rows) : len(own) - len(place)] = min(hypothesis.rigid, self.slip)
-        inner = self.rows.products[own[:, None], own] * size * size[:, None]
+        own = np.concatenate([hypothesis.rows, self._rigid, place_rows])
+        size = np.full(len(own), self.motion_size)
+        size[: len(hypothesis.rows)] *= hypothesis.deviations
+        size[len(hypothesis.rows) : len(own) - len(place_rows)] = min(hypothesis.rigid_ratio, self.slip_ratio)
+        inner = self.system.products[own[:, None], own] * size * size[:, None]
         inner.flat[:: len(own) + 1] += 1.0
         lower = np.linalg.cholesky(inner)
-        mean = size * potrs(lower.T, size * self.rows.products[-1, own])[0]
-        return HypothesisResult(share, own, mean, size, lower)
+        mean = size * potrs(lower.T, size * self.system.products[-1, own])[0]
+        return HypothesisResult(probability, own, mean, size, lower)
 
 
 def build_observed_prior(prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> ObservedPrior:
     """Whiten a prior at the points of some evidence; tips of tools (k, 3) [m] touch the cortex."""
-    seen = float(np.sqrt((evidence.value**2).sum() / len(np.unique(evidence.point))))
+    seen = float(np.sqrt((evidence.motion**2).sum() / len(np.unique(evidence.point))))
     # A motion and a rigid error may cancel, so that the observation is small; and noise hides smaller motions.
-    scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift)), float(np.median(evidence.sigma)))
+    scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift_sigma)), float(np.median(evidence.sigma)))
     return ObservedPrior(
-        prior, scale, whiten(prior, evidence, seen), prior.compute_log_odds(tips), evidence.slip, evidence.named
+        prior,
+        scale,
+        whiten_system(prior, evidence, seen),
+        prior.compute_log_odds(tips),
+        evidence.slip_ratio,
+        evidence.is_paired,
     )
 
 
 def condition_prior(
-    prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS, free: bool = False
+    prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS, allow_slip: bool = False
 ) -> Posterior:
     """Condition a prior on evidence, without points that no others support. Tips (k, 3) [m] touch the cortex.
 
-    The rigid error is of the reported size, or `free`: then it may be that of a slipped registration.
+    The rigid error is of the reported size, or `allow_slip`: then it may be that of a slipped registration.
 
     Raises
     ------
@@ -302,8 +309,8 @@ def condition_prior(
     while True:
         some = evidence.select(kept)
         seen = build_observed_prior(prior, some, tips)
-        answers = seen.compute_posteriors(free)
-        odd = _compute_distances(seen.rows, answers[0], some.point)
+        answers = seen.compute_posteriors(allow_slip)
+        odd = _compute_distances(seen.system, answers[0], some.point)
         excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], POSTERIOR.outlier_significance)
         if excess.max() <= 1.0 or len(excess) <= POSTERIOR.min_inliers:
             break
@@ -315,9 +322,11 @@ def condition_prior(
             )
     unknown = np.zeros(len(prior.kind) + 6)
     for result in answers:
-        unknown[result.rows] += result.share * result.mean
+        unknown[result.rows] += result.probability * result.mean
     outliers = np.setdiff1d(point, some.point)
-    return Posterior(some, answers, unknown, float(odd.sum() / len(some)), outliers, seen.slipped, seen.moving)
+    return Posterior(
+        some, answers, unknown, float(odd.sum() / len(some)), outliers, seen.slip_log_odds, seen.motion_evidence
+    )
 
 
 def _compute_distances(rows: WhitenedSystem, result: HypothesisResult, point: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from sim.anatomy import Anatomy
 from sim.effects import SKULLS
 from sim.errors import InputError
 
-from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING, Presses, choose_spaced
+from .causes import DRAINAGE, OEDEMA, SWELLING, TOOL, TUMOUR_SWELLING, PressResponses, select_spaced_points
 from .ensemble import Ensemble, compute_surface_motion
 
 # Maximum number of shapes of each cause in each skull model.
@@ -63,18 +63,18 @@ class Hypothesis:
     ----------
     rows
         Rows (k,) of the prior's shapes.
-    size
+    deviations
         Standard deviations (k,) of their weights, as shares of the observed motion.
-    rigid
+    rigid_ratio
         Size of the rigid error relative to the reported one; inf for a slipped registration.
-    places
+    place_rows
         (p, q) rows of shapes; those of one line may be added: a tool that presses on one place.
     """
 
     rows: np.ndarray
-    size: np.ndarray
-    rigid: float
-    places: np.ndarray
+    deviations: np.ndarray
+    rigid_ratio: float
+    place_rows: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,18 +85,18 @@ class PriorTables:
     ----------
     rows
         Rows (s, k) of the prior's shapes. A skull with fewer of a kind is padded with row 0, of size 0.
-    size
+    deviations
         Sizes (s, k), see `Hypothesis`.
     kind
         (k,) of the columns; tools all over the cortex.
-    places
+    place_rows
         Rows (s, p, q), see `Hypothesis`.
     """
 
     rows: np.ndarray
-    size: np.ndarray
+    deviations: np.ndarray
     kind: np.ndarray
-    places: np.ndarray
+    place_rows: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,16 +148,16 @@ class MotionPrior:
 
     def prepare(self) -> None:
         """Compute the tables that all observations share, once."""
-        _ = self.middle, self.hypotheses, self.together, self._by_vertex
+        _ = self.centroid_motion, self.hypotheses, self.tables, self._by_vertex
 
     @cached_property
-    def middle(self) -> np.ndarray:
+    def centroid_motion(self) -> np.ndarray:
         """(r, 3) [m]: motion of the centroid of the tumour's volume by each shape."""
         tumour = self.anatomy.tumour_nodes
-        return np.einsum("v,rvi->ri", compute_tumour_share(self.anatomy)[tumour], self.restrict_shapes(tumour))
+        return np.einsum("v,rvi->ri", compute_tumour_weights(self.anatomy)[tumour], self.restrict_shapes(tumour))
 
     @cached_property
-    def on_cortex(self) -> np.ndarray:
+    def cortex_products(self) -> np.ndarray:
         """(r, r) [m^2]: inner products of the shapes, summed over the open cortex's vertices."""
         flat = self.restrict_shapes(np.unique(self.anatomy.open_surface)).reshape(len(self.shape), -1).astype(float)
         return flat @ flat.T
@@ -216,7 +216,7 @@ class MotionPrior:
         return tuple(made)
 
     @cached_property
-    def together(self) -> PriorTables:
+    def tables(self) -> PriorTables:
         """Tables of the shapes that may act in each skull."""
         found, places = zip(*map(self._select_skull_rows, range(len(SKULLS))), strict=True)
         rows, size, kinds = [], [], []
@@ -230,28 +230,28 @@ class MotionPrior:
         )
 
 
-def build_prior(ensemble: Ensemble, presses: Presses, members: np.ndarray | None = None) -> MotionPrior:
+def build_prior(ensemble: Ensemble, presses: PressResponses, members: np.ndarray | None = None) -> MotionPrior:
     """Build the prior of an ensemble, or of some of its members (N,) bool, and of forces on the open cortex."""
     anatomy, parts = ensemble.anatomy, []
     chosen = np.ones(len(ensemble.kind), bool) if members is None else members
     for kind, skull in product(OTHER_CAUSES, range(len(SKULLS))):
         some = np.flatnonzero(chosen & (ensemble.kind == kind) & (ensemble.skull == skull))
         if len(some):
-            shape = compute_principal_parts(
+            shape = compute_principal_components(
                 normalise_motions(anatomy, ensemble.motion[some]) / np.float32(np.sqrt(len(some))), MAX_SHAPES[kind]
             )
             parts.append((shape, kind, skull, NO_PLACE))
-    centres = choose_spaced(presses.points, PRESS.place_count)
+    centres = select_spaced_points(presses.points, PRESS.place_count)
     for name in dict.fromkeys(TOOL_SKULLS.values()):
         skull, motion = list(SKULLS).index(name), presses.motion[name]
-        shape = compute_principal_parts(motion.reshape(-1, *motion.shape[-2:]), MAX_SHAPES[TOOL])
+        shape = compute_principal_components(motion.reshape(-1, *motion.shape[-2:]), MAX_SHAPES[TOOL])
         parts.append((normalise_shapes(anatomy, shape), TOOL, skull, NO_PLACE))
         for place, centre in enumerate(centres):
             away = ((presses.points - presses.points[centre]) ** 2).sum(axis=1)
             near = np.flatnonzero(away < (3.0 * PRESS.place_deviation) ** 2)
             weight = np.exp(-away[near] / (2.0 * PRESS.place_deviation**2)).astype(np.float32)
             some = motion[:, near] * weight[:, None, None, None]
-            shape = compute_principal_parts(some.reshape(-1, *motion.shape[-2:]), PRESS.max_place_shapes)
+            shape = compute_principal_components(some.reshape(-1, *motion.shape[-2:]), PRESS.max_place_shapes)
             parts.append((normalise_shapes(anatomy, shape), TOOL, skull, place))
     shapes, *labels = zip(*parts, strict=True)
     counts = [len(shape) for shape in shapes]
@@ -269,26 +269,26 @@ def normalise_motions(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
     return motion * (1e-3 / size)[:, None, None].astype(np.float32)
 
 
-def normalise_shapes(anatomy: Anatomy, shape: np.ndarray) -> np.ndarray:
+def normalise_shapes(anatomy: Anatomy, shapes: np.ndarray) -> np.ndarray:
     """Scale shapes (k, V, 3) [m] so that together they move the open cortex by 1 mm."""
-    return shape * np.float32(1e-3 / np.sqrt((compute_surface_motion(anatomy, shape) ** 2).sum()))
+    return shapes * np.float32(1e-3 / np.sqrt((compute_surface_motion(anatomy, shapes) ** 2).sum()))
 
 
-def compute_principal_parts(motion: np.ndarray, most: int) -> np.ndarray:
-    """Compute up to `most` principal components (k, V, 3) of motions (n, V, 3), with the same Gram matrix."""
+def compute_principal_components(motion: np.ndarray, max_components: int) -> np.ndarray:
+    """Compute up to `max_components` principal components (k, V, 3) of motions (n, V, 3), with the same Gram matrix."""
     flat = motion.reshape(len(motion), -1)
     value, vector = np.linalg.eigh((flat @ flat.T).astype(float))
-    chosen = np.argsort(-value)[:most]
+    chosen = np.argsort(-value)[:max_components]
     chosen = chosen[value[chosen] > MIN_SHAPE_SHARE * value.sum()]
     return (vector[:, chosen].T.astype(np.float32) @ flat).reshape(-1, *motion.shape[1:])
 
 
-def compute_middle(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
+def compute_centroid_motion(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
     """Compute the motion (n, 3) [m] of the centroid of the tumour's volume for motions (n, V, 3) [m]."""
-    return np.einsum("v,nvi->ni", compute_tumour_share(anatomy), motion)
+    return np.einsum("v,nvi->ni", compute_tumour_weights(anatomy), motion)
 
 
-def compute_tumour_share(anatomy: Anatomy) -> np.ndarray:
+def compute_tumour_weights(anatomy: Anatomy) -> np.ndarray:
     """Compute the weight (V,) of each vertex in the centroid of the tumour's volume."""
     mesh = anatomy.mesh
     inside = anatomy.in_tumour

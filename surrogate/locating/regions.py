@@ -43,15 +43,15 @@ class Region:
 
 
 def build_tissue(
-    tissue: Callable[[float, float], Tissue], poisson: float, ratio: float, regions: tuple[Region, ...]
+    make_tissue: Callable[[float, float], Tissue], poisson: float, tumour_ratio: float, regions: tuple[Region, ...]
 ) -> Elasticity:
-    """Build the elasticity of brain, tumour and known regions from `tissue(times, poisson)`.
+    """Build the elasticity of brain, tumour and known regions from `make_tissue(ratio, poisson)`.
 
-    `times` is the stiffness over the brain's. `poisson` is the brain's, and `ratio` the tumour's stiffness over it,
-    unless the tumour is a known region.
+    A `ratio` is a stiffness over the brain's. `poisson` is the brain's, `tumour_ratio` is the tumour's, unless the
+    tumour is a known region.
     """
-    known = {one.label: tissue(one.ratio, poisson if one.poisson is None else one.poisson) for one in regions}
-    return Elasticity(tissue(1.0, poisson), {TUMOUR_LABEL: tissue(ratio, poisson), **known})
+    known = {one.label: make_tissue(one.ratio, poisson if one.poisson is None else one.poisson) for one in regions}
+    return Elasticity(make_tissue(1.0, poisson), {TUMOUR_LABEL: make_tissue(tumour_ratio, poisson), **known})
 
 
 def list_known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
@@ -82,7 +82,7 @@ def check_regions(regions: tuple[Region, ...], anatomy: Anatomy) -> None:
             raise InputError(missing)
 
 
-def find_differing_regions(elasticity: Elasticity, known: tuple[Region, ...]) -> tuple[int, ...]:
+def find_differing_regions(elasticity: Elasticity, known_regions: tuple[Region, ...]) -> tuple[int, ...]:
     """Return the labels of regions whose tissue differs from the known one.
 
     Regions without an entry count as brain. The tumour is excluded: its stiffness may be unknown. Empty if a tissue has
@@ -90,7 +90,7 @@ def find_differing_regions(elasticity: Elasticity, known: tuple[Region, ...]) ->
     """
     if not all(isinstance(tissue, Material) for tissue in (elasticity.default, *elasticity.regions.values())):
         return ()
-    has, knows = ({one.label: one for one in some} for some in (list_known_regions(elasticity), known))
+    has, knows = ({one.label: one for one in some} for some in (list_known_regions(elasticity), known_regions))
     labels = {*has, *knows} - {TUMOUR_LABEL}
     as_brain = {label: Region(label, 1.0) for label in labels}
     pairs = {label: ({**as_brain, **has}[label], {**as_brain, **knows}[label]) for label in labels}

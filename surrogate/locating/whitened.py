@@ -20,63 +20,63 @@ from .prior import MotionPrior
 
 
 @dataclass(frozen=True, eq=False)
-class Equations:
+class NormalEquations:
     """Stacks (...) of partly eliminated normal equations, to which the unknowns of one of p places may be added.
 
     Parameters
     ----------
     kind
         (k,) of the remaining unknowns; those of one kind are adjacent.
-    table
-        (..., k, k + p (q + 1)): their products with each other, and with the columns of `place`.
-    place
+    products
+        (..., k, k + p (q + 1)): their products with each other, and with the columns of `place_products`.
+    place_products
         (..., p, q, q + 1): products of the q unknowns of each place with each other and with the data, which come last.
-    evidence
+    log_evidence
         (...): log evidence of the eliminated unknowns.
     """
 
     kind: np.ndarray
-    table: np.ndarray
-    place: np.ndarray
-    evidence: np.ndarray
+    products: np.ndarray
+    place_products: np.ndarray
+    log_evidence: np.ndarray
 
-    def eliminate_unknowns(self, kind: int, last: bool = False) -> Equations:
-        """Eliminate the unknowns of one kind; the `last` elimination leaves no `table`."""
+    def eliminate_unknowns(self, kind: int, is_last: bool = False) -> NormalEquations:
+        """Eliminate the unknowns of one kind; the `is_last` elimination leaves no `table`."""
         first = int(np.argmax(self.kind == kind))
         end = first + np.count_nonzero(self.kind == kind)
         own, left = slice(first, end), np.delete(self.kind, slice(first, end))
-        block = self.table[..., own, own]
-        rows = np.concatenate([self.table[..., own, :first], self.table[..., own, end:]], axis=-1)
+        block = self.products[..., own, own]
+        rows = np.concatenate([self.products[..., own, :first], self.products[..., own, end:]], axis=-1)
         solved = np.linalg.inv(block) @ rows
-        shape = (*block.shape[:-1], self.place.shape[-3], self.place.shape[-1])
+        shape = (*block.shape[:-1], self.place_products.shape[-3], self.place_products.shape[-1])
         here, there = (each[..., len(left) :].reshape(shape).swapaxes(-3, -2) for each in (rows, solved))
-        place = self.place - here[..., :-1].swapaxes(-1, -2) @ there
+        place = self.place_products - here[..., :-1].swapaxes(-1, -2) @ there
         gain = (rows[..., -1] * solved[..., -1]).sum(axis=-1)
-        evidence = self.evidence + 0.5 * (gain - np.linalg.slogdet(block)[1])
-        if last:
-            return Equations(left[:0], rows[..., :0, len(left) :], place, evidence)
+        evidence = self.log_evidence + 0.5 * (gain - np.linalg.slogdet(block)[1])
+        if is_last:
+            return NormalEquations(left[:0], rows[..., :0, len(left) :], place, evidence)
         table = rows[..., : len(left)].swapaxes(-1, -2) @ -solved
         for there, here in ((slice(first), slice(first)), (slice(first, None), slice(end, None))):
-            table[..., there, :first] += self.table[..., here, :first]
-            table[..., there, first:] += self.table[..., here, end:]
-        return Equations(left, table, place, evidence)
+            table[..., there, :first] += self.products[..., here, :first]
+            table[..., there, first:] += self.products[..., here, end:]
+        return NormalEquations(left, table, place, evidence)
 
-    def scale_unknowns(self, kind: int, sizes: np.ndarray) -> Equations:
+    def scale_unknowns(self, kind: int, deviations: np.ndarray) -> NormalEquations:
         """Return equations (..., b) in which unknowns of one kind have b prior standard deviations, instead of 1."""
         own = np.flatnonzero(self.kind == kind)
-        size = np.ones((len(sizes), self.table.shape[-1]))
-        size[:, own] = sizes[:, None]
+        size = np.ones((len(deviations), self.products.shape[-1]))
+        size[:, own] = deviations[:, None]
         rows = size[:, : len(self.kind), None]
-        table = self.table[..., None, :, :] * rows * size[:, None]
-        table[..., own, own] += 1.0 - sizes[:, None] ** 2
-        return Equations(self.kind, table, self.place[..., None, :, :, :], self.evidence[..., None])
+        table = self.products[..., None, :, :] * rows * size[:, None]
+        table[..., own, own] += 1.0 - deviations[:, None] ** 2
+        return NormalEquations(self.kind, table, self.place_products[..., None, :, :, :], self.log_evidence[..., None])
 
 
-def add_places(several: Sequence[Equations]) -> np.ndarray:
+def add_place_unknowns(equations: Sequence[NormalEquations]) -> np.ndarray:
     """Compute logarithms (n, ..., p) of the evidence of n equations with one place each, of the eliminated unknowns."""
     # Blocks are small and many: Gaussian elimination of all at once takes a tenth of the time of library calls.
-    table = np.ascontiguousarray(np.moveaxis(np.stack([each.place for each in several]), (-2, -1), (0, 1)))
-    found = np.stack([each.evidence for each in several])[..., None]
+    table = np.ascontiguousarray(np.moveaxis(np.stack([each.place_products for each in equations]), (-2, -1), (0, 1)))
+    found = np.stack([each.log_evidence for each in equations])[..., None]
     for row in range(len(table)):
         pivot = table[row, row]
         share = table[row, row + 1 :] / pivot
@@ -100,28 +100,28 @@ class WhitenedSystem:
         (m / c, v c'), as those of `Evidence.weights` and whitened. Rows of c = 3 axes use c' = 1 axis at once.
     shape
         (v c', c r) [m]: motions of the vertices.
-    rest
+    rigid_rows
         (m, 7): rows of a rigid error of one standard deviation, and the data.
     """
 
     whitening: Whitening
     weights: np.ndarray
     shape: np.ndarray
-    rest: np.ndarray
+    rigid_rows: np.ndarray
 
     def apply_precision(self, columns: np.ndarray) -> np.ndarray:
         """Compute the errors' inverse covariance times rows (m, k) of some of the unknowns and of the data (k,)."""
         shapes = columns < self._shapes
-        found, back = np.empty((len(self.rest), len(columns))), self.whitening.transform_back
+        found, back = np.empty((len(self.rigid_rows), len(columns))), self.whitening.transform_back
         some = self.shape.reshape(-1, self._shapes)[:, columns[shapes]].reshape(len(self.shape), -1)
         root = self.whitening.root.T
         found[:, shapes] = np.linalg.multi_dot([root, self.weights, some]).reshape(len(found), -1)
-        found[:, ~shapes] = back(self.rest[:, columns[~shapes] - self._shapes])
+        found[:, ~shapes] = back(self.rigid_rows[:, columns[~shapes] - self._shapes])
         return found
 
     @property
     def _shapes(self) -> int:
-        return self.shape.shape[1] * len(self.weights) // len(self.rest)
+        return self.shape.shape[1] * len(self.weights) // len(self.rigid_rows)
 
     @cached_property
     def products(self) -> np.ndarray:
@@ -129,19 +129,19 @@ class WhitenedSystem:
         count, tall = self._shapes, len(self.weights) > 2 * len(self.shape)
         few = np.linalg.qr(self.weights, mode="r") if tall else self.weights
         rows = (few @ self.shape).reshape(-1, count)
-        across = self.weights.T @ self.rest.reshape(len(self.weights), -1)
+        across = self.weights.T @ self.rigid_rows.reshape(len(self.weights), -1)
         found = np.empty((count + 7, count + 7))
         found[:count, :count] = rows.T @ rows
         found[:count, count:] = self.shape.reshape(-1, count).T @ across.reshape(-1, 7)
         found[count:, :count] = found[:count, count:].T
-        found[count:, count:] = self.rest.T @ self.rest
+        found[count:, count:] = self.rigid_rows.T @ self.rigid_rows
         return found
 
 
-def whiten(prior: MotionPrior, evidence: Evidence, seen: float) -> WhitenedSystem:
-    """Build whitened rows of a prior's shapes and of evidence, with their model error for motions of `seen` [m]."""
-    whitening = evidence.build_whitening(seen)
+def whiten_system(prior: MotionPrior, evidence: Evidence, motion_size: float) -> WhitenedSystem:
+    """Build whitened rows of a prior's shapes and of evidence, with the model error of motions of a size [m]."""
+    whitening = evidence.build_whitening(motion_size)
     vertices, weights = evidence.weights
     shape = prior.restrict_to_vertices(vertices).reshape(weights.shape[1], -1).astype(float)
-    rest = np.column_stack([evidence.rigid * evidence.rigid_scale, evidence.value])
+    rest = np.column_stack([evidence.rigid_jacobian * evidence.rigid_scale, evidence.motion])
     return WhitenedSystem(whitening, whitening.root @ weights, shape, whitening.whiten(rest))

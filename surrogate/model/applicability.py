@@ -25,7 +25,7 @@ from sim.material import Pairs
 from sim.tools import BuiltIn, Tool, name_tool
 
 from ..data.load_histories import get_relaxation_series
-from ..data.solution_rows import read_tissue_statement
+from ..data.solution_rows import read_tissue_text
 from .learned import Learned
 
 # Effects that do nothing without a load of their kind: training may include them although a scene does not.
@@ -35,20 +35,20 @@ SIZE_TOLERANCE = 1e-9  # Relative tolerance for equal tool sizes: 26 mm are 0.02
 DEFAULT_EFFECTS = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
 
 
-def read_trained_effects(stated: Mapping[str, str]) -> frozenset[str]:
+def read_trained_effects(provenance: Mapping[str, str]) -> frozenset[str]:
     """Return the names of the effects that a model was trained under, or a data set was made under, by its file."""
-    if "effects" not in stated:
+    if "effects" not in provenance:
         return DEFAULT_EFFECTS
     with suppress(SyntaxError):
-        match ast.parse(stated["effects"], mode="eval").body:  # `repr` of a tuple of effects
+        match ast.parse(provenance["effects"], mode="eval").body:  # `repr` of a tuple of effects
             case ast.Tuple(elts):
                 return frozenset(ast.unparse(one.func) for one in elts if isinstance(one, ast.Call))
     return frozenset()
 
 
-def read_trained_skull(stated: Mapping[str, str]) -> str:
+def read_trained_skull(provenance: Mapping[str, str]) -> str:
     """Return the skull model of a data set: one of `sim.effects.SKULLS`."""
-    names = read_trained_effects(stated)
+    names = read_trained_effects(provenance)
     return next((name for name, effect in SKULLS.items() if type(effect).__name__ in names), "bonded")
 
 
@@ -111,7 +111,7 @@ def _describe_body_change(model: Learned, effects: tuple[Effect, ...], element: 
     """Return the difference in tissue or element between a model's FEM and this one; None without one."""
     stated, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
     if "tissue" in stated and here is not None:
-        trained = read_tissue_statement(stated)
+        trained = read_tissue_text(stated)
         if (series := _describe_series_change(trained, here)) is not None:
             return series
         if trained != here:

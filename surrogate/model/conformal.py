@@ -12,10 +12,10 @@ import numpy as np
 
 from sim.loads import Pushed
 
-from ..array_functions import take_rows_of
+from ..array_functions import take_rows
 from ..data.indentation import get_relaxation
 from ..regressors.protocol import compute_standardisation
-from .training_range import Measured, Outside
+from .training_range import Excess, LoadMeasures
 
 LEVELS = (0.95, 0.99)  # Nominal coverage of the bounds.
 LOAD_FEATURES = 4  # Number of features of the load itself: force, radius, angle, overhang. The others are its position.
@@ -31,9 +31,9 @@ class BoundSettings:
     """Settings of `fit_bound`."""
 
     # Minimum number of calibration loads in a class of force: fewer than 99 give no guarantee at 0.99.
-    class_loads: int = 200
+    loads_per_class: int = 200
     # True if the scale's logarithm is quadratic in the load's features, given `min_quadratic_errors`; else linear.
-    curved: bool = True
+    allow_quadratic: bool = True
     max_classes: int = 10  # Maximum number of classes of force.
     # Weight of the squared coefficients relative to the squared misfit of logarithms, per load.
     ridge_weight: float = 1e-2
@@ -69,51 +69,47 @@ class Bound:
     growth: np.ndarray
     near: np.ndarray
 
-    def evaluate(self, features: np.ndarray, force: np.ndarray, outside: Outside) -> np.ndarray:
-        """Compute bounds (2, B) [m] for `LEVELS`, of features (B, f), forces (B,) [N], and the loads' `outside`."""
+    def evaluate(self, features: np.ndarray, force: np.ndarray, range_excess: Excess) -> np.ndarray:
+        """Compute bounds (2, B) [m] for `LEVELS`, by features (B, f), forces (B,) [N] and `range_excess`."""
         scale = np.exp(_compute_monomials(_normalise_features(features, self.mean, self.deviation)) @ self.weights)
-        away = np.maximum(outside.away - self.near, 0.0)
-        scale = scale * (1.0 + self.growth * away) * (1.0 + GROWTH * outside.beyond)
-        return take_rows_of(np.searchsorted(self.edges, force), self.quantile.T).T * scale
+        away = np.maximum(range_excess.distance - self.near, 0.0)
+        scale = scale * (1.0 + self.growth * away) * (1.0 + GROWTH * range_excess.bound_excess)
+        return take_rows(np.searchsorted(self.edges, force), self.quantile.T).T * scale
 
 
 def fit_bound(
-    seen: tuple[np.ndarray, np.ndarray],
-    features: np.ndarray,
-    force: np.ndarray,
-    error: np.ndarray,
-    settings: BoundSettings = BoundSettings(),
-    *,
-    away: np.ndarray | float = 0.0,
-    growth: float = 0.0,
-) -> Bound:
-    """Fit a bound whose scale follows the errors of `seen` loads, and calibrate it on other loads.
+    scale_examples: tuple[np.ndarray, np.ndarray], features: np.ndarray, force: np.ndarray, error: np.ndarray,
+    settings: BoundSettings = BoundSettings(), *, distance: np.ndarray | float = 0.0, growth: float = 0.0,
+) -> Bound:  # fmt: skip
+    """Fit a bound whose scale follows the errors of `scale_examples`, and calibrate it on other loads.
 
-    The scale depends on the load, not on its position. If `seen` loads cover few regions of the cortex, a scale that
+    The scale depends on the load, not on its position. If `scale_examples` cover little of the cortex, a scale that
     follows the position diverges between them. One such scale gave a bound of 4.2 mm for a distance with an error of
     0.05 mm.
 
     Parameters
     ----------
-    seen
+    scale_examples
         Features (m, f) and largest errors (m,) [m] of loads that are not in the model's training.
     features, force, error
         Features (n, f), forces (n,) [N] and maximum errors (n,) [m] of the calibration loads.
-    away, growth
+    distance, growth
         Distances (n,) [m] of the calibration loads from the nearest training load; growth of the bound with it [1/m].
     """
-    mean, deviation = compute_standardisation(seen[0])
-    curved = settings.curved and len(seen[1]) >= settings.min_quadratic_errors
+    mean, deviation = compute_standardisation(scale_examples[0])
+    curved = settings.allow_quadratic and len(scale_examples[1]) >= settings.min_quadratic_errors
     used = _mask_monomials(len(mean), LOAD_FEATURES if curved else 0)
-    design = _compute_monomials(_normalise_features(seen[0], mean, deviation))[:, used]
-    wanted = np.log(np.maximum(seen[1], max(settings.min_error_share * seen[1].mean(), np.finfo(float).tiny)))
+    design = _compute_monomials(_normalise_features(scale_examples[0], mean, deviation))[:, used]
+    wanted = np.log(
+        np.maximum(scale_examples[1], max(settings.min_error_share * scale_examples[1].mean(), np.finfo(float).tiny))
+    )
     penalty = settings.ridge_weight * len(design) * np.eye(design.shape[1])
     penalty[0, 0] = 0.0  # the constant is free
     weights = np.zeros(len(used))
     weights[used] = np.linalg.solve(design.T @ design + penalty, design.T @ wanted)
     scale = np.exp(_compute_monomials(_normalise_features(features, mean, deviation)) @ weights)
-    ratio = error / (scale * (1.0 + growth * away))
-    count = int(np.clip(len(ratio) // settings.class_loads, 1, settings.max_classes))
+    ratio = error / (scale * (1.0 + growth * distance))
+    count = int(np.clip(len(ratio) // settings.loads_per_class, 1, settings.max_classes))
     edges = np.unique(np.quantile(force, np.arange(1, count) / count))
     edges = edges[edges < force.max()]  # equal forces are of one class
     count, member = len(edges) + 1, np.searchsorted(edges, force)
@@ -148,14 +144,14 @@ def fit_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.nd
     return most
 
 
-def compute_features(pushed: Pushed, known: Measured) -> np.ndarray:
+def compute_scale_features(pushes: Pushed, measures: LoadMeasures) -> np.ndarray:
     """Compute features (B, 7) of an error's size: logarithms of force and radius, angle, overhang and point [mm].
 
     For relaxing tissue, where all loads have one tool, the relaxed share replaces the radius.
     """
-    force, relaxed = np.log(np.maximum(known.magnitude, np.finfo(float).tiny)), get_relaxation(pushed)
-    second = np.log(pushed.footprint) if relaxed is None else relaxed
-    return np.column_stack([force, second, known.angle, 1e3 * known.overhang, 1e3 * pushed.point])
+    force, relaxed = np.log(np.maximum(measures.magnitude, np.finfo(float).tiny)), get_relaxation(pushes)
+    second = np.log(pushes.footprint) if relaxed is None else relaxed
+    return np.column_stack([force, second, measures.angle, 1e3 * measures.overhang, 1e3 * pushes.point])
 
 
 def compute_conformal_quantile(ratio: np.ndarray, level: float) -> float:

@@ -13,7 +13,7 @@ from sim.loads import Loads
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS
 from ..regressors.rigid_contact import RigidContact
-from .held_out import MAX_VERTEX_ERROR, ReportedErrors, find_handed_over
+from .held_out import MAX_VERTEX_ERROR, ReportedErrors, find_fem_fallback
 from .learned import Learned, ModelPart
 from .tool_contact import CONTACT_KEY
 
@@ -81,7 +81,7 @@ class Guarded:
     def find_unreliable(self, predicted: Deformation) -> np.ndarray:
         """Return the mask (B,) of predictions that need FEM."""
         bound = np.where(np.isnan(predicted.bound[0]), self.model.bound, predicted.bound[0])
-        return find_handed_over(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
+        return find_fem_fallback(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
 
     unsure = find_unreliable  # Former names, for one release.
 
@@ -95,7 +95,7 @@ def describe_error(model: Learned) -> str:
     """Describe a model's reported errors, and the deformer used in scenes: see `Guarded`."""
     stated = get_reported_errors(model)
     guarded = "scenes play it without FEM, as its tissue relaxes" if model.series else "scenes play it guarded"
-    return f"{model.held_out or stated}: {guarded if stated.weak else 'scenes play it without FEM'}"
+    return f"{model.held_out or stated}: {guarded if stated.is_weak else 'scenes play it without FEM'}"
 
 
 def find_model(deformer: Deformer) -> Learned | None:
@@ -105,9 +105,9 @@ def find_model(deformer: Deformer) -> Learned | None:
     return deformer if isinstance(deformer, Learned) else None
 
 
-def find_first_model(deformer: Deformer, answer: Deformation) -> Learned | None:
+def find_first_model(deformer: Deformer, result: Deformation) -> Learned | None:
     """Return the model that computed the first result of a deformer; None if FEM did."""
-    return find_model(deformer) if answer.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
+    return find_model(deformer) if result.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
 
 
 def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation, pushed: bool) -> Deformation:
@@ -128,7 +128,7 @@ def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation,
     return replace(join_deformations([ours, theirs]).select(pick), source=source)
 
 
-def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> np.ndarray:
+def compute_tool_pressure(model: Learned, loads: Loads, result: Deformation) -> np.ndarray:
     """Compute the tool's mean pressure (B, k) [Pa] at each vertex of the bare surface: force by area.
 
     Contact forces are those on linear tissue, scaled so that their sum is the model's predicted force. Areas are thirds
@@ -136,7 +136,7 @@ def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> 
 
     Parameters
     ----------
-    answer
+    result
         Result of `model` for the loads, at all its vertices.
 
     Raises
@@ -147,23 +147,23 @@ def compute_tool_pressure(model: Learned, loads: Loads, answer: Deformation) -> 
     part = _find_contact(model)
     if part is None:
         raise InputError("this model knows no forces of contact: train the learner contact or contact-gp on poses.")
-    if answer.displacement.shape[:2] != (len(loads), len(model.nodes)):
+    if result.displacement.shape[:2] != (len(loads), len(model.nodes)):
         raise InputError(
-            f"the result has {len(answer)} load cases at {len(answer.nodes)} vertices, the loads have {len(loads)} and "
+            f"the result has {len(result)} load cases at {len(result.nodes)} vertices, the loads have {len(loads)} and "
             f"the model {len(model.nodes)}: give the complete result for these loads."
         )
     patch, mesh, contact = open_patch(model.anatomy), model.anatomy.mesh, part.regressor
     assert isinstance(contact, RigidContact)
-    held = answer.warm.get(CONTACT_KEY)
+    held = result.warm.get(CONTACT_KEY)
     if held is None:
         held = contact.compute_warm_start(ENCODERS[part.encoder](patch, model.clip_to_range(model.to_input(loads))[1]))
-    force = contact.compute_held_force(held).reshape(len(loads), -1, 3)
+    force = contact.get_warm_start_force(held).reshape(len(loads), -1, 3)
     whole = np.linalg.norm(force.sum(axis=1), axis=1)
-    size = np.linalg.norm(answer.reaction[:, 0, :3], axis=1)
+    size = np.linalg.norm(result.reaction[:, 0, :3], axis=1)
     factor = np.divide(size, whole, out=np.zeros_like(size), where=whole > 0.0)
     touchable = np.unique(mesh.surface[model.anatomy.bare])
     nodes = np.tile(mesh.nodes, (len(loads), 1, 1))
-    nodes[:, answer.nodes] += answer.displacement
+    nodes[:, result.nodes] += result.displacement
     area = np.stack([compute_vertex_areas(each, mesh.surface)[touchable] for each in nodes])
     return factor[:, None] * np.linalg.norm(force, axis=2) / area
 

@@ -42,7 +42,7 @@ class HeldOutErrors:
     limit: float = MAX_VERTEX_ERROR
 
     @property
-    def enough(self) -> bool:
+    def is_sufficient(self) -> bool:
         """True if the model does not need FEM fallback."""
         return _is_enough(self.mean, self.p999)
 
@@ -63,9 +63,9 @@ class ReportedErrors:
     held_out: HeldOutErrors | None
 
     @property
-    def weak(self) -> bool:
+    def is_weak(self) -> bool:
         """True if the model needs FEM fallback: by mean error, or by maximum vertex error if that is missing."""
-        return not (self.bound <= MAX_VERTEX_ERROR if self.held_out is None else self.held_out.enough)
+        return not (self.bound <= MAX_VERTEX_ERROR if self.held_out is None else self.held_out.is_sufficient)
 
     def __str__(self) -> str:
         """Return a description of the errors and their limits."""
@@ -79,37 +79,37 @@ class ReportedErrors:
         return f"{mean}; 99.9th percentile {1e3 * self.held_out.p999:.2g} mm (limit {1e3 * MAX_P999_ERROR:g} mm)"
 
 
-def find_handed_over(bound: np.ndarray, outside: np.ndarray, limit: float) -> np.ndarray:
-    """Return the mask (B,) of loads that need FEM: no bound within the limit, or `outside`.
+def find_fem_fallback(bound: np.ndarray, is_outside: np.ndarray, limit: float) -> np.ndarray:
+    """Return the mask (B,) of loads that need FEM: no bound within the limit, or `is_outside`.
 
-    `bound` (B,) and `limit` are in metres, `outside` (B,) bool.
+    `bound` (B,) and `limit` are in metres, `is_outside` (B,) bool.
     """
-    return ~(bound <= limit) | outside
+    return ~(bound <= limit) | is_outside
 
 
-def measure_held_out(distance: np.ndarray, motion: np.ndarray, bound: np.ndarray, outside: np.ndarray) -> HeldOutErrors:
+def measure_held_out(error: np.ndarray, motion: np.ndarray, bound: np.ndarray, is_outside: np.ndarray) -> HeldOutErrors:
     """Compute errors on B loads, and the largest of `VERTEX_ERROR_LIMITS` with a guarded model of small error.
 
     The guarded model's mean error is at most `MAX_MEAN_ERROR`, its 99.9th percentile `MAX_P999_ERROR`.
 
     Parameters
     ----------
-    distance
+    error
         Error relative to FEM (B, n) [m], at the tumour's vertices.
     motion
         Mean displacement (B,) [m] of the tumour's vertices.
     bound
         Bound of the maximum vertex error, at 95 % (B,) [m].
-    outside
+    is_outside
         Mask (B,) of loads outside the training range.
     """
-    share, left, solved, limit = distance.mean(axis=1) / motion, 0.0, outside, MAX_VERTEX_ERROR
+    share, left, solved, limit = error.mean(axis=1) / motion, 0.0, is_outside, MAX_VERTEX_ERROR
     for limit in VERTEX_ERROR_LIMITS:
-        solved = find_handed_over(bound, outside, limit)
+        solved = find_fem_fallback(bound, is_outside, limit)
         left = float(np.where(solved, 0.0, share).mean())
-        if _is_enough(left, _compute_p999(np.where(solved[:, None], 0.0, distance))):
+        if _is_enough(left, _compute_p999(np.where(solved[:, None], 0.0, error))):
             break
-    return HeldOutErrors(float(share.mean()), left, _compute_p999(distance), float(solved.mean()), limit)
+    return HeldOutErrors(float(share.mean()), left, _compute_p999(error), float(solved.mean()), limit)
 
 
 def _compute_p999(distance: np.ndarray) -> float | None:

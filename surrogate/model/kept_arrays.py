@@ -17,28 +17,25 @@ REMEDY = "Delete it: it is computed again."
 """Remedy for a damaged cache file."""
 
 
-def find_kept_path(folder: Path | None, stem: str, device: str, *stated: object) -> Path | None:
+def get_cache_path(folder: Path | None, stem: str, device: str, *inputs: object) -> Path | None:
     """Return the cache path of arrays that this version computes on a kind of device; None without a folder.
 
-    `stated` lists all other inputs that determine their bytes, the element included: each with a distinctive `repr`.
+    `inputs` lists all other inputs that determine their bytes, the element included: each with a distinctive `repr`.
     """
     if folder is None:
         return None
     on = "cuda" if find_device(device, "float32").on_cuda else "cpu"
-    key = repr((get_version("sulcus"), on, *stated))
+    key = repr((get_version("sulcus"), on, *inputs))
     return folder / f"{stem}{compute_digest(np.frombuffer(key.encode(), np.uint8))}.npz"
 
 
-def keep_arrays(
-    path: Path | None,
-    kind: str,
-    names: Iterable[str],
-    make: Callable[[], Mapping[str, np.ndarray]],
+def load_cached_arrays(
+    path: Path | None, description: str, names: Iterable[str], compute: Callable[[], Mapping[str, np.ndarray]],
     check: Callable[[Mapping[str, np.ndarray]], object] = lambda arrays: None,
-) -> Mapping[str, np.ndarray]:
+) -> Mapping[str, np.ndarray]:  # fmt: skip
     """Read arrays by name from a file if it exists; else compute and store them. Without a path: compute only.
 
-    `kind` describes the file's content, with its article; `check` rejects invalid arrays.
+    `description` describes the file's content, with its article; `check` rejects invalid arrays.
 
     Raises
     ------
@@ -46,11 +43,11 @@ def keep_arrays(
         A file that cannot be read, or that the check rejects.
     """
     if path is not None and path.exists():
-        with wrap_errors(path, kind, REMEDY), path.open("rb") as raw:
+        with wrap_errors(path, description, REMEDY), path.open("rb") as raw:
             found = Archive(raw, REMEDY).read_arrays(names)
             check(found)
             return found
-    made = make()
+    made = compute()
     if path is not None:
         with write_atomically(path, ".npz") as unfinished:
             np.savez(unfinished, **made)  # pyright: ignore[reportArgumentType]

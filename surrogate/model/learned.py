@@ -22,16 +22,16 @@ from sim.tools import BuiltIn
 from ..data.cortex_patch import Patch, find_nearest, open_patch
 from ..data.encode import ENCODERS, Basis, Encoder, split_forces
 from ..data.indentation import add_relaxation, get_only_pushes, get_poses, to_indentation
-from ..data.load_histories import read_series
-from ..data.solution_rows import read_tissue_statement
-from ..regressors.protocol import Fitted
+from ..data.load_histories import read_prony_series
+from ..data.solution_rows import read_tissue_text
+from ..regressors.protocol import FittedRegressor
 from ..regressors.rigid_contact import RigidContact
-from .conformal import LEVELS, Bound, compute_features
+from .conformal import LEVELS, Bound, compute_scale_features
 from .held_out import HeldOutErrors
-from .relaxation import MEMORY_KEY, Relaxed, follow_relaxation
-from .tip_distance import Distance, TipModel
-from .tool_contact import ForceModel, build_warm_encoders, collect_contact, compute_wrench
-from .training_range import Envelope, Measured, Outside, measure_loads
+from .relaxation import MEMORY_KEY, RelaxationState, update_relaxation
+from .tip_distance import TipModel, TumourDistance
+from .tool_contact import ForceModel, build_warm_encoders, collect_contact_state, compute_wrench
+from .training_range import Excess, LoadMeasures, TrainingRange, measure_loads
 
 # Largest force or footprint relative to the training's. On the template FEM finds no equilibrium for three loads of
 # this size, and at twice the force the error of a prediction is up to 31 %.
@@ -54,7 +54,7 @@ class ModelPart:
     """
 
     encoder: str
-    regressor: Fitted
+    regressor: FittedRegressor
     basis: Basis
 
     def compute_response(self, features: np.ndarray) -> np.ndarray:
@@ -104,7 +104,7 @@ class Learned:
 
     anatomy: Anatomy
     parts: tuple[ModelPart, ...]
-    envelope: Envelope
+    envelope: TrainingRange
     bound: float = float("nan")
     bounds: Bound | None = None
     training: Mapping[str, str] = field(default_factory=dict)
@@ -117,14 +117,14 @@ class Learned:
     def source(self) -> str:
         """Description of its model type and training, for `source` of results."""
         stated = self.training
-        tissue = str(read_tissue_statement(stated)) if "tissue" in stated else "tissue not given"
+        tissue = str(read_tissue_text(stated)) if "tissue" in stated else "tissue not given"
         element = stated.get("element", "not given")
         return f"{stated.get('learner', 'learned')}, trained on FEM ({element}; {tissue})"
 
     @cached_property
     def series(self) -> Pairs:
         """Prony series of its tissue, if it follows relaxation in time; else ()."""
-        return () if self.tool is None else read_series(self.training)
+        return () if self.tool is None else read_prony_series(self.training)
 
     @cached_property
     def nodes(self) -> np.ndarray:
@@ -132,7 +132,7 @@ class Learned:
         return np.unique(np.concatenate([part.basis.nodes for part in self.parts]))
 
     @cached_property
-    def _regressors(self) -> list[Fitted]:
+    def _regressors(self) -> list[FittedRegressor]:
         return [part.regressor for part in self.parts]
 
     @cached_property
@@ -188,7 +188,7 @@ class Learned:
                 )
         away = find_nearest(pushed.point[doubtful], self._patch.points)[1]
         if (away > pushed.footprint[doubtful]).any():  # away from nodes, but perhaps not from triangles
-            self._patch.skin.check_contact(pushed.point, pushed.footprint)
+            self._patch.contact_surface.check_contact(pushed.point, pushed.footprint)
 
     def _check_nodes(self, nodes: np.ndarray) -> None:
         inside = (nodes >= 0) & (nodes < len(self._is_predicted))
@@ -210,7 +210,7 @@ class Learned:
         ------
         InputError
             Loads of another kind, or that do not touch the open cortex, or are more than `MAX_TRAINING_RATIO` times as
-            strong or as wide as any of the training. A start with other rows, see `follow_relaxation`; a vertex in
+            strong or as wide as any of the training. A start with other rows, see `update_relaxation`; a vertex in
             `at` that the model does not predict.
         """
         check_loads(loads)
@@ -229,24 +229,25 @@ class Learned:
             return self._sum_parts(loads, pushed, nodes, begun, past, build_warm_encoders(self._regressors, start))
 
     def _sum_parts(
-        self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: Relaxed | None,
+        self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: RelaxationState | None,
         encoders: Mapping[str, Encoder],
     ) -> Deformation:  # fmt: skip
         """Sum the parts; the computation began at `begun` [s]."""
         known = measure_loads(self._patch, pushed)
-        outside = self.envelope.locate_outside(pushed, known)
+        outside = self.envelope.compute_excess(pushed, known)
         far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED_TOLERANCE
         self._check_in_range(pushed, np.flatnonzero(far | small))
         promised = self.compute_bounds(self.bounds, pushed, known, outside)
         if past is not None:
-            far = far | past.strange
+            far = far | past.outside_training
         motion = self.predict_motion(pushed, nodes, encoders)
         answer = build_prediction(motion, nodes, loads, far, begun, promised, self.source)
         if past is not None:
             answer = replace(answer, memory={MEMORY_KEY: past.memory})
         if self.tool is not None:
             answer = replace(
-                answer, warm=collect_contact(self._regressors, self._patch, self.clip_to_range(pushed)[1], encoders)
+                answer,
+                warm=collect_contact_state(self._regressors, self._patch, self.clip_to_range(pushed)[1], encoders),
             )
         if self.force is None or self.tool is None:
             return answer
@@ -298,18 +299,18 @@ class Learned:
                 found += part.regressor.predict_force(encoders[part.encoder](self._patch, asked))
         return magnitude[:, None] * found
 
-    def compute_bounds(self, bound: Bound | None, pushed: Pushed, known: Measured, outside: Outside) -> np.ndarray:
+    def compute_bounds(self, bound: Bound | None, pushed: Pushed, known: LoadMeasures, outside: Excess) -> np.ndarray:
         """Compute the bounds (2, B) of loads, [m], or [N] for a force; NaN without one."""
         if bound is None:
             return np.stack([np.nan * outside.excess] * len(LEVELS))
         # The error, like the motion, is in proportion to a force below the training's smallest.
         weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
-        features = compute_features(pushed, self.envelope.clip_to_range(known))
+        features = compute_scale_features(pushed, self.envelope.clip_to_range(known))
         return np.where(weaker > 0.0, bound.evaluate(features, known.magnitude, outside), 0.0) * weaker
 
     def predict_distance(
         self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None
-    ) -> Distance:
+    ) -> TumourDistance:
         """Predict the distance from the tool's tip to the tumour, both in the deformed brain: see `TipGauge`.
 
         Parameters
@@ -334,8 +335,8 @@ class Learned:
         magnitude, within = self.clip_to_range(pushed)
         found = tip.apply_correction(apart, self._patch, within, magnitude)
         known = measure_loads(self._patch, pushed)
-        return Distance(
-            found, self.compute_bounds(tip.bound, pushed, known, self.envelope.locate_outside(pushed, known))
+        return TumourDistance(
+            found, self.compute_bounds(tip.bound, pushed, known, self.envelope.compute_excess(pushed, known))
         )
 
     def to_input(self, loads: Loads) -> Pushed:
@@ -348,15 +349,15 @@ class Learned:
         """
         return self._convert_loads(loads)[0]
 
-    def _convert_loads(self, loads: Loads, start: Deformation | None = None) -> tuple[Pushed, Relaxed | None]:
+    def _convert_loads(self, loads: Loads, start: Deformation | None = None) -> tuple[Pushed, RelaxationState | None]:
         """Convert loads as `asked`, from a start, and return the state of relaxation, if tissue relaxes."""
         if self.tool is None:
             return get_only_pushes(loads), None
         pushed = to_indentation(loads, self.tool, self._patch)
         if not self.series:
             return pushed, None
-        past = follow_relaxation(self.series, pushed, loads.times, start, self.envelope.force[0])
-        return add_relaxation(pushed, past.share), past
+        past = update_relaxation(self.series, pushed, loads.times, start, self.envelope.force[0])
+        return add_relaxation(pushed, past.relaxed_share), past
 
     # Former names, for one release.
     motion, within, exerted, promised = predict_motion, clip_to_range, predict_force, compute_bounds
@@ -364,15 +365,10 @@ class Learned:
 
 
 def build_prediction(
-    displacement: np.ndarray,
-    nodes: np.ndarray,
-    loads: Loads,
-    outside: Iterable[bool],
-    begun: float,
-    bound: np.ndarray,
-    source: str,
-) -> Deformation:
-    """Build the result of a trained model called at `begun` [s]; `outside` (B,): True for loads outside its training.
+    displacement: np.ndarray, nodes: np.ndarray, loads: Loads, outside_range: Iterable[bool], start_time: float,
+    bound: np.ndarray, source: str,
+) -> Deformation:  # fmt: skip
+    """Build the result of a trained model called at `start_time` [s]; `outside_range` (B,): loads outside its training.
 
     displacement (B, n, 3) [m] of `nodes` (n,); bound and source as in `Deformation`.
     """
@@ -384,12 +380,12 @@ def build_prediction(
     return Deformation(
         displacement,
         nodes,
-        tuple([Outcome.EXTRAPOLATED if far else Outcome.PREDICTED for far in outside]),
+        tuple([Outcome.EXTRAPOLATED if far else Outcome.PREDICTED for far in outside_range]),
         np.zeros(count, int),
         unknown,
         loads.times,
         reaction,
-        cost=Cost({"predict": time.perf_counter() - begun}),
+        cost=Cost({"predict": time.perf_counter() - start_time}),
         reached=unknown,
         inverted=np.full(count, -1),
         bound=bound,

@@ -12,12 +12,12 @@ from sim.tools import Ball
 from ..data.cortex_patch import open_patch
 from ..data.encode import ENCODERS, Basis
 from ..data.indentation import Indented, add_relaxation
-from ..data.tool_loads import build_axes_about
+from ..data.tool_loads import build_rotations_about
 from ..regressors.rigid_contact import RigidContact
 from .conformal import LEVELS, Bound
 from .held_out import HeldOutErrors
 from .learned import Learned, ModelPart
-from .training_range import Envelope
+from .training_range import TrainingRange
 
 FEATURE_COUNT = 7  # Number of tool features, and so of the features of bounds.
 
@@ -101,7 +101,7 @@ def _compute_probe(encoder: str, model: Learned) -> np.ndarray:
     depth, wide = envelope.force[1], envelope.footprint[1]
     pushed = Pushed(envelope.points[:1].astype(float), depth * inward[None], np.array([wide]))
     if model.tool is not None and not isinstance(model.tool, Ball):
-        axes = build_axes_about(-inward[None])
+        axes = build_rotations_about(-inward[None])
         pushed = Indented(pushed.point, pushed.force, pushed.footprint, axes, -wide * inward[None])
     if model.series:
         pushed = add_relaxation(pushed, np.zeros(1))
@@ -114,17 +114,17 @@ def _check_force(model: Learned) -> None:
     _require_good(model.tool is not None, "it knows the force of a tool that it has not")
     _require_good(model.force.encoder in ENCODERS, f"no encoder is called {model.force.encoder!r}")
     grips = [part.regressor.grip for part in model.parts if isinstance(part.regressor, RigidContact)]
-    _require_good(bool(grips) or model.force.learned is not None, "it knows nothing of its tool's force")
+    _require_good(bool(grips) or model.force.regressor is not None, "it knows nothing of its tool's force")
     terms = 4 if model.series else 2
     _require_good(all(grip.shape == (terms,) for grip in grips), "what it knows of its tool's force is none")
-    if model.force.learned is not None:
-        found = model.force.learned.predict(_compute_probe(model.force.encoder, model))
+    if model.force.regressor is not None:
+        found = model.force.regressor.predict(_compute_probe(model.force.encoder, model))
         _require_good(found.shape == (1, 3) and bool(np.isfinite(found).all()), "it gives no force")
     if model.force.bound is not None:
         _check_bounds(model.force.bound)
 
 
-def _check_envelope(envelope: Envelope) -> None:
+def _check_envelope(envelope: TrainingRange) -> None:
     points = envelope.points
     _require_good(
         points.ndim == 2 and points.shape[1] == 3 and len(points) > 0 and bool(np.isfinite(points).all()),

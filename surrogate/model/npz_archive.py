@@ -40,8 +40,8 @@ class Archive:
     Every message ends with a `remedy`. Files of the wrong kind raise the exceptions of `zipfile` and NumPy.
     """
 
-    def __init__(self, file: BinaryIO, remedy: str = "", largest: int = MAX_MODEL_BYTES) -> None:
-        self._zip, self._remedy, self._largest = zipfile.ZipFile(file), remedy, largest
+    def __init__(self, file: BinaryIO, remedy: str = "", max_bytes: int = MAX_MODEL_BYTES) -> None:
+        self._zip, self._remedy, self._largest = zipfile.ZipFile(file), remedy, max_bytes
 
     def read_text(self, name: str) -> str:
         """Read an array with a single text.

@@ -35,14 +35,14 @@ PLAYER_NAMES = frozenset(["auto", "fem", "guarded"])
 
 
 @dataclass(frozen=True)
-class Own:
+class OwnLearner:
     """Registered user-defined learner: a name in `ENCODERS`, and the class of its regressor."""
 
     encoder: str
     regressor: type[Regressor]
 
 
-OWN_LEARNERS: dict[str, Own] = {}  # User-defined learners, by name.
+OWN_LEARNERS: dict[str, OwnLearner] = {}  # User-defined learners, by name.
 K = TypeVar("K", bound=type[Regressor])  # Type of a registered class.
 
 
@@ -69,13 +69,13 @@ def register_learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K]
             name in OWN_LEARNERS and _get_file(OWN_LEARNERS[name].regressor) != _get_file(kind)
         ):
             raise InputError(f"the name {name!r} is taken: give the learner another.")
-        OWN_LEARNERS[name] = Own(encoder, kind)
+        OWN_LEARNERS[name] = OwnLearner(encoder, kind)
         return kind
 
     return register
 
 
-def find_own(name: str) -> Own | None:
+def find_own_learner(name: str) -> OwnLearner | None:
     """Find a registered learner, loading the package with an entry point of its name if necessary; None without one.
 
     Raises
@@ -96,9 +96,9 @@ def find_own(name: str) -> Own | None:
     return None
 
 
-def find_learner_name(kind: type) -> str | None:
+def find_learner_name(regressor_class: type) -> str | None:
     """Return the name under which a class was registered."""
-    return next((name for name, own in OWN_LEARNERS.items() if own.regressor is kind), None)
+    return next((name for name, own in OWN_LEARNERS.items() if own.regressor is regressor_class), None)
 
 
 def _get_file(kind: type) -> str | None:

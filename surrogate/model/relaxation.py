@@ -17,7 +17,7 @@ from sim.loads import Pushed
 from sim.material import Pairs
 
 from ..data.encode import split_forces
-from ..data.load_histories import compute_unfaded
+from ..data.load_histories import compute_decayed_coefficients
 
 MEMORY_KEY = "relaxation"
 """Key in `Deformation.memory`: depth [m], position of first contact [m], then each h [m]; (B, 4 + pairs)."""
@@ -26,38 +26,38 @@ MAX_SLIDE_SHARE = 0.5  # Limit of the training: a tool slides by at most this sh
 
 
 @dataclass(frozen=True, eq=False)
-class Relaxed:
+class RelaxationState:
     """State of relaxation under B tools.
 
     Parameters
     ----------
-    share
+    relaxed_share
         (B,): r, lost share of the resistance to a change of shape.
-    strange
+    outside_training
         (B,) bool: True if the history is outside the training.
     memory
         State for the next time step, in the layout of `MEMORY_KEY`.
     """
 
-    share: np.ndarray
-    strange: np.ndarray
+    relaxed_share: np.ndarray
+    outside_training: np.ndarray
     memory: np.ndarray
 
 
-def follow_relaxation(
-    series: Pairs, pushed: Pushed, times: np.ndarray, start: Deformation | None, shallowest: float
-) -> Relaxed:
+def update_relaxation(
+    series: Pairs, pushes: Pushed, times: np.ndarray, start: Deformation | None, min_depth: float
+) -> RelaxationState:
     """Advance relaxation at indentations from the previous result; without one, assume `load_histories`.
 
     Parameters
     ----------
-    pushed
+    pushes
         Indentations of B tools.
     times
         Times (B,) [s].
     start
         Result of a model of the same series, at earlier or the same times.
-    shallowest
+    min_depth
         Depth [m] below which tissue counts as free.
 
     Raises
@@ -65,10 +65,10 @@ def follow_relaxation(
     InputError
         A start without such a memory, or of later times.
     """
-    depth, (g, tau) = split_forces(pushed)[0], np.array(series).T
+    depth, (g, tau) = split_forces(pushes)[0], np.array(series).T
     if start is None:
-        left = compute_unfaded(series, times) * depth[:, None]
-        return _compute_relaxed(g, pushed, depth, pushed.point, left, shallowest)
+        left = compute_decayed_coefficients(series, times) * depth[:, None]
+        return _compute_relaxed(g, pushes, depth, pushes.point, left, min_depth)
     past = start.memory.get(MEMORY_KEY)
     if past is None or past.shape != (len(depth), 4 + len(series)):
         raise InputError(
@@ -79,17 +79,17 @@ def follow_relaxation(
         raise InputError(f"the start is {-steps.min():g} s later than the loads: times must not decrease.")
     half = np.exp(-steps[:, None] / (2.0 * tau))
     left = half * (half * past[:, 4:] + g * (depth - past[:, 0])[:, None])
-    first = np.where((past[:, 0] > 0.0)[:, None], past[:, 1:4], pushed.point)
-    return _compute_relaxed(g, pushed, depth, first, left, shallowest)
+    first = np.where((past[:, 0] > 0.0)[:, None], past[:, 1:4], pushes.point)
+    return _compute_relaxed(g, pushes, depth, first, left, min_depth)
 
 
 def _compute_relaxed(
     g: np.ndarray, pushed: Pushed, depth: np.ndarray, first: np.ndarray, left: np.ndarray, shallowest: float
-) -> Relaxed:
+) -> RelaxationState:
     """Compute the state from h (B, n) [m] of each pair, and the tools' positions of first contact (B, 3) [m]."""
     touching = depth > 0.0
     share = (g - left / np.where(touching, depth, 1.0)[:, None]).sum(axis=1)
     back = (left < -MAX_BACK_SHARE * g * np.maximum(depth, shallowest)[:, None]).any(axis=1)
     slid = np.linalg.norm(pushed.point - first, axis=1) > MAX_SLIDE_SHARE * pushed.footprint
     memory = np.column_stack([depth, first, left])
-    return Relaxed(np.clip(np.where(touching, share, 0.0), 0.0, g.sum()), back | (slid & touching), memory)
+    return RelaxationState(np.clip(np.where(touching, share, 0.0), 0.0, g.sum()), back | (slid & touching), memory)

@@ -21,30 +21,30 @@ from sim.tools import read_tool_statement
 from ..data.encode import Basis
 from ..data.solution_rows import find_first_tissue
 from ..regressors.baselines import Ann, Pcr, Svr
-from ..regressors.force_series import ForcePairs, Remainder, Series
+from ..regressors.force_series import ForcePairs, RemainderGp, Series
 from ..regressors.gp import Gp
-from ..regressors.protocol import Fitted, Linear, Regressor
+from ..regressors.protocol import FittedRegressor, Linear, Regressor
 from ..regressors.rigid_contact import RigidContact
 from .conformal import GROWTH, Bound
 from .held_out import HeldOutErrors, ReportedErrors
 from .learned import Learned, ModelPart
 from .model_validation import check_finite_state, check_model_state
 from .npz_archive import Archive, compute_seal, write_archive
-from .own_learners import find_learner_name, find_own
+from .own_learners import find_learner_name, find_own_learner
 from .tip_distance import TipModel
 from .tool_contact import ForceModel
-from .training_range import Envelope
+from .training_range import TrainingRange
 
 FORMAT = "sulcus model 2"  # Name and version of the file format.
 REMEDY = "Make one with `sulcus train`."  # Remedy in error messages.
 # General regressors, by name.
 REGRESSORS: dict[str, type[Regressor]] = {"linear": Linear, "pcr": Pcr, "ann": Ann, "svr": Svr, "gp": Gp}
 # All types of fitted parts, by name: also regressors that depend on the tool features and their meaning.
-FITTED: dict[str, type[Fitted]] = {
+FITTED: dict[str, type[FittedRegressor]] = {
     **REGRESSORS,
     "pairs": ForcePairs,
     "series": Series,
-    "remainder": Remainder,
+    "remainder": RemainderGp,
     "contact": RigidContact,
 }
 
@@ -183,18 +183,18 @@ def _list_array_keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
             yield from (named or {}).values()
 
 
-def _get_own_name(regressor: Fitted) -> str:
+def _get_own_name(regressor: FittedRegressor) -> str:
     name = find_learner_name(type(regressor))
     if name is None:
         raise InputError(f"{type(regressor).__name__} was never registered: see surrogate.learner.")
     return name
 
 
-def _find_type(name: str) -> type[Fitted]:
+def _find_type(name: str) -> type[FittedRegressor]:
     """Return the class named in a model file: a built-in one, or one that the user has registered or installed."""
     if name in FITTED:
         return FITTED[name]
-    own = find_own(name)
+    own = find_own_learner(name)
     if own is None:
         raise InputError(
             f"a model here was made by the learner {name!r}, which is not this package's own. Name the file that "
@@ -227,20 +227,20 @@ def _describe_model(model: Learned, put: Any) -> dict[str, Any]:
     }
 
 
-def _describe_regressor(regressor: Fitted, put: Any) -> dict[str, Any]:
+def _describe_regressor(regressor: FittedRegressor, put: Any) -> dict[str, Any]:
     names = {kind: name for name, kind in FITTED.items()}
     state = {name: put(array) for name, array in regressor.state().items()}
     return {"regressor": names.get(type(regressor)) or _get_own_name(regressor), "state": state}
 
 
-def _rebuild_regressor(description: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Fitted:
+def _rebuild_regressor(description: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> FittedRegressor:
     state = {name: arrays[key] for name, key in description["state"].items()}
     check_finite_state(state)
     return _find_type(description["regressor"]).restored(state)
 
 
 def _describe_force(force: ForceModel, put: Any) -> dict[str, Any]:
-    learned = None if force.learned is None else _describe_regressor(force.learned, put)
+    learned = None if force.regressor is None else _describe_regressor(force.regressor, put)
     return {"encoder": force.encoder, "learned": learned, "bound": _put_bound(force.bound, put)}
 
 
@@ -297,7 +297,7 @@ def _rebuild_model(description: dict[str, Any], arrays: Mapping[str, np.ndarray]
     return Learned(
         anatomy=anatomy,
         parts=tuple(parts),
-        envelope=Envelope(**envelope),
+        envelope=TrainingRange(**envelope),
         bound=description["bound"],
         bounds=_rebuild_bound(description["bounds"], arrays, envelope["reach"]),
         training=description["training"],

@@ -8,7 +8,7 @@ from sim.loads import Pushed
 
 from ..data.cortex_patch import Patch
 from ..data.encode import compute_tool_features, split_forces
-from ..regressors.force_series import add_pressing
+from ..regressors.force_series import append_force_ratio
 from ..regressors.gp import Gp
 from .conformal import Bound
 
@@ -17,18 +17,18 @@ MAX_CONDITIONING_LOADS = 2000  # Maximum number of training loads that condition
 
 
 @dataclass(frozen=True, eq=False)
-class Distance:
+class TumourDistance:
     """Distances from tip to tumour.
 
     Parameters
     ----------
-    value
+    distance
         Distances (B,) [m].
     bound
         (2, B) [m]: error bound relative to FEM, with probability 0.95 and 0.99; NaN without a guarantee.
     """
 
-    value: np.ndarray
+    distance: np.ndarray
     bound: np.ndarray
 
 
@@ -50,25 +50,25 @@ class TipModel:
     correction: Gp | None = None
     bound: Bound | None = None
 
-    def apply_correction(self, distance: np.ndarray, patch: Patch, asked: Pushed, magnitude: np.ndarray) -> np.ndarray:
-        """Correct distances (B,) [m]: loads `asked` clipped to the training range, unclipped magnitude (B,) [N]."""
+    def apply_correction(self, distance: np.ndarray, patch: Patch, pushes: Pushed, magnitude: np.ndarray) -> np.ndarray:
+        """Correct distances (B,) [m]: loads `pushes` clipped to the training range, unclipped magnitude (B,) [N]."""
         if self.correction is None:
             return distance
-        off = self.correction.predict(compute_correction_features(patch, asked))[:, 0]
+        off = self.correction.predict(compute_correction_features(patch, pushes))[:, 0]
         return np.maximum(distance + magnitude * off, 0.0)
 
 
-def compute_correction_features(patch: Patch, pushed: Pushed) -> np.ndarray:
+def compute_correction_features(patch: Patch, pushes: Pushed) -> np.ndarray:
     """Compute the features of a correction (B, 9): `compute_tool_features`, and force over radius."""
-    return add_pressing(compute_tool_features(patch, pushed))
+    return append_force_ratio(compute_tool_features(patch, pushes))
 
 
-def fit_correction(patch: Patch, pushed: Pushed, off: np.ndarray) -> Gp | None:
-    """Fit the error `off` (B,) [m] of distances under loads; None if no load presses."""
-    magnitude = split_forces(pushed)[0]
+def fit_correction(patch: Patch, pushes: Pushed, error: np.ndarray) -> Gp | None:
+    """Fit the error `error` (B,) [m] of distances under loads; None if no load presses."""
+    magnitude = split_forces(pushes)[0]
     some = magnitude > 0.0
     if not some.any():
         return None
-    return Gp(rows=MAX_LENGTH_LOADS, most=MAX_CONDITIONING_LOADS).fit(
-        compute_correction_features(patch, pushed)[some], (off[some] / magnitude[some])[:, None]
+    return Gp(likelihood_rows=MAX_LENGTH_LOADS, max_rows=MAX_CONDITIONING_LOADS).fit(
+        compute_correction_features(patch, pushes)[some], (error[some] / magnitude[some])[:, None]
     )

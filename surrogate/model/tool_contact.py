@@ -11,7 +11,7 @@ from sim.tools import Ball, BuiltIn
 
 from ..data.cortex_patch import Patch
 from ..data.encode import ENCODERS, Encoder
-from ..regressors.protocol import Fitted
+from ..regressors.protocol import FittedRegressor
 from ..regressors.rigid_contact import RigidContact
 from .conformal import Bound
 
@@ -24,7 +24,7 @@ class ForceModel:
     ----------
     encoder
         Name in `ENCODERS`: features for the regressor.
-    learned
+    regressor
         Map from features of an indentation to the force (B, 3) [N/m] per metre of depth. With a contact part it
         predicts the remainder; None: nothing is added.
     bound
@@ -32,12 +32,12 @@ class ForceModel:
     """
 
     encoder: str = "tool"
-    learned: Fitted | None = None
+    regressor: FittedRegressor | None = None
     bound: Bound | None = None
 
-    def predict_remainder(self, patch: Patch, asked: Pushed) -> np.ndarray | float:
+    def predict_remainder(self, patch: Patch, pushes: Pushed) -> np.ndarray | float:
         """Predict the regressor's contribution (B, 3) [N/m] at indentations."""
-        return 0.0 if self.learned is None else self.learned.predict(ENCODERS[self.encoder](patch, asked))
+        return 0.0 if self.regressor is None else self.regressor.predict(ENCODERS[self.encoder](patch, pushes))
 
 
 def compute_wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.ndarray:
@@ -54,10 +54,10 @@ CONTACT_KEY = "where a blade touches"
 """Key of the contact in the warm data of a result: rows of `RigidContact.compute_warm_start`."""
 
 
-def build_warm_encoders(regressors: Sequence[Fitted], start: Deformation | None) -> Mapping[str, Encoder]:
+def build_warm_encoders(regressors: Sequence[FittedRegressor], start: Deformation | None) -> Mapping[str, Encoder]:
     """Return encoders that start rods and blades from the contact stored in `start`, if there is one."""
     contact, held = _find_contact(regressors), None if start is None else start.warm.get(CONTACT_KEY)
-    if contact is None or held is None or held.shape[1:] != (contact.held_width,) or not np.isfinite(held).all():
+    if contact is None or held is None or held.shape[1:] != (contact.warm_start_width,) or not np.isfinite(held).all():
         return ENCODERS
     core = ENCODERS["core"]
 
@@ -67,14 +67,14 @@ def build_warm_encoders(regressors: Sequence[Fitted], start: Deformation | None)
     return {**ENCODERS, "core": followed}
 
 
-def collect_contact(
-    regressors: Sequence[Fitted], patch: Patch, asked: Pushed, encoders: Mapping[str, Encoder]
+def collect_contact_state(
+    regressors: Sequence[FittedRegressor], patch: Patch, pushes: Pushed, encoders: Mapping[str, Encoder]
 ) -> dict[str, np.ndarray]:
     """Return the contact to store with a result for the next warm start: rows (B, h), or nothing."""
     contact = _find_contact(regressors)
-    return {} if contact is None else {CONTACT_KEY: contact.compute_warm_start(encoders["core"](patch, asked))}
+    return {} if contact is None else {CONTACT_KEY: contact.compute_warm_start(encoders["core"](patch, pushes))}
 
 
-def _find_contact(regressors: Sequence[Fitted]) -> RigidContact | None:
+def _find_contact(regressors: Sequence[FittedRegressor]) -> RigidContact | None:
     """Return the contact regressor of a rod or a blade; a ball's search is short."""
     return next((each for each in regressors if isinstance(each, RigidContact) and len(each.core)), None)

@@ -19,7 +19,7 @@ from ..data.indentation import Indented
 RANGE_TOLERANCE = 1e-6
 
 
-class Measured(NamedTuple):
+class LoadMeasures(NamedTuple):
     """Force [N], angle to the inward normal [rad], footprint beyond the edge of the craniotomy [m]: (B,) each."""
 
     magnitude: np.ndarray
@@ -27,26 +27,26 @@ class Measured(NamedTuple):
     overhang: np.ndarray
 
 
-class Outside(NamedTuple):
+class Excess(NamedTuple):
     """Position of loads relative to the training range, (B,) each.
 
-    `away` is the distance from the nearest training load [m]. `beyond` measures how far a load leaves the range
+    `distance` is that from the nearest training load [m]. `bound_excess` measures how far a load leaves the range
     otherwise: the largest of millimetres over the edge, radians beyond the angle, and three relative excesses, of
     force, radius and force over radius. `excess` includes millimetres beyond the reach, and is zero inside.
     """
 
-    away: np.ndarray
-    beyond: np.ndarray
+    distance: np.ndarray
+    bound_excess: np.ndarray
     excess: np.ndarray
 
     @property
-    def here(self) -> Outside:
+    def zero(self) -> Excess:
         """Position with all distances zero, as of training loads."""
-        return Outside(*(0.0 * each for each in self))
+        return Excess(*(0.0 * each for each in self))
 
 
 @dataclass(frozen=True, eq=False)
-class Envelope:
+class TrainingRange:
     """Bounds of the training loads.
 
     Parameters
@@ -75,9 +75,9 @@ class Envelope:
     footprint: tuple[float, float]
     line_force: float
 
-    def is_inside(self, patch: Patch, pushed: Pushed) -> np.ndarray:
+    def is_inside(self, patch: Patch, pushes: Pushed) -> np.ndarray:
         """Return the mask (B,) of loads inside the range."""
-        return self.locate_outside(pushed, measure_loads(patch, pushed)).excess == 0.0
+        return self.compute_excess(pushes, measure_loads(patch, pushes)).excess == 0.0
 
     def is_training_point(self, point: np.ndarray, corners: np.ndarray) -> bool:
         """Return True if any of the points (B, 3) [m] is exactly a training point.
@@ -87,39 +87,39 @@ class Envelope:
         asked, known, free = (set(map(tuple, place.astype(np.float32))) for place in (point, self.points, corners))
         return bool((asked & known) - free)
 
-    def clip_to_range(self, known: Measured) -> Measured:
+    def clip_to_range(self, measures: LoadMeasures) -> LoadMeasures:
         """Return loads with forces clipped to the training range."""
-        return known._replace(magnitude=np.clip(known.magnitude, *self.force))
+        return measures._replace(magnitude=np.clip(measures.magnitude, *self.force))
 
-    def locate_outside(self, pushed: Pushed, known: Measured) -> Outside:
+    def compute_excess(self, pushes: Pushed, measures: LoadMeasures) -> Excess:
         """Compute the position of loads relative to the range."""
-        magnitude, angle, overhang = known
-        away = np.sqrt(compute_squared_distances(pushed.point, self.points).min(axis=1))
+        magnitude, angle, overhang = measures
+        away = np.sqrt(compute_squared_distances(pushes.point, self.points).min(axis=1))
         beyond = np.stack(
             [
                 1e3 * (overhang - self.overhang - RANGE_TOLERANCE),
                 np.where(magnitude == 0.0, 0.0, angle - self.angle - RANGE_TOLERANCE),
                 magnitude / self.force[1] - 1.0 - RANGE_TOLERANCE,
-                magnitude / (self.line_force * pushed.footprint) - 1.0 - RANGE_TOLERANCE,
-                self.footprint[0] / pushed.footprint - 1.0 - RANGE_TOLERANCE,
-                pushed.footprint / self.footprint[1] - 1.0 - RANGE_TOLERANCE,
+                magnitude / (self.line_force * pushes.footprint) - 1.0 - RANGE_TOLERANCE,
+                self.footprint[0] / pushes.footprint - 1.0 - RANGE_TOLERANCE,
+                pushes.footprint / self.footprint[1] - 1.0 - RANGE_TOLERANCE,
             ]
         )
         beyond = np.maximum(beyond.max(axis=0), 0.0)
-        return Outside(away, beyond, np.maximum(beyond, 1e3 * (away - self.reach - RANGE_TOLERANCE)))
+        return Excess(away, beyond, np.maximum(beyond, 1e3 * (away - self.reach - RANGE_TOLERANCE)))
 
 
-def compute_training_range(patch: Patch, trained: Pushed) -> Envelope:
+def compute_training_range(patch: Patch, pushes: Pushed) -> TrainingRange:
     """Compute the envelope of the training loads, from these loads alone."""
-    magnitude, angle, overhang = measure_loads(patch, trained)
-    return Envelope(
-        trained.point.astype(np.float32),
-        _compute_reach(trained.point),
+    magnitude, angle, overhang = measure_loads(patch, pushes)
+    return TrainingRange(
+        pushes.point.astype(np.float32),
+        _compute_reach(pushes.point),
         float(overhang.max()),
         float(angle.max()),
         (float(magnitude.min()), float(magnitude.max())),
-        (float(trained.footprint.min()), float(trained.footprint.max())),
-        float((magnitude / trained.footprint).max()),
+        (float(pushes.footprint.min()), float(pushes.footprint.max())),
+        float((magnitude / pushes.footprint).max()),
     )
 
 
@@ -130,11 +130,11 @@ def _compute_reach(point: np.ndarray) -> float:
     return float(KDTree(point).query(point, 2)[0][:, 1].max())
 
 
-def measure_loads(patch: Patch, pushed: Pushed) -> Measured:
+def measure_loads(patch: Patch, pushes: Pushed) -> LoadMeasures:
     """Measure loads for the envelope; for a rod or a blade the shaft's angle counts if it is larger."""
-    (magnitude, direction), inward = split_forces(pushed), patch.find_normals(pushed.point)
+    (magnitude, direction), inward = split_forces(pushes), patch.find_normals(pushes.point)
     cosine = np.einsum("bi,bi->b", direction, inward)
-    if isinstance(pushed, Indented):
-        cosine = np.minimum(cosine, -np.einsum("bi,bi->b", pushed.axes[:, :, 2], inward))
+    if isinstance(pushes, Indented):
+        cosine = np.minimum(cosine, -np.einsum("bi,bi->b", pushes.axes[:, :, 2], inward))
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    return Measured(magnitude, angle, pushed.footprint - patch.compute_edge_distance(pushed.point))
+    return LoadMeasures(magnitude, angle, pushes.footprint - patch.compute_edge_distance(pushes.point))

@@ -22,16 +22,16 @@ from ..model.conformal import LEVELS
 from ..model.learned import Learned
 from ..model.training_range import measure_loads
 from ..regressors.baselines import Ann, Pcr, Svr
-from ..regressors.force_series import ForcePairs, Remainder, Series
+from ..regressors.force_series import ForcePairs, RemainderGp, Series
 from ..regressors.gp import Gp
 from ..regressors.protocol import Linear
-from .graph import Port, Sheet
+from .graph import GraphBuilder, Port
 
 if TYPE_CHECKING:
     from onnx import ModelProto
 
 # Regressors whose formulas use only operations that a wire supports.
-TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, Remainder, Series, ForcePairs)
+TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, RemainderGp, Series, ForcePairs)
 FORMAT = "sulcus onnx 1"  # Version of the names, shapes and meanings of inputs, outputs and metadata.
 DESCRIPTION = (  # Description in the ONNX file.
     "Displacements of a brain under a pressing tool, and how far they may be off, as sulcus learned them from finite "
@@ -52,7 +52,7 @@ def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelPr
     )
 
 
-def build_graph(name: str, model: Learned, cortex: bool = False) -> Sheet:
+def build_graph(name: str, model: Learned, cortex: bool = False) -> GraphBuilder:
     """Trace the graph of a model: of the tumour, or of all its vertices.
 
     Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has them.
@@ -72,7 +72,7 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> Sheet:
     """
     if model.series:
         raise InputError(f"{name} follows tissue that relaxes in time, which no graph does: export another model.")
-    sheet, patch, envelope = Sheet(), open_patch(model.anatomy), model.envelope
+    sheet, patch, envelope = GraphBuilder(), open_patch(model.anatomy), model.envelope
     nodes = model.nodes if cortex else model.anatomy.tumour_nodes
     for part in model.parts:
         if np.isin(part.basis.nodes, nodes).any() and type(part.regressor) not in TRACEABLE:
@@ -102,7 +102,7 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> Sheet:
     }
     displacement: Any = model.predict_motion(pushed, nodes, encoders)
     known = measure_loads(patch, pushed)
-    outside = envelope.locate_outside(pushed, known)
+    outside = envelope.compute_excess(pushed, known)
     excess: Any = outside.excess
     bound: Any = model.compute_bounds(model.bounds, pushed, known, outside)
     rest = model.anatomy.mesh.nodes[nodes]

@@ -10,7 +10,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from sim.runtime.optional_packages import require_extra
 
-from ..array_functions import Rounded, compute_squared_distances, find_columns_in_use, multiply_rows, take_rows_of
+from ..array_functions import QuantisedTable, compute_squared_distances, find_nonzero_columns, multiply_rows, take_rows
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -41,7 +41,7 @@ OPERATORS = {
 """Operators of NumPy's universal functions."""
 
 
-class Wire(NDArrayOperatorsMixin):
+class Tensor(NDArrayOperatorsMixin):
     """Named array of a graph, whose first axis is the batch. Operators and functions of NumPy write to its sheet.
 
     Parameters
@@ -55,33 +55,35 @@ class Wire(NDArrayOperatorsMixin):
         of the batch, which differs in use.
     """
 
-    def __init__(self, sheet: Sheet, name: str, sample: np.ndarray):
-        self.sheet, self.name, self.sample = sheet, name, np.asarray(sample)
+    def __init__(self, graph: GraphBuilder, name: str, sample: np.ndarray):
+        self.sheet, self.name, self.sample = graph, name, np.asarray(sample)
 
     def __len__(self) -> int:
         return len(self.sample)
 
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *operands: Operand, **_: object) -> Wire:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *operands: Operand, **_: object) -> Tensor:
         """Write a universal function; in-place assignment gives another wire."""
         if method == "__call__" and ufunc is np.arccos:
             return _compute_arccos(self)
         if method != "__call__" or ufunc not in OPERATORS:
             return NotImplemented
-        return self.sheet.put(OPERATORS[ufunc], ufunc(*map(_sample, operands)), *self.sheet.to_common_type(operands))
+        return self.sheet.add_node(
+            OPERATORS[ufunc], ufunc(*map(_sample, operands)), *self.sheet.to_common_type(operands)
+        )
 
-    def __array_function__(self, function: Callable, _: object, args: Sequence, kwargs: Mapping[str, Any]) -> Wire:
+    def __array_function__(self, function: Callable, _: object, args: Sequence, kwargs: Mapping[str, Any]) -> Tensor:
         """Write another function of NumPy."""
         return FUNCTIONS[function](self.sheet, *args, **kwargs) if function in FUNCTIONS else NotImplemented
 
-    def __getitem__(self, key: Any) -> Wire:
+    def __getitem__(self, key: Any) -> Tensor:
         """Select along axes, or add axes of length one; the batch axis must be taken whole."""
         out, axis = self, 0
         for each in key if isinstance(key, tuple) else (key,):
             if each is None:
-                out = self.sheet.put("Unsqueeze", np.expand_dims(out.sample, axis), out, np.array([axis]))
+                out = self.sheet.add_node("Unsqueeze", np.expand_dims(out.sample, axis), out, np.array([axis]))
             elif not isinstance(each, slice) or each != slice(None):
                 index = np.arange(out.shape[axis])[each]
-                out = self.sheet.put("Gather", out.sample.take(index, axis), out, index, axis=axis)
+                out = self.sheet.add_node("Gather", out.sample.take(index, axis), out, index, axis=axis)
                 axis -= index.ndim == 0
             axis += 1
         return out
@@ -92,101 +94,101 @@ class Wire(NDArrayOperatorsMixin):
         return self.sample.shape
 
     @property
-    def T(self) -> Wire:
+    def T(self) -> Tensor:
         """Wire with its axes reversed."""
-        return self.sheet.put("Transpose", self.sample.T, self)
+        return self.sheet.add_node("Transpose", self.sample.T, self)
 
-    def astype(self, kind: type) -> Wire:
+    def astype(self, dtype: type) -> Tensor:
         """Convert to another type."""
-        if self.sample.dtype == kind:
+        if self.sample.dtype == dtype:
             return self
-        return self.sheet.put("Cast", self.sample.astype(kind), self, to=KINDS[np.dtype(kind)])
+        return self.sheet.add_node("Cast", self.sample.astype(dtype), self, to=KINDS[np.dtype(dtype)])
 
-    def reshape(self, *shape: int) -> Wire:
+    def reshape(self, *shape: int) -> Tensor:
         """Change the shape; the batch axis is -1."""
-        return self.sheet.put("Reshape", self.sample.reshape(shape), self, np.array(shape))
+        return self.sheet.add_node("Reshape", self.sample.reshape(shape), self, np.array(shape))
 
-    def argmin(self, axis: int) -> Wire:
+    def argmin(self, axis: int) -> Tensor:
         """Return the position of the minimum along an axis (whole numbers)."""
-        return self.sheet.put("ArgMin", self.sample.argmin(axis), self, axis=axis, keepdims=0)
+        return self.sheet.add_node("ArgMin", self.sample.argmin(axis), self, axis=axis, keepdims=0)
 
-    def sum(self, axis: int, keepdims: bool = False) -> Wire:
+    def sum(self, axis: int, keepdims: bool = False) -> Tensor:
         """Sum over an axis."""
         sample = self.sample.sum(axis, keepdims=keepdims)
-        return self.sheet.put("ReduceSum", sample, self, np.array([axis]), keepdims=int(keepdims))
+        return self.sheet.add_node("ReduceSum", sample, self, np.array([axis]), keepdims=int(keepdims))
 
-    def min(self, axis: int) -> Wire:
+    def min(self, axis: int) -> Tensor:
         """Return the minimum over an axis."""
-        return self.sheet.put("ReduceMin", self.sample.min(axis), self, axes=(axis,), keepdims=0)
+        return self.sheet.add_node("ReduceMin", self.sample.min(axis), self, axes=(axis,), keepdims=0)
 
-    def max(self, axis: int) -> Wire:
+    def max(self, axis: int) -> Tensor:
         """Return the maximum over an axis."""
-        return self.sheet.put("ReduceMax", self.sample.max(axis), self, axes=(axis,), keepdims=0)
+        return self.sheet.add_node("ReduceMax", self.sample.max(axis), self, axes=(axis,), keepdims=0)
 
 
-Operand = Wire | np.ndarray | float
+Operand = Tensor | np.ndarray | float
 
 
 class Port(NamedTuple):
     """Input or output: its name, type and shape, and a description."""
 
     name: str
-    kind: type
+    dtype: type
     shape: tuple[int | str, ...]
-    text: str
+    description: str
 
 
-class Node(NamedTuple):
+class GraphNode(NamedTuple):
     """Operator, its inputs, its output, and its attributes."""
 
-    kind: str
+    operator: str
     inputs: tuple[str, ...]
     output: str
     attributes: Mapping[str, Any]
 
 
-class Sheet:
+class GraphBuilder:
     """Graph under construction. The same operator on the same wires is one node, equal arrays are one constant."""
 
     def __init__(self) -> None:
         self._inputs: list[Port] = []
         self._outputs: list[Port] = []
-        self._nodes: list[Node] = []
+        self._nodes: list[GraphNode] = []
         self._constants: dict[str, np.ndarray] = {}
-        self._made: dict[object, Wire] = {}
+        self._made: dict[object, Tensor] = {}
 
-    def put(self, kind: str, sample: np.ndarray, *inputs: Wire | np.ndarray, **attributes: Any) -> Wire:
+    def add_node(self, operator: str, sample: np.ndarray, *inputs: Tensor | np.ndarray, **attributes: Any) -> Tensor:
         """Write an ONNX operator on wires and constants; `sample` is its result for the sample loads."""
-        names = tuple((each if isinstance(each, Wire) else self.add_constant(each)).name for each in inputs)
-        key = kind, names, tuple(attributes.items())
+        names = tuple((each if isinstance(each, Tensor) else self.add_constant(each)).name for each in inputs)
+        key = operator, names, tuple(attributes.items())
         if key not in self._made:
-            self._made[key] = Wire(self, f"{kind}_{len(self._nodes)}", sample)
-            self._nodes.append(Node(kind, names, self._made[key].name, attributes))
+            self._made[key] = Tensor(self, f"{operator}_{len(self._nodes)}", sample)
+            self._nodes.append(GraphNode(operator, names, self._made[key].name, attributes))
         return self._made[key]
 
-    def to_common_type(self, operands: Sequence[Operand]) -> list[Wire]:
+    def to_common_type(self, operands: Sequence[Operand]) -> list[Tensor]:
         """Convert operands to their common NumPy type: NumPy's operators mix types, those of graphs do not."""
         kind = np.result_type(*map(_sample, operands))
-        wires = (each if isinstance(each, Wire) else self.add_constant(np.asarray(each, kind)) for each in operands)
+        wires = (each if isinstance(each, Tensor) else self.add_constant(np.asarray(each, kind)) for each in operands)
         return [wire.astype(kind.type) for wire in wires]
 
-    def add_constant(self, array: np.ndarray) -> Wire:
+    def add_constant(self, array: np.ndarray) -> Tensor:
         """Add a constant of the array's own type; whole numbers in 64 bits."""
         array = np.asarray(array, np.int64) if array.dtype.kind in "iu" else array
         key = array.dtype.str, array.shape, array.tobytes()
         if key not in self._made:
-            self._made[key] = Wire(self, f"constant_{len(self._constants)}", array)
+            self._made[key] = Tensor(self, f"constant_{len(self._constants)}", array)
             self._constants[self._made[key].name] = array
         return self._made[key]
 
-    def add_input(self, name: str, sample: np.ndarray, text: str) -> Any:
+    def add_input(self, name: str, sample: np.ndarray, description: str) -> Any:
         """Add an input (B, ...) of single precision; formulas compute in double precision."""
-        self._inputs.append(Port(name, np.float32, ("B", *sample.shape[1:]), text))
-        return Wire(self, name, sample.astype(np.float32)).astype(np.float64)
+        self._inputs.append(Port(name, np.float32, ("B", *sample.shape[1:]), description))
+        return Tensor(self, name, sample.astype(np.float32)).astype(np.float64)
 
-    def add_output(self, wire: Wire, port: Port) -> None:
+    def add_output(self, wire: Tensor, port: Port) -> None:
         """Add an output, of the port's type."""
-        self._nodes.append(Node("Identity", (wire.astype(port.kind).name,), port.name, {}))
+        self._nodes.append(GraphNode("Identity", (wire.astype(port.dtype).name,), port.name, {}))
         self._outputs.append(port)
 
     @property
@@ -196,15 +198,15 @@ class Sheet:
 
     def to_json(self) -> dict[str, list]:
         """Return inputs and outputs by name, and the operators in the order of evaluation, for JSON."""
-        nodes = [[node.kind, node.inputs, node.output, _to_plain(node.attributes)] for node in self._nodes]
+        nodes = [[node.operator, node.inputs, node.output, _to_plain(node.attributes)] for node in self._nodes]
         return {
             "inputs": [port.name for port in self._inputs],
             "outputs": [port.name for port in self._outputs],
             "nodes": nodes,
         }
 
-    def build_model(self, name: str, text: str, version: str, notes: Mapping[str, str]) -> ModelProto:
-        """Build the ONNX model; `notes` are its metadata.
+    def build_model(self, name: str, description: str, version: str, metadata: Mapping[str, str]) -> ModelProto:
+        """Build the ONNX model; `metadata` are its metadata.
 
         Raises
         ------
@@ -215,14 +217,14 @@ class Sheet:
             from onnx import helper, numpy_helper
 
         def described(ports: list[Port]) -> list:
-            kinds = [KINDS[np.dtype(port.kind)] for port in ports]
+            kinds = [KINDS[np.dtype(port.dtype)] for port in ports]
             return [
-                helper.make_tensor_value_info(port.name, kind, port.shape, port.text)
+                helper.make_tensor_value_info(port.name, kind, port.shape, port.description)
                 for port, kind in zip(ports, kinds, strict=True)
             ]
 
         graph = helper.make_graph(
-            [helper.make_node(node.kind, node.inputs, [node.output], **node.attributes) for node in self._nodes],
+            [helper.make_node(node.operator, node.inputs, [node.output], **node.attributes) for node in self._nodes],
             name,
             described(self._inputs),
             described(self._outputs),
@@ -234,9 +236,9 @@ class Sheet:
             ir_version=FORMAT_VERSION,
             producer_name="sulcus",
             producer_version=version,
-            doc_string=text,
+            doc_string=description,
         )
-        helper.set_model_props(model, dict(notes))
+        helper.set_model_props(model, dict(metadata))
         return model
 
 
@@ -246,41 +248,41 @@ def _to_plain(attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _sample(operand: Operand) -> np.ndarray | float:
-    return operand.sample if isinstance(operand, Wire) else operand
+    return operand.sample if isinstance(operand, Tensor) else operand
 
 
-def _concatenate(sheet: Sheet, arrays: Sequence[Operand], axis: int = 0) -> Wire:
+def _concatenate(sheet: GraphBuilder, arrays: Sequence[Operand], axis: int = 0) -> Tensor:
     sample = np.concatenate([_sample(each) for each in arrays], axis)
-    return sheet.put("Concat", sample, *sheet.to_common_type(arrays), axis=axis)
+    return sheet.add_node("Concat", sample, *sheet.to_common_type(arrays), axis=axis)
 
 
-def _stack_columns(sheet: Sheet, arrays: Sequence[Wire]) -> Wire:
+def _stack_columns(sheet: GraphBuilder, arrays: Sequence[Tensor]) -> Tensor:
     return _concatenate(sheet, [each if len(each.shape) > 1 else each[:, None] for each in arrays], 1)
 
 
-def _stack(sheet: Sheet, arrays: Sequence[Wire]) -> Wire:
+def _stack(sheet: GraphBuilder, arrays: Sequence[Tensor]) -> Tensor:
     return _concatenate(sheet, [each[None] for each in arrays])
 
 
-def _select_where(sheet: Sheet, condition: Wire, yes: Operand, no: Operand) -> Wire:
+def _select_where(sheet: GraphBuilder, condition: Tensor, yes: Operand, no: Operand) -> Tensor:
     sample = np.where(condition.sample, _sample(yes), _sample(no))
-    return sheet.put("Where", sample, condition, *sheet.to_common_type([yes, no]))
+    return sheet.add_node("Where", sample, condition, *sheet.to_common_type([yes, no]))
 
 
-def _sum_products(sheet: Sheet, equation: str, *operands: Any) -> Wire:
+def _sum_products(sheet: GraphBuilder, equation: str, *operands: Any) -> Tensor:
     (first, second), out = equation.partition("->")[0].split(","), equation.partition("->")[2]
     if first == out + second[-1] and first.endswith(second):  # product and sum: ten times as fast in runtimes
         return (operands[0] * operands[1]).sum(axis=len(out))
     sample = np.einsum(equation, *map(_sample, operands))
-    return sheet.put("Einsum", sample, *sheet.to_common_type(operands), equation=equation)
+    return sheet.add_node("Einsum", sample, *sheet.to_common_type(operands), equation=equation)
 
 
-def _search_sorted(_: Sheet, sites: np.ndarray, values: Wire) -> Wire:
+def _search_sorted(_: GraphBuilder, sites: np.ndarray, values: Tensor) -> Tensor:
     # Infinity at the end: no operator reads an empty array.
     return (values[:, None] > np.append(sites, np.inf)).astype(np.int64).sum(axis=1)
 
 
-FUNCTIONS: dict[Callable, Callable[..., Wire]] = {
+FUNCTIONS: dict[Callable, Callable[..., Tensor]] = {
     np.concatenate: _concatenate,
     np.column_stack: _stack_columns,
     np.stack: _stack,
@@ -293,34 +295,34 @@ FUNCTIONS: dict[Callable, Callable[..., Wire]] = {
 """Other functions of NumPy, called with the sheet and their arguments."""
 
 
-def _compute_arccos(cosine: Wire) -> Wire:
+def _compute_arccos(cosine: Tensor) -> Tensor:
     """Compute the arc cosine by the half-chord: runtimes have arc functions in single precision only."""
     half = np.sqrt(0.5 * np.maximum(1.0 - np.absolute(cosine), 0.0)).astype(np.float32)
-    arc = 2.0 * cosine.sheet.put("Asin", np.arcsin(half.sample), half).astype(np.float64)
+    arc = 2.0 * cosine.sheet.add_node("Asin", np.arcsin(half.sample), half).astype(np.float64)
     return np.where(cosine < 0.0, np.pi - arc, arc)
 
 
 @compute_squared_distances.register
-def _(points: Wire, sites: np.ndarray) -> Any:
+def _(points: Tensor, sites: np.ndarray) -> Any:
     """Compute |x|^2 - 2 x y + |y|^2, in double precision: differences would take the memory of B n f numbers."""
     x, y = points.astype(np.float64), sites.astype(np.float64)
     return np.maximum((x * x).sum(axis=1, keepdims=True) - x @ (2.0 * y.T) + (y * y).sum(axis=1), 0.0)
 
 
-@take_rows_of.register
-def _(index: Wire, table: np.ndarray | Rounded) -> Any:
-    if not isinstance(table, Rounded):
-        return index.sheet.put("Gather", table[index.sample], table, index, axis=0)
-    found = index.sheet.put("Gather", table.whole[index.sample], table.whole, index, axis=0)
+@take_rows.register
+def _(index: Tensor, table: np.ndarray | QuantisedTable) -> Any:
+    if not isinstance(table, QuantisedTable):
+        return index.sheet.add_node("Gather", table[index.sample], table, index, axis=0)
+    found = index.sheet.add_node("Gather", table.integers[index.sample], table.integers, index, axis=0)
     return found.astype(np.float32) * table.step
 
 
 @multiply_rows.register
-def _(rows: Wire, table: Rounded, index: np.ndarray) -> Any:
-    return (rows @ rows.sheet.add_constant(table.whole[index]).astype(np.float32)) * table.step
+def _(rows: Tensor, table: QuantisedTable, index: np.ndarray) -> Any:
+    return (rows @ rows.sheet.add_constant(table.integers[index]).astype(np.float32)) * table.step
 
 
-@find_columns_in_use.register
-def _(rows: Wire) -> np.ndarray:
+@find_nonzero_columns.register
+def _(rows: Tensor) -> np.ndarray:
     """Return all columns: zeros are unknown before the graph runs."""
     return np.arange(rows.shape[1])

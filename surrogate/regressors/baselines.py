@@ -13,34 +13,34 @@ from typing import Any, Self
 import numpy as np
 
 from ..array_functions import compute_squared_distances
-from .protocol import Stored, compute_standardisation
+from .protocol import StoredRegressor, compute_standardisation
 
 RANK_TOLERANCE = 1e-9  # Smallest singular value relative to the largest: below is round-off.
 
 
 @dataclass(eq=False)
-class Pcr(Stored):
+class Pcr(StoredRegressor):
     """Least squares on the principal components of the features, with intercept.
 
     Jolliffe 2002, "Principal Component Analysis", chapter 8. The features are not scaled, so they must share one unit
-    (forces at the nodes). Components are kept until they explain `share` of the features' variance: others would be
+    (forces at the nodes). Components are kept until they explain `variance_share` of the variance: others would be
     fitted to positions that few loads touch.
 
     Parameters
     ----------
-    share
+    variance_share
         Share of the variance, in (0, 1].
     """
 
     kept = ("mean", "map", "offset")
     """Mean of the features (f,), map (f, r), offset (r,)."""
-    share: float = 0.999
+    variance_share: float = 0.999
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Fit to rows X (n, f), Y (n, r)."""
         self.mean_, self.offset_ = X.mean(axis=0), Y.mean(axis=0)
         components, size, axes = np.linalg.svd(X - self.mean_, full_matrices=False)
-        kept = 1 + int(np.searchsorted(np.cumsum(size**2), self.share * np.sum(size**2)))
+        kept = 1 + int(np.searchsorted(np.cumsum(size**2), self.variance_share * np.sum(size**2)))
         kept = min(kept, int(np.sum(size > RANK_TOLERANCE * size[0])))
         # Components are orthogonal: each has its own least-squares problem.
         slopes = components[:, :kept].T @ (Y - self.offset_) / size[:kept, None]
@@ -53,7 +53,7 @@ class Pcr(Stored):
 
 
 @dataclass(eq=False)
-class Svr(Stored):
+class Svr(StoredRegressor):
     """Support vector regression with a Gaussian kernel exp(-gamma |x - x'|^2), gamma = 1 / f, of standardised features.
 
     By default C = iqr(y) / 1.349 and epsilon = iqr(y) / 13.49 per output. These are MATLAB's defaults, which Tonutti,
@@ -62,14 +62,14 @@ class Svr(Stored):
 
     Parameters
     ----------
-    penalty, tube
+    penalty, epsilon
         C and epsilon, in interquartile ranges of the output.
     """
 
     kept = ("mean", "deviation", "support", "dual", "intercept")
     """Standardisation, support vectors (s, f), dual coefficients (s, r), intercepts (r,)."""
     penalty: float = 1.0 / 1.349
-    tube: float = 1.0 / 13.49
+    epsilon: float = 1.0 / 13.49
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Fit to rows X (n, f), Y (n, r)."""
@@ -83,7 +83,9 @@ class Svr(Stored):
 
         def trained(mode: int) -> SVR:
             # In units of its interquartile range an output meets libsvm's absolute stopping tolerance at any scale.
-            return SVR(C=self.penalty, epsilon=self.tube, gamma=1.0 / X.shape[1]).fit(scaled, Y[:, mode] / spread[mode])
+            return SVR(C=self.penalty, epsilon=self.epsilon, gamma=1.0 / X.shape[1]).fit(
+                scaled, Y[:, mode] / spread[mode]
+            )
 
         modes = np.flatnonzero(spread > 0.0)
         with ThreadPoolExecutor() as pool:
@@ -117,7 +119,7 @@ def limit_to_one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def forward(x: Any, weights: Sequence[Any], biases: Sequence[Any], tanh: Callable[[Any], Any]) -> Any:
+def compute_outputs(x: Any, weights: Sequence[Any], biases: Sequence[Any], tanh: Callable[[Any], Any]) -> Any:
     """Compute the layers' outputs (B, r) for inputs x (B, f): arrays of NumPy or of torch, with its `tanh`."""
     for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
         x = tanh(x @ weight + bias)
@@ -132,19 +134,19 @@ class Ann:
 
     Parameters
     ----------
-    hidden
+    hidden_units
         Number of units in each layer.
-    decay
+    weight_decay
         Weight of the sum of squared weights over the summed squared error of outputs whose total variance is one.
-    steps
+    max_iterations
         Number of L-BFGS iterations.
     seed
         Seed of the initial weights.
     """
 
-    hidden: int = 64
-    decay: float = 1e-2
-    steps: int = 1000
+    hidden_units: int = 64
+    weight_decay: float = 1e-2
+    max_iterations: int = 1000
     seed: int = 0
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
@@ -158,7 +160,7 @@ class Ann:
         inputs = torch.from_numpy((X - self.mean_) / self.deviation_)
         targets = torch.from_numpy((Y - self.offset_) / self.scale_)
         random = torch.Generator().manual_seed(self.seed)
-        widths = (X.shape[1], self.hidden, self.hidden, Y.shape[1])
+        widths = (X.shape[1], self.hidden_units, self.hidden_units, Y.shape[1])
         weights = [
             (torch.randn(a, b, generator=random, dtype=torch.float64) / a**0.5).requires_grad_()
             for a, b in pairwise(widths)
@@ -166,12 +168,14 @@ class Ann:
         biases = [torch.zeros(b, dtype=torch.float64, requires_grad=True) for b in widths[1:]]
 
         def loss() -> torch.Tensor:
-            misfit = (forward(inputs, weights, biases, torch.tanh) - targets).square().sum(dim=1).mean()
-            return misfit + self.decay / len(X) * torch.stack([weight.square().sum() for weight in weights]).sum()
+            misfit = (compute_outputs(inputs, weights, biases, torch.tanh) - targets).square().sum(dim=1).mean()
+            return (
+                misfit + self.weight_decay / len(X) * torch.stack([weight.square().sum() for weight in weights]).sum()
+            )
 
         search = torch.optim.LBFGS(
             [*weights, *biases],
-            max_iter=self.steps,
+            max_iter=self.max_iterations,
             history_size=20,
             tolerance_change=1e-12,
             line_search_fn="strong_wolfe",
@@ -192,7 +196,7 @@ class Ann:
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of features (B, f)."""
         x = ((X - self.mean_) / self.deviation_).astype(np.float32)
-        y = forward(x, self.weights_, self.biases_, np.tanh)
+        y = compute_outputs(x, self.weights_, self.biases_, np.tanh)
         return y * np.float32(self.scale_) + self.offset_.astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from sim.errors import InputError
 
-from ..array_functions import Rounded, find_columns_in_use, multiply_rows, predict_in_chunks, take_rows_of
+from ..array_functions import QuantisedTable, find_nonzero_columns, multiply_rows, predict_in_chunks, take_rows
 from .gp import Gp
 
 MAX_ORDER = 3  # Order of the power series in the force.
@@ -29,7 +29,7 @@ DUAL_STEP = 2e-6
 FLAT_TOLERANCE = 1e-6  # Smallest spread of places along an axis relative to the largest: a flat cortex has two axes.
 
 
-def compute_forms(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
+def compute_direction_monomials(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Compute products (B, 19) of the components of directions (B, 3), times force^(order - 1) of forces (B,) [N]."""
     columns = [direction[:, FACTORS[0][0]]]
     for order, factors in enumerate(FACTORS[1:], start=1):
@@ -62,15 +62,15 @@ class Series:
     corners: np.ndarray
     triangles: np.ndarray
     radii: np.ndarray
-    table: Rounded
+    table: QuantisedTable
 
     @classmethod
-    def round_table(
+    def quantise_table(
         cls, corners: np.ndarray, triangles: np.ndarray, radii: np.ndarray, table: np.ndarray, step: np.ndarray
     ) -> Self:
         """Round a table (places, R, 19, r) to the steps of its terms (19,)."""
         steps = np.repeat(step, table.shape[-1])
-        return cls(corners, triangles, radii, Rounded.round_table(table.reshape(-1, len(steps)), steps))
+        return cls(corners, triangles, radii, QuantisedTable.quantise(table.reshape(-1, len(steps)), steps))
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of `compute_tool_features` (B, 8)."""
@@ -82,19 +82,19 @@ class Series:
         count = place.shape[1] * radius.shape[1]
         row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(-1, count)
         factor = (share[:, :, None] * weight[:, None]).reshape(-1, 1, count).astype(np.float32)
-        mixed = (factor @ take_rows_of(row, self.table)).reshape(-1, TERM_COUNT, len(self.table.step) // TERM_COUNT)
-        return (compute_forms(X[:, 3:6], X[:, 6]).astype(np.float32)[:, None] @ mixed)[:, 0]
+        mixed = (factor @ take_rows(row, self.table)).reshape(-1, TERM_COUNT, len(self.table.step) // TERM_COUNT)
+        return (compute_direction_monomials(X[:, 3:6], X[:, 6]).astype(np.float32)[:, None] @ mixed)[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:
         """Return places, radii, and the table: whole numbers of steps, `share`, and the step of each column, `unit`."""
         known = {name: getattr(self, name) for name in ("corners", "triangles", "radii")}
-        return {**known, "unit": self.table.step, "share": self.table.whole}
+        return {**known, "unit": self.table.step, "share": self.table.integers}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
         """Rebuild from `state`; files of earlier versions have float16 instead of whole numbers, and more axes."""
         step = state["unit"].ravel()
-        table = Rounded(state["share"].reshape(-1, len(step)), step)
+        table = QuantisedTable(state["share"].reshape(-1, len(step)), step)
         return cls(state["corners"], state["triangles"], state["radii"], table)
 
     @cached_property
@@ -118,11 +118,11 @@ class Series:
         local = (point @ self._columns[:3] + self._columns[3]).reshape(-1, 4, len(self.triangles))
         miss = np.absolute(local[:, 3]) - HEIGHT_EQUIVALENT * np.minimum(local[:, :3].min(axis=1), 0.0)
         best = miss.argmin(axis=1)
-        frame = take_rows_of(best, self._frames[:, :3])
+        frame = take_rows(best, self._frames[:, :3])
         corner = np.maximum(np.einsum("bij,bj->bi", frame[:, :, :3], point) + frame[:, :, 3], 0.0)
         corner = corner / corner.sum(axis=1, keepdims=True)
         share = [corner * (2.0 * corner - 1.0), 4.0 * corner[:, [1, 2, 0]] * corner[:, [2, 0, 1]]]
-        return take_rows_of(best, self.triangles), np.concatenate(share, axis=1)
+        return take_rows(best, self.triangles), np.concatenate(share, axis=1)
 
     def _interpolate_radii(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return radii (B, k) and weights (B, k): the parabola through the three radii about each radius (B,) [m]."""
@@ -130,7 +130,7 @@ class Series:
         inside = np.clip(radius, self.radii[0], self.radii[-1])
         first = np.clip(np.searchsorted(self.radii, inside) - 2, 0, len(self.radii) - width)
         index = first[:, None] + np.arange(width)
-        at, x = take_rows_of(index, np.log(self.radii)), np.log(inside)[:, None]
+        at, x = take_rows(index, np.log(self.radii)), np.log(inside)[:, None]
         weight = np.ones((1, width))
         for other in range(1, width):
             beside = at[:, np.roll(np.arange(width), other)]
@@ -138,7 +138,7 @@ class Series:
         return index, weight
 
 
-class Remainder:
+class RemainderGp:
     """Gaussian process of the response's remainder in units of force^3 + faint^3.
 
     The first neglected order is in proportion to force^3, so that the rows of strong and weak loads have equal weight.
@@ -151,7 +151,7 @@ class Remainder:
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Fit to `compute_tool_features` X (n, 8) and remainders Y (n, r)."""
         self.faint_ = np.array(SMALL_FORCE_SHARE * X[:, 6].max())
-        self.gp_ = Gp().fit(add_pressing(X), Y / self._compute_unit(X))
+        self.gp_ = Gp().fit(append_force_ratio(X), Y / self._compute_unit(X))
         strongest = X[[X[:, 6].argmax()]]
         step = np.exp2(np.floor(np.log2(DUAL_STEP / (strongest[0, 6] * self._compute_unit(strongest).item()))))
         self.gp_.dual_ = (np.rint(self.gp_.dual_ / step) * step).astype(np.float32)
@@ -159,7 +159,7 @@ class Remainder:
 
     def predict(self, X: np.ndarray) -> np.ndarray:
         """Predict coefficients (B, r) float32 of `compute_tool_features` (B, 8)."""
-        return (self.gp_.predict(add_pressing(X)) * self._compute_unit(X)).astype(np.float32)
+        return (self.gp_.predict(append_force_ratio(X)) * self._compute_unit(X)).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return the Gaussian process's state, and `faint` [N]."""
@@ -178,14 +178,14 @@ class Remainder:
         return X[:, 6:7] ** MAX_ORDER + self.faint_**MAX_ORDER
 
 
-def add_pressing(X: np.ndarray) -> np.ndarray:
+def append_force_ratio(X: np.ndarray) -> np.ndarray:
     """Append force / radius to the features (n, 8) of `compute_tool_features`: (n, 9)."""
     return np.column_stack([X, X[:, 6] / X[:, 7]])
 
 
 @dataclass(frozen=True, eq=False)
 class ForcePairs:
-    """Regressor of the second-order contribution to the response, from `compute_rooted_shares`.
+    """Regressor of the second-order contribution to the response, from `compute_root_scaled_forces`.
 
     Parameters
     ----------
@@ -196,14 +196,14 @@ class ForcePairs:
     """
 
     pairs: np.ndarray
-    table: Rounded
+    table: QuantisedTable
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict coefficients (B, r) float32 of `compute_rooted_shares` (B, 3 m)."""
+        """Predict coefficients (B, r) float32 of `compute_root_scaled_forces` (B, 3 m)."""
         return predict_in_chunks(self._compute_prediction, X)
 
     def _compute_prediction(self, X: np.ndarray) -> np.ndarray:
-        used = find_columns_in_use(X)
+        used = find_nonzero_columns(X)
         row = self._rows[used[:, None], used]
         row = row[row >= 0]
         first, second = self.pairs[row].T
@@ -218,15 +218,15 @@ class ForcePairs:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return pairs, and the table: whole numbers of steps, `share`, and the step of each mode, `unit`."""
-        return {"pairs": self.pairs.astype(np.int32), "unit": self.table.step, "share": self.table.whole}
+        return {"pairs": self.pairs.astype(np.int32), "unit": self.table.step, "share": self.table.integers}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
         """Rebuild from `state`; files of earlier versions have float16 instead of whole numbers."""
-        return cls(state["pairs"], Rounded(state["share"], state["unit"]))
+        return cls(state["pairs"], QuantisedTable(state["share"], state["unit"]))
 
 
-def fill_table(points: np.ndarray, table: np.ndarray, held_out: np.ndarray) -> np.ndarray:
+def interpolate_table(points: np.ndarray, table: np.ndarray, held_out: np.ndarray) -> np.ndarray:
     """Replace the rows of the `held_out` places of a table by interpolation of the others.
 
     By cubic radial basis functions with a linear polynomial (Duchon 1977, "Splines minimizing rotation-invariant

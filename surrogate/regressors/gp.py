@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 from sim.runtime.threads import limit_to_one_thread
 
 from ..array_functions import compute_squared_distances
-from .protocol import Stored, compute_standardisation
+from .protocol import StoredRegressor, compute_standardisation
 
 LENGTH_BOUNDS = (0.05, 1e3)  # Bounds of the lengths [standard deviations of a feature].
 NOISE_BOUNDS = (1e-8, 1.0)  # Bounds of the noise relative to the variance of an output.
@@ -22,18 +22,18 @@ START_NOISE = 1e-4  # Initial noise relative to the variance of an output.
 
 
 @dataclass(eq=False)
-class Gp(Stored):
+class Gp(StoredRegressor):
     """Gaussian process with a Matern 5/2 kernel and a length for each feature; all outputs share lengths and noise.
 
     Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equations 2.25, 2.26, 4.17, 5.9. The
-    hyperparameters maximise the likelihood of at most `rows` rows, of the `strongest` outputs. It is conditioned on
-    every row, up to `most`, beyond which a random subset is used.
+    hyperparameters maximise the likelihood of at most `likelihood_rows`, of the strongest `likelihood_outputs`. It is
+    conditioned on every row, up to `max_rows`, beyond which a random subset is used.
 
     Parameters
     ----------
-    rows, most
+    likelihood_rows, max_rows
         Maximum numbers of rows of the likelihood and of the conditioning; the cost is cubic in them.
-    strongest
+    likelihood_outputs
         Number of outputs of largest variance in the likelihood, each in units of its own variance.
     seed
         Seed of the subsets.
@@ -41,21 +41,21 @@ class Gp(Stored):
 
     kept = ("mean", "deviation", "offset", "length", "noise", "scaled", "dual")
     """Standardisation, lengths (f,), noise, standardised training rows (n, f), their dual coefficients (n, r)."""
-    rows: int = 600
-    most: int = 4000
-    strongest: int = 20
+    likelihood_rows: int = 600
+    max_rows: int = 4000
+    likelihood_outputs: int = 20
     seed: int = 0
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
         """Fit to rows X (n, f), Y (n, r)."""
         vars(self).pop("seen_", None)
-        order = np.random.default_rng(self.seed).permutation(len(X))[: self.most]
+        order = np.random.default_rng(self.seed).permutation(len(X))[: self.max_rows]
         self.mean_, self.deviation_ = compute_standardisation(X)
         x = self.scaled_ = ((X - self.mean_) / self.deviation_)[order].astype(np.float32)
         self.offset_ = Y.mean(axis=0)
         y = (Y - self.offset_)[order]
-        spread = y[: self.rows].std(axis=0)
-        loudest = np.argsort(-spread, kind="stable")[: self.strongest]
+        spread = y[: self.likelihood_rows].std(axis=0)
+        loudest = np.argsort(-spread, kind="stable")[: self.likelihood_outputs]
         loudest = loudest[spread[loudest] > 0.0]
         start = np.log(np.append(np.full(X.shape[1], START_LENGTH), START_NOISE))
         if len(loudest):
@@ -63,7 +63,7 @@ class Gp(Stored):
                 fitted = minimize(
                     compute_negative_likelihood,
                     start,
-                    args=(x[: self.rows], y[: self.rows, loudest] / spread[loudest]),
+                    args=(x[: self.likelihood_rows], y[: self.likelihood_rows, loudest] / spread[loudest]),
                     jac=True,
                     method="L-BFGS-B",
                     bounds=[*[tuple(np.log(LENGTH_BOUNDS))] * X.shape[1], tuple(np.log(NOISE_BOUNDS))],

@@ -6,7 +6,7 @@ from typing import ClassVar, Protocol, Self
 import numpy as np
 
 
-class Fitted(Protocol):
+class FittedRegressor(Protocol):
     """Map from features X (B, f) to coefficients Y (B, r)."""
 
     def predict(self, X: np.ndarray) -> np.ndarray:
@@ -26,12 +26,12 @@ class Fitted(Protocol):
 class RegressorFactory(Protocol):
     """Factory of a fitted map: a regressor itself, or a selection among several."""
 
-    def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
+    def fit(self, X: np.ndarray, Y: np.ndarray) -> FittedRegressor:
         """Fit a map to rows X (n, f), Y (n, r)."""
         ...
 
 
-class Regressor(Fitted, Protocol):
+class Regressor(FittedRegressor, Protocol):
     """Map that is fitted to rows. `fit` sets attributes that end in an underscore."""
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
@@ -45,7 +45,7 @@ def compute_standardisation(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return X.mean(axis=0), np.where(deviation > 1e-9 * np.abs(X).max(axis=0), deviation, 1.0)
 
 
-class Stored:
+class StoredRegressor:
     """Regressor whose state is its attributes of the names in `kept`, each with a trailing underscore."""
 
     kept: ClassVar[tuple[str, ...]]
@@ -63,7 +63,7 @@ class Stored:
         return model
 
 
-class Linear(Stored):
+class Linear(StoredRegressor):
     """Y = X C without intercept, C of least norm among the least-squares solutions.
 
     Fitted to unit responses at the nodes it is the exact compliance matrix; with any other rows, its least-squares

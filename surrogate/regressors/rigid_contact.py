@@ -119,7 +119,7 @@ class RigidContact:
         return self._compute_resultant(X) * (self._compute_terms(X) @ self.grip)[:, None]
 
     @property
-    def held_width(self) -> int:
+    def warm_start_width(self) -> int:
         """Number of columns of `held`."""
         return self._width + len(self.compliance) + 4 * MAX_STORED_POINTS
 
@@ -127,9 +127,9 @@ class RigidContact:
         """Return poses of rods or blades, forces and contact points (B, h): a warm start for the next pose."""
         return np.hstack([X[:, : self._width], self._find_contact(X)])
 
-    def compute_held_force(self, held: np.ndarray) -> np.ndarray:
-        """Extract the forces (B, 3 k) [N] from rows of `held`."""
-        return held[:, self._width : self._width + len(self.compliance)]
+    def get_warm_start_force(self, warm_start: np.ndarray) -> np.ndarray:
+        """Extract the forces (B, 3 k) [N] from rows of `warm_start`."""
+        return warm_start[:, self._width : self._width + len(self.compliance)]
 
     def _compute_terms(self, X: np.ndarray) -> np.ndarray:
         """Compute the terms of lines (B, 2), or for relaxing tissue (B, 4)."""
@@ -139,7 +139,7 @@ class RigidContact:
     def _split_features(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Split features: pose of the tool, relaxed share, and `held`; the last two may be empty."""
         more = X[:, self._width :]
-        relaxed, held = np.split(more, [more.shape[1] % self.held_width], axis=1)
+        relaxed, held = np.split(more, [more.shape[1] % self.warm_start_width], axis=1)
         return X[:, : self._width], relaxed, held
 
     @property
@@ -171,17 +171,19 @@ class RigidContact:
         self._last = asked, out
         return out
 
-    def fit_lines(self, X: np.ndarray, Y: np.ndarray, alike: np.ndarray, exerted: np.ndarray | None = None) -> Self:
-        """Fit the lines to coefficients Y (B, r); `alike` (r,) numbers the columns that share one.
+    def fit_lines(
+        self, X: np.ndarray, Y: np.ndarray, column_groups: np.ndarray, tool_force: np.ndarray | None = None
+    ) -> Self:
+        """Fit the lines to coefficients Y (B, r); `column_groups` (r,) numbers the columns that share one.
 
-        `exerted` (B, 3) [N/m] is the tool's force per metre of depth, if available.
+        `tool_force` (B, 3) [N/m] is the tool's force per metre of depth, if available.
         """
         found, terms = self.compute_linear(X), self._compute_terms(X)
         line = np.zeros((terms.shape[1], found.shape[1]))
-        for each in np.unique(alike):
-            mine = alike == each
+        for each in np.unique(column_groups):
+            mine = column_groups == each
             line[:, mine] = _fit_line(terms, found[:, mine], Y[:, mine])[:, None]
-        grip = self.grip if exerted is None else _fit_line(terms, self._compute_resultant(X), exerted)
+        grip = self.grip if tool_force is None else _fit_line(terms, self._compute_resultant(X), tool_force)
         return replace(self, line=line, grip=grip)
 
     def state(self) -> dict[str, np.ndarray]:

@@ -13,52 +13,52 @@ from sim.loads import Loads, Pushed, select_cases
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
 from ..data.indentation import add_relaxation, to_indentation
-from ..data.load_histories import read_series
+from ..data.load_histories import read_prony_series
 from ..data.splits import DiscSplit
-from ..evaluation.coverage import Coverage, measure_covered
+from ..evaluation.coverage import Coverage, measure_coverage
 from ..evaluation.score import compute_force_errors, compute_point_errors
-from ..model.conformal import Bound, BoundSettings, compute_features, fit_bound, fit_growth
+from ..model.conformal import Bound, BoundSettings, compute_scale_features, fit_bound, fit_growth
 from ..model.learned import Learned, get_only_pushes
-from ..model.relaxation import follow_relaxation
+from ..model.relaxation import update_relaxation
 from ..model.tip_distance import MAX_CONDITIONING_LOADS, TipModel, fit_correction
-from ..model.training_range import Measured, Outside, measure_loads
+from ..model.training_range import Excess, LoadMeasures, measure_loads
 from .examples import Examples
 from .expansion import Expansion
 
 SCALE_STRIDE = 3  # One in this many calibration loads fits the scale of a bound; the others fit its quantiles.
-MIN_SCALE_LOADS = BoundSettings.class_loads  # Number of calibration loads below which all fit the quantiles.
+MIN_SCALE_LOADS = BoundSettings.loads_per_class  # Number of calibration loads below which all fit the quantiles.
 
 
 @dataclass(frozen=True, eq=False)
-class KnownDistances:
+class ReferenceDistances:
     """Loads, and the FEM distances (B,) [m] from tip to tumour under them."""
 
     loads: Loads
     distance: np.ndarray
 
-    def select(self, index: np.ndarray | slice) -> KnownDistances:
+    def select(self, index: np.ndarray | slice) -> ReferenceDistances:
         """Select loads by numbers, a slice, or (B,) bool."""
-        return KnownDistances(self.loads.select(index), self.distance[index])
+        return ReferenceDistances(self.loads.select(index), self.distance[index])
 
 
-def compute_distance_errors(model: Learned, known: KnownDistances) -> np.ndarray:
+def compute_distance_errors(model: Learned, reference: ReferenceDistances) -> np.ndarray:
     """Compute absolute errors (B,) [m] of a model's distances relative to FEM."""
-    return np.abs(model.predict_distance(known.loads).value - known.distance)
+    return np.abs(model.predict_distance(reference.loads).distance - reference.distance)
 
 
-def add_correction(model: Learned, patch: Patch, known: KnownDistances) -> Learned:
+def add_distance_correction(model: Learned, patch: Patch, reference: ReferenceDistances) -> Learned:
     """Add a correction of distances to a model, trained on its training loads or some of them."""
-    plain, stride = replace(model, tip=TipModel()), -(-len(known.loads) // MAX_CONDITIONING_LOADS)
-    some = known.select(slice(None, None, stride))
-    off = some.distance - plain.predict_distance(some.loads).value
+    plain, stride = replace(model, tip=TipModel()), -(-len(reference.loads) // MAX_CONDITIONING_LOADS)
+    some = reference.select(slice(None, None, stride))
+    off = some.distance - plain.predict_distance(some.loads).distance
     return replace(model, tip=TipModel(fit_correction(patch, model.to_input(some.loads), off)))
 
 
-def correct_if_better(
-    model: Learned, patch: Patch, trained: KnownDistances, held_out: KnownDistances
+def improve_distances(
+    model: Learned, patch: Patch, training: ReferenceDistances, held_out: ReferenceDistances
 ) -> tuple[Learned, np.ndarray]:
     """Add a correction if it reduces the mean error of held-out distances; return the model and errors (B,) [m]."""
-    candidates = [replace(model, tip=TipModel()), add_correction(model, patch, trained)]
+    candidates = [replace(model, tip=TipModel()), add_distance_correction(model, patch, training)]
     error = [compute_distance_errors(each, held_out) for each in candidates]
     best = int(error[1].mean() < error[0].mean())
     return candidates[best], error[best]
@@ -67,18 +67,18 @@ def correct_if_better(
 TUMOUR_FIT = BoundSettings()  # Settings of the bound of the tumour.
 # Settings of the bound of the tip distance. The tip sometimes snaps through with the cortex, so that the tail of its
 # errors grows with the force: classes are as small as a 99 % bound allows, and the scale's logarithm is linear.
-TIP_FIT = BoundSettings(class_loads=100, curved=False)
+TIP_FIT = BoundSettings(loads_per_class=100, allow_quadratic=False)
 FORCE_FIT = BoundSettings()  # Settings of the bound of the force of a tool moved by pose.
 BOUND_FITS = {"tumour": TUMOUR_FIT, "tip": TIP_FIT, "force": FORCE_FIT}  # Settings of all bounds, by name.
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOutMisses:
+class BoundExamples:
     """Errors of a model on loads that none of its fits has used.
 
     Parameters
     ----------
-    pushed, known, outside
+    pushes, measures, excess
         B loads, and their position relative to the model's training range.
     features
         Features (B, f) of the scale of its bounds.
@@ -86,85 +86,92 @@ class HeldOutMisses:
         (B,) [m]: maximum over the tumour's vertices, or of the distance; [N]: of the tool's force.
     """
 
-    pushed: Pushed
-    known: Measured
-    outside: Outside
+    pushes: Pushed
+    measures: LoadMeasures
+    excess: Excess
     features: np.ndarray
     error: np.ndarray
 
-    def select(self, some: np.ndarray) -> HeldOutMisses:
+    def select(self, index: np.ndarray) -> BoundExamples:
         """Select loads by number or (B,) bool."""
-        known, outside = Measured(*(each[some] for each in self.known)), Outside(*(each[some] for each in self.outside))
-        return HeldOutMisses(select_cases(self.pushed, some), known, outside, self.features[some], self.error[some])
+        known, outside = (
+            LoadMeasures(*(each[index] for each in self.measures)),
+            Excess(*(each[index] for each in self.excess)),
+        )
+        return BoundExamples(select_cases(self.pushes, index), known, outside, self.features[index], self.error[index])
 
     @property
     def extrapolated(self) -> np.ndarray:
         """Mask (B,) of loads outside the training range."""
-        return self.outside.excess > 0.0
+        return self.excess.excess > 0.0
 
     @property
     def force(self) -> np.ndarray:
         """(B,) [N]: force magnitudes."""
-        return self.known.magnitude
+        return self.measures.magnitude
 
 
-def collect_missed(model: Learned, patch: Patch, pushed: Pushed, error: np.ndarray) -> HeldOutMisses:
+def collect_bound_examples(model: Learned, patch: Patch, pushes: Pushed, error: np.ndarray) -> BoundExamples:
     """Combine errors (B,) [m] of a model with its input loads."""
-    known, envelope = measure_loads(patch, pushed), model.envelope
-    features = compute_features(pushed, envelope.clip_to_range(known))
-    return HeldOutMisses(pushed, known, envelope.locate_outside(pushed, known), features, error)
+    known, envelope = measure_loads(patch, pushes), model.envelope
+    features = compute_scale_features(pushes, envelope.clip_to_range(known))
+    return BoundExamples(pushes, known, envelope.compute_excess(pushes, known), features, error)
 
 
-def bound_by(near: HeldOutMisses, way: BoundSettings, growth: float, seen: HeldOutMisses | None = None) -> Bound:
+def calibrate_bound(
+    near: BoundExamples, settings: BoundSettings, growth: float, examples: BoundExamples | None = None
+) -> Bound:
     """Calibrate a bound on loads `near` the training loads, with a `growth` [1/m] by distance from these.
 
     One in `SCALE_STRIDE` of these loads fits its scale, and the others its quantiles: they have the distribution of the
-    guarantee. With fewer than `MIN_SCALE_LOADS` loads all calibrate, and its scale follows the errors of `seen`, if
+    guarantee. With fewer than `MIN_SCALE_LOADS` loads all calibrate, and its scale follows the errors of `examples`, if
     given.
     """
-    if seen is None or len(near.error) >= MIN_SCALE_LOADS:
+    if examples is None or len(near.error) >= MIN_SCALE_LOADS:
         fits = _select_scale_loads(near)
-        seen, near = near.select(fits), near.select(~fits)
+        examples, near = near.select(fits), near.select(~fits)
     known = near.features, near.force, near.error
-    return fit_bound((seen.features, seen.error), *known, way, away=near.outside.away, growth=growth)
+    return fit_bound(
+        (examples.features, examples.error), *known, settings, distance=near.excess.distance, growth=growth
+    )
 
 
-def compute_growth(near: HeldOutMisses, far: HeldOutMisses, way: BoundSettings) -> float:
+def compute_growth(near: BoundExamples, far: BoundExamples, settings: BoundSettings) -> float:
     """Compute the growth [1/m] with which a bound has equal coverage `far` from training loads and near them."""
-    return fit_growth(*_compute_relative_errors(near, far, way))
+    return fit_growth(*_compute_relative_errors(near, far, settings))
 
 
 def compute_held_out_bounds(
-    model: Learned, near: HeldOutMisses, far: HeldOutMisses, split: DiscSplit, way: BoundSettings
+    model: Learned, near: BoundExamples, far: BoundExamples, split: DiscSplit, settings: BoundSettings
 ) -> np.ndarray:
     """Compute bounds (2, B) [m] of loads on held-out discs, each with the growth estimated from the other discs."""
-    known, (ratio, away) = _compute_relative_errors(near, far, way)
-    disc, bound = split.disc[split.test], np.empty((2, len(far.error)))
+    known, (ratio, away) = _compute_relative_errors(near, far, settings)
+    disc, bound = split.disc_index[split.test_mask], np.empty((2, len(far.error)))
     for each in np.unique(disc):
         here = disc == each
-        own = bound_by(near, way, fit_growth(known, (ratio[~here], away[~here])))
+        own = calibrate_bound(near, settings, fit_growth(known, (ratio[~here], away[~here])))
         some = far.select(here)
-        bound[:, here] = model.compute_bounds(own, some.pushed, some.known, some.outside)
+        bound[:, here] = model.compute_bounds(own, some.pushes, some.measures, some.excess)
     return bound
 
 
-def measure_coverage_by(bound: np.ndarray, far: HeldOutMisses) -> Coverage:
+def measure_bound_coverage(bound: np.ndarray, examples: BoundExamples) -> Coverage:
     """Compute the empirical coverage of bounds (2, B) [m]."""
-    return measure_covered(far.force, far.error, bound, int(far.extrapolated.sum()))
+    return measure_coverage(examples.force, examples.error, bound, int(examples.extrapolated.sum()))
 
 
 def _compute_relative_errors(
-    near: HeldOutMisses, far: HeldOutMisses, way: BoundSettings
+    near: BoundExamples, far: BoundExamples, way: BoundSettings
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Compute errors over a bound without growth, and distances [m] from training loads: calibration loads, `far`."""
-    plain = bound_by(near, way, 0.0)
+    plain = calibrate_bound(near, way, 0.0)
     return [
-        (each.error / plain.evaluate(each.features, each.force, each.outside.here)[0], each.outside.away)
+        (each.error / plain.evaluate(each.features, each.force, each.excess.zero)[0], each.excess.distance)
         for each in (near.select(~_select_scale_loads(near)), far)
     ]
 
 
-def _select_scale_loads(near: HeldOutMisses) -> np.ndarray:
+def _select_scale_loads(near: BoundExamples) -> np.ndarray:
     """Select the loads that fit the scale: (B,) bool."""
     return np.arange(len(near.error)) % SCALE_STRIDE == 0
 
@@ -176,11 +183,11 @@ class ModelErrors:
     The force is that of a tool moved by pose; None if not available.
     """
 
-    tumour: HeldOutMisses
-    tip: HeldOutMisses
-    force: HeldOutMisses | None = None
+    tumour: BoundExamples
+    tip: BoundExamples
+    force: BoundExamples | None = None
 
-    def list_available(self) -> dict[str, HeldOutMisses]:
+    def list_available(self) -> dict[str, BoundExamples]:
         """Return the available errors, by the names of `BOUND_FITS`."""
         found = {"tumour": self.tumour, "tip": self.tip}
         return found if self.force is None else {**found, "force": self.force}
@@ -192,7 +199,7 @@ class TrainingSolutions:
 
     Parameters
     ----------
-    loads, pushed
+    loads, pushes
         Loads as in the data set, and as input of a model.
     patch, nodes
         Open cortex, and the tumour's vertices (n,).
@@ -205,18 +212,18 @@ class TrainingSolutions:
     """
 
     loads: Loads
-    pushed: Pushed
+    pushes: Pushed
     patch: Patch
     nodes: np.ndarray
     tumour: np.ndarray
     cortex: np.ndarray
-    distances: KnownDistances
+    distances: ReferenceDistances
     force: np.ndarray | None
 
     def select_examples(self, rows: np.ndarray) -> Examples:
         """Select rows (B,) bool as examples, to fit models on."""
         force = None if self.force is None else self.force[rows]
-        return Examples(select_cases(self.pushed, rows), self.tumour[rows], self.cortex[rows], force)
+        return Examples(select_cases(self.pushes, rows), self.tumour[rows], self.cortex[rows], force)
 
     def compute_vertex_errors(self, model: Learned, rows: np.ndarray) -> np.ndarray:
         """Compute errors (k, n) [m] of a model at the tumour's vertices, on selected rows (B,) bool."""
@@ -226,10 +233,10 @@ class TrainingSolutions:
         self, model: Learned, rows: np.ndarray, tumour: np.ndarray | None = None, tip: np.ndarray | None = None
     ) -> ModelErrors:
         """Compute a model's errors on rows (B,) bool; those at the tumour or of the tip (k,) [m] may be given."""
-        asked = select_cases(self.pushed, rows)
+        asked = select_cases(self.pushes, rows)
 
-        def of(error: np.ndarray) -> HeldOutMisses:
-            return collect_missed(model, self.patch, asked, error)
+        def of(error: np.ndarray) -> BoundExamples:
+            return collect_bound_examples(model, self.patch, asked, error)
 
         return ModelErrors(
             of(self.compute_vertex_errors(model, rows).max(axis=1) if tumour is None else tumour),
@@ -238,7 +245,7 @@ class TrainingSolutions:
         )
 
 
-def read_solutions(data: Dataset, shared: Expansion) -> TrainingSolutions:
+def read_solutions(data: Dataset, expansion: Expansion) -> TrainingSolutions:
     """Read the FEM results for the converged loads of a data set.
 
     Raises
@@ -253,25 +260,25 @@ def read_solutions(data: Dataset, shared: Expansion) -> TrainingSolutions:
             "table: simulate again with a looser --tolerance."
         )
     loads = data.loads.select(np.flatnonzero(data.good))
-    pushed, nodes = _convert_loads(data, loads, shared.patch), shared.tumour
+    pushed, nodes = _convert_loads(data, loads, expansion.patch), expansion.tumour
     if not len(nodes):
         raise InputError(f"{data.path}: its anatomy has no tumour to predict: make one that has.")
     tumour = data.read_displacement(nodes)[data.good]
-    cortex = data.read_displacement(shared.cortex)[data.good]
-    at, both = np.concatenate([nodes, shared.cortex]), np.concatenate([tumour, cortex], axis=1)
-    distances = KnownDistances(loads, build_tip_gauge(data.anatomy).compute_distances(loads, both, at, data.tool))
+    cortex = data.read_displacement(expansion.cortex)[data.good]
+    at, both = np.concatenate([nodes, expansion.cortex]), np.concatenate([tumour, cortex], axis=1)
+    distances = ReferenceDistances(loads, build_tip_gauge(data.anatomy).compute_distances(loads, both, at, data.tool))
     reaction = None if data.tool is None else data.read_reaction()
     force = None if reaction is None else reaction[data.good, 0, :3]
-    return TrainingSolutions(loads, pushed, shared.patch, nodes, tumour, cortex, distances, force)
+    return TrainingSolutions(loads, pushed, expansion.patch, nodes, tumour, cortex, distances, force)
 
 
 def _convert_loads(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
     """Convert loads of a data set to a model's input, like `Learned.to_input`."""
     if data.tool is not None:
-        pushed, series = to_indentation(loads, data.tool, patch), read_series(data.provenance)
+        pushed, series = to_indentation(loads, data.tool, patch), read_prony_series(data.provenance)
         if not series:
             return pushed
-        return add_relaxation(pushed, follow_relaxation(series, pushed, loads.times, None, 0.0).share)
+        return add_relaxation(pushed, update_relaxation(series, pushed, loads.times, None, 0.0).relaxed_share)
     if loads.get_only(Pushed) is None:
         raise InputError(
             "the data holds other loads than `Pushed`, which the learners do not take: simulate pushes, or one tool's "

@@ -33,10 +33,10 @@ class Examples:
 
 
 def compute_residual_responses(
-    parts: Sequence[ModelPart], patch: Patch, loads: Pushed, moved: np.ndarray
+    parts: Sequence[ModelPart], patch: Patch, loads: Pushed, motion: np.ndarray
 ) -> np.ndarray:
-    """Compute residual responses (B, n, 3) [m/N]: motions `moved` (B, n, 3) [m] per newton minus the parts."""
-    response = moved / split_forces(loads)[0][:, None, None]
+    """Compute residual responses (B, n, 3) [m/N]: motions `motion` (B, n, 3) [m] per newton minus the parts."""
+    response = motion / split_forces(loads)[0][:, None, None]
     for part in parts:
         response = response - part.compute_response(ENCODERS[part.encoder](patch, loads))
     return response

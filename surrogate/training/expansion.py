@@ -23,21 +23,21 @@ from sim.runtime.journal import open_journal
 from sim.runtime.outside_files import wrap_errors
 from sim.runtime.versions import get_version
 
-from ..array_functions import Rounded, round_to_half
+from ..array_functions import QuantisedTable, round_to_half
 from ..data.cortex_patch import Patch, open_patch
 from ..data.dataset import Dataset
-from ..data.encode import Basis, compute_nodal_shares, reduce, split_forces
-from ..data.solution_rows import read_tissue_statement
-from ..data.tool_loads import spread
+from ..data.encode import Basis, compute_unit_nodal_forces, fit_basis, split_forces
+from ..data.solution_rows import read_tissue_text
+from ..data.tool_loads import select_spread
 from ..model.applicability import read_trained_skull
 from ..model.kept_arrays import REMEDY
 from ..model.learned import ModelPart, get_only_pushes
 from ..model.npz_archive import Archive
-from ..regressors.force_series import FACTORS, ORDER_COLUMNS, ForcePairs, Series, fill_table
+from ..regressors.force_series import FACTORS, ORDER_COLUMNS, ForcePairs, Series, interpolate_table
 from ..regressors.protocol import Linear
 from ..regressors.rigid_contact import RigidContact
 from .examples import Examples, compute_residual_responses
-from .fem_tables import add_edge_midpoints, choose_radii, condense_contact, find_disc_nodes, join_bases, tabulate
+from .fem_tables import add_edge_midpoints, choose_radii, condense_contact, find_disc_nodes, join_bases, tabulate_series
 
 COARSE_BASIS = (1e-3, 60)  # Truncation tolerance and maximum number of modes of a model's basis.
 # Truncation tolerance and maximum number of modes of the series beyond the exact orders, 2 % of the motion.
@@ -78,25 +78,25 @@ class Expansion:
         Device of the FEM.
     progress
         Receives the number of places done and their total.
-    kept
+    table_path
         File of the series' table, read if it exists, else written; the caller ensures that it belongs to these data.
-    most_pairs
+    max_pairs
         Maximum number of pairs of force components for the second order: this many take minutes, and 60 MB of a model.
     batch
         Maximum number of load cases solved together; None: as many as fit now, on a GPU that no other process uses.
-    begun
+    journal_path
         Journal of the table's rows while it is computed, so that an interrupted run resumes; the caller removes it.
     settings
-        Accuracy of tables and bases; a file that is `kept` must have been written with the same.
+        Accuracy of tables and bases; a file that is `table_path` must have been written with the same.
     """
 
     data: Dataset
     device: str = "auto"
     progress: Callable[[int, int], object] = lambda done, total: None
-    kept: Path | None = None
-    most_pairs: int = 150_000
+    table_path: Path | None = None
+    max_pairs: int = 150_000
     batch: int | None = None
-    begun: Path | None = None
+    journal_path: Path | None = None
     settings: ExpansionSettings = ExpansionSettings()
 
     @cached_property
@@ -115,12 +115,12 @@ class Expansion:
         return np.setdiff1d(self.patch.nodes, self.tumour)
 
     @cached_property
-    def places(self) -> np.ndarray:
+    def positions(self) -> np.ndarray:
         """Places (P, 3) [m] of the series' table: nodes of the open cortex, and midpoints of its edges."""
         return add_edge_midpoints(self.patch)[1]
 
     @cached_property
-    def tables(self) -> tuple[ModelPart, ...]:
+    def compliance_parts(self) -> tuple[ModelPart, ...]:
         """Compliance of the tumour, and of the cortex if there is more: exact at every node of the open cortex.
 
         The number of modes follows from `ExpansionSettings.table_tolerance`.
@@ -128,7 +128,7 @@ class Expansion:
         return tuple(self._build_compliance(nodes) for nodes in self._known)
 
     @cached_property
-    def pairs(self) -> ModelPart:
+    def second_order_part(self) -> ModelPart:
         """Second order of the tumour: exact for forces at any nodes of the open cortex.
 
         Raises
@@ -136,18 +136,18 @@ class Expansion:
         InputError
             Data without a tissue.
         """
-        known = self.tabulated
-        table = Rounded.round_table(known.second, self.settings.pair_step * np.abs(known.second).max())
+        known = self.table
+        table = QuantisedTable.quantise(known.second_order, self.settings.pair_step * np.abs(known.second_order).max())
         return ModelPart("rooted", ForcePairs(known.pairs, table), known.pair_basis)
 
     @cached_property
-    def exact(self) -> list[tuple[ModelPart, ...]]:
+    def exact_parts(self) -> list[tuple[ModelPart, ...]]:
         """Parts without training or interpolation: two orders of the tumour, and the first of the cortex.
 
         With too many pairs of nodes, the tumour's second order is in the table.
         """
-        paired = (self.pairs,) if len(self.tabulated.pairs) else ()
-        return [(table, *paired) if k == 0 else (table,) for k, table in enumerate(self.tables)]
+        paired = (self.second_order_part,) if len(self.table.pairs) else ()
+        return [(table, *paired) if k == 0 else (table,) for k, table in enumerate(self.compliance_parts)]
 
     def build_bases(self, examples: Examples, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
         """Compute bases of the examples' motion beyond the exact parts, at the tumour and the cortex if there is more.
@@ -155,9 +155,11 @@ class Expansion:
         A dent as small as its tool is not a sum of a few modes, but its nonlinear part is. `tumour` and `cortex` are
         the truncation tolerance and the maximum number of modes.
         """
-        both = zip(self.exact, (examples.tumour, examples.cortex), (tumour, cortex), strict=False)
+        both = zip(self.exact_parts, (examples.tumour, examples.cortex), (tumour, cortex), strict=False)
         return [
-            reduce(parts[0].basis.nodes, compute_residual_responses(parts, self.patch, examples.loads, moved), *limits)
+            fit_basis(
+                parts[0].basis.nodes, compute_residual_responses(parts, self.patch, examples.loads, moved), *limits
+            )
             for parts, moved, limits in both
         ]
 
@@ -170,25 +172,25 @@ class Expansion:
             Data without a tissue.
         """
         triangles = add_edge_midpoints(self.patch)[0]
-        inside = self.patch.compute_edge_distance(self.places)[:, None] > self.radii
+        inside = self.patch.compute_edge_distance(self.positions)[:, None] > self.radii
         strongest = split_forces(get_only_pushes(self.data.loads))[0].max()
         unit = strongest ** np.repeat([1, 2, 3], [factors.shape[1] for factors in FACTORS])
         found = []
-        for added, parts, wide, basis in zip(self._beyond, self.exact, self.tabulated.bases, bases, strict=True):
+        for added, parts, wide, basis in zip(self._beyond, self.exact_parts, self.table.bases, bases, strict=True):
             # Footprints across the edge press on nodes beyond the open cortex. For others the exact parts leave no
             # residual.
-            every = fill_table(self.places, added @ (wide.modes @ basis.modes.T), held_out)
+            every = interpolate_table(self.positions, added @ (wide.modes @ basis.modes.T), held_out)
             for order in ORDER_COLUMNS[: len(parts)]:
                 every[inside, order] = 0.0
             step = self.settings.series_step * (np.abs(every).max(axis=(0, 1, 3)) * unit).max() / unit
-            found.append(Series.round_table(self.patch.points, triangles, self.radii, every, step))
+            found.append(Series.quantise_table(self.patch.points, triangles, self.radii, every, step))
         return found
 
     @cached_property
     def _beyond(self) -> list[np.ndarray]:
         """Tables (P, R, 19, r) minus the exact parts."""
-        known, found = self.tabulated, []
-        for table, parts, wide in zip(known.tables, self.exact, known.bases, strict=True):
+        known, found = self.table, []
+        for table, parts, wide in zip(known.basis_columns, self.exact_parts, known.bases, strict=True):
             added = table.copy()
             for part, order, form_of in zip(parts, ORDER_COLUMNS, (_compute_linear_form, _square_form), strict=False):
                 met = form_of(part, self._unit_shares) @ (part.basis.modes @ wide.modes.T)
@@ -199,9 +201,9 @@ class Expansion:
     @cached_property
     def _unit_shares(self) -> np.ndarray:
         """Forces (P R, 3, 3 m) at the patch's nodes by one newton along each axis, at each place and radius."""
-        point = np.repeat(self.places, 3 * len(self.radii), axis=0)
-        radius = np.tile(np.repeat(self.radii, 3), len(self.places))
-        shares = compute_nodal_shares(self.patch, Pushed(point, np.tile(np.eye(3), (len(point) // 3, 1)), radius))
+        point = np.repeat(self.positions, 3 * len(self.radii), axis=0)
+        radius = np.tile(np.repeat(self.radii, 3), len(self.positions))
+        shares = compute_unit_nodal_forces(self.patch, Pushed(point, np.tile(np.eye(3), (len(point) // 3, 1)), radius))
         return shares.reshape(len(point) // 3, 3, -1)
 
     @cached_property
@@ -219,11 +221,11 @@ class Expansion:
 
     def _build_compliance(self, nodes: np.ndarray) -> ModelPart:
         response = self.data.compute_unit_response(nodes)
-        basis = reduce(nodes, response, self.settings.table_tolerance, len(response))
+        basis = fit_basis(nodes, response, self.settings.table_tolerance, len(response))
         return ModelPart("nodal", Linear().fit(np.eye(len(response)), round_to_half(basis.encode(response))), basis)
 
     @cached_property
-    def tabulated(self) -> Tabulated:
+    def table(self) -> SeriesTable:
         """Series at every place.
 
         Raises
@@ -231,13 +233,13 @@ class Expansion:
         InputError
             Data without a tissue.
         """
-        if self.kept is not None and self.kept.exists():
-            with wrap_errors(self.kept, "a table of the series", REMEDY), self.kept.open("rb") as raw:
+        if self.table_path is not None and self.table_path.exists():
+            with wrap_errors(self.table_path, "a table of the series", REMEDY), self.table_path.open("rb") as raw:
                 modes = [f"modes{k}" for k in range(len(self._known))]
                 file = Archive(raw, REMEDY).read_arrays([*modes, "pairs", "second", "second_modes", "table", "seconds"])
                 bases = [Basis(nodes, file[name]) for name, nodes in zip(modes, self._known, strict=True)]
                 pair_basis = Basis(self.tumour, file["second_modes"])
-                return Tabulated(
+                return SeriesTable(
                     bases, file["table"], file["pairs"], file["second"], pair_basis, float(file["seconds"])
                 )
         begun = time.perf_counter()
@@ -245,24 +247,24 @@ class Expansion:
         bases, table, anew = self._tabulate(fem)
         pairs, second, pair_basis = self._compute_pairs(fem, bases[0])
         seconds = time.perf_counter() - begun if anew else np.nan
-        found = Tabulated(bases, table, pairs, second, pair_basis, seconds)
-        if self.kept is not None:
+        found = SeriesTable(bases, table, pairs, second, pair_basis, seconds)
+        if self.table_path is not None:
             arrays = {f"modes{k}": basis.modes for k, basis in enumerate(bases)}
             arrays |= {"table": table, "pairs": pairs, "second": second, "second_modes": pair_basis.modes}
-            with write_atomically(self.kept, ".npz") as partial:
+            with write_atomically(self.table_path, ".npz") as partial:
                 np.savez(partial, seconds=np.array(found.seconds), **arrays)  # pyright: ignore[reportArgumentType]
         return found
 
     def _compute_pairs(self, fem: Fem, basis: Basis) -> tuple[np.ndarray, np.ndarray, Basis]:
         """Compute pairs within one footprint, the tumour's second order of each, and a basis of modes for it."""
         near = find_disc_nodes(self.patch, float(self.radii[-1]))
-        if 4.5 * near.sum() > self.most_pairs:
+        if 4.5 * near.sum() > self.max_pairs:
             return np.zeros((0, 2), int), np.zeros((0, 0), np.float32), Basis(basis.nodes, basis.modes[:0])
         reading = fem.build_reading(basis.nodes, basis.modes.reshape(len(basis.modes), -1, 3))
         nodes = self.patch.nodes
         units = fem.build_reading(nodes, np.eye(3 * len(nodes)).reshape(-1, len(nodes), 3))
         pairs, table = compute_second_order(fem.problem, units.solutions, reading.solutions, near)
-        turn = reduce(basis.nodes, table, self.settings.second_order_tolerance, len(basis.modes)).modes
+        turn = fit_basis(basis.nodes, table, self.settings.second_order_tolerance, len(basis.modes)).modes
         return pairs, table @ turn.T, Basis(basis.nodes, round_to_half(turn @ basis.modes))
 
     def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray, bool]:
@@ -270,13 +272,15 @@ class Expansion:
 
         The last value is True if the whole table was computed now.
         """
-        count = len(self.places)
-        few = np.sort(spread(self.places, self.settings.table_places))
+        count = len(self.positions)
+        few = np.sort(select_spread(self.positions, self.settings.table_places))
         every, motions = np.concatenate(self._known), []
         for first in range(0, 3 * len(every), self.settings.strip_size):
             components = np.eye(3 * len(every))[first : first + self.settings.strip_size].reshape(-1, len(every), 3)
             reading = fem.build_reading(every, components)
-            motions.append(tabulate(fem, self.places[few], self.radii, reading, lambda n, _: self.progress(n, count)))
+            motions.append(
+                tabulate_series(fem, self.positions[few], self.radii, reading, lambda n, _: self.progress(n, count))
+            )
         cuts = 3 * np.cumsum([len(nodes) for nodes in self._known])[:-1]
         parts = np.split(np.concatenate(motions, axis=-1), cuts, axis=-1)
         # The cortex's first order is given by its compliance.
@@ -290,11 +294,11 @@ class Expansion:
         table[few] = np.concatenate([part @ basis.modes.T for part, basis in zip(parts, bases, strict=True)], axis=-1)
         anew = True
         if len(others):
-            what = {"version": get_version("sulcus"), "table": compute_digest(whole.modes, self.places, self.radii)}
-            with nullcontext() if self.begun is None else open_journal(self.begun, what) as journal:
+            what = {"version": get_version("sulcus"), "table": compute_digest(whole.modes, self.positions, self.radii)}
+            with nullcontext() if self.journal_path is None else open_journal(self.journal_path, what) as journal:
                 anew = not journal
-                table[others] = tabulate(
-                    fem, self.places[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count),
+                table[others] = tabulate_series(
+                    fem, self.positions[others], self.radii, reading, lambda n, _: self.progress(n + len(few), count),
                     journal,
                 )  # fmt: skip
         return bases, table, anew
@@ -324,12 +328,12 @@ class Expansion:
                 f"{self.data.path}: does not state its tissue, so series and contact are not available: "
                 "choose other learners, or simulate again."
             )
-        effects = build_push_effects(self.data.anatomy, read_tissue_statement(stated), read_trained_skull(stated))
+        effects = build_push_effects(self.data.anatomy, read_tissue_text(stated), read_trained_skull(stated))
         return Fem(self.data.anatomy, effects, REFERENCE, self.device, self.batch, stated.get("element"))
 
 
 @dataclass(frozen=True, eq=False)
-class Tabulated:
+class SeriesTable:
     """Table of the series: bases of tumour and cortex, coefficients at all places, and computing time.
 
     Parameters
@@ -338,7 +342,7 @@ class Tabulated:
         One basis, or two.
     table
         (P, R, 19, r) float32: coefficients of the bases' modes, one after the other.
-    pairs, second, pair_basis
+    pairs, second_order, pair_basis
         Pairs of nodal forces (P, 2), and the tumour's second order of each (P, r) float32 in a basis.
     seconds
         [s]; NaN if an interrupted run was resumed.
@@ -347,12 +351,12 @@ class Tabulated:
     bases: list[Basis]
     table: np.ndarray
     pairs: np.ndarray
-    second: np.ndarray
+    second_order: np.ndarray
     pair_basis: Basis
     seconds: float
 
     @property
-    def tables(self) -> list[np.ndarray]:
+    def basis_columns(self) -> list[np.ndarray]:
         """Table columns of each basis."""
         return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
 
@@ -378,4 +382,4 @@ def _build_wide_basis(
     """Compute the wide basis of motions (F, R, 19, 3 n) of vertices (n,), with equal weight for each of some orders."""
     rows = [motions[:, :, order].reshape(-1, len(nodes), 3) for order in orders]
     tiny = np.finfo(np.float32).tiny
-    return reduce(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *wide)
+    return fit_basis(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *wide)

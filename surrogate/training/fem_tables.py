@@ -14,7 +14,7 @@ from sim.tools import Ball, BuiltIn, get_core
 
 from ..array_functions import compute_squared_distances
 from ..data.cortex_patch import Patch
-from ..data.encode import Basis, reduce
+from ..data.encode import Basis, fit_basis
 from ..regressors.force_series import FACTORS, MAX_ORDER, STENCIL_SIZE, TERM_COUNT
 from ..regressors.rigid_contact import RigidContact
 
@@ -34,7 +34,7 @@ def condense_contact(
     nodes, triangles = np.unique(surface, return_inverse=True)
     response = compute_unit_responses(fem, nodes, np.concatenate([nodes, *parts]))
     compliance, *answers = np.split(response, np.cumsum([len(nodes), *map(len, parts[:-1])]), axis=1)
-    bases = [reduce(some, each, BASIS_TOLERANCE, len(each)) for some, each in zip(parts, answers, strict=True)]
+    bases = [fit_basis(some, each, BASIS_TOLERANCE, len(each)) for some, each in zip(parts, answers, strict=True)]
     coefficients = np.hstack([basis.encode(each) for basis, each in zip(bases, answers, strict=True)])
     rows = 3 * len(nodes)
     contact = RigidContact(
@@ -60,41 +60,37 @@ def join_bases(bases: list[Basis]) -> Basis:
     return Basis(np.concatenate([basis.nodes for basis in bases]), modes)
 
 
-def compute_unit_responses(fem: Fem, nodes: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Compute displacements (3 n, k, 3) float32 [m/N] of vertices `at` (k,) by small unit forces on `nodes` (n,)."""
+def compute_unit_responses(fem: Fem, nodes: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Compute displacements (3 n, k, 3) float32 [m/N] of `vertices` (k,) by small unit forces on `nodes` (n,)."""
     found = []
     for first in range(0, len(nodes), STRIP_NODES):
         some = nodes[first : first + STRIP_NODES]
         answers = fem.build_reading(some, np.eye(3 * len(some)).reshape(-1, len(some), 3)).solutions
-        found.append(answers.reshape(len(answers), -1, 3)[:, at].astype(np.float32))
+        found.append(answers.reshape(len(answers), -1, 3)[:, vertices].astype(np.float32))
     return np.concatenate(found)
 
 
 MAX_RADIUS_RATIO = 1.5  # Maximum ratio of neighbouring radii.
 
 
-def choose_radii(least: float, greatest: float) -> np.ndarray:
-    """Compute radii [m] at which to tabulate footprints from `least` to `greatest`: one, or at least three."""
-    if greatest <= least * (1.0 + 1e-9):
-        return np.array([least])
-    steps = int(np.ceil(np.log(greatest / least) / np.log(MAX_RADIUS_RATIO)))
-    return np.geomspace(least, greatest, max(STENCIL_SIZE, steps + 1))
+def choose_radii(min_radius: float, max_radius: float) -> np.ndarray:
+    """Compute radii [m] at which to tabulate footprints from `min_radius` to `max_radius`: one, or at least three."""
+    if max_radius <= min_radius * (1.0 + 1e-9):
+        return np.array([min_radius])
+    steps = int(np.ceil(np.log(max_radius / min_radius) / np.log(MAX_RADIUS_RATIO)))
+    return np.geomspace(min_radius, max_radius, max(STENCIL_SIZE, steps + 1))
 
 
-def tabulate(
-    fem: Fem,
-    places: np.ndarray,
-    radii: np.ndarray,
-    reading: OutputFunctionals,
-    progress: Callable[[int, int], object] = lambda done, total: None,
-    journal: Journal | None = None,
-) -> np.ndarray:
+def tabulate_series(
+    fem: Fem, positions: np.ndarray, radii: np.ndarray, projection: OutputFunctionals,
+    progress: Callable[[int, int], object] = lambda done, total: None, journal: Journal | None = None,
+) -> np.ndarray:  # fmt: skip
     """Compute the coefficients of `forms` at each of the places (P, 3) [m] and each radius: (P, R, 19, r) float32.
 
-    `reading` projects each response on r modes; `progress` receives places done and their total. Places in the
+    `projection` projects each response on r modes; `progress` receives places done and their total. Places in the
     `journal` are not solved again.
     """
-    table = np.empty((len(places), len(radii), TERM_COUNT, reading.count), np.float32)
+    table = np.empty((len(positions), len(radii), TERM_COUNT, projection.count), np.float32)
     some = max(1, fem.batch // (len(radii) * FACTORS[-1].shape[1]))
     left = []
     for number, row in enumerate(table):
@@ -104,15 +100,15 @@ def tabulate(
             row[:] = np.frombuffer(journal.read(("row", number)), table.dtype).reshape(row.shape)
     for first in range(0, len(left), some):
         rows = left[first : first + some]
-        here = places[rows]
+        here = positions[rows]
         point = np.repeat(here, 3 * len(radii), axis=0)
         force = np.tile(np.eye(3), (len(here) * len(radii), 1))
         loads = Loads((Pushed(point, force, np.tile(np.repeat(radii, 3), len(here))),))
-        table[rows] = fem.compute_series(loads, MAX_ORDER, reading, 3).reshape(len(here), *table.shape[1:])
+        table[rows] = fem.compute_series(loads, MAX_ORDER, projection, 3).reshape(len(here), *table.shape[1:])
         if journal is not None:
             for number in rows:
                 journal.add(("row", number), table[number].tobytes())
-        progress(len(places) - len(left) + first + len(here), len(places))
+        progress(len(positions) - len(left) + first + len(here), len(positions))
     return table
 
 

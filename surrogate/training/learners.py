@@ -10,17 +10,17 @@ from sim.errors import InputError
 from sim.loads import Pushed
 
 from ..data.cortex_patch import Patch, find_nearest
-from ..data.encode import ENCODERS, Basis, reduce, split_forces
+from ..data.encode import ENCODERS, Basis, fit_basis, split_forces
 from ..data.splits import DiscSplit
-from ..data.tool_loads import spread
+from ..data.tool_loads import select_spread
 from ..evaluation.score import SolveCounts
 from ..model.learned import ModelPart
-from ..model.own_learners import find_learner_name, find_own
+from ..model.own_learners import find_learner_name, find_own_learner
 from ..model.tool_contact import ForceModel
 from ..regressors.baselines import Ann, Pcr, Svr
-from ..regressors.force_series import TERM_COUNT, Remainder
+from ..regressors.force_series import TERM_COUNT, RemainderGp
 from ..regressors.gp import Gp
-from ..regressors.protocol import Fitted, RegressorFactory
+from ..regressors.protocol import FittedRegressor, RegressorFactory
 from ..regressors.rigid_contact import RigidContact
 from .examples import Examples, compute_residual_responses
 from .expansion import ADDED_BASIS, COARSE_BASIS, CONTACT_MODELS, SERIES_MODELS, Expansion
@@ -37,7 +37,7 @@ class SharedInputs:
 
     Parameters
     ----------
-    basis_from
+    basis_examples
         Examples whose responses span the series' bases.
     expansion
         Expansion of the same data.
@@ -45,18 +45,18 @@ class SharedInputs:
         Held-out loads, if any.
     """
 
-    basis_from: Examples
+    basis_examples: Examples
     expansion: Expansion
     split: DiscSplit | None = None
 
     @cached_property
     def series(self) -> tuple[ModelPart, ...]:
         """Contribution of the FEM series beyond compliance, at the tumour and at the cortex, if there is more."""
-        bases = self.expansion.build_bases(self.basis_from, ADDED_BASIS, COARSE_BASIS)
-        found = self.expansion.build_series(bases, self._mask_left_out(self.expansion.places))
+        bases = self.expansion.build_bases(self.basis_examples, ADDED_BASIS, COARSE_BASIS)
+        found = self.expansion.build_series(bases, self._mask_left_out(self.expansion.positions))
         return tuple(ModelPart("tool", part, basis) for part, basis in zip(found, bases, strict=True))
 
-    def solve_counts(self, name: str, examples: Examples) -> SolveCounts:
+    def count_solves(self, name: str, examples: Examples) -> SolveCounts:
         """Count the FEM solves that a model of `LEARNERS` or `POSE_LEARNERS`, or a user-defined one, depends on."""
         known, data, loads = self.expansion, self.expansion.data, len(examples.loads.point)
         units = series = inside = 0
@@ -71,9 +71,9 @@ class SharedInputs:
             units, inside = contact.points.size, 3 * int(self._mask_left_out(contact.points).sum())
             seconds.append(took)
         if name in SERIES_MODELS:
-            places = int((~self._mask_left_out(known.places)).sum())
+            places = int((~self._mask_left_out(known.positions)).sum())
             series = places * len(known.radii) * TERM_COUNT
-            took = known.tabulated.seconds * places / len(known.places)
+            took = known.table.seconds * places / len(known.positions)
             seconds.append(took if np.isfinite(took) else None)
         total = None if None in seconds else float(sum(filter(None, seconds)))
         return SolveCounts(loads, units, series, inside, total)
@@ -84,7 +84,7 @@ class SharedInputs:
 
 @dataclass(frozen=True)
 class SelectionSettings:
-    """Settings of the selection by `Tuned`."""
+    """Settings of the selection by `TunedRegressor`."""
 
     inner_discs: int = 6  # Number of discs, far apart, that inner fits hold out.
     inner_share: float = 0.2  # Share of the loads in the held-out discs of inner fits.
@@ -94,7 +94,7 @@ class SelectionSettings:
 
 
 @dataclass(frozen=True)
-class Tuned:
+class TunedRegressor:
     """Regressor that selects its settings by the error on discs held out of the training rows.
 
     One fit for each of the settings, to the strongest outputs of four fifths of the first rows, then one to all rows.
@@ -110,7 +110,7 @@ class Tuned:
     settings: tuple[Callable[[], RegressorFactory], ...]
     selection: SelectionSettings = SelectionSettings()
 
-    def fit(self, X: np.ndarray, Y: np.ndarray) -> Fitted:
+    def fit(self, X: np.ndarray, Y: np.ndarray) -> FittedRegressor:
         """Fit the best of the regressors to rows X (n, f) of `compute_tool_features`, Y (n, r)."""
         return self.settings[self.find_best(X, Y)]().fit(X, Y)
 
@@ -131,7 +131,7 @@ class Tuned:
 
 def find_inner_discs(points: np.ndarray, selection: SelectionSettings = SelectionSettings()) -> np.ndarray:
     """Return the mask (n,) of points in discs round `inner_discs` of the points (n, 3), far from each other."""
-    distance = find_nearest(points, points[spread(points, selection.inner_discs)])[1]
+    distance = find_nearest(points, points[select_spread(points, selection.inner_discs)])[1]
     return distance <= np.quantile(distance, selection.inner_share)
 
 
@@ -145,10 +145,10 @@ SVR_CANDIDATES = tuple(
 # forces.
 LEARNED_MODELS: dict[str, tuple[str, Callable[[], RegressorFactory]]] = {
     "pcr": ("nodal", Pcr),
-    "ann": ("tool", partial(Tuned, ANN_CANDIDATES)),
-    "svr": ("tool", partial(Tuned, SVR_CANDIDATES)),
+    "ann": ("tool", partial(TunedRegressor, ANN_CANDIDATES)),
+    "svr": ("tool", partial(TunedRegressor, SVR_CANDIDATES)),
     "gp": ("tool", Gp),
-    "residual": ("tool", partial(Tuned, ANN_CANDIDATES)),
+    "residual": ("tool", partial(TunedRegressor, ANN_CANDIDATES)),
 }
 POSE_MODELS = ("gp", "ann", "svr")  # Model types for poses: the tool's position replaces its force.
 
@@ -159,14 +159,14 @@ def fit_parts(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Mode
     trained = partial(_fit_part, known.patch, examples.loads)
     if name in SERIES_MODELS:
         added = inputs.series
-        exact = [part for parts in known.exact for part in parts]
+        exact = [part for parts in known.exact_parts for part in parts]
         if name == "series":
             return (*exact, *added)
-        both = zip(known.exact, added, (examples.tumour, examples.cortex), strict=False)
-        left = [trained(("tool", Remainder), (*parts, more), more.basis, truth) for parts, more, truth in both]
+        both = zip(known.exact_parts, added, (examples.tumour, examples.cortex), strict=False)
+        left = [trained(("tool", RemainderGp), (*parts, more), more.basis, truth) for parts, more, truth in both]
         return (*exact, *added, *left)
     if name == "linear":
-        return known.tables
+        return known.compliance_parts
     if name in CONTACT_MODELS:
         contact, left = _fit_contact(known, examples)
         if name == "contact":
@@ -175,7 +175,7 @@ def fit_parts(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Mode
     if known.data.tool is not None:
         both = ((known.tumour, examples.tumour), (known.cortex, examples.cortex))
         return tuple(trained(_find_model_type(name), (), nodes, truth) for nodes, truth in both if len(nodes))
-    tumour, *cortex = known.tables
+    tumour, *cortex = known.compliance_parts
     before = (tumour,) if name == "residual" else ()
     learnt = trained(_find_model_type(name), before, known.tumour, examples.tumour)
     return (*before, learnt, *cortex)
@@ -203,7 +203,7 @@ def _find_model_type(name: str) -> tuple[str, Callable[[], RegressorFactory]]:
     """Return encoder and regressor of a model type, user-defined ones included."""
     if name in LEARNED_MODELS:
         return LEARNED_MODELS[name]
-    own = find_own(name)
+    own = find_own_learner(name)
     assert own is not None, name  # checked by the caller
     return own.encoder, own.regressor
 
@@ -223,16 +223,12 @@ def _fit_contact(known: Expansion, examples: Examples) -> tuple[ModelPart, list[
 
 
 def _fit_part(
-    patch: Patch,
-    loads: Pushed,
-    kind: tuple[str, Callable[[], RegressorFactory]],
-    before: Sequence[ModelPart],
-    on: Basis | np.ndarray,
-    truth: np.ndarray,
-) -> ModelPart:
+    patch: Patch, loads: Pushed, kind: tuple[str, Callable[[], RegressorFactory]], before: Sequence[ModelPart],
+    on: Basis | np.ndarray, truth: np.ndarray,
+) -> ModelPart:  # fmt: skip
     """Fit a part to the residual of `truth` (B, n, 3) [m] after parts `before`: `on` a basis, or on vertices (n,)."""
     response = compute_residual_responses(before, patch, loads, truth)
-    basis = on if isinstance(on, Basis) else reduce(on, response, *COARSE_BASIS)
+    basis = on if isinstance(on, Basis) else fit_basis(on, response, *COARSE_BASIS)
     encoder, make = kind
     X, Y = ENCODERS[encoder](patch, loads), basis.encode(response)
     regressor = make().fit(X, Y)
@@ -241,7 +237,7 @@ def _fit_part(
     return ModelPart(encoder, regressor, basis)
 
 
-def _check_own(regressor: Fitted, X: np.ndarray, Y: np.ndarray) -> None:
+def _check_own(regressor: FittedRegressor, X: np.ndarray, Y: np.ndarray) -> None:
     """Check that a user-defined regressor returns finite coefficients of the right shape on its training loads."""
     found = np.asarray(regressor.predict(X))
     if found.shape != Y.shape or not np.isfinite(found).all():

@@ -11,26 +11,26 @@ from sim.runtime.timing import time_stage
 
 from ..data.cortex_patch import Patch
 from ..data.dataset import Dataset
-from ..data.splits import CALIBRATION_STRIDE, MAX_CALIBRATION_LOADS, DiscSplit, leave_discs_out
+from ..data.splits import CALIBRATION_STRIDE, MAX_CALIBRATION_LOADS, DiscSplit, hold_out_discs
 from ..evaluation.coverage import FORCE_CLASSES, Coverage
 from ..evaluation.score import ForceScore, Score, score, score_forces
 from ..model.conformal import LEVELS, USUAL_GROWTH, compute_conformal_quantile
 from ..model.held_out import measure_held_out
 from ..model.learned import Learned, ModelPart
-from ..model.own_learners import OWN_LEARNERS, find_own
+from ..model.own_learners import OWN_LEARNERS, find_own_learner
 from ..model.tip_distance import TipModel
 from ..model.tool_contact import ForceModel
-from ..model.training_range import Envelope, compute_training_range
+from ..model.training_range import TrainingRange, compute_training_range
 from .bounds import (
     BOUND_FITS,
     ModelErrors,
     TrainingSolutions,
-    add_correction,
-    bound_by,
+    add_distance_correction,
+    calibrate_bound,
     compute_growth,
     compute_held_out_bounds,
-    correct_if_better,
-    measure_coverage_by,
+    improve_distances,
+    measure_bound_coverage,
     read_solutions,
 )
 from .examples import Examples
@@ -76,16 +76,16 @@ def list_learners(data: Dataset) -> tuple[str, ...]:
     return tuple(name for name in kinds if stated or name not in (*SERIES_MODELS, *CONTACT_MODELS))
 
 
-def check_learners(names: Sequence[str], of_poses: bool, where: str) -> None:
-    """Check that data of pushes, or of poses, can train the model types. `where` names the data in the message.
+def check_learners(names: Sequence[str], has_poses: bool, source: str) -> None:
+    """Check that data of pushes, or of poses, can train the model types. `source` names the data in the message.
 
     Raises
     ------
     InputError
         No name, an unknown name, or a model type for the other kind of data.
     """
-    kinds, others, held = (POSE_LEARNERS, LEARNERS, "poses") if of_poses else (LEARNERS, POSE_LEARNERS, "pushes")
-    unknown = [name for name in names if name not in (*kinds, *others) and find_own(name) is None]
+    kinds, others, held = (POSE_LEARNERS, LEARNERS, "poses") if has_poses else (LEARNERS, POSE_LEARNERS, "pushes")
+    unknown = [name for name in names if name not in (*kinds, *others) and find_own_learner(name) is None]
     if unknown or not names:
         allowed = ", ".join((*kinds, *OWN_LEARNERS))
         raise InputError(
@@ -95,18 +95,14 @@ def check_learners(names: Sequence[str], of_poses: bool, where: str) -> None:
     strange = [name for name in names if name in others and name not in kinds]
     if strange:
         raise InputError(
-            f"{where}: holds {held}, of which {', '.join(strange)} cannot be had: choose from {', '.join(kinds)}."
+            f"{source}: holds {held}, of which {', '.join(strange)} cannot be had: choose from {', '.join(kinds)}."
         )
 
 
 def train(
-    data: Dataset,
-    learners: Sequence[str] | None = None,
-    progress: Callable[[str], object] = lambda learner: None,
-    split: DiscSplit | None = None,
-    most: int | None = None,
-    expansion: Expansion | None = None,
-) -> Trained:
+    data: Dataset, learners: Sequence[str] | None = None, progress: Callable[[str], object] = lambda learner: None,
+    split: DiscSplit | None = None, most: int | None = None, expansion: Expansion | None = None,
+) -> Trained:  # fmt: skip
     """Fit `learners`, by default all that the data can train: first for the scores, then for use.
 
     Scored models are trained outside discs of the cortex, and scored inside. Returned models are trained on all those
@@ -134,7 +130,7 @@ def train(
         did not converge.
     """
     wanted = list_learners(data) if learners is None else tuple(dict.fromkeys(learners))
-    check_learners(wanted, of_poses=data.tool is not None, where=str(data.path))
+    check_learners(wanted, has_poses=data.tool is not None, source=str(data.path))
     if most is not None and most < 1:
         raise InputError(f"{most} loads train nothing: give at least 1.")
     with time_stage("read"):
@@ -143,8 +139,8 @@ def train(
     apart = np.zeros(len(answers.loads), bool)
     if split is None:
         apart[len(apart) - min(len(apart) // CALIBRATION_STRIDE, MAX_CALIBRATION_LOADS) :] = True
-        split = _extend_split(leave_discs_out(answers.pushed.point[~apart], answers.patch), apart)
-    chosen = [_select_first(split.train, most), *([_select_first(~apart, most)] if apart.any() else [])]
+        split = _extend_split(hold_out_discs(answers.pushes.point[~apart], answers.patch), apart)
+    chosen = [_select_first(split.training_mask, most), *([_select_first(~apart, most)] if apart.any() else [])]
     fits = [_fit_of(answers, rows, shared, left) for rows, left in zip(chosen, (split, None), strict=False)]
     results = {}
     for name in wanted:
@@ -154,7 +150,7 @@ def train(
         models={name: each.model for name, each in results.items()},
         scores=tuple(each.score for each in results.values()),
         split=split,
-        motion=float(_compute_motion(answers, split.test).mean()),
+        motion=float(_compute_motion(answers, split.test_mask).mean()),
         calibrated=int(apart.sum()),
         training_loads=int(fits[-1].rows.sum()),
         held_out_coverage={name: each.coverage for name, each in results.items() if each.coverage},
@@ -166,13 +162,13 @@ def train(
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class ModelFit:
     """Inputs of a fit: mask (B,) of the results to fit, these as examples, and the inputs common to all model types."""
 
     rows: np.ndarray
     examples: Examples
     inputs: SharedInputs
-    envelope: Envelope
+    envelope: TrainingRange
 
     def fit_parts(self, name: str, patch: Patch) -> tuple[tuple[ModelPart, ...], ForceModel | None]:
         """Fit a model type: the parts of its model, and its model of a tool's force."""
@@ -192,15 +188,15 @@ class TrainingResult:
     force: ForceScore | None
 
 
-def _fit_of(answers: TrainingSolutions, rows: np.ndarray, shared: Expansion, left: DiscSplit | None) -> Fit:
+def _fit_of(answers: TrainingSolutions, rows: np.ndarray, shared: Expansion, left: DiscSplit | None) -> ModelFit:
     examples = answers.select_examples(rows)
-    return Fit(
+    return ModelFit(
         rows, examples, SharedInputs(examples, shared, left), compute_training_range(answers.patch, examples.loads)
     )
 
 
 def _train_and_score(
-    name: str, data: Dataset, answers: TrainingSolutions, split: DiscSplit, apart: np.ndarray, fits: Sequence[Fit]
+    name: str, data: Dataset, answers: TrainingSolutions, split: DiscSplit, apart: np.ndarray, fits: Sequence[ModelFit]
 ) -> TrainingResult:
     """Fit one model type outside the discs and score it inside, then fit it to all loads not used for calibration."""
     outside, patch = fits[0], answers.patch
@@ -208,36 +204,36 @@ def _train_and_score(
     training = {"learner": name, **data.provenance}
     model = Learned(data.anatomy, parts, outside.envelope, training=training, tool=data.tool, force=force)
     with time_stage("score"):
-        test = answers.loads.select(np.flatnonzero(split.test))
-        solves = outside.inputs.solve_counts(name, outside.examples)
-        scored = score(name, model, test, answers.tumour[split.test], answers.nodes, solves)
-        distance = answers.compute_vertex_errors(model, split.test)
-        trained, held_out = (answers.distances.select(rows) for rows in (outside.rows, split.test))
-        model, off = correct_if_better(model, patch, trained, held_out)
-        far = answers.compute_errors(model, split.test, distance.max(axis=1), off)
+        test = answers.loads.select(np.flatnonzero(split.test_mask))
+        solves = outside.inputs.count_solves(name, outside.examples)
+        scored = score(name, model, test, answers.tumour[split.test_mask], answers.nodes, solves)
+        distance = answers.compute_vertex_errors(model, split.test_mask)
+        trained, held_out = (answers.distances.select(rows) for rows in (outside.rows, split.test_mask))
+        model, off = improve_distances(model, patch, trained, held_out)
+        far = answers.compute_errors(model, split.test_mask, distance.max(axis=1), off)
         model = replace(
             model, bound=min(compute_conformal_quantile(far.tumour.error, LEVELS[0]), float(far.tumour.error.max()))
         )
     growth = dict.fromkeys(BOUND_FITS, USUAL_GROWTH)
     of_tumour = of_tip = None
-    promised, beside = None, apart & ~split.is_covered(answers.pushed.point)
+    promised, beside = None, apart & ~split.is_covered(answers.pushes.point)
     if beside.sum() >= 2 * MIN_CALIBRATION_LOADS and len(test) >= FORCE_CLASSES:
         with time_stage("calibrate"):
             near, there = answers.compute_errors(model, beside).list_available(), far.list_available()
             growth = {way: compute_growth(near[way], there[way], BOUND_FITS[way]) for way in near}
             bound = {way: compute_held_out_bounds(model, near[way], there[way], split, BOUND_FITS[way]) for way in near}
             of_tumour, of_tip = (
-                measure_coverage_by(bound["tumour"], far.tumour),
-                measure_coverage_by(bound["tip"], far.tip),
+                measure_bound_coverage(bound["tumour"], far.tumour),
+                measure_bound_coverage(bound["tip"], far.tip),
             )
-            motion = _compute_motion(answers, split.test)
+            motion = _compute_motion(answers, split.test_mask)
             model = replace(
                 model, held_out=measure_held_out(distance, motion, bound["tumour"][0], far.tumour.extrapolated)
             )
             promised = bound.get("force")
     forces = None
     if far.force is not None and answers.force is not None:
-        forces = score_forces(far.force.error, answers.force[split.test], promised)
+        forces = score_forces(far.force.error, answers.force[split.test_mask], promised)
     if apart.any():
         model = _fit_on_all(name, model, answers, fits[1])
     if apart.sum() >= MIN_CALIBRATION_LOADS:
@@ -246,21 +242,22 @@ def _train_and_score(
     return TrainingResult(model, scored, of_tumour, of_tip, forces)
 
 
-def _fit_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: Fit) -> Learned:
+def _fit_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: ModelFit) -> Learned:
     """Fit the model to further loads, with a correction of its distances if it had one."""
     parts, force = fit.fit_parts(name, answers.patch)
     fitted = replace(model, parts=parts, envelope=fit.envelope, force=force)
     if model.tip is None or model.tip.correction is None:
         return fitted
     with time_stage(f"learn {name}"):
-        return add_correction(fitted, answers.patch, answers.distances.select(fit.rows))
+        return add_distance_correction(fitted, answers.patch, answers.distances.select(fit.rows))
 
 
 def _add_bounds(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:
     """Add bounds, calibrated on errors `near` training loads, to a model; they grow by `growth` [1/m] towards `far`."""
     seen = far.list_available()
     bounds = {
-        way: bound_by(here, BOUND_FITS[way], growth[way], seen[way]) for way, here in near.list_available().items()
+        way: calibrate_bound(here, BOUND_FITS[way], growth[way], seen[way])
+        for way, here in near.list_available().items()
     }
     tip, force = model.tip or TipModel(), model.force
     return replace(
@@ -284,5 +281,5 @@ def _select_first(rows: np.ndarray, most: int | None) -> np.ndarray:
 def _extend_split(split: DiscSplit, apart: np.ndarray) -> DiscSplit:
     """Extend a split of the rows that are not `apart` (B,) to all rows."""
     disc = np.full(len(apart), -2)
-    disc[~apart] = split.disc
-    return replace(split, disc=disc)
+    disc[~apart] = split.disc_index
+    return replace(split, disc_index=disc)
