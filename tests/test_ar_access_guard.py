@@ -332,7 +332,7 @@ class TestMessages:
         said = capfd.readouterr().err
         assert "Traceback" not in said and len(said.splitlines()) <= 1
 
-    @pytest.mark.parametrize("shared", [{"burst": 50.0, "per_second": 20.0}], indirect=True)
+    @pytest.mark.parametrize("shared", [{"max_burst": 50.0, "messages_per_second": 20.0}], indirect=True)
     def test_message_flood_closes_only_its_connection(self, page):
         hostile, begun = Visitor(page, 1200), time.monotonic()
         assert wait_for(lambda: page.visitors == 1)

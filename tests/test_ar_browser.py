@@ -157,7 +157,7 @@ def test_only_the_first_visitor_controls_the_page(page, heard):
     """Others may request control; the leader grants it, and it passes on when the leader leaves."""
     first, second = Visitor(page, 1600), Visitor(page, 420)
     page.show_line(lambda visitor: f"number {visitor}")
-    assert wait_for(lambda: set(page.crowd.rows) == {0, 1} and page.crowd.rows[1].ask.visible)
+    assert wait_for(lambda: set(page.crowd.rows) == {0, 1} and page.crowd.rows[1].request_button.visible)
     leads, looks = (page.crowd.rows[number] for number in (0, 1))
     assert "You have control" in leads.line.content and "Visitor 1 has control" in looks.line.content
     assert "number 2" in looks.line.content and not leads.dim.content and "opacity" in looks.dim.content

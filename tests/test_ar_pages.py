@@ -67,7 +67,7 @@ def test_squares_and_markers_have_nominal_printed_size(pages, number):
         for line, count in ((box[22], face.columns), (box[:, 22], face.rows)):  # in the margin of the markers
             assert len(edges(line)) == count + 1
             np.testing.assert_allclose(np.diff(edges(line)) / per_mm, 1e3 * face.square, atol=1e-9)
-        second = np.rot90(box, each.turns)[20 : 20 + round(1e3 * face.square * per_mm), :]
+        second = np.rot90(box, each.quarter_turns)[20 : 20 + round(1e3 * face.square * per_mm), :]
         across = edges(second[len(second) // 8 + 4, 20 + len(second) : 20 + 2 * len(second)])  # a marker's border
         assert np.diff(across) / per_mm == pytest.approx(750.0 * face.square)
 
@@ -100,7 +100,7 @@ def on_paper(each, places):
     """Places (n, 2) [mm] on a face, as they lie on its page."""
     size = 1e3 * each.face.size
     around = places - 0.5 * size
-    for _ in range(each.turns):
+    for _ in range(each.quarter_turns):
         around = np.column_stack([-around[:, 1], around[:, 0]])
     return around + 0.5 * size + [each.left, each.top]
 

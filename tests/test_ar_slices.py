@@ -69,9 +69,9 @@ class TestViews:
 
     def test_unknown_error_or_unreliable_position_has_no_band(self):
         known = SlicedSurfaces(ball(12e-3), ball(12e-3, (2e-3, 0.0, 0.0)), 4e-3)
-        green = [np.count_nonzero(tinted(draw_view(PLANES[0], None, np.zeros(3), cut))) for cut in (
-            known, SlicedSurfaces(known.current, known.before), SlicedSurfaces(known.current, known.before, 4e-3, True)
-        )]  # fmt: skip
+        bare, doubtful = (SlicedSurfaces(known.current, known.initial, *more) for more in ((), (4e-3, True)))
+        cuts = (known, bare, doubtful)
+        green = [np.count_nonzero(tinted(draw_view(PLANES[0], None, np.zeros(3), cut))) for cut in cuts]
         assert green[0] > 2 * green[1] > 0 and green[2] == 0
 
     def test_slices_have_three_views_for_empty_surface_too(self):

@@ -155,7 +155,7 @@ def test_peer_engine_finds_the_same_displacement(case, judge, name, tolerance):
 
 def test_only_sulcus_and_tled_run_on_the_gpu():
     moved = {
-        engine.name for engine in (OWN, *PEERS) if engine.select_device("cuda").words == (*engine.arguments, "cuda")
+        engine.name for engine in (OWN, *PEERS) if engine.select_device("cuda").arguments == (*engine.arguments, "cuda")
     }
     assert moved == {"sulcus", "tled"}
     assert all(engine.select_device("cpu") == engine for engine in (OWN, *PEERS))

@@ -190,7 +190,7 @@ def test_record_entry_states_outcome_and_reason(script, state, reason):
 def test_benchmark_process_runs_in_a_temporary_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     script = "open('growth.png', 'w'); print(*sys.argv[1:], file=sys.stderr)\nsys.exit(2)"
-    found = said_by(script, anatomy=Path("box.vtu"), quick=True)
+    found = said_by(script, anatomy=Path("box.vtu"), is_quick=True)
     words = f"live --anatomy {tmp_path}/box.vtu --frames 60 --frames 3 --checked 2 --device cpu --json"
     assert found.reason.endswith(words) and not list(tmp_path.iterdir())
     assert "box.vtu" not in found.command  # of another folder tomorrow
@@ -255,7 +255,7 @@ def test_slower_numbers_are_reported_with_exit_code_1(tmp_path, capsys):
 def test_change_above_ten_percent_counts_as_worse(better, old, new, worse):
     before, after = (replace(entry(), values=(Value("x", number, "", better),)) for number in (old, new))
     found = compare_records(build_record(HERE, [before]), build_record(HERE, [after]))
-    assert bool(found.worse) is worse and len(found.changes) == 1
+    assert bool(found.regressions) is worse and len(found.changes) == 1
 
 
 def test_differing_machine_version_and_command_are_reported(tmp_path, capsys):

@@ -72,7 +72,7 @@ def test_frames_start_from_last_result_and_skip_warm_up(site, pretender):
     frames = list(solve_frames(Watched(), loads))
     assert [frame.loads for frame in frames] == loads[WARM_UP:]
     assert starts[0] is None and all(start is not None for start in starts[1:])
-    np.testing.assert_array_equal(starts[-1].displacement, frames[-2].answer.displacement)
+    np.testing.assert_array_equal(starts[-1].displacement, frames[-2].result.displacement)
     assert all(frame.seconds > 0.0 for frame in frames)
 
 

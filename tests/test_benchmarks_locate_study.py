@@ -24,15 +24,7 @@ from benchmarks.studies.locate_study import (
     sample_observation,
     summarise_estimates,
 )
-from benchmarks.studies.locate_twins import (
-    CAUSES,
-    SyntheticCase,
-    build_effects,
-    build_loads,
-    sample_parameters,
-    solve_case,
-    solve_cases,
-)
+from benchmarks.studies.locate_twins import SyntheticCase, sample_parameters, solve_cases
 from sim.accuracy import REFERENCE
 from sim.bodies.meshfile import write_anatomy
 from sim.bodies.open_cortex import open_cortex
@@ -282,7 +274,7 @@ def test_twins_depend_only_on_seed_and_number():
         sample_parameters(0, 5) == many[5] != replace(sample_parameters(0, 9), number=5)
         and sample_parameters(1, 5) != many[5]
     )
-    assert [one.cause for one in many[:8]] == [*CAUSES, *CAUSES]
+    assert [one.cause for one in many[:8]] == [*locate_twins.CAUSES, *locate_twins.CAUSES]
     assert {one.skull for one in many if one.cause == "drainage"} == {"contact"}
     assert {one.skull for one in many if one.cause != "drainage"} == {"contact", "bonded", "slide"}
     for name, low, high in (("stiffness", 0.5, 1.3), ("ratio", 0.5, 3.0), ("left", 0.1, 0.5)):
@@ -296,12 +288,12 @@ def test_twins_depend_only_on_seed_and_number():
 def test_twins_have_drawn_tissue_and_single_cause(body):
     for number in range(4):
         draw = sample_parameters(3, number)
-        elasticity = build_effects(draw)[0]
+        elasticity = locate_twins.build_effects(draw)[0]
         for law, times in ((elasticity.default, 1.0), (elasticity.regions[2], draw.ratio)):
             mu, lam = law.lame
             assert mu == pytest.approx(670.0 * draw.stiffness * times) and law.terms[0][1] == -19.0
             assert lam / (2.0 * (lam + mu)) == pytest.approx(0.49)
-        loads = build_loads(body, draw)
+        loads = locate_twins.build_loads(body, draw)
         pushed, posture = loads.get(Pushed), loads.get(Posture)
         assert pushed.force.any() == ("tool" in draw.cause)
         assert (loads.times[0] != 0.0) == (draw.cause == "swelling")
@@ -313,8 +305,8 @@ def test_twins_have_drawn_tissue_and_single_cause(body):
 def test_twin_motion_follows_the_push_of_its_tool(body):
     """The push moves the open cortex along its direction, and the tumour less."""
     draw = replace(sample_parameters(0, 0), skull="slide", stiffness=1.0)
-    motion = solve_case(body, draw, "cpu", "p1")
-    pushed = build_loads(body, draw).get(Pushed)
+    motion = locate_twins.solve_case(body, draw, "cpu", "p1")
+    pushed = locate_twins.build_loads(body, draw).get(Pushed)
     near = np.linalg.norm(body.mesh.nodes - pushed.point[0], axis=1).argmin()
     assert motion[near] @ pushed.force[0] > 0.7 * np.linalg.norm(motion[near]) * np.linalg.norm(pushed.force[0])
     deep = np.linalg.norm(motion[body.tumour_nodes], axis=1).mean()

@@ -172,11 +172,10 @@ def tips(follower, elsewhere, truth):
     """How far off the tool's tip is in the scan [m], and deviations, where it is known."""
     out = []
     for row, time in enumerate(truth.times):
-        beside = elsewhere.find_tool_pose(time)
-        if beside is not None:
-            there = follower.registration.T_patient_scan @ [*truth.T_scan_tool[row][:3, 3], 1.0]
-            place, spread = beside.point(follower.tool.T_cube_tool[:3, 3])
-            out.append((np.linalg.norm(place - there[:3]), np.sqrt(np.trace(spread))))
+        if (beside := elsewhere.find_tool_pose(time)) is not None:
+            there = (follower.registration.T_patient_scan @ [*truth.T_scan_tool[row][:3, 3], 1.0])[:3]
+            place, spread = beside.transform_point(follower.tool.T_cube_tool[:3, 3])
+            out.append((np.linalg.norm(place - there), np.sqrt(np.trace(spread))))
     return np.array(out).T
 
 

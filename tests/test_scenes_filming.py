@@ -47,7 +47,7 @@ def shots(player):
 
 
 def grey(shot):
-    return cv2.cvtColor(shot.colour, cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(shot.image, cv2.COLOR_RGB2GRAY)
 
 
 def test_both_targets_are_tracked_at_their_true_poses(player, shots):

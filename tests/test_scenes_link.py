@@ -45,7 +45,7 @@ def test_link_command_measures_one_solution(follower, monkeypatch, capsys, delay
             time.sleep(delay)
             return follower.motion.deformer.deform(loads)
 
-    monkeypatch.setattr("scenes.commands.link.build_mover", lambda *words: (Slow(), "a slow one"))
+    monkeypatch.setattr("scenes.commands.link.build_requested_deformer", lambda *words: (Slow(), "a slow one"))
     words = ["--tool", FILM / "tool.json", "--port", "0", "--device", "cpu", "--seconds", "0.1"]
     assert main(["link", str(get_template_path()), *map(str, words)]) == 0
     out, error = capsys.readouterr()

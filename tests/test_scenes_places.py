@@ -39,7 +39,7 @@ def test_part_error_is_the_larger_of_both_field_errors(kinked, fields):
     errors = places.compute_errors(fields)
     assert 0.05e-3 < errors[places.tumour].max() < 1e-3 and errors[places.cortex].max() < 1e-6
     # No field reaches beyond the grid.
-    index = fields.grid.index(places.rest)
+    index = fields.grid.to_indices(places.rest)
     inside = ((index > 0.0) & (index < np.array(fields.grid.shape) - 1)).all(axis=1)
     exact = inside & (errors < 1e-6)
     assert exact.sum() > 20 and not inside[places.cortex].any()

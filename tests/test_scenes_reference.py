@@ -50,7 +50,7 @@ def test_damaged_reference_file_is_rejected_by_name(study):
     get_reference(study)
     kept = study.folder / "answers"
     answer, table = min(kept.glob("reference-*")), kept / f"series-{study.digest}.npz"
-    for path, ask in ((answer, lambda: get_reference(study)), (table, lambda: replace(study).expansion.tabulated)):
+    for path, ask in ((answer, lambda: get_reference(study)), (table, lambda: replace(study).expansion.table)):
         path.write_bytes(b"PK" * 100)
         with pytest.raises(InputError, match=f"{path.name}.*Delete it: it is computed again"):
             ask()
@@ -68,7 +68,7 @@ def test_finer_reference_is_evaluated_at_the_same_points(study, tmp_path):
 
 
 def test_outside_loads_lie_beyond_the_training_range(study):
-    training = study.converged.select(np.flatnonzero(study.disc_split.train)).get(Pushed)
+    training = study.converged.select(np.flatnonzero(study.disc_split.training_mask)).get(Pushed)
     outside = study.loads_beyond.get(Pushed)
     assert not compute_training_range(study.patch, training).is_inside(study.patch, outside).any()
     size = np.linalg.norm(outside.force, axis=1)

@@ -153,7 +153,7 @@ def test_each_visitor_sees_who_controls_the_tool(running):
     assert wait_for(lambda: len(read()) == 2 and all("Automatic playback; 2 visitors" in line for line in read()))
     one.set(page.inputs["force [N]"], 0.31)
     assert wait_for(lambda: "**You control the tool**" in read()[0] and "Visitor 1 controls" in read()[1])
-    other.set(page.crowd.rows[1].ask, True)
+    other.set(page.crowd.rows[1].request_button, True)
     assert wait_for(lambda: page.crowd.rows[0].give.visible)
     one.set(page.crowd.rows[0].give, True)
     assert wait_for(lambda: "You lead" in read()[1])

@@ -67,9 +67,9 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
     assert row.loads == training.sum()
     # Of loads that point into the sectors, by a model of those that do not.
     data, sectors = read_dataset(path), hold_out_sectors(pushed, study.patch)
-    asked = data.loads.select(np.flatnonzero(data.good)[sectors.test])
+    asked = data.loads.select(np.flatnonzero(data.good)[sectors.test_mask])
     guess = train(data, ["svr"], split=sectors).models["svr"].deform(asked, at=nodes).displacement
-    wanted = 1e3 * np.linalg.norm(guess - data.read_displacement(nodes)[data.good][sectors.test], axis=2)
+    wanted = 1e3 * np.linalg.norm(guess - data.read_displacement(nodes)[data.good][sectors.test_mask], axis=2)
     mm = row.own_fem["sectors"].mm
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
 

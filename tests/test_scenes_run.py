@@ -38,7 +38,7 @@ def film(count):
 def test_masked_areas_have_no_overlay_and_report_their_share(parts):
     follower, painter = parts
     (whole,) = draw_overlays(read_timed_images(film(1)), follower, painter)
-    camera, tumour = whole.tracking.camera, painter.stage.tumour_at_rest
+    camera, tumour = whole.result.camera, painter.stage.tumour_at_rest
     mask = compute_silhouette(camera, tumour.vertices, tumour.triangles)
     columns = np.flatnonzero(mask.any(axis=0))
     covered = np.zeros(mask.shape, np.uint8)
@@ -50,14 +50,14 @@ def test_masked_areas_have_no_overlay_and_report_their_share(parts):
     share = np.count_nonzero(mask & (covered > 0)) / np.count_nonzero(mask)
     assert 0.2 < share < 0.8
     assert has_text(hidden.image, f"{share:.0%} of the tumour is behind what lies in front", TEXT_SCALE)
-    assert hidden.tracking.bound == whole.tracking.bound and not hidden.tracking.is_reliable
+    assert hidden.result.bound == whole.result.bound and not hidden.result.is_reliable
 
 
 def test_frozen_overlay_is_hidden_by_the_mask(parts):
     follower, painter = parts
     (shown,) = draw_overlays(read_timed_images(film(1)), follower, painter)
     blank = np.full(shown.image.shape, 120, np.uint8)
-    lost = follower.step(blank[..., 0], 0.1, shown.tracking)
+    lost = follower.step(blank[..., 0], 0.1, shown.result)
     covered = np.zeros(blank.shape[:2], bool)
     covered[:600] = True
     assert (painter.paint(blank, lost).colour[:600] != 120).any()

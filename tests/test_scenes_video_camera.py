@@ -16,7 +16,7 @@ from scenes.tracked.video_camera import check_video
 @pytest.mark.parametrize(("factor", "way"), [(1.15, "13% shorter"), (0.85, "18% longer")])
 def test_video_of_another_zoom_is_rejected_before_tracking(factor, way, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
-        "scenes.tracked.external_tracker.follow_body", lambda *given: pytest.fail("the whole film is followed")
+        "scenes.tracked.external_tracker.track_video", lambda *given: pytest.fail("the whole film is followed")
     )
     calibration = read_calibration(FILM / "camera.yaml")
     path = tmp_path / "camera.yaml"

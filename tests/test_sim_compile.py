@@ -37,7 +37,7 @@ TOOLS = cost(
     "contact.tool_kernels contact.tool_path",
     "contact.enclosure:add_angle contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction "
     "contact.tool_kernels:clearance contact.tool_kernels:nearest",
-    "ContactSampling Reduced ToolContactTerm ToolFunctions ToolKernels",
+    "ContactSampling ReducedToolBarrier ToolContactTerm ToolFunctions ToolKernels",
 )
 # A new effect adds one line.
 OF_EFFECT = {
@@ -49,10 +49,10 @@ OF_EFFECT = {
     "Held": cost(),
     "Bonded": cost(),
     "Slide": cost(),
-    "ToolForce": cost("dead_force", "dead_force:spread dead_force:subtract", "DeadForce DeadForceKernels Forces"),
+    "ToolForce": cost("dead_force", "dead_force:spread dead_force:subtract", "DeadForce DeadForceKernels NodalForces"),
     "ToolDisplacement": cost(),
     "NodalForce": cost("dead_force", "", "DeadForce DeadForceKernels"),
-    "Gravity": cost("dead_force gravity", "dead_force:subtract", "DeadForce DeadForceKernels Forces"),
+    "Gravity": cost("dead_force gravity", "dead_force:subtract", "DeadForce DeadForceKernels NodalForces"),
     "Inertia": cost("inertia", "inertia:add_force", "InertiaKernels InertiaTerm"),
     "Pulsation": cost("swelling", "swelling:fill element_kernels:spread", "Swelling SwellingKernels"),
     "Resection": cost(),

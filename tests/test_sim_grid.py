@@ -30,7 +30,7 @@ def fields(box, moved):
 def errors(box, moved, fields):
     """How far the fields, read between nodes, are from what moves a body: at its vertices, (2, V) [m]."""
     rest, grid = box.mesh.nodes, fields.grid
-    off = grid.read(fields.forward, rest) - moved, grid.read(fields.backward, rest + moved) + moved
+    off = grid.interpolate(fields.forward, rest) - moved, grid.interpolate(fields.backward, rest + moved) + moved
     return np.linalg.norm(off, axis=-1)
 
 
@@ -57,7 +57,7 @@ def test_faint_motion_is_set_to_zero_and_shrinks_the_grid(box, moved, fields):
 
 
 def test_fields_have_no_folds_and_bounded_jacobians(fields):
-    assert not fields.folds and min(fields.least) > 0.5
+    assert not fields.has_folds and min(fields.least) > 0.5
     for field, least in ((fields.forward, fields.least[0]), (fields.backward, fields.least[1])):
         gradient = np.stack(np.gradient(field.astype(float), fields.grid.spacing, axis=(1, 2, 3)), axis=-1)
         between = np.linalg.det(np.moveaxis(gradient, 0, -2) + np.eye(3))
@@ -72,18 +72,18 @@ def test_field_is_continuous_and_zero_at_the_grid_edge(box, fields):
         for axis in (1, 2, 3):
             assert np.abs(np.take(field, [0, -1], axis=axis)).max() < 1e-12
     below = np.array([[x, y, -43.5e-3] for x in (-20e-3, 0.0, 20e-3) for y in (-20e-3, 0.0)])
-    assert np.abs(fields.grid.read(fields.forward, below)).max() < 1e-9  # a skull that holds is left where it is
+    assert np.abs(fields.grid.interpolate(fields.forward, below)).max() < 1e-9  # a skull that holds is left where it is
 
 
 def test_field_is_smooth_across_the_surface_of_the_body(box, moved, fields):
     top = np.array([[2e-3, 1e-3, 0.0], [-5e-3, 4e-3, 0.0], [8e-3, -3e-3, 0.0]])
-    below, at, above = (fields.grid.read(fields.forward, top + [0, 0, z]) for z in (-5e-4, 0.0, 5e-4))
+    below, at, above = (fields.grid.interpolate(fields.forward, top + [0, 0, z]) for z in (-5e-4, 0.0, 5e-4))
     assert np.abs((above - at) - (at - below)).max() < 2e-5 < np.abs(at - below).max()
 
 
 def test_fields_outside_body_are_inverse_to_each_other(box, fields):
     around = np.array([[x, y, z] for x in (-8e-3, 0.0, 7e-3) for y in (-4e-3, 5e-3) for z in (3e-3, 6e-3)])
-    back = around + fields.grid.read(fields.backward, around)
+    back = around + fields.grid.interpolate(fields.backward, around)
     assert np.abs(back + fields.grid.read(fields.forward, back) - around).max() < 0.05e-3
 
 

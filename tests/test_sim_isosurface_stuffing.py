@@ -76,6 +76,6 @@ def test_zero_snap_distance_leaves_lattice_nodes_in_place():
 
 def test_isosurface_stuffing_is_deterministic(carved):
     body, both = carved
-    again = cut_mesh(body, core, fixed=body.surface)
+    again = cut_mesh(body, core, fixed=body.on_surface)
     np.testing.assert_array_equal(again.nodes, both.nodes)
     np.testing.assert_array_equal(again.tets, both.tets)

@@ -151,7 +151,7 @@ class TestAcrossCuts:
         first = made.deform(replace(lying([0]), time=np.array([0.01])))
         second = made.deform(replace(lying([1]), time=np.array([0.0101])), first)
         still = made.deform(replace(lying([1]), time=np.array([0.0101])), replace(first, memory={}))
-        stays = ~made.get_remains(1).anatomy.orphaned  # type: ignore
+        stays = ~made.get_remaining_body(1).anatomy.orphaned  # type: ignore
         one, other, dead = (answer.displacement[0, stays] for answer in (first, second, still))
         flown = 1e-4 * np.linalg.norm(first.memory["inertia"][0, : len(MESH.nodes)][stays], axis=1)
         moved = np.linalg.norm(other - one, axis=1)

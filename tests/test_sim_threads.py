@@ -88,6 +88,6 @@ def test_kernel_launch_waits_for_the_foreground(monkeypatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr("sim.runtime.device.wait_for_foreground", lambda: asked.append(1))
     monkeypatch.setattr("sim.runtime.device.wp.launch", lambda *_, **__: None)
-    monkeypatch.setattr("sim.runtime.device.load", lambda _: None)
+    monkeypatch.setattr("sim.runtime.device.load_module", lambda _: None)
     find_device("cpu", "float64").launch(SimpleNamespace(module=None), (1,), [], [])
     assert asked == [1]

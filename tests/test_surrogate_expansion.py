@@ -117,11 +117,11 @@ def test_tabulated_series_matches_fem_in_the_example_basis(data, expansion, box,
     places = np.array([0, 17, 60, 120, 198])
     point = np.repeat(add_edge_midpoints(patch)[1][places], 3, axis=0)
     units = Loads((Pushed(point, np.tile(np.eye(3), (len(places), 1)), np.full(len(point), 7e-3)),))
-    predicted = expansion.build_series(bases, np.zeros(len(expansion.places), bool))
-    for at, basis, found, exact in zip(nodes, bases, predicted, expansion.exact, strict=True):
+    predicted = expansion.build_series(bases, np.zeros(len(expansion.positions), bool))
+    for at, basis, found, exact in zip(nodes, bases, predicted, expansion.exact_parts, strict=True):
         wanted = fem.compute_series(units, MAX_ORDER, every_motion(fem, at), 3) @ basis.modes.T
         for terms in ORDER_COLUMNS[len(exact) :]:
-            table = found.table.values.reshape(len(expansion.places), *wanted.shape[1:])
+            table = found.table.values.reshape(len(expansion.positions), *wanted.shape[1:])
             miss = np.linalg.norm((table[places] - wanted)[:, terms])
             assert miss < 0.06 * np.linalg.norm(wanted[:, terms])  # rounded to 1 in 500 of the largest
 
@@ -135,16 +135,17 @@ def test_first_two_series_orders_are_exact_for_any_tool(expansion, box):
     exact = fem.compute_series(Loads((loads,)), 2, every_motion(fem, expansion.tumour))
     size = split_forces(loads)[0][:, None, None]
     found = [
-        size * part.compute_response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]
+        size * part.compute_response(ENCODERS[part.encoder](expansion.patch, loads))
+        for part in expansion.exact_parts[0]
     ]
     for order, (motion, limit) in enumerate(zip(found, (1e-3, 3e-2), strict=True)):
         off = np.linalg.norm(motion.reshape(40, -1) - exact[:, order], axis=1) / np.linalg.norm(exact[:, order], axis=1)
         assert off[inside].max() < limit
     many = [
         part.compute_response(ENCODERS[part.encoder](expansion.patch, replaced(loads, 3)))
-        for part in expansion.exact[0]
+        for part in expansion.exact_parts[0]
     ]
-    some = [part.compute_response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact[0]]
+    some = [part.compute_response(ENCODERS[part.encoder](expansion.patch, loads)) for part in expansion.exact_parts[0]]
     for few, more in zip(some, many, strict=True):  # more than are answered at once
         np.testing.assert_allclose(more, np.tile(few, (3, 1, 1)), rtol=1e-4, atol=1e-6)
 

@@ -46,7 +46,7 @@ def test_each_conditioning_round_starts_from_the_last_result(prior, monkeypatch,
     every = prior.restrict_shapes(np.arange(len(body.mesh.nodes)))
     for result, (points, motion, bias) in zip(results, starts, strict=False):
         np.testing.assert_array_equal(points, near)
-        np.testing.assert_allclose(motion[cortex], np.tensordot(result.weight, every[:, cortex], 1), atol=1e-12)
+        np.testing.assert_allclose(motion[cortex], np.tensordot(result.shape_weights, every[:, cortex], 1), atol=1e-12)
         assert not np.delete(motion, cortex, axis=0).any()
         np.testing.assert_array_equal(bias, result.compute_bias(rest))
     assert [free for _, free in given] == [True] * len(results)

@@ -94,8 +94,8 @@ def test_held_out_disc_loads_are_excluded_from_training(trained, scored, data):
     for model in scored.models.values():
         away = np.linalg.norm(model.envelope.points[:, None] - split.centres, axis=2).min()
         assert away > split.radius * (1 - 1e-5)
-        assert len(model.envelope.points) == split.train.sum()
-    assert len(split.test) == data.good.sum() < len(data.loads)  # failed cases are neither learnt nor scored
+        assert len(model.envelope.points) == split.training_mask.sum()
+    assert len(split.test_mask) == data.good.sum() < len(data.loads)  # failed cases are neither learnt nor scored
 
 
 def arrays_of(model):
@@ -106,7 +106,7 @@ def arrays_of(model):
 
 def test_scored_model_ignores_held_out_displacements(trained, scored, data, tmp_path):
     """Bit-identical: random displacements of loads in and out of the discs change only scores."""
-    wild, _ = poisoned(data.path, tmp_path / "wild.h5", np.flatnonzero(data.good)[~trained.split.train])
+    wild, _ = poisoned(data.path, tmp_path / "wild.h5", np.flatnonzero(data.good)[~trained.split.training_mask])
     again = train(read_dataset(wild), ["linear", "pcr", "svr"], split=trained.split)
     for row in again.scores:
         known, training = scored.models[row.name], again.models[row.name]
@@ -130,7 +130,7 @@ def test_model_parameters_ignore_calibration_displacements(trained, data, tmp_pa
 
 
 def test_final_model_is_trained_on_held_out_discs(trained, scored, data):
-    held_out = data.loads.select(np.flatnonzero(data.good)[trained.split.test])
+    held_out = data.loads.select(np.flatnonzero(data.good)[trained.split.test_mask])
     truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test]
     for name in ("ann", "svr", "gp", "residual"):
         both = (trained.models[name], scored.models[name])
@@ -142,7 +142,7 @@ def test_final_model_is_trained_on_held_out_discs(trained, scored, data):
 
 def test_bounds_are_calibrated_on_untrained_loads(trained, data, fresh, pretender):
     apart = np.flatnonzero(data.good)[-trained.calibrated :]
-    assert (trained.split.disc[-trained.calibrated :] == -2).all()
+    assert (trained.split.disc_index[-trained.calibrated :] == -2).all()
     for name, model in trained.models.items():
         points = model.envelope.points
         assert not np.isin(data.loads.get(Pushed).point[apart, 0].astype(np.float32), points[:, 0]).any(), name
@@ -174,7 +174,9 @@ def test_held_out_coverage_is_reported(trained, scored, data):
 
         near, held, alone, stated = seen(beside), [], [], trained.models[name].held_out
         for disc in range(len(split.centres)):
-            here, others = (np.flatnonzero(split.test & ((split.disc == disc) == inside)) for inside in (True, False))
+            here, others = (
+                np.flatnonzero(split.test_mask & ((split.disc_index == disc) == inside)) for inside in (True, False)
+            )
             bounds = calibrate_bound(near, TUMOUR_FIT, compute_growth(near, seen(others), TUMOUR_FIT))
             bounded, asked = replace(model, bounds=bounds), good.select(here)
             answer = bounded.deform(asked, at=data.anatomy.tumour_nodes)
@@ -185,7 +187,7 @@ def test_held_out_coverage_is_reported(trained, scored, data):
         assert (stated.mean, stated.solved) == pytest.approx((share.mean(), solved.mean())) and solved.any()
         assert stated.guarded == pytest.approx((share * (1.0 - solved)).mean())
         found, held = trained.held_out_coverage[name], np.concatenate(held, axis=1)
-        assert found.loads == held.shape[1] == split.test.sum() and found.shares == (held[0].mean(), None)
+        assert found.loads == held.shape[1] == split.test_mask.sum() and found.shares == (held[0].mean(), None)
     assert scored.held_out_coverage == {}
 
 
@@ -210,7 +212,7 @@ def test_scores_equal_errors_of_held_out_loads(trained, scored, data, box):
     """Computed again in another way, from the data file."""
     name, model = "linear", scored.models["linear"]
     row = next(row for row in trained.scores if row.name == name)
-    held_out = np.flatnonzero(data.good)[trained.split.test]
+    held_out = np.flatnonzero(data.good)[trained.split.test_mask]
     truth = data.read_displacement(box.tumour_nodes)[held_out].astype(float)
     miss, motion = [], []
     for number, load_case in enumerate(held_out):
@@ -321,7 +323,7 @@ def test_threads_sharing_a_model_get_their_own_results(trained, fresh, name):
 def test_training_range_contains_new_but_not_held_out_loads(trained, scored, data, fresh):
     inside = [outcome is Outcome.PREDICTED for outcome in trained.models["linear"].deform(fresh).outcome]
     assert np.mean(inside) > 0.9  # a few exceed the extremes in training, or lie in a gap
-    held_out = data.loads.select(np.flatnonzero(data.good)[trained.split.test])
+    held_out = data.loads.select(np.flatnonzero(data.good)[trained.split.test_mask])
     strange = [outcome is Outcome.EXTRAPOLATED for outcome in scored.models["linear"].deform(held_out).outcome]
     assert np.mean(strange) > 0.3
 

@@ -26,8 +26,12 @@ def test_single_step_history_equals_two_played_steps():
     for time in (0.0, 0.2, APPROACH_TIME, 3.0, 80.0):
         alone = update_relaxation(SERIES, pressed(2e-3), np.array([time]), None, 1e-4)
         steps = [t for t in (min(time, APPROACH_TIME), time) if t > 0.0]
-        np.testing.assert_allclose(alone.share, played([2e-3] * len(steps), steps)[-1].share if steps else 0.0)
-        assert alone.share[0] == pytest.approx(0.7 - compute_decayed_coefficients(SERIES, np.array([time])).sum())
+        np.testing.assert_allclose(
+            alone.relaxed_share, played([2e-3] * len(steps), steps)[-1].relaxed_share if steps else 0.0
+        )
+        assert alone.relaxed_share[0] == pytest.approx(
+            0.7 - compute_decayed_coefficients(SERIES, np.array([time])).sum()
+        )
 
 
 def test_fem_response_depends_only_on_the_relaxed_share(box):

@@ -58,7 +58,7 @@ def drawn(prior, random, number=0):
 def seen_unknowns(prior, evidence):
     """What unit weights, and a rigid error of one standard deviation, do at the points (m, r + 6)."""
     moved = np.einsum("mc,rmci->rmi", evidence.location.weights, prior.shape[:, evidence.location.vertices])
-    return np.hstack([np.einsum("rmi,mi->mr", moved, evidence.axis), evidence.rigid * evidence.rigid_scale])
+    return np.hstack([np.einsum("rmi,mi->mr", moved, evidence.axis), evidence.rigid_jacobian * evidence.rigid_scale])
 
 
 def test_projected_shapes_equal_their_motion_at_the_points(prior):

@@ -72,17 +72,17 @@ def test_relaxed_share_equals_the_hereditary_integral():
         t = times[frame]
         coming = min(t, 1.0)
         left = sum(g * tau / coming * (np.exp(-(t - coming) / tau) - np.exp(-t / tau)) for g, tau in SERIES)
-        assert found[frame].share[0] == pytest.approx(0.7 - left, abs=2e-4)
+        assert found[frame].relaxed_share[0] == pytest.approx(0.7 - left, abs=2e-4)
         assert not found[frame].strange[0]
 
 
 def test_histories_outside_training_are_marked():
     """A held tool that retracts, or one that slides far; a first contact is not marked."""
     back = played([4e-3, 4e-3, 3e-3, 0.0], [0.5, 6.0, 6.1, 6.2])
-    assert [bool(each.strange[0]) for each in back] == [False, False, True, True]
+    assert [bool(each.outside_training[0]) for each in back] == [False, False, True, True]
     assert back[3].share[0] == 0.0
     slid = played([4e-3] * 3, [0.5, 1.0, 1.5], [0.0, 2e-3, 4e-3])
-    assert [bool(each.strange[0]) for each in slid] == [False, False, True]
+    assert [bool(each.outside_training[0]) for each in slid] == [False, False, True]
 
 
 def test_start_without_matching_history_is_rejected():
@@ -104,7 +104,7 @@ class Fading:
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
         pushed = to_indentation(loads, BALL, self.patch)
-        share = update_relaxation(SERIES, pushed, loads.times, start, 1e-4).share[:, None]
+        share = update_relaxation(SERIES, pushed, loads.times, start, 1e-4).relaxed_share[:, None]
         X, count = compute_tool_features(self.patch, pushed), len(loads)
         answered = self.contact.compute_linear(X) * X[:, 6:7] * (1.0 - 0.3 * share)
         split, moved = len(self.bases[0].modes), np.zeros((count, len(self.anatomy.mesh.nodes), 3))

@@ -30,7 +30,7 @@ def test_sector_split_holds_out_whole_sectors(box, pushed):
     off = np.abs((azimuth + 90.0) % 180.0 - 90.0)  # from the nearer of the two opposite directions
     assert np.array_equal(split.test_mask, (off < 22.5) & (tilt > 10.0))
     assert (
-        split.share == 0.25
+        split.area_share == 0.25
         and set(split.disc_index) == {-1, 0, 1}
         and split.training_mask.sum() + split.test_mask.sum() == 400
     )
@@ -56,14 +56,14 @@ def test_training_uses_only_loads_of_its_split(box, pretender, tmp_path):
     trained = train(data, ["linear"], split=fewer)
     points = data.loads.get(Pushed).point
     assert np.allclose(trained.models["linear"].envelope.points, points[order[:50]])
-    assert trained.split is fewer and fewer.train.sum() == 50 and fewer.test.sum() == split.test_mask.sum()
+    assert trained.split is fewer and fewer.training_mask.sum() == 50 and fewer.test.sum() == split.test_mask.sum()
 
 
 def test_disc_split_holds_out_whole_discs(box, patch):
     points = pushes("palpation", box, 600, 0).point
     split = hold_out_discs(points, patch)
     distance = np.linalg.norm(points[:, None] - split.centres, axis=2)
-    assert split.radius == 6e-3 and len(split.centres) >= 6 and split.share >= 0.15
+    assert split.radius == 6e-3 and len(split.centres) >= 6 and split.area_share >= 0.15
     assert np.array_equal(split.test_mask, distance.min(axis=1) <= 6e-3)  # none stays inside, none is taken outside
     assert set(split.disc_index[split.test_mask]) == set(range(len(split.centres)))
     assert 0.1 < split.test_mask.mean() <= 0.5
@@ -74,7 +74,7 @@ def test_disc_split_has_more_discs_on_wide_patch(box, patch):
     centres = hold_out_discs(points, patch).centres
     wide = type(patch)(patch.nodes, patch.triangles, 3.0 * patch.points)
     split = hold_out_discs(3.0 * points, wide)
-    assert split.share >= 0.15 and len(split.centres) > len(centres)
+    assert split.area_share >= 0.15 and len(split.centres) > len(centres)
 
 
 def test_disc_split_holds_out_single_positions(box, patch):

@@ -83,7 +83,7 @@ def test_distance_bound_has_nominal_coverage(model, fresh):
     assert 0.89 <= found.shares[0] <= 0.99 and found.shares[1] >= found.shares[0]
     # It follows the load: bounds of one size would be the 95th percentile for all.
     predicted = model.predict_distance(fresh[0])
-    error = np.abs(predicted.value - fresh[1])
+    error = np.abs(predicted.distance - fresh[1])
     assert np.median(predicted.bound[0]) < 0.7 * np.quantile(error, 0.95)
 
 
@@ -133,7 +133,9 @@ def test_held_out_distance_coverage_is_reported(trained, data, gauge):
 def test_correction_halves_the_distance_error(model, fresh):
     plain = replace(model, tip=None).predict_distance(fresh[0])
     assert np.isnan(plain.bound).all()
-    off, left = (np.abs(predicted.value - fresh[1]).mean() for predicted in (plain, model.predict_distance(fresh[0])))
+    off, left = (
+        np.abs(predicted.distance - fresh[1]).mean() for predicted in (plain, model.predict_distance(fresh[0]))
+    )
     assert left < 0.5 * off
 
 
@@ -141,7 +143,7 @@ def test_distance_bound_is_zero_at_rest_and_wide_when_strong(model, fresh):
     loads = fresh[0].select(slice(0, 20))
     idle = model.predict_distance(loads.scale(0.0))
     still = np.zeros((20, len(model.nodes), 3))
-    assert np.array_equal(idle.value, build_tip_gauge(model.anatomy).compute_distances(loads, still, model.nodes))
+    assert np.array_equal(idle.distance, build_tip_gauge(model.anatomy).compute_distances(loads, still, model.nodes))
     assert (idle.bound == 0.0).all()
     strong = model.predict_distance(loads.scale(2.5))
     assert (strong.bound[0] > 2.0 * model.predict_distance(loads).bound[0]).all() and (strong.value >= 0.0).all()
@@ -151,7 +153,7 @@ def test_given_deformation_predicts_the_same_distance(model, fresh):
     loads = fresh[0].select(slice(0, 3))
     answer = model.deform(loads, at=build_tip_gauge(model.anatomy).nodes)
     given, asked = model.predict_distance(loads, answer), model.predict_distance(loads)
-    assert given.value == pytest.approx(asked.value, abs=1e-9) and np.array_equal(given.bound, asked.bound)
+    assert given.distance == pytest.approx(asked.distance, abs=1e-9) and np.array_equal(given.bound, asked.bound)
 
 
 def test_model_file_stores_the_distance_correction(model, fresh, tmp_path):
@@ -162,7 +164,7 @@ def test_model_file_stores_the_distance_correction(model, fresh, tmp_path):
     models = load(tmp_path / "m.npz", model.anatomy)
     for found, expected in ((models["whole"], model), (models["bare"], bare)):
         one, other = found.predict_distance(fresh[0]), expected.predict_distance(fresh[0])
-        assert np.array_equal(one.distance, other.value) and np.array_equal(one.bound, other.bound, equal_nan=True)
+        assert np.array_equal(one.distance, other.distance) and np.array_equal(one.bound, other.bound, equal_nan=True)
     assert models["bare"].tip is None and models["none"].tip == TipModel()
 
 
@@ -185,17 +187,17 @@ def test_frame_distance_uses_the_error_bound_of_its_model(model, pretender, gaug
     predicted = model.predict_distance(loads)
     apart = gauge.compute_distances(loads, answer.displacement, answer.nodes)[0]
     assert predict_tip_distance(model, loads, answer, tool, apart) == TipDistance(
-        predicted.value[0], predicted.bound[0, 0]
+        predicted.distance[0], predicted.bound[0, 0]
     )
     assert predict_tip_distance(pretender, loads, truth, tool, fresh[1][2]) == TipDistance(fresh[1][2], None)
     high = gauge.compute_distances(loads, truth.displacement, truth.nodes, lift=2e-3)[0]
     assert drawn_distance(model.anatomy, loads, truth, tool, 2e-3).distance == high > fresh[1][2] + 1e-3
     assert predict_tip_distance(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(
-        predicted.value[0] + 2e-3
+        predicted.distance[0] + 2e-3
     )
     plain = replace(model, tip=None).predict_distance(loads).value[0]
     outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
-    assert predict_tip_distance(model, loads, outside, tool, apart) == TipDistance(predicted.value[0], None)
+    assert predict_tip_distance(model, loads, outside, tool, apart) == TipDistance(predicted.distance[0], None)
     assert predict_tip_distance(replace(model, tip=None), loads, answer, tool, apart) == TipDistance(plain, None)
     assert (
         predict_tip_distance(model, loads, answer, Blade(), apart) is None

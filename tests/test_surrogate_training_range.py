@@ -40,5 +40,5 @@ def test_envelope_reach_is_spacing_of_training_loads(box):
 def test_envelope_measures_distance_outside_training_range(force, angle, overhang, radius, away, beyond, excess):
     envelope = TrainingRange(np.zeros((1, 3)), 1e-3, 2e-3, 0.5, (0.1, 0.3), (4e-3, 8e-3), 50.0)
     pushed = Pushed(np.array([[away, 0.0, 0.0]]), np.array([[0.0, 0.0, force]]), np.array([radius]))
-    found = envelope.locate_outside(pushed, LoadMeasures(*(np.array([each]) for each in (force, angle, overhang))))
+    found = envelope.compute_excess(pushed, LoadMeasures(*(np.array([each]) for each in (force, angle, overhang))))
     assert np.concatenate(found) == pytest.approx([away, beyond, excess], abs=1e-2)

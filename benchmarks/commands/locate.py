@@ -98,7 +98,11 @@ def run(args: argparse.Namespace) -> int:
     table = sys.stderr if args.json else sys.stdout
     where = f"{describe_machine(args.device)}; truths of {len(finer.mesh.nodes)} nodes, {args.element}"
     print(f"{where}\n\n{len(some)} twins\n\n| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}", file=table)
-    others = {"named": not args.clouds, "slip": 1e-3 * args.slip, "wrong": args.wrong_registration}
+    others = {
+        "has_correspondences": not args.clouds,
+        "slip": 1e-3 * args.slip,
+        "is_misregistered": args.wrong_registration,
+    }
     sights = build_point_models(args.points, args.cover, args.noise, **others)
     made = []
     with show_progress("observations") as heard:

@@ -247,7 +247,7 @@ def evaluate_locator(locator: Locator, motion: np.ndarray, observation: Observat
         return compare_motion(np.zeros_like(true), true, None, None, is_rejected=True)
     off = found.centroid - compute_centroid_motion(body, motion[None])[0]
     square = float(off @ np.linalg.solve(found.centroid_covariance, off))
-    doubts = {"doubted": found.slipped, "warned": found.is_registration_suspect}
+    doubts = {"has_slip": found.slipped, "has_warning": found.is_registration_suspect}
     return compare_motion(found.compute_motion(body.tumour_nodes), true, square, found.seconds, **doubts)
 
 

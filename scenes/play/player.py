@@ -278,11 +278,9 @@ class Player:
     def _measure_tip_gauge(self, held: PlacedTool, loads: Loads, answer: Deformation, tumour: Layer) -> DistanceGauge:
         """Measure from the tip to the tumour, with the error bound of the deformer, if known."""
         gauge = measure_tip_gauge(held.tip, tumour)
-        read = (
-            None
-            if held.bone_penetration > CARRIED_DEPTH
-            else predict_tip_distance(self.deformer, loads, answer, self.scene.tool, gauge.distance)
-        )
+        if held.bone_penetration > CARRIED_DEPTH:
+            return gauge
+        read = predict_tip_distance(self.deformer, loads, answer, self.scene.tool, gauge.distance)
         return gauge if read is None else replace(gauge, reading=read.distance, error=read.bound)
 
     def _get_model_error(self, answer: Deformation) -> float | None:
@@ -381,10 +379,8 @@ def _estimate_positions(positions: np.ndarray, estimate: TumourEstimate | None) 
 
 def list_estimate_traces(estimate: TumourEstimate, tumour: Layer) -> tuple[MarkOutline, ...]:
     """Build the traces of an estimate: its ellipsoid, and the true tumour surface with its centroid."""
-    ellipsoid, true = (
-        estimate.build_ellipsoid(),
-        MarkOutline(tumour, TRUE_STROKES, estimate.centroid + estimate.true_motion),
-    )
+    ellipsoid = estimate.build_ellipsoid()
+    true = MarkOutline(tumour, TRUE_STROKES, estimate.centroid + estimate.true_motion)
     if ellipsoid is None:
         return (true,)
     return MarkOutline(ellipsoid, ELLIPSOID_STROKES, estimate.centroid + estimate.motion), true

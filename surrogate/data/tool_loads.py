@@ -110,7 +110,7 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
 
 def sample_pushes(tool: ToolLoadRange, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample positions of a tool, and its unit directions, (count, 3) each: as `draw`, for any force."""
-    free = replace(tool, pressure=(0.0, np.inf), depth=np.inf)
+    free = replace(tool, pressure_range=(0.0, np.inf), max_depth=np.inf)
     rows = _sample_in_blocks([free], patch, count, seed)
     return rows[:, :3], rows[:, 3:6] / np.linalg.norm(rows[:, 3:6], axis=1, keepdims=True)
 

@@ -82,7 +82,7 @@ def draw_poses(
         room, deepest, cone = tool.radius, settings.max_rod_depth * tool.radius, TOOLS[preset].max_angle
     else:
         room, deepest, cone = compute_extent(tool), settings.max_blade_depth * tool.width, settings.max_blade_tilt
-    kind = replace(TOOLS[preset], name=type(tool).__name__, footprint=(room, room), cone=cone)
+    kind = replace(TOOLS[preset], name=type(tool).__name__, radius_range=(room, room), max_angle=cone)
     point, direction = sample_pushes(kind, patch, count, seed)
     share = source.random((count, 2))
     shallowest = settings.min_depth_ratio * get_core(tool).radius
