@@ -160,21 +160,21 @@ def test_only_the_first_visitor_controls_the_page(page, heard):
     assert wait_for(lambda: set(page.crowd.rows) == {0, 1} and page.crowd.rows[1].request_button.visible)
     leads, looks = (page.crowd.rows[number] for number in (0, 1))
     assert "You have control" in leads.line.content and "Visitor 1 has control" in looks.line.content
-    assert "number 2" in looks.line.content and not leads.dim.content and "opacity" in looks.dim.content
+    assert "number 2" in looks.line.content and not leads.dim_style.content and "opacity" in looks.dim_style.content
     second.set(page.inputs["force [N]"], 0.4)
     second.set(page.button, True)
     second.hit(page.controls.commands[0])
     assert wait_for(lambda: second.updates and page.inputs["force [N]"].value == 0.2)
     first.set(page.frame, 12)
     assert wait_for(lambda: heard["frame"] == [12]) and heard["force"] == [] and heard["play"] == []
-    second.set(looks.ask, True)
+    second.set(looks.request_button, True)
     page.show_line(lambda visitor: "")
-    assert wait_for(lambda: page.crowd.lead.asking == (2,))
+    assert wait_for(lambda: page.crowd.lead.queue == (2,))
     page.show_line(lambda visitor: "")
-    assert wait_for(lambda: leads.give.visible and "Visitor 2 requests control" in leads.line.content)
-    assert not looks.ask.visible
-    first.set(leads.give, True)
-    assert wait_for(lambda: page.crowd.lead.leader == 2)
+    assert wait_for(lambda: leads.release_button.visible and "Visitor 2 requests control" in leads.line.content)
+    assert not looks.request_button.visible
+    first.set(leads.release_button, True)
+    assert wait_for(lambda: page.crowd.lead.holder == 2)
     first.set(page.frame, 13)
     second.set(page.frame, 14)
     assert wait_for(lambda: heard["frame"] == [12, 14])

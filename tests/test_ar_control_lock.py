@@ -12,8 +12,8 @@ class TestLead:
             lead.request_control(visitor, 2.0)
         assert (
             lead.holder == 2
-            and "Visitor 4 asks" in lead.describe_control(2, {2, 3, 4})
-            and "asked" in lead.describe_control(3, {2, 3, 4})
+            and "Visitor 4 requests" in lead.describe_control(2, {2, 3, 4})
+            and "requested" in lead.describe_control(3, {2, 3, 4})
         )
         lead.update_clients({3, 4}, 3.0)
         assert lead.holder == 4 and lead.queue == (3,)

@@ -123,7 +123,7 @@ def test_adjacent_faces_on_paper_are_adjacent_on_the_cube(pages):
     assert len(shared) == 5  # two folds, whose ends meet in one place of the paper three times
     for one, other in shared:
         np.testing.assert_allclose(one, other, atol=1e-9)
-    names = {to_face_name(each.face): each for each in pages[0].placed}
+    names = {to_face_name(each.face): each for each in pages[0].faces}
     assert (names["+z"].left, names["+z"].top + 48.0) == (names["+x"].left, names["+x"].top)
     assert (names["+y"].left - 48.0, names["+y"].top) == (names["+x"].left, names["+x"].top)
 

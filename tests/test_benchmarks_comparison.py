@@ -25,24 +25,24 @@ from benchmarks.peers.engine_sulcus import build_fem
 from sim.bodies.meshfile import write_anatomy
 
 WRONG = """
-from benchmarks.peers.engine_sulcus import set_up
-from benchmarks.peers.engine_process import serve
+from benchmarks.peers.engine_sulcus import set_up_solver
+from benchmarks.peers.engine_process import serve_loads
 
 def spoilt(case):
-    solve = set_up(case)
+    solve = set_up_solver(case)
     return lambda force: 1.00001 * solve(force)
 
-serve(spoilt)
+serve_loads(spoilt)
 """
-FAILING = "from benchmarks.peers.engine_process import serve; serve(lambda case: lambda force: 1 / 0)"
+FAILING = "from benchmarks.peers.engine_process import serve_loads; serve_loads(lambda case: lambda force: 1 / 0)"
 EXPLICIT = f"""
 import sys
 from dataclasses import replace
 sys.path.insert(0, {str(HOUSE / "benchmarks" / "peers")!r})
 import peer_tled
-from peer_tled import serve, set_up
+from peer_tled import serve_loads, set_up_solver
 """
-DYING = "import os; from benchmarks.peers.engine_process import serve; serve(lambda case: lambda force: os._exit(3))"
+DYING = FAILING.replace("1 / 0", "os._exit(3)").replace("from", "import os; from", 1)
 
 
 @pytest.fixture(scope="module")
@@ -172,9 +172,11 @@ def test_tled_on_gpu_finds_the_same_displacement(case, judge):
 
 
 def test_tled_with_other_law_or_few_steps_is_detected(case, judge, tmp_path):
-    other = engine(tmp_path, "other", EXPLICIT + "serve(lambda case: set_up(replace(case, lam=1.001 * case.lam)))")
-    hasty = engine(tmp_path, "hasty", EXPLICIT + "peer_tled.STEPS = 50; serve(set_up)")
-    bold = engine(tmp_path, "bold", EXPLICIT + "peer_tled.SAFETY = 1.9; serve(set_up)")
+    other = engine(
+        tmp_path, "other", EXPLICIT + "serve_loads(lambda case: set_up_solver(replace(case, lam=1.001 * case.lam)))"
+    )
+    hasty = engine(tmp_path, "hasty", EXPLICIT + "peer_tled.STEPS = 50; serve_loads(set_up_solver)")
+    bold = engine(tmp_path, "bold", EXPLICIT + "peer_tled.SAFETY = 1.9; serve_loads(set_up_solver)")
     _, other, hasty, bold = compared(case, judge, OWN, other, hasty, bold)
     assert all(answer.reason == "" and TOLERANCE < answer.residual < 1e-1 for answer in other.answers)
     assert all("not reached in 50 steps" in answer.reason for answer in hasty.answers)

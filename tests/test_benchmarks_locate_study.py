@@ -186,10 +186,10 @@ def test_squared_error_uses_the_centroid_covariance(locator, body):
     seen = sample_observation(body, motion, PointModel(60, 60, 1), (0, 0))
     found, answer = evaluate_locator(locator, motion, seen), locator.locate(seen)
     off = answer.centroid - compute_centroid_motion(body, motion[None])[0]
-    assert found.square == pytest.approx(off @ np.linalg.inv(answer.centroid_covariance) @ off)
+    assert found.mahalanobis_square == pytest.approx(off @ np.linalg.inv(answer.centroid_covariance) @ off)
     wild = replace(seen, now=seen.rest + 0.01 * np.random.default_rng(0).standard_normal(seen.rest.shape))
     refused = evaluate_locator(locator, motion, wild)
-    assert refused.refused and refused.square is None and np.array_equal(refused.error, refused.motion)
+    assert refused.is_rejected and refused.mahalanobis_square is None and np.array_equal(refused.error, refused.motion)
 
 
 def test_observations_use_same_points_at_any_noise(locator, body):
@@ -225,7 +225,7 @@ def test_every_twin_is_observed_at_its_own_points(locator, body):
     found = list(measure_baselines(some, build_point_models([30], [50], [0, 1]), spy, locator))
     assert [(each.noise, each.estimator) for each in found[::3]] == [(0, "spy"), (1, "spy")] and len(found) == 6
     assert np.array_equal(given[0], given[2]) and not np.array_equal(given[0], given[1])
-    clouds = list(measure_baselines(some, build_point_models([30], [50], [0], named=False), spy, locator))
+    clouds = list(measure_baselines(some, build_point_models([30], [50], [0], has_correspondences=False), spy, locator))
     assert [each.estimator for each in clouds] == [OURS, ORACLE] and len(given) == 4
     seen = [sample_observation(body, some[0].motion, PointModel(30, 50, 0, named), (0, 0)) for named in (True, False)]
     assert seen[1].rest is None and np.array_equal(seen[0].now, seen[1].now)
@@ -329,7 +329,7 @@ def test_twins_are_stored_and_read_at_body_vertices(body, tmp_path, monkeypatch)
     found = list(solve_cases(body, finer, 3, seed=7, folder=tmp_path, progress=lambda *each: heard.append(each)))
     assert made == [0, 1, 2, 2] and heard == [(1, 3), (2, 3), (3, 3)] and found[1] is None
     for twin in (found[0], found[2]):
-        assert twin.motion == pytest.approx(0.1 * twin.draw.stiffness * body.mesh.nodes, abs=1e-9)
+        assert twin.motion == pytest.approx(0.1 * twin.parameters.stiffness * body.mesh.nodes, abs=1e-9)
     list(solve_cases(body, finer, 1, seed=8, folder=tmp_path))  # another draw, element or mesh is another twin
     list(solve_cases(body, finer, 1, seed=7, element="p1", folder=tmp_path))
     list(solve_cases(body, body, 1, seed=7, folder=tmp_path))

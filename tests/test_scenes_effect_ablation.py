@@ -111,7 +111,7 @@ def test_effect_change_is_difference_between_solutions(small_theatre):
 
 def test_ablation_rejects_scene_with_unsolved_frame(theatre):
     scene = replace(short(), accuracy=replace(short().accuracy, outer=1, inner=1, steps=0))
-    with pytest.raises(InputError, match=r"the frame at 0\.\d+ s is not solved: stopped"):
+    with pytest.raises(InputError, match=r"the frame at 0\.\d+ s is not solved: not converged"):
         solve_frames(theatre, scene, 1)
 
 

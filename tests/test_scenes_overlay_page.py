@@ -88,7 +88,7 @@ def test_style_change_redraws_a_paused_image(page):
     assert wait_for(lambda: page.browser.shown[1] is not before and page.browser.shown[0] == 6)
     assert not np.array_equal(page.browser.shown[1], before)
     other = Visitor(page.browser, 1200)
-    assert wait_for(lambda: "(number 1) leads" in str(other.updates))
+    assert wait_for(lambda: "Visitor 1 has control" in str(other.updates))
     other.set(page.browser.inputs["overlay"], "outline")
     time.sleep(0.3)
     assert page.style == "none"

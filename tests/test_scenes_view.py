@@ -38,7 +38,7 @@ def test_comparison_of_previous_load_is_greyed_until_new_one(demo, monkeypatch):
     tints = []
     monkeypatch.setattr(demo.browser, "tint", lambda name, colour: tints.append(colour))
     asked = []
-    monkeypatch.setattr(demo.fem_worker, "ask", lambda number, touch: asked.append((number, touch)))
+    monkeypatch.setattr(demo.fem_worker, "request_frame", lambda *request: asked.append(request[:2]))
     demo.wish.take_over(x=0.004, force=0.25)
     demo.run(0.5)
     assert wait_for(lambda: "force 0.25 N" in report(demo))
@@ -66,5 +66,5 @@ def test_page_3d_view_has_craniotomy_scan_and_slice_planes(theatre):
     for intensity, count in ((stage.intensity, 3), (None, 0)):  # a texture of vessels is no scan
         drawn = replace(stage.scene, look=replace(stage.scene.look, vessels=3))
         found = build_static_bodies(replace(stage, scene=drawn, intensity=intensity))[-3:]
-        same = [np.array_equal(a.image, b.image) for a, b in zip(found, planes, strict=True) if hasattr(a, "colour")]
+        same = [np.array_equal(a.image, b.image) for a, b in zip(found, planes, strict=True) if hasattr(a, "image")]
         assert same == [True] * count

@@ -20,11 +20,11 @@ COUNT, KILLS = 80, 50
 CLIENT = """
 import sys
 from pathlib import Path
-from scenes.episodes.workers import start_own_workers
+from scenes.episodes.workers import start_local_workers
 from tiny_work import Trouble, played
 
 if __name__ == "__main__":
-    with start_own_workers(["cpu"] * 3, {"distributed.scheduler.allowed-failures": 1000}, 1000) as workers:
+    with start_local_workers(["cpu"] * 3, {"distributed.scheduler.allowed-failures": 1000}, 1000) as workers:
         played(Path(sys.argv[1]), workers, int(sys.argv[2]), Trouble(seconds=0.2))
 """
 

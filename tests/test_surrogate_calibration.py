@@ -42,10 +42,10 @@ def test_sampled_patch_points_lie_on_the_open_cortex(body, evidence):
     assert np.ptp(places[:, 2]) == pytest.approx(0.0, abs=1e-12) and places[0, 2] == pytest.approx(on[:, 2].max())
     whole = sample_observed_patch(body, np.zeros_like(body.mesh.nodes), np.random.default_rng(0), 400, 1.0).positions
     assert np.ptp(places[:, :2], axis=0).max() < 0.95 * np.ptp(whole[:, :2], axis=0).max()
-    triangles = np.unique(np.sort(evidence.place.vertices[:, :3], axis=1), axis=0)
+    triangles = np.unique(np.sort(evidence.location.vertices[:, :3], axis=1), axis=0)
     share = len(triangles) / len(body.open_surface)  # all of one size
     assert 0.3 < share <= 0.5
-    moved = np.einsum("mc,mci->mi", evidence.place.weights, body.mesh.nodes[evidence.place.vertices])
+    moved = np.einsum("mc,mci->mi", evidence.location.weights, body.mesh.nodes[evidence.location.vertices])
     assert moved == pytest.approx(evidence.positions)
 
 

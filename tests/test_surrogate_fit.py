@@ -35,7 +35,7 @@ def drained(body, parts):
 def build_tool_frame(body, motion, seed=0):
     """What is seen of a motion (V, 3) [m] without error, on most of the open cortex."""
     evidence = sample_observed_patch(body, motion, np.random.default_rng(seed), 60, 0.9)
-    rest, moved = evidence.positions[::3], evidence.value.reshape(-1, 3)
+    rest, moved = evidence.positions[::3], evidence.motion.reshape(-1, 3)
     return ObservedFrame(Observation(rest + moved, rest, np.full(len(rest), 5e-5), rigid=0.0))
 
 

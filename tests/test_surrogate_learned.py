@@ -131,7 +131,7 @@ def test_model_parameters_ignore_calibration_displacements(trained, data, tmp_pa
 
 def test_final_model_is_trained_on_held_out_discs(trained, scored, data):
     held_out = data.loads.select(np.flatnonzero(data.good)[trained.split.test_mask])
-    truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test]
+    truth = data.read_displacement(data.anatomy.tumour_nodes)[data.good][trained.split.test_mask]
     for name in ("ann", "svr", "gp", "residual"):
         both = (trained.models[name], scored.models[name])
         used, judged = (compute_point_errors(model, held_out, truth, data.anatomy.tumour_nodes) for model in both)

@@ -73,14 +73,14 @@ def test_relaxed_share_equals_the_hereditary_integral():
         coming = min(t, 1.0)
         left = sum(g * tau / coming * (np.exp(-(t - coming) / tau) - np.exp(-t / tau)) for g, tau in SERIES)
         assert found[frame].relaxed_share[0] == pytest.approx(0.7 - left, abs=2e-4)
-        assert not found[frame].strange[0]
+        assert not found[frame].outside_training[0]
 
 
 def test_histories_outside_training_are_marked():
     """A held tool that retracts, or one that slides far; a first contact is not marked."""
     back = played([4e-3, 4e-3, 3e-3, 0.0], [0.5, 6.0, 6.1, 6.2])
     assert [bool(each.outside_training[0]) for each in back] == [False, False, True, True]
-    assert back[3].share[0] == 0.0
+    assert back[3].relaxed_share[0] == 0.0
     slid = played([4e-3] * 3, [0.5, 1.0, 1.5], [0.0, 2e-3, 4e-3])
     assert [bool(each.outside_training[0]) for each in slid] == [False, False, True]
 

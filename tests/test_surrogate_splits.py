@@ -56,7 +56,7 @@ def test_training_uses_only_loads_of_its_split(box, pretender, tmp_path):
     trained = train(data, ["linear"], split=fewer)
     points = data.loads.get(Pushed).point
     assert np.allclose(trained.models["linear"].envelope.points, points[order[:50]])
-    assert trained.split is fewer and fewer.training_mask.sum() == 50 and fewer.test.sum() == split.test_mask.sum()
+    assert trained.split is fewer and fewer.training_mask.sum() == 50 and fewer.test_mask.sum() == split.test_mask.sum()
 
 
 def test_disc_split_holds_out_whole_discs(box, patch):

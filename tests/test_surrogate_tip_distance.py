@@ -146,7 +146,7 @@ def test_distance_bound_is_zero_at_rest_and_wide_when_strong(model, fresh):
     assert np.array_equal(idle.distance, build_tip_gauge(model.anatomy).compute_distances(loads, still, model.nodes))
     assert (idle.bound == 0.0).all()
     strong = model.predict_distance(loads.scale(2.5))
-    assert (strong.bound[0] > 2.0 * model.predict_distance(loads).bound[0]).all() and (strong.value >= 0.0).all()
+    assert (strong.bound[0] > 2.0 * model.predict_distance(loads).bound[0]).all() and (strong.distance >= 0.0).all()
 
 
 def test_given_deformation_predicts_the_same_distance(model, fresh):
@@ -195,7 +195,7 @@ def test_frame_distance_uses_the_error_bound_of_its_model(model, pretender, gaug
     assert predict_tip_distance(model, loads, answer, tool, apart + 2e-3).distance == pytest.approx(
         predicted.distance[0] + 2e-3
     )
-    plain = replace(model, tip=None).predict_distance(loads).value[0]
+    plain = replace(model, tip=None).predict_distance(loads).distance[0]
     outside = replace(answer, outcome=(Outcome.EXTRAPOLATED,))
     assert predict_tip_distance(model, loads, outside, tool, apart) == TipDistance(predicted.distance[0], None)
     assert predict_tip_distance(replace(model, tip=None), loads, answer, tool, apart) == TipDistance(plain, None)

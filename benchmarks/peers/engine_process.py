@@ -49,7 +49,7 @@ class Case:
 
 
 def write_case(folder: Path, case: Case) -> None:
-    """Write a case to the folder from which `serve` reads it."""
+    """Write a case to the folder from which `serve_loads` reads it."""
     np.savez(folder / "case.npz", **asdict(case))
 
 

@@ -109,7 +109,7 @@ class InertiaTerm:
         Nodal masses (N,) [kg].
     damping
         Mass-proportional damping [1/s].
-    marks
+    keys
         Unique key (N, k) of each node, unchanged by cuts.
     device
         Device of the arrays.
@@ -119,9 +119,9 @@ class InertiaTerm:
     constant, passive, steep = False, False, False
     width = 3
 
-    def __init__(self, mass: np.ndarray, damping: float, marks: np.ndarray, device: Device):
+    def __init__(self, mass: np.ndarray, damping: float, keys: np.ndarray, device: Device):
         self._device, self._kernels = device, build_kernels(device)
-        self._damping, self._masses, self.marks = damping, mass, marks
+        self._damping, self._masses, self.keys = damping, mass, keys
         self._mass = device.upload(mass)
         self._weight = Workspaces(lambda columns: device.allocate(columns), device)
         self._aim = Workspaces(lambda columns: device.allocate(3 * len(mass), columns), device)
