@@ -82,7 +82,7 @@ def get_poses(loads: Loads, tool: BuiltIn) -> np.ndarray:
 def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     """Convert one tool's poses to pushes: nearest point (B, 3) [m], normal depth as force [m], radius.
 
-    The foot is the centre of a ball, of a rod's lower end, or of a blade. A tool without contact has depth zero.
+    The point is nearest to the foot: the centre of a ball, or of a rod's or blade's lower end. Depth 0: no contact.
 
     Raises
     ------

@@ -57,7 +57,7 @@ def add_distance_correction(model: Learned, patch: Patch, reference: ReferenceDi
 def improve_distances(
     model: Learned, patch: Patch, training: ReferenceDistances, held_out: ReferenceDistances
 ) -> tuple[Learned, np.ndarray]:
-    """Add a correction if it reduces the mean error of held-out distances; return the model and errors (B,) [m]."""
+    """Add a distance correction if it reduces the mean held-out error; return the model and those errors (B,) [m]."""
     candidates = [replace(model, tip=TipModel()), add_distance_correction(model, patch, training)]
     error = [compute_distance_errors(each, held_out) for each in candidates]
     best = int(error[1].mean() < error[0].mean())
@@ -163,7 +163,7 @@ def measure_bound_coverage(bound: np.ndarray, examples: BoundExamples) -> Covera
 def _compute_relative_errors(
     near: BoundExamples, far: BoundExamples, way: BoundSettings
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Compute errors over a bound without growth, and distances [m] from training loads: calibration loads, `far`."""
+    """Return errors over a bound without growth, and distances [m] from training loads, for `near` and `far`."""
     plain = calibrate_bound(near, way, 0.0)
     return [
         (each.error / plain.evaluate(each.features, each.force, each.excess.zero)[0], each.excess.distance)

@@ -81,9 +81,9 @@ class Expansion:
     table_path
         File of the series' table, read if it exists, else written; the caller ensures that it belongs to this data set.
     max_pairs
-        Maximum number of pairs of force components for the second order: this many take minutes, and 60 MB of a model.
+        Maximum number of pairs of force components in the second order; 150,000 take minutes, and 60 MB in a file.
     batch
-        Maximum number of load cases solved together; None: as many as fit now, on a GPU that no other process uses.
+        Maximum number of load cases solved together; None: as many as fit on a GPU that no other process uses.
     journal_path
         Journal of finished table rows, so that an interrupted run resumes; the caller deletes this file.
     settings
@@ -164,7 +164,7 @@ class Expansion:
         ]
 
     def build_series(self, bases: list[Basis], held_out: np.ndarray) -> list[Series]:
-        """Return the series beyond the exact parts, as coefficients of the examples' `bases`, without some places (P,).
+        """Return the series beyond the exact parts, in `bases`; rows of `held_out` (P,) positions are interpolated.
 
         Raises
         ------
@@ -343,7 +343,7 @@ class SeriesTable:
     table
         Coefficients (P, R, 19, r) float32 of the modes of all bases, one basis after the other.
     pairs, second_order, pair_basis
-        Pairs of nodal forces (P, 2), and the tumour's second order of each (P, r) float32 in a basis.
+        Pairs of force components (P, 2), the tumour's second order for each (P, r) float32, and its basis.
     seconds
         Computing time [s]; NaN if an interrupted run was resumed.
     """

@@ -74,7 +74,7 @@ MAX_RADIUS_RATIO = 1.5  # Maximum ratio of neighbouring tabulated radii.
 
 
 def choose_radii(min_radius: float, max_radius: float) -> np.ndarray:
-    """Compute radii [m] at which to tabulate footprints from `min_radius` to `max_radius`: one, or at least three."""
+    """Compute footprint radii [m] to tabulate, geometric from `min_radius` to `max_radius`: one, or at least three."""
     if max_radius <= min_radius * (1.0 + 1e-9):
         return np.array([min_radius])
     steps = int(np.ceil(np.log(max_radius / min_radius) / np.log(MAX_RADIUS_RATIO)))
@@ -123,7 +123,7 @@ def find_disc_nodes(patch: Patch, radius: float) -> np.ndarray:
 
 
 def add_edge_midpoints(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
-    """Build triangles (S, 6) with the midpoint of the edge opposite each corner, and their places (P, 3) [m]."""
+    """Build triangles (S, 6): corners, then midpoints of the opposite edges; return them and positions (P, 3) [m]."""
     edges = np.sort(patch.triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
     ends, middle = np.unique(edges, axis=0, return_inverse=True)
     triangles = np.column_stack([patch.triangles, len(patch.points) + middle.reshape(-1, 3)])

@@ -252,7 +252,7 @@ def _fit_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: Mode
 
 
 def _add_bounds(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:
-    """Add bounds, calibrated on errors `near` training loads, to a model; they grow by `growth` [1/m] towards `far`."""
+    """Return the model with bounds calibrated on errors `near` training loads; each grows by its `growth` [1/m]."""
     seen = far.list_available()
     bounds = {
         way: calibrate_bound(here, BOUND_FITS[way], growth[way], seen[way])
