@@ -145,8 +145,8 @@ def fit_tissue(
 ) -> FittedTissue:  # fmt: skip
     """Estimate the tissue of a locator's anatomy from observed frames.
 
-    Points that no others support are removed: `left_out`, or by `find_unsupported_points`. Those in `folder` are read.
-    `progress` receives a stage, the number of its parts done, and their total.
+    Outliers are removed: the points in `left_out` (one array per frame), or those of `find_unsupported_points`. FEM
+    responses stored in `folder` are reused. `progress` receives a stage, the number of its parts done, and their total.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Likelihood of one frame in each tissue: Gaussian in the unknown sizes of the tissue's own motions, and in errors."""
+"""Likelihood of a frame for each candidate tissue: Gaussian in the sizes of its motions and in the errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

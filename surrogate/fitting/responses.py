@@ -45,7 +45,7 @@ class Responses:
     nodes
         Sorted mesh vertices (n,).
     motion
-        Displacements by skull (poissons, ratios, loads, n, 3) [m], with the tissue stiffness of `locating.causes`.
+        Displacements (poissons, ratios, loads, n, 3) [m] by skull model, for the brain's stiffness `causes.YOUNG`.
     regions
         Regions of known stiffness that were included.
     """
@@ -70,7 +70,7 @@ def build_drainage_loads(anatomy: Anatomy) -> Loads:
 def build_force_loads(
     anatomy: Anatomy, point: np.ndarray, radius: np.ndarray, force: np.ndarray | None = None
 ) -> Loads:
-    """Build forces (n, 3) [N] on discs round points (k, 3) with radii (k,) [m]; None: along each axis of each point."""
+    """Build forces (n, 3) [N] on discs of radii (k,) [m] round points (k, 3); None: one along each axis, per point."""
     some = TOOL_FORCE * np.tile(np.eye(3), (len(point), 1)) if force is None else force
     each, count = len(some) // len(point), len(some)
     pushed = Pushed(np.repeat(point, each, axis=0), some, np.repeat(radius, each))

@@ -35,7 +35,7 @@ class FittedTissue:
     frames
         Number of observed frames.
     probability
-        Probability (skulls, poissons, ratios), with sum 1, of `sim.effects.SKULLS`, `FINE_POISSONS` and `FINE_RATIOS`.
+        Joint probability (skulls, poissons, ratios) of `sim.effects.SKULLS`, `FINE_POISSONS` and `FINE_RATIOS`.
     young
         Equally probable samples (k,) of the brain's Young's modulus [Pa]; empty if no force was measured.
     """
@@ -94,7 +94,7 @@ class FittedTissue:
     def sample(
         self, count: int, seed: int = 0, skulls: tuple[str, ...] = tuple(SKULLS)
     ) -> tuple[list[str], np.ndarray, np.ndarray]:
-        """Sample `count` triples of skull, Poisson's ratio and stiffness ratio, restricted to some skulls."""
+        """Sample `count` triples of skull, Poisson's ratio and stiffness ratio; `skulls` are the allowed skulls."""
         random = np.random.default_rng([seed, 2])
         allowed = np.array([name in skulls for name in SKULLS])
         share = (self.probability * allowed[:, None, None]).ravel()

@@ -78,7 +78,7 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> GraphBuilder
         if np.isin(part.basis.nodes, nodes).any() and type(part.regressor) not in TRACEABLE:
             kind = type(part.regressor).__name__
             raise InputError(f"{name} has a part of the kind {kind}, which has no ONNX graph: export another learner.")
-    # Any two loads of the training range give the formulas the types and shapes of their arrays.
+    # Two arbitrary loads in the training range determine the types and shapes of all arrays.
     down = np.array([0.0, 0.0, -envelope.force[1]])
     pushed = Pushed(
         sheet.add_input(

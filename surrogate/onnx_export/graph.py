@@ -42,7 +42,7 @@ OPERATORS = {
 
 
 class Tensor(NDArrayOperatorsMixin):
-    """Named array of a graph, whose first axis is the batch. Operators and functions of NumPy write to its sheet.
+    """Symbolic array of a graph, with the batch as first axis. NumPy operators and functions add nodes to the graph.
 
     Parameters
     ----------

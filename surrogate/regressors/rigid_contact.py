@@ -52,7 +52,7 @@ class ContactSearchSettings:
     # Number of iterations after which constraints without force are kept, to prevent cycles. Until then they are
     # dropped, which is faster.
     dropping_iterations: int = 15
-    # Compliance of a point relative to the nodes' mean, below which it counts as bone, which the tool enters: no force,
+    # Compliance of a point, relative to the nodes' mean, below which it is bone. A tool may enter bone, as no force,
     # or an unbounded one, would prevent that.
     min_compliance: float = 0.02
     max_exchanges: int = 10  # Maximum number of exchanges of the active set.
@@ -87,7 +87,7 @@ class RigidContact:
     answers
         Coefficients (3 k, r) [1/N] float32 of the basis's modes for unit forces on the nodes.
     line
-        (2, r): value at depth 0, and slope per radius of depth. (4, r): then the change of both at full relaxation.
+        Factor (2, r): value at depth 0, and slope per depth / radius; (4, r): then the change of both on relaxation.
     grip
         Factor (2,) or (4,) on the tool's force, as `line`; (0,) if not fitted.
     core
