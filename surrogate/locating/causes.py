@@ -42,7 +42,7 @@ class Causes:
     exponent
         Smallest and largest -m of Ogden's law, log-uniform: 4.7 of Miller, Chinzei 2002; 19 of `sim.MATERIALS`.
     tools
-        Tool members in one group; second value for a skull that separates, whose loads are solved one by one.
+        Number of tool loads in a group; the second number is for a separating skull, which is solved load by load.
     drainages
         Number of gravity directions in a group.
     levels

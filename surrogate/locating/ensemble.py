@@ -150,7 +150,7 @@ def solve_members(
 def _solve_swelling(
     anatomy: Anatomy, group: Group, shares: tuple[float, ...], regions: tuple[int, ...], device: str, fem: Fem
 ) -> Deformation:
-    """Solve relative volume changes `shares` of some regions; the preconditioner's stiffness is that of `fem`."""
+    """Solve relative volume changes `shares` of some regions; the factorised stiffness of `fem` is used again."""
     swells = Fem(anatomy, group.build_effects(shares, regions), ACCURACY, device, stiff_as=fem)
     return swells.deform(build_swellings(anatomy, shares))
 

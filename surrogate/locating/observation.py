@@ -274,7 +274,7 @@ def _check_spread(where: np.ndarray, near: np.ndarray) -> None:
 
 
 def _compute_surface_distances(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
-    """Compute distances (n,) [m] from the open cortex; up to `LIMITS.near_distance`, from the nearest vertex."""
+    """Compute distances (n,) [m] from the open cortex; below `LIMITS.near_distance`, from the nearest vertex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     away = np.sqrt(compute_squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
     far = np.flatnonzero(away > LIMITS.near_distance)

@@ -330,7 +330,7 @@ def condition_prior(
 
 
 def _compute_distances(rows: WhitenedSystem, result: HypothesisResult, point: np.ndarray) -> np.ndarray:
-    """Compute square Mahalanobis distances (n,) of points from their leave-one-out predictions by one hypothesis."""
+    """Compute squared Mahalanobis distances (n,) of points from leave-one-out predictions under one hypothesis."""
     data = len(rows.products) - 1
     precise = rows.apply_precision(np.append(result.rows, data))
     known = precise[:, :-1] @ result.root.T
