@@ -1,7 +1,7 @@
 """Cameras: projection of world points into an image, stereo pairs, and rolling shutters.
 
-OpenCV's convention throughout: camera frame x right, y down, z forward; pixel (u, v) = (column, row) with whole numbers
-at pixel centres, so that the image spans -0.5 .. width - 0.5. World points are in metres (RAS in this project).
+OpenCV's convention: the camera frame has x right, y down, z forward; a pixel (u, v) = (column, row) has whole numbers
+at its centre, so the image spans -0.5 .. width - 0.5. World points are in metres (in this project RAS).
 
 A rolling shutter exposes the rows one after the other, so a moving camera has another pose for each row. The time of an
 image is that of its middle row; row times are relative to it.
@@ -83,7 +83,7 @@ class Camera:
 
     @property
     def vertical_fov(self) -> float:
-        """Angle between the upper and the lower border [rad]; exact without lens, if the principal point is centred."""
+        """Angle [rad] between upper and lower image border; exact without lens and with central principal point."""
         return float(2.0 * np.arctan(0.5 * self.height / self.K[1, 1]))
 
     def to_camera_frame(self, points: np.ndarray) -> np.ndarray:
@@ -126,7 +126,7 @@ class Camera:
     def perturb(self, degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Camera:
         """Return the camera with the world rotated by `degrees` about the camera's centre.
 
-        The rotation is right-handed about `axis` (camera frame): about y, the default, the scene moves to the right.
+        The rotation is right-handed about `axis` in the camera frame; about y (default), the scene moves to the right.
         """
         direction = np.asarray(axis, np.float64) / np.linalg.norm(axis)
         turn = np.eye(4)
@@ -156,7 +156,7 @@ class Camera:
     def refocus(self, focal_length: float, before: float, now: float) -> Camera:
         """Return the camera after a change of the focus distance, which changes the magnification.
 
-        A thin lens of focal length f forms the image of an object at d at the distance f d / (d - f) behind it.
+        A thin lens of focal length f forms the image of an object at distance d at f d / (d - f) behind the lens.
 
         Parameters
         ----------

@@ -87,7 +87,7 @@ class Lens:
         return np.stack(self._apply_distortion(x, y), axis=-1)
 
     def undistort(self, places: np.ndarray) -> np.ndarray:
-        """Invert `distort` at positions (..., 2) by Newton's method; NaN without a solution within `reach`."""
+        """Map distorted positions (..., 2) to undistorted ones by Newton's method; NaN if there are none in `reach`."""
         places = np.asarray(places, np.float64)
         wanted = places.reshape(-1, 2).T
         _, moved = self._along
@@ -160,7 +160,7 @@ class Lens:
 
 @lru_cache(maxsize=4)
 def undistort_pixels(lens: Lens, K: tuple[float, ...], width: int, height: int) -> np.ndarray:
-    """Undistort each pixel, (H, W, 2) [pixel]; NaN where nothing is seen. K (9,): row by row."""
+    """Compute each pixel's undistorted position (H, W, 2) [pixel]; NaN without one. K (9,) is in row-major order."""
     matrix = np.reshape(K, (3, 3))
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     places = lens.undistort(to_normalised(matrix, np.stack([columns, rows], axis=-1)))

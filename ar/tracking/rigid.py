@@ -17,7 +17,7 @@ def compute_rotation_angles(rotations: np.ndarray) -> np.ndarray:
 
 
 def move_rigidly(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Apply `step` (6,), a shift [m] and a rotation [rad] about T `centre` (3,) [m], to a rigid motion T (4, 4)."""
+    """Apply `step` (6,), shift [m] and rotation [rad] about the moved `centre` (3,) [m], to a motion T (4, 4)."""
     out = np.eye(4)
     out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
     out[:3, 3] = T[:3, :3] @ centre + T[:3, 3] + step[:3] - out[:3, :3] @ centre
