@@ -268,7 +268,7 @@ class Tracker:
     def _detect_corners(
         self, grey: np.ndarray, number: int, last: Mapping[str, tuple[np.ndarray, int]]
     ) -> dict[str, DetectedCorners]:
-        """Detect corners near the last poses, or in the whole image if just lost, and at intervals while lost."""
+        """Detect corners near the last poses; lost targets are searched in the whole image, then at intervals."""
         settings, found = self.settings, dict[str, DetectedCorners]()
         for target in self.targets:
             if target.name in last:

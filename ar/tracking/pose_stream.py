@@ -226,7 +226,7 @@ def _refine_offset(
 
 
 def _compute_differences(at: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Compute differences (n, 3) of positions from those of samples at times (n,), without their mean; NaN in gaps."""
+    """Compute differences (n, 3) of interpolated samples and `places` at times (n,), minus their mean; NaN in gaps."""
     there = np.column_stack([np.interp(at, samples, column) for column in others.T])
     after = np.searchsorted(samples, at).clip(1, len(samples) - 1)
     there[samples[after] - samples[after - 1] > MAX_GAP] = np.nan

@@ -248,7 +248,7 @@ def compute_jacobian(T: np.ndarray, points: np.ndarray, centre: np.ndarray) -> n
 
 
 def _widen_covariance(normal: np.ndarray, freedom: int) -> np.ndarray:
-    """Compute the covariance (6, 6) of a normal matrix, widened because its scatter is estimated from few numbers."""
+    """Invert a normal matrix to a covariance (6, 6), widened as its scatter has few degrees of freedom (`freedom`)."""
     inverse = 3.0 * f.ppf(LEVEL, 3, freedom) / chi2.ppf(LEVEL, 3) * np.linalg.inv(normal)
     return 0.5 * (inverse + inverse.T)
 

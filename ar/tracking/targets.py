@@ -35,7 +35,7 @@ class Face:
     first_marker
         Number of the face's first marker in the dictionary; the other numbers follow.
     T_target_face
-        (4, 4): the face's frame has its origin in the upper left corner, x to the right, y down, z into the target.
+        Pose (4, 4) [m] of the face; its frame has its origin in the upper left corner, x right, y down, z inwards.
     """
 
     columns: int
@@ -212,7 +212,7 @@ class Detector:
         return {name: each for name, each in found.items() if len(each.points)}
 
     def detect_in_window(self, target: Target, grey: np.ndarray, window: Window) -> DetectedCorners | None:
-        """Detect corners of one target in a window of an image (H, W) uint8, if any: faster, with one threshold."""
+        """Detect a target's corners in a window of an image (H, W) uint8, faster than `detect`; None without any."""
         part = np.ascontiguousarray(grey[window])
         if min(part.shape) < MIN_PART_SIDE:
             return None

@@ -44,7 +44,7 @@ class HandEye:
     axis_spread
         Root mean square angle [rad] of the motions' axes from their closest common axis.
     distances
-        Root mean square (n,) `translation_error` of the motions from and to each pose [m]; 0 for poses without any.
+        Root mean square translation residuals (n,) [m] of the motions from and to each pose; 0 without motions.
     """
 
     X: np.ndarray
@@ -73,7 +73,7 @@ def solve_hand_eye(poses_a: np.ndarray, poses_b: np.ndarray, settings: HandEyeSe
     Raises
     ------
     ValueError
-        Different numbers of poses, too few, too small rotations, or axes that are all parallel.
+        The numbers of poses differ, there are too few poses, rotations are too small, or all axes are parallel.
     """
     if len(poses_a) != len(poses_b):
         raise ValueError(f"{len(poses_a)} and {len(poses_b)} poses: give both bodies' poses at the same times.")
