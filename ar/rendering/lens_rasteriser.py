@@ -16,9 +16,9 @@ CELL_PIXELS = 64  # Average number of pixels in a cell of the lookup table.
 class Undistortion:
     """Undistorted pixels of B images, and a lookup table of the pixels in each cell of the undistorted image.
 
-    `pixels` (B, H, W) [pixel], NaN where the lens sees nothing; empty if no camera has a lens. `cells` (B, n, m, 4):
-    bounding box of the pixels in a cell, as first column and row, and last column and row. It is empty if a cell has no
-    pixel. `origin` and `scale` (B,) map an undistorted pixel to its cell: (column, row) = (pixel - corner) scale.
+    `pixels` (B, H, W) [pixel] is NaN where no point is projected, and empty if no camera has a lens. `cells` (B, n, m,
+    4) has the box of the pixels in each cell: first column and row, last column and row (last < first without a pixel).
+    `origin` and `scale` (B,) map an undistorted pixel to its cell: (column, row) = (pixel - origin) scale.
     """
 
     pixels: wp.array3d(dtype=wp.vec2d)

@@ -1,4 +1,4 @@
-"""Multi-threaded CPU kernels: Warp runs a kernel on the calling thread, so each thread gets a band of the image."""
+"""CPU kernels on several threads: Warp runs a kernel on the calling thread, so each thread gets a band of the image."""
 
 import os
 from collections.abc import Callable

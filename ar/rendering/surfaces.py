@@ -31,7 +31,7 @@ class Light:
 
 @wp.struct
 class LayerShading:
-    """Appearance of a layer: number, highlight, solid texture (first texel, size, transform, dark end, relief [m])."""
+    """Appearance of a layer: id, highlight, solid texture (first texel, size, transform, dark colour, relief [m])."""
 
     id: wp.uint8
     gloss: wp.float32

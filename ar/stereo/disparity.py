@@ -95,12 +95,12 @@ class StereoView:
 
     @cached_property
     def slope(self) -> np.ndarray:
-        """(size, size): sum over a point's square of the left window's squared gradient along rows, per pixel^2."""
+        """Squared gradient (size, size) of the left window along rows, summed in a square round each pixel."""
         slope = cv2.Sobel(self.left, cv2.CV_32F, 1, 0, scale=0.125)
         return cv2.boxFilter(slope * slope, -1, 2 * (self.settings.subpixel_side,), normalize=False)
 
     def sample_field(self, pixels: np.ndarray, field: np.ndarray) -> np.ndarray:
-        """Return values (n,) of a field (size, size) at the pixels nearest to (n, 2); NaN or True beyond its border."""
+        """Return values (n,) of a field (size, size) at the pixels nearest to `pixels` (n, 2); NaN or True outside."""
         here = np.nan_to_num(np.round(pixels).clip(-1.0, self.geometry.size), nan=-1.0).astype(int)
         inside = np.all((here >= 0) & (here < self.geometry.size), axis=1)
         here = np.where(inside[:, None], here, 0)
@@ -271,7 +271,7 @@ def find_consistent_motions(
 def _find_coarse(
     before: StereoView, now: StereoView, pixels: np.ndarray, settings: FlowSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find pixels (n, 2) again to a coarse pixel, (n, 2), by template matching, with correlations (n,)."""
+    """Find pixels (n, 2) in a later view by coarse template matching; return positions (n, 2), correlations (n,)."""
     size, half = before.geometry.size, settings.half_template
     share = before.geometry.depth / before.geometry.focal / settings.coarse_pixel
     few = max(1, round(share * size))
@@ -295,7 +295,7 @@ def _find_coarse(
 def _track_pixels(
     one: np.ndarray, other: np.ndarray, start: np.ndarray, guess: np.ndarray, settings: FlowSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track pixels (n, 2) float32 of a window into another from a guess (n, 2); return positions, success (n,)."""
+    """Track pixels `start` (n, 2) float32 to another window from `guess` (n, 2); return positions and success (n,)."""
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, *settings.flow_criteria)
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         one, other, start, guess.copy(), winSize=2 * (settings.flow_side,), maxLevel=settings.flow_levels,

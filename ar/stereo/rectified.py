@@ -42,7 +42,7 @@ class RectifiedPair:
     maps: tuple[Maps, Maps]
 
     def rectify(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rectify images (H, W, ...) uint8 of both eyes to windows (size, size, ...), black beyond their borders."""
+        """Rectify images (H, W, ...) uint8 of both eyes to windows (size, size, ...), black outside the images."""
         one, other = self.maps
         return cv2.remap(left, *one, cv2.INTER_LINEAR), cv2.remap(right, *other, cv2.INTER_LINEAR)
 
@@ -52,7 +52,7 @@ class RectifiedPair:
         return self.focal * self.baseline
 
     def compute_disparity(self, depth: np.ndarray) -> np.ndarray:
-        """Compute the disparity [pixel] of a depth [m]: shift to the left in the right window, 0 at the target."""
+        """Compute disparities [pixel] of depths [m]: shift to the left in the right window, 0 at the target."""
         return self.depth_disparity / depth - self.depth_disparity / self.depth
 
     def project_points(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

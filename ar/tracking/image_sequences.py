@@ -145,7 +145,7 @@ def _warn_once(text: str) -> None:
 
 
 def _read(path: Path, kind: str = "L") -> np.ndarray:
-    """Read an image as stored, grey or RGB; EXIF orientation is ignored, since the lens is not turned either."""
+    """Read an image as stored, grey ("L") or "RGB"; EXIF orientation is ignored, as calibrations use stored pixels."""
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path}: is larger than {MAX_FILE_BYTES / 1e6:.0f} MB. Remove it, or write it smaller.")
     try:

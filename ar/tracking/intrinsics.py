@@ -270,7 +270,7 @@ def _check_views(
 def _solve_views(
     views: Sequence[BoardView], width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
-    """Solve for K (3, 3), five coefficients, and each view's rotation vector, translation (3,), rms error [pixel]."""
+    """Compute K (3, 3), five lens coefficients, each view's pose (rotation vector, translation), rms errors [pixel]."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     try:

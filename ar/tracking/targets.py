@@ -242,7 +242,7 @@ class Detector:
 def find_window(camera: Camera, points: np.ndarray, relative_margin: float, min_margin: float) -> Window | None:
     """Return the image part round points (n, 3) [m] in the camera's frame; None if they are out of view.
 
-    The margin is `relative_margin` x their extent, at least `min_margin` pixels. The camera is at the world's origin.
+    The margin is `relative_margin` x the points' extent, at least `min_margin` pixels. The camera is at the origin.
     """
     pixels = camera.project(points)[0]
     pixels = pixels[~np.isnan(pixels).any(axis=1)]

@@ -67,7 +67,7 @@ class HandEye:
 def solve_hand_eye(poses_a: np.ndarray, poses_b: np.ndarray, settings: HandEyeSettings = HandEyeSettings()) -> HandEye:
     """Compute X with A X = X B for all motions A and B of two bodies, from their poses (n, 4, 4) [m] in their trackers.
 
-    Motions lead from pose i to pose j: A = P_i^-1 P_j of the first, B = Q_i^-1 Q_j of the second. Daniilidis (1999),
+    Between poses i and j, the first body's motion is A = P_i^-1 P_j, the second's B = Q_i^-1 Q_j. Daniilidis (1999),
     "Hand-eye calibration using dual quaternions", equations 31 to 38: X is in the null space of a 6 m x 8 matrix.
 
     Raises
