@@ -40,7 +40,7 @@ HALF_NUMBER_WIDTH = 10  # Half the width of a number [pixel].
 
 @dataclass(frozen=True, eq=False)
 class CutPlane:
-    """Plane through `centre` (3,) [m]: `along` (3,) the line of sight and, at right angles, `across` (3,)."""
+    """Plane through `centre` (3,) [m], with the unit vectors `along` (3,) the line of sight and `across` (3,) it."""
 
     centre: np.ndarray
     across: np.ndarray
@@ -58,7 +58,7 @@ class CutPlane:
 def build_plane(camera: Camera, centre: np.ndarray, tip: np.ndarray | None) -> CutPlane:
     """Build the plane through the camera's centre, a surface's centre (3,) [m] and, if given, a tip (3,) [m].
 
-    Without a tip, or with one on the line of sight, the plane is horizontal in the image.
+    Without a tip, or with a tip on the line of sight, the plane is horizontal in the image. `across` points right.
     """
     along = (centre - camera.centre) / np.linalg.norm(centre - camera.centre)
     level = camera.T_camera_world[0, :3]

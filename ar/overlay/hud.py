@@ -75,7 +75,7 @@ class Hideable:
     Parameters
     ----------
     objects
-        (H, W) uint8: above 0 where text hides what should stay visible, as a tool; used if there is no other space.
+        Mask (H, W) uint8 of objects that should stay visible, as tools; text covers them only without other space.
     lines
         Mask (H, W) uint8 of lines, which text covers if it is placed with `force`.
     ring_lines

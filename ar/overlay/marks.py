@@ -121,7 +121,7 @@ class Marks:
     Parameters
     ----------
     margin
-        Error bound of the surface, one number or (V,) [m]. If positive, a dashed second outline runs at that distance.
+        Error bound [m] of the surface, one number or (V,); if positive, a dashed outline is drawn at that distance.
     gauge
         Gauge whose line is drawn from the tip to the hidden surface, with its length in millimetres; None: no gauge.
     initial

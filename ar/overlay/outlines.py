@@ -214,7 +214,7 @@ def _compute_distance(mask: np.ndarray) -> np.ndarray:
 
 
 def has_text(image: np.ndarray, text: str, scale: float, colour: Sequence[float] = WHITE) -> bool:
-    """Return True if `hud.write` wrote exactly this text at this scale anywhere into the image (H, W, 3) uint8."""
+    """Return True if an image (H, W, 3) uint8 has exactly this text at this scale, as drawn by `hud.write_text`."""
     return find_text(image, text, scale, colour) is not None
 
 

@@ -45,7 +45,7 @@ class Opening:
     def describe(self, pixel_counts: Mapping[int, int]) -> str:
         """Return the label of the closed ground over the silhouette; empty if its share is too small.
 
-        pixel_counts: pixels of the silhouette by the id of the layer over it, without those in front of the overlay.
+        `pixel_counts` are the silhouette's pixels by the id of the layer over them, without objects before the overlay.
         """
         under: dict[str, int] = {}
         for layer, count in pixel_counts.items():

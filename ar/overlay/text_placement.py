@@ -7,7 +7,7 @@ BORDER_DISTANCE = 8  # Distance of text from the image border [pixel].
 TEXT_DISTANCE = 6  # Distance of text from lines and other text [pixel].
 GRID_SPACING = 4  # Grid spacing of candidate positions [pixel].
 SEARCH_RADII = 64, 256  # Search radii round the desired position [pixel], tried in order before the whole image.
-SIDEWAYS_WEIGHT = 2  # Weight of a sideways distance relative to a vertical one: lines of text go below each other.
+SIDEWAYS_WEIGHT = 2  # Weight of horizontal relative to vertical distances, so that texts are placed below each other.
 
 
 def find_free_position(occupied: np.ndarray, size: tuple[int, int], desired: tuple[int, int]) -> tuple[int, int] | None:
