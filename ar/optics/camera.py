@@ -107,7 +107,7 @@ class Camera:
     def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Compute the world points (..., 3) [m] at pixels (..., 2) and `depth` (...) [m], which is z, not range.
 
-        NaN at pixels that no point is projected to by the lens.
+        NaN at pixels to which the lens projects no point.
         """
         if self.lens is not None:
             pixels = to_pixels(self.K, self.lens.undistort(to_normalised(self.K, np.asarray(pixels, np.float64))))
@@ -117,7 +117,7 @@ class Camera:
 
     @cached_property
     def straight(self) -> np.ndarray:
-        """Undistorted position (H, W, 2) [pixel] of each pixel; NaN at pixels that no point is projected to."""
+        """Undistorted position (H, W, 2) [pixel] of each pixel; NaN where the lens projects no point to a pixel."""
         if self.lens is None:
             rows, columns = np.mgrid[: self.height, : self.width].astype(np.float64)
             return np.stack([columns, rows], axis=-1)

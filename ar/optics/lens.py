@@ -30,7 +30,7 @@ class Lens:
     Raises
     ------
     ValueError
-        A coefficient is not finite, or the distortion is not one-to-one already at the image's centre.
+        A coefficient is not finite, or the distortion is not one-to-one even at the image's centre.
 
     Examples
     --------

@@ -140,10 +140,10 @@ def composite(
     hidden
         Surface to show, in its own colour; occluders do not change its silhouette.
     style
-        "contour": the outline. "window": also the surface, shaded and darker with depth, while the ground around the
-        outline is dimmed. "fill": outline and a flat tint. "depth": outline and a tint that is stronger at smaller
-        depth, with its scale. "rings": lines of equal distance from the surface on the ground (`distances.py`).
-        "cut": an inset (`cut.py`). "none": only warnings. Outlines alone cross occluding layers.
+        "contour": the outline. "window": also the surface, shaded and darker with depth, while the ground round the
+        outline is dimmed. "fill": outline and uniform tint. "depth": outline, and a tint with scale that is stronger at
+        smaller depth. "rings": lines of equal distance from the surface, on the ground (`distances.py`). "cut": a
+        cross-section in an inset (`cut.py`). "none": only header and warning. Only outlines cross occluding layers.
     cover, marks, words
         Occluders of the surface; additional lines; additional text.
 
@@ -248,7 +248,7 @@ def _describe_motion(hidden: Layer, before: Layer, words: ImageText) -> str:
 def _write_lines(sketch: LineDrawing, camera: Camera, words: ImageText, motion: str) -> Overlaid:
     """Write the header, the motion and the warning; return the image.
 
-    Texts at the top and in the corners are placed first, so that they seldom move; then the most important text first.
+    Texts at the top and in the corners are placed first, so that they seldom move; other texts follow by importance.
     """
     drawn = Overlaid(sketch.colour, sketch.occupied.copy())
     write_header(drawn, words.header)

@@ -40,7 +40,7 @@ HALF_NUMBER_WIDTH = 10  # Half the width of a number [pixel].
 
 @dataclass(frozen=True, eq=False)
 class CutPlane:
-    """Plane through `centre` (3,) [m], with the unit vectors `along` (3,) the line of sight and `across` (3,) it."""
+    """Plane through `centre` (3,) [m]; unit vectors `along` and `across` (3,) are relative to the line of sight."""
 
     centre: np.ndarray
     across: np.ndarray

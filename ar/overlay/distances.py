@@ -34,7 +34,7 @@ def compute_signed_distance(bvh: wp.Mesh, points: np.ndarray, max_distance: floa
 def compute_visible_distance(
     bvh: wp.Mesh, camera: Camera, box: tuple[slice, slice], depth: wp.array, mask: np.ndarray, max_distance: float
 ) -> np.ndarray:
-    """Compute the distance (h, w) float32 [m] from a surface of the visible point at each pixel of a box.
+    """Compute the distance (h, w) float32 [m] between a surface and the visible point at each pixel of a box.
 
     NaN beyond `max_distance` [m], and where `mask` (h, w) bool is False.
 

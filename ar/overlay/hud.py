@@ -75,7 +75,7 @@ class Hideable:
     Parameters
     ----------
     objects
-        Mask (H, W) uint8 of objects that should stay visible, as tools; text covers them only without other space.
+        Mask (H, W) uint8 of objects that should stay visible, such as tools; text covers them only if necessary.
     lines
         Mask (H, W) uint8 of lines, which text covers if it is placed with `force`.
     ring_lines

@@ -209,7 +209,7 @@ def find_colour(image: np.ndarray, colour: Sequence[float], tolerance: int = COL
 
 
 def _compute_distance(mask: np.ndarray) -> np.ndarray:
-    """Compute the distance (H, W) of each pixel from the nearest pixel of a mask (H, W) [pixel]."""
+    """Compute the distance (H, W) [pixel] of each pixel from the nearest pixel in a mask (H, W)."""
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 

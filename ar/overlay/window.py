@@ -177,7 +177,7 @@ def mark_edges(
     # output
     non_edge: wp.array2d(dtype=wp.uint8),
 ):  # fmt: skip
-    """Set each pixel to 0 if a surface is visible there, but not at all of its four neighbours; else to 1."""
+    """Set each edge pixel to 0, others to 1: the surface is visible there, but not at one of its four neighbours."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         row = index / z_buffer.shape[1]

@@ -246,7 +246,7 @@ PATCH_LOCK = threading.Lock()  # Lock while websockets' `serve` is replaced.
 
 @contextmanager
 def guard_server(policy: AccessPolicy, controls: ControlLookup, limits: ConnectionLimits) -> Iterator[list[bool]]:
-    """Guard the server that viser opens within this context; the yielded list is not empty once that has happened."""
+    """Guard the server that viser opens within this context; the yielded list is not empty once it is open."""
     opened: list[bool] = []
     serve = websockets.asyncio.server.serve
     log = logging.Logger("page", logging.WARNING)

@@ -58,8 +58,8 @@ class Browser:
     ) -> None:  # fmt: skip
         """Start the server; if `port` is in use, the next free port is taken, see `address`.
 
-        `words` is HTML under the image, `size` the image's width and height [pixel] until the first arrives. `origins`
-        are further addresses of the page, of a proxy or another port, as written by `access_guard.format_origin`.
+        `words` is HTML below the image. `size` is the image's width and height [pixel] until the first one arrives.
+        `origins` are further addresses of the page, by a proxy or another port, as from `access_guard.format_origin`.
 
         Raises
         ------
@@ -290,7 +290,7 @@ class Browser:
         self.note(f"note {label}", send)
 
     def close(self) -> None:
-        """Stop the page."""
+        """Stop the page's thread and its server."""
         self.closed.set()
         self.sender.join()
         self.server.stop()

@@ -144,7 +144,7 @@ class Inputs:
     deed
         Action of the newest message, for the callback that the message triggers.
     kept
-        Last value of each control set by the client with control; values of other clients are reset to it.
+        Last value of each control set by the client with control; values of other clients are reset to this value.
     notes
         Folder and text of each note, by label.
     """

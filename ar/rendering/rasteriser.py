@@ -102,7 +102,7 @@ class RasterisedSurface:
     """Surface rasterised in one image, on a device.
 
     `points` (1, V) vec3d are homogeneous pixel coordinates, undistorted; `triangles` (F,) vec3i; `z_buffer` (1, H, W)
-    has (depth, face); only `rows` may be covered. `undistortion` is that of `build_undistortion`.
+    has (depth, face); only `rows` may be covered. `undistortion` is the result of `build_undistortion`.
     """
 
     points: wp.array

@@ -115,7 +115,7 @@ class VisiblePoint:
 
 
 def list_vertex_faces(triangles: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the faces at all vertices (3 F,) int32, vertex by vertex, and where each vertex starts (count + 1,)."""
+    """Return the start (count + 1,) of each vertex's faces, and all these faces (3 F,), vertex by vertex, int32."""
     corners = triangles.reshape(-1)
     begins = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=vertex_count))])
     return begins.astype(np.int32), (np.argsort(corners, kind="stable") // 3).astype(np.int32)

@@ -47,7 +47,7 @@ def extend_box_to_edge(a: wp.vec3d, b: wp.vec3d, near: wp.float64, box: wp.vec4d
 
 @wp.func
 def compute_triangle_box(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, near: wp.float64) -> wp.vec4d:
-    """Compute the pixel box (u min, v min, u max, v max) of the part of a triangle beyond the near plane."""
+    """Compute the pixel box (u min, v min, u max, v max) of the triangle's part beyond the near plane."""
     far = wp.float64(1.0e30)
     box = wp.vec4d(far, far, -far, -far)
     box = extend_box_to_edge(a, b, near, box)

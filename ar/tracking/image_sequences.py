@@ -57,7 +57,7 @@ def read_images(path: Path) -> Iterator[NamedImage]:
     Raises
     ------
     ValueError
-        The file does not exist, the folder has no images, or a file is no readable video or image, or too large.
+        The file does not exist, the folder has no images, a file is not a readable video or image, or is too large.
     """
     if path.is_dir():
         files = _list_files(path)

@@ -268,7 +268,7 @@ class Tracker:
     def _detect_corners(
         self, grey: np.ndarray, number: int, last: Mapping[str, tuple[np.ndarray, int]]
     ) -> dict[str, DetectedCorners]:
-        """Detect corners near the last poses; lost targets are searched in the whole image, then at intervals."""
+        """Detect corners near the last poses; search lost targets in the whole image, at once and at intervals."""
         settings, found = self.settings, dict[str, DetectedCorners]()
         for target in self.targets:
             if target.name in last:

@@ -67,9 +67,9 @@ class PoseStream:
     def interpolate(self, time: float) -> Pose | None:
         """Interpolate the pose at a time [s], at constant velocity between two samples; None if not available.
 
-        Gaps longer than `MAX_GAP` are not interpolated. Beyond the last sample before a gap or the end, the motion is
-        extrapolated for at most `MAX_EXTRAPOLATION`. The covariance includes the interpolation error, for a body that
-        accelerates as in the neighbouring samples.
+        Gaps longer than `MAX_GAP` are not interpolated. After the last sample of the stream or before such a gap, the
+        motion is extrapolated for at most `MAX_EXTRAPOLATION`. The covariance includes the interpolation error, for a
+        body that accelerates as in the neighbouring samples.
         """
         time = self.to_stream_time(time)
         first = int(np.searchsorted(self.times, time + TIME_TOLERANCE, side="right")) - 1
@@ -155,9 +155,9 @@ def estimate_clock_offset(
     times: np.ndarray, positions: np.ndarray, tracker_times: np.ndarray, tracker_positions: np.ndarray,
     settings: ClockSettings = ClockSettings(),
 ) -> Clock:  # fmt: skip
-    """Estimate the time offset of a tracker (m,) [s], (m, 3) [m] from a point's motion in images (n,) [s], (n, 3) [m].
+    """Estimate a tracker's clock offset from a point's motion in images (n, 3) [m] and by the tracker (m, 3) [m].
 
-    Positions of both may differ by a constant. The error is that of least squares, from the scatter of residuals.
+    Positions, with times [s], may differ by a constant. The error is that of least squares, from scatter of residuals.
 
     Raises
     ------

@@ -220,7 +220,7 @@ def _check_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray, settings:
 
 
 def _compute_swapped_rms(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[int, int], float]:
-    """Compute the rms residual [m] after swapping the patient's points of two pairs; return it by the two indices."""
+    """Compute rms residuals [m] after swapping the patient's points of two pairs; return each by the pairs' indices."""
     out = {}
     for pair in combinations(range(len(scan)), 2):
         other = patient.copy()
@@ -240,7 +240,7 @@ def _fit_rigid(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def compute_jacobian(T: np.ndarray, points: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Compute the Jacobian (3 n, 6) of points (n, 3) in the reference by translation and rotation about `centre`."""
+    """Compute the Jacobian (3 n, 6) of transformed points (n, 3) by translation and rotation about `centre`."""
     arms = (points - centre) @ T[:3, :3].T
     return np.concatenate(
         [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -build_cross_matrices(arms)], axis=2

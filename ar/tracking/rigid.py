@@ -1,4 +1,4 @@
-"""Rotations and rigid motions as matrices: angles, axes and validation."""
+"""Rotations and rigid motions as matrices: conversions, angles, and validation."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,7 @@
 """Printed targets (tool cube, patient reference, calibration board), and detection of their corners in an image.
 
 Every face is a ChArUco board with odd numbers of squares; its corners are the inner corners of the chessboard. OpenCV
-detects these with an error of 0.1 pixel. The markers' own corners have 0.2 pixel, with a bias inwards.
+detects these with an error of 0.1 pixel. The error of the markers' own corners is 0.2 pixel, biased inwards.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,10 @@
 """Data sets: loads, the displacement of every vertex, and their provenance. HDF5, SI units, RAS.
 
-Layout: `anatomy/` has the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/` have `displacement` (n,
-V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` has a result for each load. `unit/` has
-small-strain responses [m/N] to a unit force at every node `unit/node` of the open cortex, along x, then y, then z. Data
-of poses have no `unit/`, but have `answers/reaction` (n, tools, 6), which older files lack. Each array has attributes
-that describe it (`array_meanings`).
+Layout: `anatomy/` has the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/` have the arrays
+`displacement` (n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` has a result for each
+load. `unit/` has small-strain responses [m/N] to a unit force at every node `unit/node` of the open cortex, along x,
+then y, then z. Data of poses have no `unit/`, but `answers/reaction` (n, tools, 6), which older files lack. Each array
+has attributes that describe it (`array_meanings`).
 """
 
 from collections.abc import Mapping
@@ -55,7 +55,7 @@ class Dataset:
     loads
         Loads of n load cases.
     outcome
-        Outcomes of the n cases; the rows of failed cases are no equilibrium under the whole load.
+        Outcomes of the n cases; displacements of failed cases are not an equilibrium under the whole load.
     iterations, residual
         Solver iterations and final residual of each case (n,).
     unit_good
@@ -151,7 +151,7 @@ class Dataset:
         return found if np.isfinite(found[self.good]).all() else None
 
     def compute_unit_response(self, nodes: np.ndarray) -> np.ndarray:
-        """Read small-strain responses (3 m, k, 3) float32 [m/N] of the vertices `nodes` (k,).
+        """Read the small-strain responses (3 m, k, 3) float32 [m/N] of the vertices `nodes` (k,) to unit forces.
 
         Raises
         ------

@@ -60,7 +60,7 @@ def compute_tool_features(patch: Patch, pushes: Pushed) -> np.ndarray:
 
 
 def compute_core_features(patch: Patch, pushes: Pushed) -> np.ndarray:
-    """Compute a rod's or blade's features (B, 17): 8 as for a ball, centre of the core [m], tool axes x and z.
+    """Compute features (B, 17) of a rod or a blade: the 8 of a ball, centre of the core [m], tool axes x and z.
 
     For relaxing tissue, the last feature is the relaxed share, as in `compute_tool_features`.
 

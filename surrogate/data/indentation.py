@@ -87,7 +87,7 @@ def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     Raises
     ------
     InputError
-        Loads that are not the poses of one tool.
+        The loads are not the poses of one tool.
     """
     pose, core = get_poses(loads, tool), get_core(tool)
     foot = pose[:, :3, 3] + pose[:, :3, :3] @ (core.centre - [0.0, 0.0, core.half[2]])

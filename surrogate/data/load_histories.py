@@ -41,9 +41,9 @@ def get_relaxation_series(effects: Iterable[Effect]) -> Pairs:
 
 
 def solve_histories(deformer: Deformer, loads: Loads) -> Deformation:
-    """Solve the histories of B loads in two time steps: arrival of the tool, and its stay, if it stays.
+    """Solve the histories of B loads in two time steps: arrival and stay of the tool.
 
-    The second step is skipped for a tool without an equilibrium in the first step; its result has that outcome.
+    The second step is skipped for tools that still arrive, or that have no equilibrium in the first step.
     """
     first = deformer.deform(Loads(loads.causes, np.minimum(loads.times, APPROACH_TIME)))
     stay = np.flatnonzero([good.good for good in first.outcome] & (loads.times > APPROACH_TIME))

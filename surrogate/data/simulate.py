@@ -62,7 +62,7 @@ class SimulatedRows:
 
     @property
     def total(self) -> int:
-        """Total number of rows."""
+        """Total number of rows that the call solved."""
         return self.unit_count + self.load_count
 
 
@@ -107,7 +107,7 @@ class SimulationPlan:
         return np.arange(first, min(first + self.batch_size, self.row_counts[name]))
 
     def build_task(self, batch: Batch) -> LoadBatch:
-        """Build the task that solves a batch."""
+        """Build the task that solves a batch, with its rows and loads."""
         rows = self.list_rows(batch)
         return LoadBatch(batch, rows, None if batch[0] == "unit" else self.loads.select(rows))
 
@@ -180,7 +180,7 @@ def _fill(
     journal: Journal, work: SimulationPlan, deformer: Deformer | SolverPool, finished: set[Batch],
     progress: Callable[[int, int], None],
 ) -> dict[str, int]:  # fmt: skip
-    """Solve the batches that are in neither file; return the number of solved rows by group. Writing is parallel."""
+    """Solve the batches that neither the journal nor the finished file has; return the numbers of solved rows."""
     known = [batch for batch in work.batches if batch in finished or batch in journal]
     total, done = sum(work.row_counts.values()), sum(len(work.list_rows(batch)) for batch in known)
     solved = dict.fromkeys(work.row_counts, 0)

@@ -53,7 +53,7 @@ def _to_key(label: int) -> str:
 
 
 def get_row_dtype(vertex_count: int, tool_count: int = 0) -> np.dtype:
-    """Return the dtype of a row: displacement (vertices, 3), outcome, and reaction (tools, 6) of posed tools."""
+    """Return the dtype of a row: displacement, outcome, iterations, residual, and (for posed tools) reaction."""
     # Number widths are those of the file, 64 kB a load on a brain of 5,300 nodes: conversion by HDF5 takes 3 times as
     # long. It is not compressed: deflate, with its bytes in the best order, saves a sixth and takes longer than the
     # solve on a GPU.

@@ -85,7 +85,7 @@ def open_solvers(fem: LazyFem, devices: Sequence[str], report: Callable[[str], o
     ------
     InputError
         See `Fem`, or a GPU has too little memory.
-    LostError
+    LostProcessError
         A process was killed.
     """
     if len(devices) == 1:

@@ -72,7 +72,7 @@ class DiscSplit:
 
 
 def hold_out_discs(points: np.ndarray, patch: Patch, settings: DiscSettings = DiscSettings()) -> DiscSplit:
-    """Hold out discs of 6 mm radius round distant load points (B, 3) [m]: at least 6, and 15 % of the patch.
+    """Hold out 6 mm discs round load points (B, 3) [m] far from each other: at least 6, and 15 % of the patch.
 
     Discs beyond the sixth are added only while at least half of the loads remain for training. At a small craniotomy,
     where six discs contain more than half of the loads, smaller radii are used. The few positions of the preset `seed`

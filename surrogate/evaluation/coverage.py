@@ -27,7 +27,7 @@ class Coverage:
     loads
         Number n of loads.
     shares
-        Empirical coverage for each of `conformal.LEVELS`; None without a guarantee, for lack of calibration loads. The
+        Empirical coverage for each of `conformal.LEVELS`; None if too few calibration loads give no guarantee. The
         error is the maximum over the tumour, or the error of the tip-tumour distance.
     tenths
         Coverage at the first level by decile of the force, in ascending order.

@@ -203,7 +203,7 @@ def compute_tissue_likelihood(
 
 
 def compute_probability(log_likelihood: np.ndarray) -> np.ndarray:
-    """Interpolate log-likelihoods to the fine grid, smooth in log ratio and compressibility; return probabilities."""
+    """Interpolate log-likelihoods to `FINE_POISSONS` and `FINE_RATIOS`; return probabilities with sum 1."""
     fine = CubicSpline(np.log(RATIOS), log_likelihood, axis=2)(np.log(FINE_RATIOS))
     order = np.argsort(1.0 - 2.0 * POISSONS)
     x, want = (1.0 - 2.0 * POISSONS)[order], 1.0 - 2.0 * FINE_POISSONS

@@ -147,8 +147,8 @@ def to_deformed_evidence(
     """Convert an observation to evidence, with the brain deformed by `motion` (V, 3) [m].
 
     Only the points with indices `point_numbers` (k,) are used. Points without an undeformed position, and tips, are
-    matched to the closest surface point, and give its motion along the normal. `bias` maps positions (n, 3) to the
-    estimated rigid error (n, 3) [m]. Tips are numbered after the points.
+    matched to the closest surface point, and give the surface's motion along the normal. `bias` maps positions (n, 3)
+    to the estimated rigid error (n, 3) [m]. Tips are numbered after the points.
     """
     parts, count = [], len(observation.now)
     cloud, number = observation.tips, count + np.arange(len(observation.tips))

@@ -45,8 +45,8 @@ POSTERIOR = PosteriorSettings()
 def is_within_errors(posterior: Posterior) -> bool:
     """Return True if the observation is within its errors, rigid error included, so that no motion is significant.
 
-    Two tests compare its size: the squared Mahalanobis distance is the sum of a rigid part, by generalised least
-    squares, and a remainder, which are both chi-squared. The third test compares its form: the ratio of the mean
+    Two tests are on the observation's size: its squared Mahalanobis distance is the sum of a rigid part, by generalised
+    least squares, and a remainder, which are both chi-squared. The third test is on its form: the ratio of the mean
     evidence of prior motions to that of errors alone. By Markov's inequality, errors alone exceed a ratio of 1 / p with
     a probability of p at most. This test detects a dent whose total size is within the errors.
     """
@@ -109,7 +109,7 @@ class Posterior:
     outliers
         Numbers of the points that were removed as outliers.
     slip_log_odds
-        Log-odds of a slipped registration: best hypothesis with a slip against the best one without.
+        Log-odds of a slipped registration: best hypothesis with a slip against the best hypothesis without one.
     motion_evidence
         Log evidence of motions, see `ObservedPrior.motion_evidence`.
     covariance_factor

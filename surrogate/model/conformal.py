@@ -120,7 +120,7 @@ def fit_bound(
 
 
 def fit_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.ndarray]) -> float:
-    """Compute the growth [1/m] of a bound for which its coverage far from training loads is as near to training loads.
+    """Compute the growth [1/m] with which a bound has the same coverage far from the training loads as near them.
 
     Parameters
     ----------

@@ -92,7 +92,7 @@ def get_reported_errors(model: Learned) -> ReportedErrors:
 
 
 def describe_error(model: Learned) -> str:
-    """Describe a model's errors on held-out cortex, and if scenes use the model alone or with FEM fallback."""
+    """Describe a model's errors on held-out cortex, and state if scenes use the model with FEM fallback."""
     stated = get_reported_errors(model)
     guarded = "scenes play it without FEM, as its tissue relaxes" if model.series else "scenes play it guarded"
     return f"{model.held_out or stated}: {guarded if stated.is_weak else 'scenes play it without FEM'}"

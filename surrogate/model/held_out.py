@@ -1,4 +1,4 @@
-"""Errors of a model on held-out cortex regions, and the decision if the model needs FEM fallback."""
+"""Errors of a model on held-out cortex regions, and the decision that a model needs FEM fallback."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ class HeldOutErrors:
     Parameters
     ----------
     mean, guarded
-        Mean over loads and tumour vertices of error / mean motion of the load: of the model alone, and of `Guarded`.
+        Mean over loads and tumour vertices of (error / mean motion of the load), of the model alone and of `Guarded`.
         Loads solved by FEM count as exact.
     p999
         99.9th percentile [m] over loads and vertices of the model's errors; None for fewer than `MIN_LOADS_FOR_P999`

@@ -1,4 +1,4 @@
-"""Cache of computed arrays in a folder, so that an interrupted run continues."""
+"""Cache of computed arrays in a folder, from which an interrupted run resumes."""
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path

@@ -141,7 +141,7 @@ class Learned:
 
     @cached_property
     def _modes_at(self) -> Callable[[bytes], tuple[tuple[list[ModelPart], np.ndarray], ...]]:
-        """Function from vertices (int64 bytes) to the parts of each basis and its modes (r, 3 n) at the vertices."""
+        """Function from vertices (int64 bytes) to the parts of each basis, with its modes (r, 3 n) at the vertices."""
         groups: dict[int, list[ModelPart]] = {}
         for part in self.parts:
             groups.setdefault(id(part.basis.modes), []).append(part)

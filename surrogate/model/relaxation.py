@@ -1,7 +1,7 @@
 """Stress relaxation of tissue under a moving tool, and the test that the training covers the tool's history.
 
 FEM stores the decaying part of the stress for each pair (g, tau) of a Prony series (`sim/terms/viscoelastic.py`). A
-trained model stores a decaying part h of one number only, the tool's depth d:
+trained model stores the decaying part h of one number, the tool's depth d:
     h <- exp(-dt / tau) h + g exp(-dt / (2 tau)) (d - its last value).
 
 The shear resistance has then lost the share r = sum_i (g_i - h_i / d), which is an input of all predictions.
@@ -47,7 +47,7 @@ class RelaxationState:
 def update_relaxation(
     series: Pairs, pushes: Pushed, times: np.ndarray, start: Deformation | None, min_depth: float
 ) -> RelaxationState:
-    """Compute the relaxation at indentations, from the previous result `start` or else by `load_histories`.
+    """Compute the relaxation at indentations, from the result `start` or else from a history as in `load_histories.py`.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ class ForceModel:
         Name in `ENCODERS` of the function that computes the regressor's features.
     regressor
         Map from features of an indentation to the force (B, 3) [N/m] per metre of depth; in a model with a contact
-        part, the force that this part leaves over. None: nothing is added to the contact part.
+        part, to the difference from that part's force. None: nothing is added to the contact part.
     bound
         Bound of the force's error [N]; None if no calibration loads were set aside.
     """

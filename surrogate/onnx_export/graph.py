@@ -304,7 +304,7 @@ def _compute_arccos(cosine: Tensor) -> Tensor:
 
 @compute_squared_distances.register
 def _(points: Tensor, sites: np.ndarray) -> Any:
-    """Compute |x|^2 - 2 x y + |y|^2, in double precision: differences would take the memory of B n f numbers."""
+    """Compute |x|^2 - 2 x y + |y|^2 in double precision, as differences x - y would need memory for B n f numbers."""
     x, y = points.astype(np.float64), sites.astype(np.float64)
     return np.maximum((x * x).sum(axis=1, keepdims=True) - x @ (2.0 * y.T) + (y * y).sum(axis=1), 0.0)
 
@@ -324,5 +324,5 @@ def _(rows: Tensor, table: QuantisedTable, index: np.ndarray) -> Any:
 
 @find_nonzero_columns.register
 def _(rows: Tensor) -> np.ndarray:
-    """Return all columns: zeros are unknown before the graph runs."""
+    """Return all columns, because the zeros are not known before the graph runs."""
     return np.arange(rows.shape[1])

@@ -139,7 +139,7 @@ class Series:
 
 
 class RemainderGp:
-    """Gaussian process of the response that the series leaves over, in units of force^3 + faint^3.
+    """Gaussian process of the response that the series does not represent, in units of force^3 + faint^3.
 
     The first neglected order is proportional to force^3, so in these units strong and weak loads have equal weight. The
     features are `compute_tool_features` and force over radius, to which indentation is proportional.

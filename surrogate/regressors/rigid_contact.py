@@ -73,8 +73,8 @@ class RigidContact:
     followed by `compute_warm_start` of the previous pose: the search then starts from that contact, which takes a
     fraction of the time.
 
-    Far from the tool, nonlinearity is nearly a factor on the force that is linear in depth over radius. Only this line
-    is fitted. For relaxing tissue a second line is added, in proportion to the relaxed share.
+    Far from the tool, nonlinearity acts nearly as a factor on the force. This factor is a line in depth over radius,
+    which is fitted. For relaxing tissue a second line is added, in proportion to the relaxed share.
 
     Parameters
     ----------

@@ -137,14 +137,14 @@ def calibrate_bound(
 
 
 def compute_growth(near: BoundExamples, far: BoundExamples, settings: BoundSettings) -> float:
-    """Compute the growth [1/m] for which a bound's coverage is the same `far` from training loads as `near` them."""
+    """Compute the growth [1/m] with which a bound has equal coverage on loads `far` from and `near` training loads."""
     return fit_growth(*_compute_relative_errors(near, far, settings))
 
 
 def compute_held_out_bounds(
     model: Learned, near: BoundExamples, far: BoundExamples, split: DiscSplit, settings: BoundSettings
 ) -> np.ndarray:
-    """Compute bounds (2, B) [m] of loads on held-out discs; for each disc, the others determine the growth."""
+    """Compute bounds (2, B) [m] of loads on held-out discs; the other discs determine the growth for each disc."""
     known, (ratio, away) = _compute_relative_errors(near, far, settings)
     disc, bound = split.disc_index[split.test_mask], np.empty((2, len(far.error)))
     for each in np.unique(disc):

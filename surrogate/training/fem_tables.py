@@ -115,7 +115,7 @@ def tabulate_series(
 def find_disc_nodes(patch: Patch, radius: float) -> np.ndarray:
     """Return the mask (m, m) of node pairs that one disc of `radius` [m], or adjacent triangles, may load at once.
 
-    A disc may also load nodes of a triangle that only partly overlaps it; these contribute 1 in 100,000 of the tumour's
+    More distant nodes, whose triangles extend into a disc, are excluded: they contribute 1 in 100,000 of the tumour's
     motion.
     """
     longest = compute_edge_lengths(patch.points[patch.triangles]).max()
