@@ -150,7 +150,7 @@ def _format_matrix(name: str, values: np.ndarray) -> list[str]:
     return [f"{name}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{numbers}]"]
 
 
-MAX_TEXT_LENGTH = 64 * 1024  # Maximum length of a calibration file [characters]: a calibration has about a thousand.
+MAX_TEXT_LENGTH = 64 * 1024  # Maximum length of a calibration file [characters]; about a thousand are usual.
 MAX_NESTING = 4  # Maximum nesting depth of brackets: OpenCV's parser is recursive, and a calibration needs two.
 # Minimum number of coefficients of the distortion models named by ROS.
 MIN_COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8}

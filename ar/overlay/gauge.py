@@ -56,7 +56,7 @@ def format_tip_distance(distance: float, error: float | None, is_inside: bool) -
 
 def draw_gauge_line(canvas: np.ndarray, camera: Camera, gauge: DistanceGauge) -> None:
     """Draw the gauge's line in place; nothing if a part of the line is not projected by the camera."""
-    # Lens distortion bends it.
+    # Lens distortion bends the line.
     shares = np.linspace(0.0, 1.0, 2 if camera.lens is None else LINE_POINTS)[:, None]
     line, _ = camera.project((1.0 - shares) * gauge.tip + shares * gauge.nearest_point)
     if not np.isfinite(line).all():

@@ -18,8 +18,8 @@ STYLES: Mapping[Style, str] = MappingProxyType(
     }
 )
 """Display names of the styles, by their names in code."""
-MIN_REPORTED_SHARE = 0.1  # Share of the silhouette from which layers over it that are not open are reported.
-WHOLE_SHARE = 0.9  # Share of the silhouette from which such layers are reported without "partly".
+MIN_REPORTED_SHARE = 0.1  # Smallest reported share of the silhouette that closed ground covers.
+WHOLE_SHARE = 0.9  # Share of the silhouette above which closed ground is reported without "partly".
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,8 @@ class ImageElementIds:
     alt: str
 
 
-MAIN = ImageElementIds(PICTURE, SAID, NEXT, "camera image with overlay")  # Place of the camera image.
-# Place of the slices.
+MAIN = ImageElementIds(PICTURE, SAID, NEXT, "camera image with overlay")  # Elements of the camera image.
+# Elements of the slices.
 ASIDE_SPOT = ImageElementIds(SLICES, HISTORY, "sulcus-next-aside", "axial, coronal and sagittal slices of the scan")
 # Script that shows the next image. If images are loaded out of order, older ones are dropped.
 SWAP = """
@@ -86,7 +86,7 @@ CAPTION = (  # Text under the slices.
     "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: 95 % error of its "
     "outline, by the named source (none: not known). White: tool in the slice; ring: tip outside the slice."
 )
-# Image of one pixel: loading it runs the script, which an element's HTML alone would not.
+# Image of one pixel: when it is loaded, its script runs; a script element in the HTML would not run.
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 
 

@@ -17,7 +17,7 @@ def fill_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, labels: Seq
     gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
     gui.main_panel.dock_left()
     gui.main_panel.set_width(PANEL_WIDTH)
-    # Two soft lights from the first viewpoint's sides: the page's own four wash the colours out.
+    # Two soft lights from both sides of the initial viewpoint, as viser's four default lights make colours pale.
     scene.configure_default_lights(enabled=False)
     scene.add_light_ambient("/light/ambient", intensity=0.8)
     across = np.cross(np.asarray(viewpoint.target) - viewpoint.eye, viewpoint.up)

@@ -113,7 +113,7 @@ def build_embedded_surface(
     place = row, np.arange(len(row)) - shares.indptr[row]
     corners, weights = np.zeros((len(at), 3), np.int64), np.zeros((len(at), 3))
     corners[place], weights[place] = shares.indices, shares.data
-    # Neighbours lie next to each other in memory: drawing takes less time.
+    # Neighbours are adjacent in memory, so that drawing takes less time.
     order = np.lexsort([*weights.T, *np.sort(corners, axis=1).T])
     triangles = np.argsort(order)[triangles]
     triangles = triangles[np.argsort(triangles.min(axis=1))]

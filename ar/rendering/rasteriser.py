@@ -35,7 +35,7 @@ EMPTY_PIXEL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 NEAR_PLANE = 1e-3
 """Depth of the near plane [m]; nothing nearer to a camera is drawn."""
 ROW_THREADS = 8  # Number of threads that share the rows of a triangle on a GPU.
-MIN_PIXELS = 8  # Pixels of an image per triangle above which CPU threads share the rows, below the triangles.
+MIN_PIXELS = 8  # Number of pixels per triangle above which CPU threads divide the rows, not the triangles.
 
 
 @dataclass(frozen=True, eq=False)

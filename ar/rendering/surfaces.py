@@ -260,6 +260,6 @@ def collect_textures(layers: Sequence[Layer], device: str) -> tuple[wp.array, li
 def to_texels(solids: tuple[Solid, ...], device: str) -> wp.array:
     """Copy the texels of solid textures to a device, one texture after the other."""
     each = [solid.texels.reshape(-1, 4) for solid in solids]
-    # A single one, as of a scan, is large: on the CPU it is used without a copy.
+    # A single texture, such as a scan, is large: on the CPU it is used without a copy.
     texels = each[0] if len(each) == 1 else np.concatenate([np.zeros((0, 4), np.float32), *each])
     return wp.array(texels, dtype=wp.vec4f, device=device, copy=False)

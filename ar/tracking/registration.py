@@ -124,8 +124,8 @@ def refine_registration(
 ) -> Registration:  # fmt: skip
     """Fit as `register_points`, with additional `surface_points` (m, 3) [m] in the reference's frame.
 
-    Residuals of pairs and distances from the surface's tangent planes (Chen, Medioni 1992, "Object modelling by
-    registration of multiple range images") are weighted by their scatter. A surface that moved since then gives a bias.
+    Residuals of pairs, and distances from tangent planes of the surface (Chen, Medioni 1992, "Object modelling by
+    registration of multiple range images"), are weighted by their scatter. Surface motion after the scan causes bias.
 
     Raises
     ------

@@ -16,8 +16,7 @@ from sim.geometry.surface import compute_vertex_normals, normalise_vectors
 from ..array_functions import compute_squared_distances
 from .evidence import SHIFT_ERROR, SIGMA, Evidence, build_motion_evidence
 
-# Likely unit errors: factor that brings the points to the cortex, hint to the user.
-UNIT_ERRORS = (  # Likely unit and axis errors: factor that brings the points to the cortex, hint to the user.
+UNIT_ERRORS = (  # Likely unit errors: factor that brings the points to the cortex, hint to the user.
     (1.0, ""),
     (1e-3, "if they were a thousandth of that: files are in mm, arrays in metres"),
     (1e3, "if they were a thousand times of that: files are in mm, arrays in metres"),

@@ -34,7 +34,7 @@ class PosteriorSettings:
 
     motion_significance: float = 0.005  # Significance level of a motion, for each of three tests.
     outlier_significance: float = 1e-4  # Significance level of an outlier.
-    min_inliers: int = 4  # Minimum number of points that remain; with so few, no outlier is tested.
+    min_inliers: int = 4  # Minimum number of remaining points; if reached, no outlier is tested.
     evidence_divisor: float = 2.0  # Divisor of the log evidence, for model errors of the shapes.
     max_hypotheses: int = 24  # Maximum number of hypotheses in the mixture: the most probable ones.
 

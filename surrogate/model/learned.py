@@ -324,7 +324,7 @@ class Learned:
         InputError
             The loads are of another kind, or `answer` lacks vertices of the open cortex or the tumour.
         """
-        # With the result of these very loads as start, no time passes.
+        # With the result of the same loads as start, no time passes.
         pushed = self._convert_loads(loads, answer)[0]
         if apart is None:
             if answer is None:

@@ -80,7 +80,7 @@ def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
     nodes, modes = basis.nodes, basis.modes
     _require_good(nodes.ndim == 1 and nodes.dtype.kind in "iu" and len(nodes) > 0, "its nodes are no vertex numbers")
     _require_good(nodes.min() >= 0 and nodes.max() < len(anatomy.mesh.nodes), "its nodes lie outside the mesh")
-    # They increase; if one basis has the tumour and the cortex, once more from the start.
+    # Numbers increase; a basis of tumour and cortex has two increasing parts.
     rises = np.diff(nodes.astype(np.int64)) > 0
     _require_good(
         bool(np.sum(~rises) <= 1) and len(np.unique(nodes)) == len(nodes), "its nodes are not sorted, or come twice"

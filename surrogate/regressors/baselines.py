@@ -42,7 +42,7 @@ class Pcr(StoredRegressor):
         components, size, axes = np.linalg.svd(X - self.mean_, full_matrices=False)
         kept = 1 + int(np.searchsorted(np.cumsum(size**2), self.variance_share * np.sum(size**2)))
         kept = min(kept, int(np.sum(size > RANK_TOLERANCE * size[0])))
-        # Components are orthogonal: each has its own least-squares problem.
+        # Components are orthogonal, so that each is a separate least-squares problem.
         slopes = components[:, :kept].T @ (Y - self.offset_) / size[:kept, None]
         self.map_ = axes[:kept].T @ slopes
         return self

@@ -20,7 +20,7 @@ FACTORS = [np.array(list(combinations_with_replacement(range(3), order))).T for 
 ORDER_COLUMNS = (slice(0, 3), slice(3, 9), slice(9, 19))  # Columns of the products of each order.
 TERM_COUNT = ORDER_COLUMNS[-1].stop  # Number of products of all orders.
 STENCIL_SIZE = 3  # Number of radii of an interpolating parabola.
-HEIGHT_EQUIVALENT = 1e-2  # Height equivalent to a barycentric coordinate of -1 [m].
+HEIGHT_EQUIVALENT = 1e-2  # Height above a triangle that counts like a barycentric coordinate of -1 [m].
 SMALL_FORCE_SHARE = (
     0.4  # Share of the largest training force, below which the remainder is smaller than the table's own errors.
 )

@@ -46,7 +46,7 @@ class ContactSearchSettings:
     rod_tolerance: float = 1e-5  # Penetration tolerance of a rod or a blade [m].
     min_search_motion: float = 3.0  # Smallest nodal motion that continues the contact search [tolerances].
     max_iterations: int = 60  # Maximum number of iterations of the contact search.
-    path_step: float = 0.5  # Step of a rod or a blade on its path [radii]; larger ones may pass through tissue.
+    path_step: float = 0.5  # Step of a rod or a blade on its path [radii], so that tissue stays in front of it.
     # Number of iterations at intermediate steps: more change the result by less than its error, in twice the time.
     path_iterations: int = 3
     # Number of iterations after which constraints without force are kept, to prevent cycles. Until then they are

@@ -44,7 +44,7 @@ COARSE_BASIS = (1e-3, 60)  # Truncation tolerance and maximum number of modes of
 ADDED_BASIS = (5e-3, 160)
 # Models with the contact on linear tissue; the second also has a part trained on the residual.
 CONTACT_MODELS = ("contact", "contact-gp")
-SERIES_MODELS = ("series", "series-gp")  # Models that use the power series; the second is trained on its residual.
+SERIES_MODELS = ("series", "series-gp")  # Models with the power series; the second also fits its residual.
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class ExpansionSettings:
     """Accuracy settings of an `Expansion`."""
 
     table_tolerance: float = 1e-4  # Truncation tolerance of the compliance matrix.
-    second_order_tolerance: float = 3e-3  # Truncation tolerance of the second order's modes: 0.1 % of the motion.
+    second_order_tolerance: float = 3e-3  # Truncation tolerance of the second order's modes, 0.1 % of the motion.
     # Truncation tolerance and maximum number of modes of the series' table.
     wide_basis: tuple[float, int] = (1e-5, 192)
     table_places: int = 40  # Number of distant positions whose series span the bases of the table.
