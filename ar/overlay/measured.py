@@ -59,7 +59,7 @@ class Measurement:
 
     @property
     def extent(self) -> np.ndarray:
-        """Points (n, 3) [m] whose box in the image contains the rings; none for other styles."""
+        """Points (n, 3) [m] whose box in the image contains the rings; no points for other styles."""
         low, high = self.layer.vertices.min(axis=0), self.layer.vertices.max(axis=0)
         if self.style != "rings":
             return np.stack([low, high])[:0]

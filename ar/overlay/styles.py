@@ -45,7 +45,7 @@ class Opening:
     def describe(self, pixel_counts: Mapping[int, int]) -> str:
         """Return the label of the closed ground over the silhouette; empty if its share is too small.
 
-        `pixel_counts` are the silhouette's pixels by the id of the layer over them, without objects before the overlay.
+        `pixel_counts` has the number of silhouette pixels by the id of the layer over them, occluders excluded.
         """
         under: dict[str, int] = {}
         for layer, count in pixel_counts.items():

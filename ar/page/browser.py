@@ -203,8 +203,8 @@ class Browser:
     def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
         """Show an image (H, W, 3) uint8 of slices, and charts (HTML), in the tabs next to the 3-D view.
 
-        The page's thread calls `drawn` to compute both, as often as `ConnectionLimits` allow; calls between are
-        skipped.
+        The page's thread calls `drawn` to compute both, as often as `ConnectionLimits` allow; only the newest `drawn`
+        is called.
         """
         with self.lock:
             self.drawn = drawn

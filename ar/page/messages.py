@@ -19,7 +19,7 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class MessageError(ValueError):
-    """Error for a rejected message; `malformed` is True if a page of this server would not send it."""
+    """Error for a rejected message; `malformed` is True if no page of this server would send such a message."""
 
     def __init__(self, reason: str, malformed: bool = False) -> None:
         super().__init__(reason)

@@ -134,7 +134,7 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
 class Renderer:
     """Renderer of layers under a lamp: prepared once, used for any number of images, from one thread at a time.
 
-    The image of the fixed layers is cached from the second successive image of the same camera on.
+    If the same camera is used again, the image of the fixed layers is cached, starting with its second image.
     """
 
     def __init__(self, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> None:

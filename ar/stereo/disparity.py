@@ -79,7 +79,7 @@ class StereoView:
 
     @cached_property
     def disparity(self) -> np.ndarray:
-        """Disparity (size, size) float32 [pixel], at least to a whole pixel; NaN without a match."""
+        """Disparity (size, size) float32 [pixel], accurate to a pixel or better; NaN without a match."""
         settings = self.settings
         reach = int(np.ceil(self.geometry.depth_disparity / self.geometry.depth**2 * settings.depth_range))
         # OpenCV takes multiples of 16.

@@ -220,7 +220,7 @@ def _compose_page(
     target: Target, page: Image.Image, ink: ImageDraw.ImageDraw, placed: tuple[PlacedFace, ...], said: Sequence[str],
     rulers: tuple[tuple[float, float], tuple[float, float]],
 ) -> PrintedPage:  # fmt: skip
-    """Complete a portrait page with title, text and two rulers, which start at `rulers`: one down, one to the right."""
+    """Complete a portrait page: add the title, the text and two rulers, which start at the positions `rulers` [mm]."""
     _write(ink, f"sulcus: {target.name}", 15.0, 14.0, TITLE_HEIGHT)
     _write_paragraph(ink, said, 15.0, 25.0)
     _draw_ruler(ink, *rulers[0], down=True)

@@ -279,7 +279,7 @@ class PairResiduals:
         `held_out` (n,) over its standard deviation, predicted from the other pairs' scatter; NaN for three pairs, from
         which scatter cannot be estimated.
     p_value
-        Probability that a set without outliers has a largest studentised residual of this size; NaN for three pairs.
+        Probability that a set without outliers has a largest residual at least this large; NaN for three pairs.
     """
 
     residuals: np.ndarray

@@ -38,7 +38,7 @@ def to_rotation_vectors(rotations: np.ndarray) -> np.ndarray:
 
 
 def list_conventions(poses: np.ndarray) -> dict[str, np.ndarray]:
-    """Return poses (n, 4, 4) by quaternion convention: as given, and as if the file had another convention."""
+    """Return poses (n, 4, 4) by quaternion convention: as given, and reinterpreted under other conventions."""
     read = Rotation.from_matrix(poses[:, :3, :3])
     forms = {"": read, "as w, x, y, z": Rotation.from_quat(np.roll(read.as_quat(), -1, axis=1)), "inverted": read.inv()}
     found = {how: poses.copy() for how in forms}

@@ -118,7 +118,7 @@ def _compute_signed_distances(patch: Patch, points: np.ndarray) -> tuple[np.ndar
 
 
 def _sample_core(core: Core) -> np.ndarray:
-    """Sample points (k, 3) [m] of a core, border included, in tool coordinates; for a rod, only near its lower end."""
+    """Sample points (k, 3) [m] of a core and its border, in the tool's frame; of a rod, only near its lower end."""
     steps = np.ceil(2.0 * core.half / (SAMPLE_SPACING * core.radius)).astype(int)
     low, high = core.centre - core.half, core.centre + core.half
     if steps[2] > MAX_ROD_SAMPLES:

@@ -37,7 +37,7 @@ class SolverPool:
 
 
 def solve_batches(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -> Iterator[tuple[LoadBatch, bytes]]:
-    """Solve batches; yield each with its bytes from `solve_batch`, in order without a pool, else in any order."""
+    """Solve batches and yield each with its rows as bytes: in order without a pool, in any order with a pool."""
     if isinstance(deformer, SolverPool):
         yield from map_unordered(deformer.processes, solve_batch, tasks)
     else:

@@ -126,7 +126,7 @@ class Evidence:
 
     @property
     def axis_count(self) -> int:
-        """3 if every point has a row for each of the three axes, in order; else 1."""
+        """Number of axes per point: 3 if every point has a row for each of the axes, in order; else 1."""
         threefold = len(self) % 3 == 0 and np.array_equal(self.axis, np.tile(np.eye(3), (len(self) // 3, 1)))
         return 3 if threefold else 1
 

@@ -81,7 +81,7 @@ class Location:
     outliers, outlier_tips
         Indices of the rejected points and tips, which are far from the open cortex or not supported by other points.
     slipped
-        True if the registration error may be far larger than reported; the posterior then includes this.
+        True if the registration error may be far larger than reported; the posterior then includes such an error.
     checked
         True if the user has checked the registration, so that no slip is assumed.
     calibrated

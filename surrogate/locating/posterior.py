@@ -103,7 +103,7 @@ class Posterior:
     results
         Posteriors of the hypotheses; their probabilities sum to 1.
     unknowns
-        Mean (r + 6,) of the shapes' weights, and of the rigid error over its prior standard deviations.
+        Mean (r + 6,) of the shapes' weights, and of the rigid error divided by its prior standard deviations.
     surprise
         Mean over rows of the squared Mahalanobis distance from leave-one-out predictions; about 1 if the model fits.
     outliers

@@ -35,7 +35,7 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 class Archive:
-    """Reader of an open `.npz` file, of at most `max_bytes` array bytes per call.
+    """Reader of an open `.npz` file; each call reads at most `max_bytes` bytes of arrays.
 
     Every error message ends with `remedy`. Files of the wrong kind raise the exceptions of `zipfile` and NumPy.
     """

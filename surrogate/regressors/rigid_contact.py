@@ -295,7 +295,7 @@ class RigidContact:
 
 
 def _fit_line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Fit coefficients (k,) of terms (B, k), whose sum is the factor from `found` (B, r) to `wanted` (B, r)."""
+    """Fit coefficients (k,) of terms (B, k) whose sum is the factor that scales `found` (B, r) to `wanted` (B, r)."""
     factor = np.einsum("br,br->b", found, wanted) / np.square(found).sum(axis=1)
     return np.linalg.lstsq(terms, factor, rcond=None)[0]
 
