@@ -53,7 +53,7 @@ def read_png(path: Path) -> np.ndarray:
 def write_movie(path: Path, images: Iterable[np.ndarray], frames_per_second: float = 25.0) -> None:
     """Write images (H, W, 3) uint8 sRGB of equal size as a video: `.mp4`, or a looping `.gif` or `.webp`.
 
-    The file is written atomically. If reading `images` or writing fails, there is no file.
+    The file is written atomically. If reading `images` or writing fails, nothing is written.
 
     Raises
     ------

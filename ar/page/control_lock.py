@@ -36,7 +36,7 @@ class ControlLock:
         return client == self.holder
 
     def request_control(self, client: int, time: float) -> None:
-        """Add a client to the queue for control; it gets control at once if the holder is idle."""
+        """Add a client to the queue for control; if the holder is idle, the first in the queue gets control."""
         if client == self.holder or client in self.queue:
             return
         self.queue += (client,)

@@ -310,7 +310,7 @@ def to_light(lamp: Lamp) -> Light:
     angle = np.arctan(lamp.radius / np.linalg.norm(axis))
     light.outer, light.steepness = float(np.cos(angle)), float(1.0 / (np.cos(0.55 * angle) - np.cos(angle)))
     light.strength, light.ambient, light.P = lamp.strength, lamp.ambient, wp.mat44f(compute_projection(camera))
-    # The offset equals the filter width: then the surface itself is never under the filter, at any slant to the lamp.
+    # The offset equals the filter width, so that the surface itself is never under the filter, at any slant.
     light.offset = float(1.05 * (HALF_SOFT_WIDTH + 0.5) * np.linalg.norm(axis) / camera.K[0, 0])
     return light
 

@@ -84,7 +84,7 @@ def find_pose(
 
     From each face, two mirrored poses can be computed (Schweighofer, Pinz 2006, "Robust pose estimation from a planar
     target", IEEE Trans. Pattern Anal. Mach. Intell. 28:2024-2030). Each is refined to all corners. The best pose is
-    returned if no other one fits about as well, or if `previous` distinguishes them.
+    returned if no other pose fits about as well; else the pose nearest to `previous`, if clearly nearest.
 
     Parameters
     ----------

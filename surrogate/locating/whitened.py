@@ -62,7 +62,7 @@ class NormalEquations:
         return NormalEquations(left, table, place, evidence)
 
     def scale_unknowns(self, kind: int, deviations: np.ndarray) -> NormalEquations:
-        """Return equations (..., b) with b prior standard deviations of the unknowns of one kind, instead of 1."""
+        """Return equations (..., b) with b prior standard deviations for the unknowns of one kind, instead of 1."""
         own = np.flatnonzero(self.kind == kind)
         size = np.ones((len(deviations), self.products.shape[-1]))
         size[:, own] = deviations[:, None]

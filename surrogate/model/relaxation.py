@@ -56,7 +56,7 @@ def update_relaxation(
     times
         Times (B,) [s].
     start
-        Previous result of a model with the same `series`, at the same or earlier times; None at the first frame.
+        Previous result of a model with the same `series`, at the same or earlier times; None: no earlier result.
     min_depth
         Smallest depth [m] in the test for a tool that moves back.
 

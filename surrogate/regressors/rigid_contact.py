@@ -157,7 +157,7 @@ class RigidContact:
         return self._find_contact(X)[:, : len(self.compliance)]
 
     def _find_contact(self, X: np.ndarray) -> np.ndarray:
-        """Compute rows of nodal forces (3 k,) [N], then of contact points: triangle, barycentric coordinates, or -1."""
+        """Compute nodal forces (B, 3 k) [N], then contact points: triangle, barycentric coordinates; -1 if none."""
         stands, _, held = self._split_features(X)
         X = np.ascontiguousarray(np.hstack([stands, held]))
         asked, (known, found) = X.tobytes(), self._last

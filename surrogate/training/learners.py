@@ -209,7 +209,7 @@ def _find_model_type(name: str) -> tuple[str, Callable[[], RegressorFactory]]:
 
 
 def _fit_contact(known: Expansion, examples: Examples) -> tuple[ModelPart, list[tuple[np.ndarray, np.ndarray]]]:
-    """Fit the contact part to examples; return it, and per basis the vertices and residuals (B, n, 3) [m]."""
+    """Fit the contact part to examples; return it, and the vertices and residuals (B, n, 3) [m] of each basis."""
     contact, bases, _ = known.contact
     encoder = "core" if len(contact.core) else "tool"
     features, size = ENCODERS[encoder](known.patch, examples.loads), split_forces(examples.loads)[0][:, None, None]
