@@ -1,4 +1,4 @@
-"""Image files (PNG, folder of frames, video), and decoding of untrusted image bytes with a given size."""
+"""Image files (PNG, folder of frames, video), and decoding of image bytes from untrusted sources."""
 
 import struct
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class FrameFolder:
-    """Folder of `frame_0000.png`, `frame_0001.png`, ...; each file is written atomically."""
+    """Folder that receives frames as `frame_0000.png`, `frame_0001.png`, ...; each file is written atomically."""
 
     def __init__(self, folder: Path) -> None:
         """Create the folder if it is missing; ValueError if the path is a file."""
@@ -19,14 +19,14 @@ class FrameFolder:
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def show(self, number: int, colour: np.ndarray) -> None:
-        """Write one PNG."""
+        """Write the image `colour` (H, W, 3) uint8 sRGB of frame `number` as a PNG file."""
         write_png(self.folder / f"frame_{number:04d}.png", colour)
 
 
 def write_png(path: Path, colour: np.ndarray) -> None:
-    """Write an image (H, W, 3) uint8 sRGB atomically, and create its folder if necessary.
+    """Write an image (H, W, 3) uint8 sRGB as a PNG file, atomically; a missing folder is created.
 
-    Raises OSError if it cannot be written.
+    Raises OSError if the file cannot be written.
     """
     part = path.with_name(f".{path.name}.part")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -38,12 +38,12 @@ def write_png(path: Path, colour: np.ndarray) -> None:
 
 
 def shrink_image(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Downsample an image (H, W, 3) uint8 to (height, width, 3): means of the pixels covered."""
+    """Downsample an image (H, W, 3) uint8 to (height, width, 3), by the mean of the pixels under each new pixel."""
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def read_png(path: Path) -> np.ndarray:
-    """Read an image (H, W, 3) uint8 sRGB from a file; ValueError if it holds none."""
+    """Read an image file as (H, W, 3) uint8 sRGB; ValueError if it is not a readable image."""
     bgr = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if bgr is None:
         raise ValueError(f"{path} is not a readable image.")
@@ -51,16 +51,16 @@ def read_png(path: Path) -> np.ndarray:
 
 
 def write_movie(path: Path, images: Iterable[np.ndarray], frames_per_second: float = 25.0) -> None:
-    """Write images (H, W, 3) uint8 sRGB of one size as a video: `.mp4`, or `.gif` or `.webp` that loops.
+    """Write images (H, W, 3) uint8 sRGB of equal size as a video: `.mp4`, or a looping `.gif` or `.webp`.
 
-    The file is written atomically, or not at all if `images` or the writing fails.
+    The file is written atomically. If reading `images` or writing fails, nothing is written.
 
     Raises
     ------
     ValueError
-        An unknown suffix, a rate that is not positive, no image, or images of different sizes.
+        The suffix is unknown, the rate is not positive, there is no image, or image sizes differ.
     OSError
-        A file that cannot be written.
+        The file cannot be written.
     """
     path = Path(path)
     writers = {".mp4": write_video, ".gif": write_animation, ".webp": write_animation}
@@ -77,7 +77,7 @@ def write_movie(path: Path, images: Iterable[np.ndarray], frames_per_second: flo
 
 
 def write_video(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float) -> None:
-    """Write MPEG-4 part 2, image by image: nothing is kept in memory."""
+    """Write an MPEG-4 part 2 video image by image, so that only one image is in memory."""
     writer, size = None, None
     for colour in pictures:
         if writer is None:
@@ -94,7 +94,7 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], frames_per_second: f
 
 
 def write_animation(path: Path, images: Iterable[np.ndarray], frames_per_second: float) -> None:
-    """Write a GIF or WebP that loops for ever; all images are in memory at once."""
+    """Write a GIF or WebP animation that loops forever; all images are in memory at once."""
     frames = [np.ascontiguousarray(colour[..., ::-1]) for colour in images]
     if not frames:
         raise ValueError("a video needs at least one image.")
@@ -109,7 +109,7 @@ def write_animation(path: Path, images: Iterable[np.ndarray], frames_per_second:
 
 
 def check_size(image: np.ndarray, size: tuple[int, ...] | None) -> None:
-    """Raise ValueError unless an image has the size of the first."""
+    """Raise ValueError if an image does not have the shape `size` of the first image."""
     if image.shape != size:
         raise ValueError(f"images of {size} and {image.shape}: all images of a video must have one size.")
 
@@ -119,7 +119,7 @@ PNG_END, JPEG_END = b"IEND\xaeB`\x82", b"\xff\xd9"  # Last bytes of a PNG and of
 # Markers of a JPEG's frame header, which holds its size; the markers of coding tables in that range are excluded.
 SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 IGNORE_ORIENTATION = cv2.IMREAD_IGNORE_ORIENTATION
-"""Flag to ignore EXIF orientation: the camera matrix is for unrotated images."""
+"""OpenCV flag to ignore EXIF orientation, because camera matrices are for unrotated images."""
 
 
 def read_image_size(data: bytes) -> tuple[int, int]:
@@ -128,7 +128,7 @@ def read_image_size(data: bytes) -> tuple[int, int]:
     Raises
     ------
     ValueError
-        Bytes that are neither, or that end too early.
+        The bytes are neither a JPEG nor a PNG, or they are truncated or damaged.
     """
     ending = PNG_END if data.startswith(PNG) else JPEG_END if data.startswith(JPEG) else None
     if ending is None:
@@ -153,18 +153,18 @@ def read_image_size(data: bytes) -> tuple[int, int]:
 
 
 def decode_colour(data: bytes, width: int, height: int) -> np.ndarray:
-    """Decode an image (height, width, 3) uint8 sRGB.
+    """Decode a JPEG or PNG to an image (height, width, 3) uint8 sRGB.
 
     Raises
     ------
     ValueError
-        Bytes that are not such an image, or one of another size.
+        The bytes are not such an image, or the image has another size or type.
     """
     return _decode_image(data, (height, width, 3), cv2.IMREAD_COLOR_RGB | IGNORE_ORIENTATION, np.uint8)
 
 
 def decode_depth(data: bytes, width: int, height: int, scale: float) -> np.ndarray:
-    """Decode depth (height, width) float32 [m] from a PNG of 16 bits with unit `scale` [m]; 0 without a surface.
+    """Decode depth (height, width) float32 [m] from a 16-bit PNG with unit `scale` [m]; 0 means no surface.
 
     Raises
     ------
@@ -176,7 +176,7 @@ def decode_depth(data: bytes, width: int, height: int, scale: float) -> np.ndarr
 
 
 def decode_labels(data: bytes, width: int, height: int) -> np.ndarray:
-    """Decode labels (height, width) uint8 from a PNG of 8 bits.
+    """Decode labels (height, width) uint8 from an 8-bit PNG.
 
     Raises
     ------

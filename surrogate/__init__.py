@@ -9,9 +9,9 @@ FORMER = {
     "learner": "register_learner",
     "onnx_model": "build_onnx_model",
 }
-"""Former names of public names, for one release."""
+"""Former names of public names, mapped to the current names; they work for one more release."""
 
 
 def __getattr__(name):
-    """Load a public name, also by its former name."""
+    """Load a public name of this package by its current or its former name."""
     return _load(FORMER.get(name, name))

@@ -1,1 +1,1 @@
-"""Cameras: projection, lenses, calibrations."""
+"""Cameras with their projection, lens distortion and calibration files."""

@@ -1,6 +1,6 @@
-"""Calibration of a camera, and its text in the formats of OpenCV and ROS.
+"""Intrinsic calibration of a camera, and its text in the formats of OpenCV and ROS.
 
-OpenCV: `cv2.FileStorage` with the names of its calibration sample. ROS: the camera_info of camera_calibration_parsers.
+OpenCV: `cv2.FileStorage` with the keys of OpenCV's calibration sample. ROS: camera_info of camera_calibration_parsers.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .lens import Lens
 
 MAX_IMAGE_SIDE = 16384  # Largest image side [pixel].
 READOUT_KEY = "readout_time"
-"""Key of a rolling shutter's readout time [s]: neither OpenCV nor ROS has one, and both ignore it."""
+"""Key of a rolling shutter's readout time [s]; OpenCV and ROS have no such key, and ignore it."""
 MAX_NAME_LENGTH = 256  # Maximum length of a camera's name [characters].
 MAX_READOUT = 1.0  # Largest readout time, from the first row of an image to the last [s].
 
@@ -29,7 +29,7 @@ class Calibration:
     Parameters
     ----------
     focal, principal
-        Focal lengths, and the principal point, along columns and rows [pixel]; whole numbers are pixel centres.
+        Focal lengths and principal point along columns and rows [pixel]; integer positions are pixel centres.
     width, height
         Size of the image [pixel].
     lens
@@ -37,13 +37,13 @@ class Calibration:
     name
         Name of the camera; may be empty.
     readout
-        Rolling-shutter readout time: from the first row of an image to the last [s]. An image's time is that of its
+        Rolling-shutter readout time [s] from the first row of an image to the last. The time of an image is that of its
         middle row.
 
     Raises
     ------
     ValueError
-        An image size, a focal length, a principal point or a readout out of range.
+        An image size, focal length, principal point, readout time or name is out of range.
     """
 
     focal: tuple[float, float]
@@ -78,21 +78,21 @@ class Calibration:
 
     @property
     def K(self) -> np.ndarray:
-        """(3, 3) intrinsics [pixel]."""
+        """Intrinsic camera matrix (3, 3) [pixel]."""
         (fx, fy), (cx, cy) = self.focal, self.principal
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def build_camera(self, T_camera_world: np.ndarray) -> Camera:
-        """Return the camera at a pose T_camera_world (4, 4) [m]; errors as in `Camera`."""
+        """Return the camera at the pose T_camera_world (4, 4) [m]; raises ValueError as `Camera`."""
         return Camera(self.K, T_camera_world, self.width, self.height, self.lens)
 
     def resize_calibration(self, width: int, height: int, allow_scaling: bool = False) -> Calibration:
-        """Return the calibration for an image size; another size needs `allow_scaling` and the same aspect ratio.
+        """Return the calibration for another image size; this needs `allow_scaling` and the same aspect ratio.
 
         Raises
         ------
         ValueError
-            An image of another size without `allow_scaling`, or another aspect ratio.
+            The size differs without `allow_scaling`, or the aspect ratio differs.
         """
         if (width, height) == (self.width, self.height):
             return self
@@ -107,7 +107,7 @@ class Calibration:
 
 
 def to_opencv_text(calibration: Calibration) -> str:
-    """Write a calibration as YAML of `cv2.FileStorage`; five coefficients, or eight of a rational lens."""
+    """Format a calibration as YAML of `cv2.FileStorage`, with five coefficients, or eight for a rational lens."""
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", calibration.width)
     storage.write("image_height", calibration.height)
@@ -120,9 +120,9 @@ def to_opencv_text(calibration: Calibration) -> str:
 
 
 def to_ros_text(calibration: Calibration) -> str:
-    """Write a calibration as YAML of ROS's camera_info; lens model plumb_bob, or rational_polynomial if needed.
+    """Format a calibration as YAML of ROS's camera_info; lens model plumb_bob, or rational_polynomial if needed.
 
-    Images are not rectified: the projection matrix equals the camera matrix.
+    As images are not rectified, the projection matrix equals the camera matrix.
     """
     coefficients = to_opencv_coefficients(calibration.lens)
     lines = [
@@ -140,7 +140,7 @@ def to_ros_text(calibration: Calibration) -> str:
 
 
 def to_opencv_coefficients(lens: Lens) -> np.ndarray:
-    """Return the lens coefficients in OpenCV's order: (5,), or (8,) for a rational lens."""
+    """Return the lens coefficients in OpenCV's order, (5,), or (8,) for a rational lens."""
     return lens.coefficients if lens.coefficients[5:].any() else lens.coefficients[:5]
 
 
@@ -150,7 +150,7 @@ def _format_matrix(name: str, values: np.ndarray) -> list[str]:
     return [f"{name}:", f"  rows: {rows}", f"  cols: {columns}", f"  data: [{numbers}]"]
 
 
-MAX_TEXT_LENGTH = 64 * 1024  # Maximum length of a calibration file [characters]: a calibration has about a thousand.
+MAX_TEXT_LENGTH = 64 * 1024  # Maximum length of a calibration file [characters]; about a thousand are usual.
 MAX_NESTING = 4  # Maximum nesting depth of brackets: OpenCV's parser is recursive, and a calibration needs two.
 # Minimum number of coefficients of the distortion models named by ROS.
 MIN_COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8}
@@ -160,30 +160,30 @@ KEYS = (
     "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model", "distortion_coefficients",
     "rectification_matrix", "projection_matrix", "fisheye_model", READOUT_KEY,
 )  # fmt: skip
-"""Keys of a calibration that are read."""
+"""Keys of a calibration file that are read."""
 # Pattern of a YAML list of numbers, one on each line.
 BLOCK_LIST = re.compile(r"^(( *)data: *)\n((?:\2 *- *[-+.\w]+ *\n)+)", re.MULTILINE)
 ITEM = re.compile(r"^ *- *([-+.\w]+)", re.MULTILINE)
-"""Pattern of one number of such a list."""
+"""Pattern of a number in such a list."""
 # Pattern of a camera name without quotes.
 NAME_LINE = re.compile(r"^(camera_name:[ \t]+)([^\s\"'\[{][^\n\"#]*?)[ \t]*$", re.MULTILINE)
 OTHER_LINE = re.compile(rf"^(?!(?:{'|'.join(KEYS)})\b)\w+:[ \t]+[^\s\[{{|>&!][^\n]*\n", re.MULTILINE)
-"""Pattern of a one-line entry whose key is not read."""
+"""Pattern of a one-line entry with a key that is not read."""
 REMEDY = (  # Required content of the file, in error messages.
     "Give YAML with image_width, image_height, camera_matrix and distortion_coefficients, as OpenCV or ROS writes it."
 )
 
 
 def parse_calibration(text: str) -> Calibration:
-    """Parse a calibration from YAML of `cv2.FileStorage`, or of ROS's camera_info.
+    """Parse a calibration from YAML of `cv2.FileStorage` or of ROS's camera_info.
 
-    Four coefficients (k1 k2 p1 p2) are read as five. More than eight are accepted if those after the eighth are 0.
+    With four coefficients (k1 k2 p1 p2), k3 is 0. More than eight are accepted if those after the eighth are 0.
 
     Raises
     ------
     ValueError
-        A text that is too long or not valid YAML. A part that is missing, is given twice, has another shape or is not
-        finite. An unsupported lens or distortion model. Errors of `Calibration`.
+        The text is too long or not valid YAML. An entry is missing, given twice, of another shape, or not finite. The
+        lens or distortion model is not supported. Errors of `Calibration`.
     """
     storage = _open_text(text)
     root = storage.root()
@@ -211,7 +211,7 @@ def parse_calibration(text: str) -> Calibration:
 
 
 def _open_text(text: str) -> cv2.FileStorage:
-    """Open the text with OpenCV."""
+    """Open the text with OpenCV; ValueError if it is too long or not valid YAML."""
     if len(text) > MAX_TEXT_LENGTH:
         raise ValueError(f"it has more than {MAX_TEXT_LENGTH} characters, and a calibration some thousand. {REMEDY}")
     text = text.removeprefix("\ufeff").replace("\r\n", "\n")
@@ -230,7 +230,7 @@ def _open_text(text: str) -> cv2.FileStorage:
 
 
 def _convert_text(text: str) -> str:
-    """Convert the text for OpenCV's parser: lists in brackets, names in quotes, and only keys that are read."""
+    """Convert the text for OpenCV's parser: lists in brackets, names in quotes, and only the keys that are read."""
     text = BLOCK_LIST.sub(lambda found: f"{found[1]}[{', '.join(ITEM.findall(found[3]))}]\n", text)
     return OTHER_LINE.sub("", NAME_LINE.sub(r'\1"\2"', text))
 
@@ -243,7 +243,7 @@ def _read_int(root: cv2.FileNode, key: str) -> int:
 
 
 def _read_matrix(root: cv2.FileNode, key: str, shape: tuple[int, int] | None = None) -> np.ndarray:
-    """Read a matrix of finite numbers; its declared size allocates no memory."""
+    """Read a matrix of finite numbers; memory is allocated by its actual size, not its declared size."""
     node = root.getNode(key)
     if not node.isMap() or not {"rows", "cols", "data"} <= set(node.keys()):
         raise ValueError(f"{key} must have rows, cols and data. {REMEDY}")
@@ -261,7 +261,7 @@ def _read_matrix(root: cv2.FileNode, key: str, shape: tuple[int, int] | None = N
 
 
 def _read_lens(root: cv2.FileNode, keys: list[str]) -> Lens:
-    """Read the lens distortion."""
+    """Read the lens distortion; ValueError if the model is not supported."""
     if "distortion_coefficients" not in keys:
         raise ValueError(f"distortion_coefficients is missing; five times 0 for no distortion. {REMEDY}")
     values = _read_matrix(root, "distortion_coefficients")
@@ -296,7 +296,7 @@ def _read_readout(root: cv2.FileNode, keys: list[str]) -> float:
 
 
 def _name(root: cv2.FileNode, keys: list[str]) -> str:
-    """Read the camera's name."""
+    """Read the camera's name; empty if the text has none."""
     if "camera_name" not in keys:
         return ""
     node = root.getNode("camera_name")

@@ -1,9 +1,9 @@
-"""Cameras: projection of world points into the image, stereo pairs, and rolling shutters.
+"""Cameras: projection of world points into an image, stereo pairs, and rolling shutters.
 
-OpenCV's convention throughout: camera frame x right, y down, z forward; pixel (u, v) = (column, row) with whole numbers
-at pixel centres, so that the image spans -0.5 .. width - 0.5. World points are in metres (RAS in this project).
+OpenCV's convention: the camera frame has x right, y down, z forward; a pixel (u, v) = (column, row) has whole numbers
+at its centre, so the image spans -0.5 .. width - 0.5. World points are in metres (in this project RAS).
 
-The rows of a rolling shutter are exposed one after the other: a moving camera has another pose in each. The time of an
+A rolling shutter exposes the rows one after the other, so a moving camera has another pose for each row. The time of an
 image is that of its middle row; row times are relative to it.
 """
 
@@ -27,18 +27,18 @@ class Camera:
     Parameters
     ----------
     K
-        (3, 3) intrinsics [pixel]: (u w, v w, w) = K x_camera.
+        Intrinsic matrix (3, 3) [pixel]: (u w, v w, w) = K x_camera.
     T_camera_world
-        (4, 4) rigid transform: x_camera = T_camera_world x_world [m].
+        Rigid transform (4, 4): x_camera = T_camera_world x_world [m].
     width, height
         Size of the image [pixel].
     lens
-        Lens distortion; None, or all coefficients 0: none.
+        Lens distortion; None, or a lens with all coefficients 0: no distortion.
 
     Raises
     ------
     ValueError
-        Wrong shapes, numbers that are not finite, no focal length, or a transform that is not rigid.
+        A shape is wrong, a number is not finite, a focal length is not positive, or the transform is not rigid.
 
     Examples
     --------
@@ -73,27 +73,27 @@ class Camera:
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,): position of the camera in the world [m]."""
+        """Position (3,) [m] of the camera in the world."""
         return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
 
     @property
     def distortion(self) -> np.ndarray:
-        """(8,) coefficients of the lens in OpenCV's order: zeros without one."""
+        """Lens coefficients (8,) in OpenCV's order; zeros without a lens."""
         return np.zeros(8) if self.lens is None else self.lens.coefficients
 
     @property
     def vertical_fov(self) -> float:
-        """Angle between the upper and the lower border [rad]; exact without lens, if the principal point is centred."""
+        """Angle [rad] between upper and lower image border; exact without lens and with central principal point."""
         return float(2.0 * np.arctan(0.5 * self.height / self.K[1, 1]))
 
     def to_camera_frame(self, points: np.ndarray) -> np.ndarray:
-        """Transform world points (..., 3) to the camera frame, (..., 3) [m]."""
+        """Transform world points (..., 3) [m] to the camera frame (..., 3) [m]."""
         return points @ self.T_camera_world[:3, :3].T + self.T_camera_world[:3, 3]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project world points (..., 3) to pixels (..., 2) and depth (...) [m].
+        """Project world points (..., 3) [m] to pixels (..., 2), and compute their depths (...) [m].
 
-        Pixels are NaN where depth <= 0 (behind), and beyond the reach of the lens (`Lens.reach`).
+        Pixels are NaN for depth <= 0 (behind the camera), and beyond the reach of the lens (`Lens.reach`).
         """
         in_camera = self.to_camera_frame(np.asarray(points, np.float64))
         if self.lens is not None:
@@ -105,9 +105,9 @@ class Camera:
         return homogeneous[..., :2] / np.where(depth > 0.0, depth, np.nan)[..., None], depth
 
     def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """Compute world points (..., 3) [m] at `depth` (...) [m] (z, not range) behind pixels (..., 2).
+        """Compute the world points (..., 3) [m] at pixels (..., 2) and `depth` (...) [m], which is z, not range.
 
-        NaN at pixels where the lens sees nothing.
+        NaN at pixels to which the lens projects no point.
         """
         if self.lens is not None:
             pixels = to_pixels(self.K, self.lens.undistort(to_normalised(self.K, np.asarray(pixels, np.float64))))
@@ -117,16 +117,16 @@ class Camera:
 
     @cached_property
     def straight(self) -> np.ndarray:
-        """Undistorted position of each pixel, (H, W, 2) [pixel]; NaN where the lens sees nothing."""
+        """Undistorted position (H, W, 2) [pixel] of each pixel; NaN where the lens projects no point to a pixel."""
         if self.lens is None:
             rows, columns = np.mgrid[: self.height, : self.width].astype(np.float64)
             return np.stack([columns, rows], axis=-1)
         return undistort_pixels(self.lens, tuple(self.K.ravel().tolist()), self.width, self.height)
 
     def perturb(self, degrees: float, axis: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> Camera:
-        """Return the camera with the world rotated about the camera's centre by an angle [degree].
+        """Return the camera with the world rotated by `degrees` about the camera's centre.
 
-        The rotation is right-handed about `axis` (camera frame): about y, the default, the scene moves to the right.
+        The rotation is right-handed about `axis` in the camera frame; about y (default), the scene moves to the right.
         """
         direction = np.asarray(axis, np.float64) / np.linalg.norm(axis)
         turn = np.eye(4)
@@ -134,18 +134,18 @@ class Camera:
         return replace(self, T_camera_world=turn @ self.T_camera_world)
 
     def move(self, shift: np.ndarray) -> Camera:
-        """Return the camera moved by `shift` (3,) [m] in the camera frame: right, down, forward."""
+        """Return the camera moved by `shift` (3,) [m] in its own frame: right, down, forward."""
         T = self.T_camera_world.copy()
         T[:3, 3] -= shift
         return replace(self, T_camera_world=T)
 
     def zoom(self, factor: float) -> Camera:
-        """Return the camera with `factor` times the focal length; principal point and lens are unchanged.
+        """Return the camera with its focal lengths multiplied by `factor`; principal point and lens are unchanged.
 
         Raises
         ------
         ValueError
-            A factor that is not a number above 0.
+            The factor is not a finite number above 0.
         """
         if not 0.0 < factor < np.inf:
             raise ValueError(f"a camera cannot zoom by {factor}: give a number above 0.")
@@ -154,21 +154,21 @@ class Camera:
         return replace(self, K=K)
 
     def refocus(self, focal_length: float, before: float, now: float) -> Camera:
-        """Return the camera focused on another distance, which changes the magnification.
+        """Return the camera after a change of the focus distance, which changes the magnification.
 
-        A thin lens of focal length f forms the image of an object at d at the distance f d / (d - f) behind it.
+        A thin lens of focal length f forms the image of an object at distance d at f d / (d - f) behind the lens.
 
         Parameters
         ----------
         focal_length
             Focal length of the lens [m].
         before, now
-            Focus distances [m] during calibration, and now.
+            Focus distances [m]: during the calibration, and for the returned camera.
 
         Raises
         ------
         ValueError
-            A focal length <= 0, or a distance <= the focal length.
+            The focal length is <= 0, or a distance is <= the focal length.
         """
         if not 0.0 < focal_length < min(before, now) < np.inf:
             raise ValueError(
@@ -178,7 +178,7 @@ class Camera:
         return self.zoom(behind[0] / behind[1])
 
     def scale(self, factor: float) -> Camera:
-        """Return the camera of the same view with `factor` times as many pixels along each side."""
+        """Return the camera with the same view and `factor` times as many pixels along each side."""
         width, height = round(self.width * factor), round(self.height * factor)
         resize = np.array(
             [
@@ -190,7 +190,7 @@ class Camera:
         return replace(self, K=resize @ self.K, width=width, height=height)
 
     def crop_to(self, rows: slice, columns: slice) -> Camera:
-        """Return the camera of the image part `[rows, columns]`, two slices with start and stop."""
+        """Return the camera of the image part `[rows, columns]`; both slices have start and stop."""
         shift = np.zeros((3, 3))
         shift[:2, 2] = columns.start, rows.start
         part = replace(self, K=self.K - shift, width=columns.stop - columns.start, height=rows.stop - rows.start)
@@ -199,7 +199,7 @@ class Camera:
         return part
 
     def pad(self, aspect: float) -> Camera:
-        """Return the camera of the smallest canvas of width / height = `aspect` with the image at its centre."""
+        """Return the camera of the smallest canvas with width / height = `aspect` round the image, which is centred."""
         width = max(self.width, round(self.height * aspect))
         height = max(self.height, round(self.width / aspect))
         shift = np.zeros((3, 3))
@@ -213,10 +213,10 @@ def look_at(
     eye: np.ndarray, target: np.ndarray, up: np.ndarray, vertical_fov: float = np.radians(35.0), width: int = 640,
     height: int = 480,
 ) -> Camera:  # fmt: skip
-    """Build a camera at `eye` (3,) [m] that looks at `target` (3,) [m], with `up` (3,) upwards in the image.
+    """Build a camera at `eye` (3,) [m] that looks at `target` (3,) [m]; `up` (3,) points upwards in the image.
 
-    `vertical_fov` [rad]; square pixels, principal point in the centre. Raises ValueError if no direction is defined:
-    eye on target, or `up` along the line of sight.
+    `vertical_fov` is in radians. Pixels are square, and the principal point is central. Raises ValueError if eye and
+    target coincide, or if `up` is along the line of sight.
 
     Examples
     --------
@@ -239,7 +239,7 @@ def look_at(
 
 
 def project_cv2(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Project world points (N, 3) [m] to pixels (N, 2) by `cv2.projectPoints`, to check `Camera.project`."""
+    """Project world points (N, 3) [m] to pixels (N, 2) by `cv2.projectPoints`, as a reference for `Camera.project`."""
     rotation = cv2.Rodrigues(camera.T_camera_world[:3, :3])[0]
     points = np.ascontiguousarray(points, np.float64).reshape(-1, 1, 3)
     pixels, _ = cv2.projectPoints(points, rotation, camera.T_camera_world[:3, 3], camera.K, camera.distortion)
@@ -258,12 +258,12 @@ def build_stereo_pair(
     Parameters
     ----------
     working_distance
-        Distance at which the two axes meet [m]; None: they are parallel, and rows of both images correspond.
+        Distance [m] at which the optical axes meet; None: the axes are parallel, and rows of both images correspond.
 
     Raises
     ------
     ValueError
-        A baseline or a distance that is not a number above 0.
+        The baseline or the distance is not a finite number above 0.
     """
     if not 0.0 < baseline < np.inf or (working_distance is not None and not 0.0 < working_distance < np.inf):
         raise ValueError(f"a baseline of {baseline} m, a distance of {working_distance} m: give numbers above 0.")
@@ -273,7 +273,7 @@ def build_stereo_pair(
 
 
 MAX_BAND_MOTION = (
-    0.4  # Largest motion of points during a band of rows [pixel]: the error of a row is then at most half of it.
+    0.4  # Largest motion of points during a band of rows [pixel]; the error of a row is at most half of it.
 )
 MOTION_SAMPLES = 33  # Number of times at which motion during the readout is sampled.
 MIN_BAND_ROWS = 4  # Minimum height of a band [rows].
@@ -281,16 +281,16 @@ ROW_ITERATIONS = 6  # Number of fixed-point iterations for the row in which a po
 
 
 def compute_row_time(row: np.ndarray | float, height: int, readout: float) -> np.ndarray | float:
-    """Compute the time [s] of a row in an image of `height` rows; rows outside are clipped to the image."""
+    """Compute the time [s] of a row in an image of `height` rows, relative to its middle row; rows are clipped."""
     return readout * (np.clip(np.asarray(row) / max(height - 1, 1), 0.0, 1.0) - 0.5)
 
 
 def split_row_bands(
     camera_at: Callable[[float], Camera], readout: float, points: np.ndarray
 ) -> list[tuple[slice, Camera]]:
-    """Split the rows, from top to bottom, into bands, each with the camera at its time, cropped to these rows.
+    """Split the image rows into bands, from top to bottom; return each band with its camera, cropped to these rows.
 
-    In each band, points (n, 3) [m] move by at most `MAX_BAND_MOTION` pixels.
+    `camera_at` gives the camera at a time. In each band, points (n, 3) [m] move by at most `MAX_BAND_MOTION` pixels.
     """
     middle = camera_at(0.0)
     moments = readout * np.linspace(-0.5, 0.5, MOTION_SAMPLES)
@@ -306,7 +306,7 @@ def split_row_bands(
 
 
 def find_row_time(camera_at: Callable[[float], Camera], readout: float, point: np.ndarray) -> float:
-    """Compute the time [s] of the row in which a point (3,) [m] is visible; 0 if the point has no pixel."""
+    """Compute the time [s] of the row in which a point (3,) [m] is visible; 0 if the point is not projected."""
     time = 0.0
     for _ in range(ROW_ITERATIONS):
         camera = camera_at(time)

@@ -1,6 +1,6 @@
-"""Lens distortion by Brown and Conrady, with OpenCV's coefficients in OpenCV's order.
+"""Lens distortion by the model of Brown and Conrady, with the coefficients and their order as in OpenCV.
 
-Image positions are normalised here: (x, y) = (X / Z, Y / Z) of a point in the camera frame.
+Image positions in this module are normalised: (x, y) = (X / Z, Y / Z) of a point in the camera frame.
 """
 
 from dataclasses import astuple, dataclass
@@ -8,18 +8,18 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-MAX_ANGLE = np.radians(88.0)  # Largest angle from the optical axis that is tried [rad].
+MAX_ANGLE = np.radians(88.0)  # Largest angle from the optical axis for which `Lens.reach` is searched [rad].
 RADIUS_COUNT = 4096  # Number of radii, from the axis outwards, at which the mapping is sampled.
 DIRECTION_COUNT = 32  # Number of directions round the axis at which the mapping is sampled.
 MAX_NEWTON_ITERATIONS = 20  # Maximum number of Newton iterations of the inverse mapping.
 # Residual that ends the Newton iterations, in normalised coordinates: 1e-9 pixel at a focal length of 1000 pixels.
 NEWTON_TOLERANCE = 1e-12
-CHUNK_POINTS = 8192  # Chunk size [points]: its arrays fit in the CPU cache. Without chunks it takes 1.5 times as long.
+CHUNK_POINTS = 8192  # Chunk size [points]: its arrays fit in the CPU cache; without chunks it takes 1.5 times as long.
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Lens with distortion.
+    """Distortion of a camera lens.
 
     With r^2 = x^2 + y^2 and q = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6), (x, y) is mapped to
 
@@ -30,7 +30,7 @@ class Lens:
     Raises
     ------
     ValueError
-        A coefficient that is not finite, or a lens that folds the image already at its centre.
+        A coefficient is not finite, or the distortion is not one-to-one even at the image's centre.
 
     Examples
     --------
@@ -56,15 +56,15 @@ class Lens:
 
     @property
     def coefficients(self) -> np.ndarray:
-        """(8,): coefficients in OpenCV's order, for `cv2.projectPoints`."""
+        """Coefficients (8,) in OpenCV's order, for `cv2.projectPoints`."""
         return np.array(astuple(self), np.float64)
 
     @cached_property
     def reach(self) -> float:
-        """Largest distance from the axis, X / Z, where the distortion is one-to-one: points beyond are not projected.
+        """Largest distance X / Z from the axis at which the distortion is one-to-one; points beyond are not projected.
 
-        Polynomials fold back. In a disc where the Jacobian's symmetric part is positive definite, no two points have
-        the same image.
+        Polynomials fold back at large distances. In a disc where the Jacobian's symmetric part is positive definite, no
+        two points have the same image.
         """
         radii = np.tan(np.linspace(0.0, MAX_ANGLE, RADIUS_COUNT))
         angles = np.linspace(0.0, 2.0 * np.pi, DIRECTION_COUNT, endpoint=False)
@@ -79,7 +79,7 @@ class Lens:
         return float(radii[-1] if not len(folds) else radii[max(folds[0] - 1, 0)])
 
     def distort(self, places: np.ndarray) -> np.ndarray:
-        """Distort positions (..., 2); NaN beyond `reach`."""
+        """Map undistorted positions (..., 2) to distorted positions; NaN beyond `reach`."""
         x, y = places[..., 0], places[..., 1]
         with np.errstate(invalid="ignore"):
             seen = np.hypot(x, y) <= self.reach
@@ -87,7 +87,7 @@ class Lens:
         return np.stack(self._apply_distortion(x, y), axis=-1)
 
     def undistort(self, places: np.ndarray) -> np.ndarray:
-        """Invert `distort` at positions (..., 2) by Newton's method; NaN without a solution within `reach`."""
+        """Map distorted positions (..., 2) to undistorted ones by Newton's method; NaN if there are none in `reach`."""
         places = np.asarray(places, np.float64)
         wanted = places.reshape(-1, 2).T
         _, moved = self._along
@@ -100,7 +100,7 @@ class Lens:
         return out.T.reshape(places.shape)
 
     def _undistort_points(self, wanted: np.ndarray) -> np.ndarray:
-        """Undistort positions (2, n)."""
+        """Undistort normalised positions (2, n); return (2, n), NaN where Newton's method fails."""
         far = np.hypot(*wanted)
         # Start: without its tangential part the lens moves positions along rays.
         radii, moved = self._along
@@ -122,13 +122,13 @@ class Lens:
 
     @cached_property
     def _along(self) -> tuple[np.ndarray, np.ndarray]:
-        """Distances from the axis, undistorted and distorted without the tangential part, both ascending."""
+        """Distances from the axis, undistorted and distorted (tangential part excluded), both ascending."""
         radii = np.linspace(0.0, self.reach, RADIUS_COUNT)
         moved = radii * self._compute_radial(radii**2)[0]
         return radii, np.maximum.accumulate(moved)
 
     def _compute_radial(self, r2: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Compute q, and its derivative by r^2."""
+        """Compute the radial factor q at `r2` = r^2, and its derivative by r^2."""
         over = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         under = 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
         steep = self.k1 + r2 * (2.0 * self.k2 + 3.0 * r2 * self.k3)
@@ -137,7 +137,7 @@ class Lens:
         return q, (steep - q * lower) / under
 
     def _apply_distortion(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distort (x, y) without the limit of the reach."""
+        """Distort (x, y), also beyond `reach`."""
         r2, xy = x * x + y * y, 2.0 * x * y
         q, _ = self._compute_radial(r2)
         return (
@@ -146,7 +146,7 @@ class Lens:
         )
 
     def _compute_slopes(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Compute the entries (xx, xy, yy) of the Jacobian, which is symmetric."""
+        """Compute the entries (xx, xy, yy) of the distortion's Jacobian, which is symmetric."""
         q, steep = self._compute_radial(x * x + y * y)
         across = 2.0 * steep * x * y + 2.0 * self.p1 * x + 2.0 * self.p2 * y
         return (
@@ -160,7 +160,7 @@ class Lens:
 
 @lru_cache(maxsize=4)
 def undistort_pixels(lens: Lens, K: tuple[float, ...], width: int, height: int) -> np.ndarray:
-    """Undistort each pixel, (H, W, 2) [pixel]; NaN where nothing is seen. K (9,): row by row."""
+    """Compute each pixel's undistorted position (H, W, 2) [pixel]; NaN without one. K (9,) is in row-major order."""
     matrix = np.reshape(K, (3, 3))
     rows, columns = np.mgrid[:height, :width].astype(np.float64)
     places = lens.undistort(to_normalised(matrix, np.stack([columns, rows], axis=-1)))

@@ -1,1 +1,1 @@
-"""Overlay of the hidden surface on the image: styles, lines and text."""
+"""Overlay of a hidden surface on a camera image: styles, lines and text."""

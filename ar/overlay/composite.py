@@ -1,4 +1,4 @@
-"""Composition of a hidden surface into the registered camera image, never over the tool."""
+"""Composition of a hidden surface into a registered camera image, without covering tools."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -58,22 +58,22 @@ from .window import BORDER_COLOUR, CLOSED_GROUND, FRONT, LayerRoles, OverlayLine
 DOUBTFUL_COLOUR = (0.92, 0.50, 0.05)  # Outline (RGB, 0 to 1) of an unreliable overlay, which is broken as well.
 WARNING_COLOUR = (1.0, 0.84, 0.5)  # Text colour of an unreliable overlay; differs from the outline's.
 POINT_COLOUR = (255.0, 245.0, 190.0)  # Colour of observed points.
-MARGIN_BRIGHTNESS = 0.75  # Brightness of the margin line relative to the outline, which is the surface itself.
+MARGIN_BRIGHTNESS = 0.75  # Brightness of the margin line relative to the surface's outline.
 BROKEN_STROKES = (9, 6)  # Stroke and gap lengths of an unreliable outline [pixel].
 MARGIN_STROKES = (12, 7)  # Stroke and gap lengths of a margin [pixel].
 HIDDEN_STROKES = (9, 6)  # Stroke and gap lengths of an outline under closed ground or a tool [pixel].
 HIDDEN_LINE_WIDTH = 2  # Line width of an outline under closed ground or a tool [pixel].
 SILHOUETTE_TEXT_WIDTH = 96  # Width of text lines within the silhouette [pixel].
-MAX_LOWER_ROWS = 2  # Largest downward shift of the text at the top that avoids lines [text rows].
+MAX_LOWER_ROWS = 2  # Largest downward shift of the text at the top to avoid lines [text rows].
 HEAD_WIDTHS = 0.62, 0.5, 0.4, 0.32, 0.25  # Text widths at the top / image width; the first that covers no tool is used.
 STYLE_TEXT_DISTANCE = 2 * LINE_SPACING  # Distance of a style's text from the number next to the tip [pixel].
 
 
 @dataclass(frozen=True, eq=False)
 class Overlaid:
-    """Image with lines and text: colour (H, W, 3) uint8, and taken (H, W) uint8, above 0 at lines and text.
+    """Image with an overlay: `colour` (H, W, 3) uint8, and mask `taken` (H, W) uint8 of lines and text.
 
-    `named`: True if a legend names the lines.
+    `named` is True if a legend names the lines.
     """
 
     colour: np.ndarray
@@ -83,14 +83,14 @@ class Overlaid:
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """Ground over the silhouette, in a box of the image.
+    """Layers over the silhouette in a box of the image.
 
     Parameters
     ----------
     silhouette, opaque
-        (h, w) bool: the silhouette, and the ground that the surface does not shine through.
+        Masks (h, w) bool: of the silhouette, and of closed ground, through which the surface does not shine.
     label
-        Label of the closed ground; empty if it covers too small a share.
+        Label of the closed ground; empty if its share is too small.
     """
 
     silhouette: np.ndarray
@@ -99,24 +99,24 @@ class Ground:
 
 
 def load_kernels(device: str = "cpu") -> None:
-    """Load all kernels that draw an image with its overlay, so that the first image does not wait for them."""
+    """Load all kernels that draw images and overlays, so that the first image is not delayed."""
     load_modules(device, surfaces, embedding, rasteriser, shade, real_image, window, distances)
 
 
 @dataclass(frozen=True, eq=False)
 class LineDrawing:
-    """Image with its lines, before text.
+    """Image with the lines of an overlay, before text is added.
 
     Parameters
     ----------
     colour, occupied
-        See `Overlaid`.
+        Image, and mask of its lines, as in `Overlaid`.
     margin_lines, ring_lines
-        (H, W) bool: lines of the margin, and of rings, which text may cover.
+        Masks (H, W) bool of the margin's line and of the rings, which text may cover.
     box
-        Box of the drawn region; None if nothing is visible.
+        Box of the drawn region; None if nothing is drawn.
     ground
-        Ground over the surface in the box, if the style shows it.
+        Layers over the silhouette in the box; None if no open ground is given.
     """
 
     colour: np.ndarray
@@ -131,26 +131,26 @@ def composite(
     picture: Picture, camera: Camera, hidden: Layer, style: Style = "window", cover: Occluders = NO_COVER,
     marks: Marks = NO_MARKS, words: ImageText = NO_WORDS,
 ) -> Overlaid:  # fmt: skip
-    """Draw a hidden surface into an image. On a GPU, depth is copied to the host only for the style "cut".
+    """Draw a hidden surface into an image; on a GPU, depth is copied to the host only for the style "cut".
 
     Parameters
     ----------
     picture, camera
-        Camera image, and its camera.
+        Image to draw on, and its camera.
     hidden
-        Surface to show, in its colour; its whole silhouette is used, regardless of occluders.
+        Surface to show, in its own colour; occluders do not change its silhouette.
     style
-        "contour": the outline. "window": also the surface, shaded and darker with depth, while the ground around the
-        outline is dimmed. "fill": outline and a flat tint. "depth": outline and a tint that is stronger at smaller
-        depth, with its scale. "rings": lines of equal distance from the surface on the ground (`distances.py`).
-        "cut": an inset (`cut.py`). "none": only warnings. Outlines alone cross occluding layers.
+        "contour": the outline. "window": also the surface, shaded and darker with depth, while the ground round the
+        outline is dimmed. "fill": outline and uniform tint. "depth": outline, and a tint with scale that is stronger at
+        smaller depth. "rings": lines of equal distance from the surface, on the ground (`distances.py`). "cut": a
+        cross-section in an inset (`cut.py`). "none": only header and warning. Only outlines cross occluding layers.
     cover, marks, words
-        Occluders of the surface, and additional marks and text.
+        Occluders of the surface; additional lines; additional text.
 
     Raises
     ------
     ValueError
-        An unknown style, or a camera or a mask whose size differs from the image's.
+        The style is unknown, or the size of the camera or of a mask differs from the image's.
 
     Examples
     --------
@@ -194,7 +194,7 @@ def _draw_sketch(
     measure: Measurement, grown: Layer | None, marks: Marks, opening: Opening | None, doubtful: bool,
     box: tuple[slice, slice] | None,
 ) -> LineDrawing:  # fmt: skip
-    """Draw all lines of a measure, with `grown` (the surface plus its margin); the surfaces are in a `box`."""
+    """Draw all lines of a style; `grown` is the surface with its margin, and `box` contains the surfaces."""
     picture, camera, hidden, style, gauge = measure.image, measure.camera, measure.layer, measure.style, marks.gauge
     shape = camera.height, camera.width
     taken, faint, thin = np.zeros(shape, np.uint8), np.zeros(shape, bool), np.zeros(shape, bool)
@@ -240,15 +240,15 @@ def _draw_sketch(
 
 
 def _describe_motion(hidden: Layer, before: Layer, words: ImageText) -> str:
-    """Describe the surface's mean motion, or the given motion."""
+    """Describe the surface's mean motion, or the motion given in `words`."""
     mean = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
     return f"{words.legend.motion} {format_millimetres(*((mean, None) if words.motion is None else words.motion))}"
 
 
 def _write_lines(sketch: LineDrawing, camera: Camera, words: ImageText, motion: str) -> Overlaid:
-    """Write the lines at the top, the motion and the warning.
+    """Write the header, the motion and the warning; return the image.
 
-    Text at the top and in the corner is placed first and seldom moves. Then the most important text comes first.
+    Texts at the top and in the corners are placed first, so that they seldom move; other texts follow by importance.
     """
     drawn = Overlaid(sketch.colour, sketch.occupied.copy())
     write_header(drawn, words.header)
@@ -261,7 +261,7 @@ def _write_lines(sketch: LineDrawing, camera: Camera, words: ImageText, motion: 
 
 
 def _write_labels(drawn: Overlaid, sketch: LineDrawing, measure: Measurement, keys: Sequence[LegendEntry]) -> Overlaid:
-    """Write the number next to the tip, the label of closed ground, the text of the style, and the legend."""
+    """Write the tip's distance, the label of closed ground, the style's text and the legend; return the image."""
     out, taken = drawn.colour, drawn.taken
     whole = measure.roles.read_roles(measure.image.segmentation)
     front = (whole == FRONT).view(np.uint8)
@@ -286,7 +286,7 @@ def _write_labels(drawn: Overlaid, sketch: LineDrawing, measure: Measurement, ke
 
 
 def _check(picture: Picture, camera: Camera, style: str, covered: np.ndarray | None) -> None:
-    """Raise ValueError as `composite` does."""
+    """Raise ValueError for an unknown style, or a camera or mask of another size than the image."""
     if style not in STYLES:
         raise ValueError(f"there is no overlay style {style!r}: choose one of {', '.join(STYLES)}.")
     shape = picture.drawn.colour.shape[1:]
@@ -298,7 +298,7 @@ def _check(picture: Picture, camera: Camera, style: str, covered: np.ndarray | N
 
 
 def find_ground(segmentation: np.ndarray, roles: np.ndarray, surface: RasterisedSurface, opening: Opening) -> Ground:
-    """Determine the ground over a surface in a box, from the segmentation and roles (h, w) uint8."""
+    """Return the ground over a rasterised surface in a box, from segmentation and roles (h, w) uint8."""
     mask = surface.mask
     counts = np.bincount(segmentation[mask & (roles != FRONT)], minlength=256)
     layers = np.flatnonzero(counts).tolist()
@@ -309,7 +309,7 @@ def draw_broken_outline(
     canvas: np.ndarray, surface: RasterisedSurface, colour: tuple[float, float, float], ground: Ground | None,
     unreliable: bool,
 ) -> None:  # fmt: skip
-    """Draw the broken parts of an outline, in place: all of an unreliable one, and those under closed ground."""
+    """Draw broken parts of an outline in place: the whole of an unreliable one, else the parts under closed ground."""
     if unreliable:
         draw_dashes(canvas, find_outlines(surface.mask), colour, BROKEN_STROKES)
     elif ground is not None and ground.opaque.any():
@@ -318,12 +318,12 @@ def draw_broken_outline(
 
 
 def tint_margin(layer: Layer) -> tuple[float, ...]:
-    """Compute the colour of the margin line round a surface."""
+    """Return the colour of the margin line round a surface, which is darker than the surface's."""
     return tuple(MARGIN_BRIGHTNESS * share for share in average_colour(layer.colour))
 
 
 def list_legend_entries(layer: Layer, margin: Layer | None, marks: Marks, text: ImageText) -> tuple[LegendEntry, ...]:
-    """List legend entries of the drawn lines that have a name."""
+    """Return the legend entries of the drawn lines that have a name."""
     names = text.legend
     named, pattern = zip(marks.outlines, names.outlines, strict=False), BROKEN_STROKES if text.warning else None
     entries = [
@@ -336,7 +336,7 @@ def list_legend_entries(layer: Layer, margin: Layer | None, marks: Marks, text: 
 
 
 def draw_points(overlay: Overlaid, camera: Camera, points: np.ndarray, mask: np.ndarray) -> None:
-    """Draw a small dot at each of the points (n, 3) [m] where `mask` (H, W) bool is true and no line is; in place."""
+    """Draw dots at points (n, 3) [m] where `mask` (H, W) bool is True and there is no line, in place."""
     pixels, _ = camera.project(points)
     here = pixels[np.isfinite(pixels).all(axis=1)].round().astype(int)
     here = here[((here >= 0) & (here < (camera.width, camera.height))).all(axis=1)]
@@ -349,7 +349,7 @@ def draw_points(overlay: Overlaid, camera: Camera, points: np.ndarray, mask: np.
 def write_ground_label(
     overlay: Overlaid, box: tuple[slice, slice], ground: Ground, front: np.ndarray, lines_there: np.ndarray
 ) -> None:
-    """Write the label of closed ground over the surface, in place; front and lines (H, W) uint8 as in `Hideable`."""
+    """Write the label of closed ground over the surface, in place; `front` and `lines_there` are as in `Hideable`."""
     if not ground.label:
         return
     there = cv2.moments((ground.silhouette & ground.opaque).view(np.uint8), binaryImage=True)
@@ -361,12 +361,12 @@ def write_ground_label(
 
 
 def wrap_label(label: str) -> list[str]:
-    """Break the ground's label into short lines, which fit into a silhouette."""
+    """Break the label of closed ground into short lines that fit into a silhouette."""
     return wrap_line(label, SILHOUETTE_TEXT_WIDTH)
 
 
 def wrap_header(texts: Sequence[str], tool_mask: np.ndarray) -> list[str]:
-    """Break text for the top of an image into lines, as wide as possible without covering a tool (H, W) bool."""
+    """Break header text into lines, as wide as possible without covering `tool_mask` (H, W) bool."""
     width = tool_mask.shape[1]
     tried = [[part for text in texts for part in wrap_line(text, share * width)] for share in HEAD_WIDTHS]
     for lines in tried:
@@ -378,7 +378,7 @@ def wrap_header(texts: Sequence[str], tool_mask: np.ndarray) -> list[str]:
 
 
 def write_header(overlay: Overlaid, lines: Sequence[str]) -> None:
-    """Draw text lines in the top-left corner, below the orientation letter, in place; may cover other lines."""
+    """Write header lines in the top-left corner, below the orientation letter, in place; they may cover lines."""
     free, middle = overlay.taken.copy(), len(overlay.taken) // 2
     below = HEAD_ROW + LINE_SPACING * (len(lines) + MAX_LOWER_ROWS)
     free[:HEAD_ROW] = free[middle - HEAD_ROW // 2 : middle + HEAD_ROW // 2] = 1  # kept free for the orientation letters
@@ -389,12 +389,12 @@ def write_header(overlay: Overlaid, lines: Sequence[str]) -> None:
 
 
 def write_warning(overlay: Overlaid, reason: str) -> None:
-    """Write the reason why a result is unreliable in the bottom-left corner, in place; may cover other text."""
+    """Write the reason why a result is unreliable in the bottom-left corner, in place; it may cover other text."""
     height, width = overlay.taken.shape
     lines, ink = format_warning(reason, width), average_colour(WARNING_COLOUR)
     place_text(overlay.colour, overlay.taken, lines, (0, height), TEXT_SCALE, ink, force=True)
 
 
 def format_warning(reason: str, width: int) -> list[str]:
-    """Break a warning into lines for an image of this width [pixel]: its reason, and its consequence."""
+    """Break a warning into lines for an image of `width` [pixel]; reason and consequence have separate lines."""
     return [line for part in reason.split(": ") for line in wrap_line(part, MAX_BOTTOM_WIDTH * width)]

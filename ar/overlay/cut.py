@@ -1,7 +1,7 @@
 """Cross-section of a hidden surface in an inset: along the line of sight, through its centroid and the tool's tip.
 
-The plane contains the camera's centre, so that it appears in the image as a line, and everything seen along that line
-is in the plane.
+The plane contains the camera's centre, so it appears in the image as a line, and all points seen on that line are in
+the plane.
 """
 
 from dataclasses import dataclass
@@ -16,49 +16,49 @@ from .hud import WHITE, write_text_with_halo
 from .outlines import draw_dashes, find_outlines
 from .window import CLOSED_GROUND, FRONT
 
-# Smallest distance of a tip from the line of sight that gives a direction [m]; below, the image's right is used.
+# Smallest distance of a tip from the line of sight that defines the plane [m]; below it, the plane is horizontal.
 MIN_TIP_DISTANCE = 1e-3
 SURFACE_MARGIN = 12e-3  # Margin of the inset round the hidden surface [m].
 TOP_MARGIN = 4e-3  # Margin of the inset above the visible surface, and round the tip [m].
 MAX_DISTANCE = 60e-3  # Largest measured distance to the hidden surface [m].
-TONE_WIDTH = 5e-3  # Width of a tone [m]: tissue is toned by its distance to the surface.
+TONE_WIDTH = 5e-3  # Width of a tone [m]; tissue is shaded by its distance from the surface.
 # Colours of the tones (RGB), the closest to the surface first.
 TONES = np.array([(222, 206, 192), (184, 168, 156), (146, 132, 124), (112, 100, 94), (82, 74, 70)], np.float64)
 EMPTY_COLOUR = (20.0, 24.0, 27.0)
-"""Colour of the inset above the visible surface."""
+"""Colour of the inset above the visible surface (RGB)."""
 CLOSED_COLOUR = (120.0, 165.0, 180.0)
-"""Colour of the visible surface where the hidden one does not shine through."""
+"""Colour of the visible surface (RGB) where it is closed ground."""
 INSET_TEXT_SCALE = 0.38  # Font scale of the inset's text.
 INSET_LINE_SPACING = 14  # Line spacing of the inset's text [pixel].
 INSET_STROKES = (5, 4)  # Stroke and gap lengths of the margin [pixel].
 SCALE_BAR_LENGTH = 10e-3
 """Length of the scale bar [m]."""
 END_LETTERS = ("a", "b")
-"""Letters at the ends of the cutting line in the image, and at the inset's sides."""
+"""Letters at the ends of the cutting line in the image, and at the left and right side of the inset."""
 HALF_NUMBER_WIDTH = 10  # Half the width of a number [pixel].
 
 
 @dataclass(frozen=True, eq=False)
 class CutPlane:
-    """Plane through `centre` (3,) [m]: `along` (3,) the line of sight and, at right angles, `across` (3,)."""
+    """Plane through `centre` (3,) [m]; unit vectors `along` and `across` (3,) are relative to the line of sight."""
 
     centre: np.ndarray
     across: np.ndarray
     along: np.ndarray
 
     def to_plane(self, points: np.ndarray) -> np.ndarray:
-        """Convert points (..., 3) [m] of the plane to (..., 2) [m]: across, and along the line of sight."""
+        """Convert points (..., 3) [m] in the plane to coordinates (..., 2) [m]: across and along the line of sight."""
         return (points - self.centre) @ np.stack([self.across, self.along], axis=1)
 
     def to_world(self, coordinates: np.ndarray) -> np.ndarray:
-        """Convert plane coordinates (..., 2) [m] back to points (..., 3) [m]."""
+        """Convert plane coordinates (..., 2) [m] to points (..., 3) [m]."""
         return self.centre + coordinates @ np.stack([self.across, self.along])
 
 
 def build_plane(camera: Camera, centre: np.ndarray, tip: np.ndarray | None) -> CutPlane:
-    """Build the plane through a camera's centre, a surface's centre (3,) [m] and a tip (3,) [m], right in the inset.
+    """Build the plane through the camera's centre, a surface's centre (3,) [m] and, if given, a tip (3,) [m].
 
-    Without a tip, or with one on the line of sight, the plane is horizontal in the image.
+    Without a tip, or with a tip on the line of sight, the plane is horizontal in the image. `across` points right.
     """
     along = (centre - camera.centre) / np.linalg.norm(centre - camera.centre)
     level = camera.T_camera_world[0, :3]
@@ -73,10 +73,10 @@ def build_plane(camera: Camera, centre: np.ndarray, tip: np.ndarray | None) -> C
 def compute_surface_profile(
     camera: Camera, plane: CutPlane, depth: np.ndarray, roles: np.ndarray, half_width: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Extract the visible surface along the plane: positions (n, 2) [m], in order across, and their roles (n,).
+    """Extract the visible surface in the plane: positions (n, 2) [m], sorted across, and their roles (n,).
 
-    depth (H, W) [m] and roles (H, W) uint8 of the image; objects in front of the overlay are left out. The search
-    across has a `half_width` [m].
+    `depth` (H, W) [m] and `roles` (H, W) uint8 belong to the image. Objects in front of the overlay are left out.
+    Positions are searched up to `half_width` [m] across.
     """
     steps = np.linspace(-half_width, half_width, 4 * max(camera.width, 1))
     pixels, _ = camera.project(plane.to_world(np.stack([steps, 0.0 * steps], axis=1)))
@@ -93,18 +93,18 @@ def draw_section(
     camera: Camera, layer: Layer, plane: CutPlane, profile: tuple[np.ndarray, np.ndarray], size: tuple[int, int],
     colour: tuple[float, ...], tip: np.ndarray | None = None, error: float | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Draw the inset (h, w, 3) uint8: tissue toned by its distance to the hidden surface, the inside in its colour.
+    """Draw the inset (h, w, 3) uint8: tissue shaded by its distance from the hidden surface, inside in `colour`.
 
     Parameters
     ----------
     profile
-        Profile from `compute_surface_profile`.
+        Visible surface from `compute_surface_profile`.
     size
-        Width and height [pixel].
+        Width and height of the inset [pixel].
     tip
-        Tip of the tool (3,) [m], drawn as a dot.
+        Tip of the tool (3,) [m], drawn as a dot; None: no dot.
     error
-        Error bound of the surface [m]: drawn as a dashed line at this distance outside.
+        Error bound [m] of the surface, drawn as a dashed line at this distance outside; None: no line.
     """
     wide, tall = size
     low, scale = _compute_frame(plane, layer, profile[0], tip, size)
@@ -138,7 +138,7 @@ def draw_section(
 
 
 def add_caption(inset: np.ndarray, lines: list[str]) -> np.ndarray:
-    """Add lines of text below an inset (h, w, 3) uint8, and a thin frame."""
+    """Return an inset (h, w, 3) uint8 with lines of text below, and a thin frame."""
     foot = np.full((INSET_LINE_SPACING * len(lines) + 4, inset.shape[1], 3), np.array(EMPTY_COLOUR), np.uint8)
     for number, line in enumerate(lines):
         write_text_with_halo(foot, line, (5, INSET_LINE_SPACING * (number + 1) - 2), INSET_TEXT_SCALE)
@@ -150,7 +150,7 @@ def add_caption(inset: np.ndarray, lines: list[str]) -> np.ndarray:
 def _compute_frame(
     plane: CutPlane, hidden: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
 ) -> tuple[np.ndarray, float]:
-    """Compute the position (2,) [m] of the inset's upper left corner, and pixels per metre."""
+    """Compute the plane coordinates (2,) [m] of the inset's upper left corner, and its scale [pixel/m]."""
     places = plane.to_plane(hidden.vertices)
     held = [places.min(axis=0) - SURFACE_MARGIN, places.max(axis=0) + SURFACE_MARGIN]
     near = surface[(surface[:, 0] > held[0][0]) & (surface[:, 0] < held[1][0])]
@@ -162,7 +162,7 @@ def _compute_frame(
 
 
 def _write_bands(out: np.ndarray, distance: np.ndarray, places: np.ndarray, surface: np.ndarray) -> None:
-    """Write the distances [mm] where tones change, near the centre row, on the side of more tissue; in place."""
+    """Write the distances [mm] at the borders of tones, near the centre row, on the side with more tissue; in place."""
     middle, wide = int(np.abs(places[:, 0, 1]).argmin()), out.shape[1]
     for step in (1, 2, 3):
         row = min(max(middle + (step - 2) * INSET_LINE_SPACING, 0), len(out) - 1)

@@ -1,4 +1,4 @@
-"""Distances of points and pixels from a closed surface by a tree of its triangles; lines of equal distance."""
+"""Distances of points and pixels from a closed surface, computed with a BVH, and lines of equal distance."""
 
 from collections.abc import Sequence
 
@@ -12,17 +12,17 @@ from .hud import FONT, TEXT_SCALE
 from .outlines import OPAQUE, clip_to_canvas, clip_to_mask, find_outlines
 from .window import BORDER_COLOUR
 
-RAY_COUNT = wp.constant(3)  # Number of rays of the inside test: odd, so that there is always a majority.
+RAY_COUNT = wp.constant(3)  # Number of rays of the inside test; it is odd, so that there is always a majority.
 
 
 def build_bvh(vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> wp.Mesh:
-    """Build a BVH of the triangles (F, 3) of vertices (V, 3) [m]."""
+    """Build a bounding volume hierarchy of triangles (F, 3) with vertices (V, 3) [m], on a device."""
     points = wp.array(vertices, dtype=wp.vec3f, device=device)
     return wp.Mesh(points, wp.array(np.asarray(triangles, np.int32).ravel(), dtype=wp.int32, device=device))
 
 
 def compute_signed_distance(bvh: wp.Mesh, points: np.ndarray, max_distance: float) -> np.ndarray:
-    """Compute distances (n,) float32 of points (n, 3) to a closed surface, < 0 inside, NaN if too far; all [m]."""
+    """Compute signed distances (n,) float32 [m] of points (n, 3) [m], < 0 inside; NaN beyond `max_distance` [m]."""
     device = str(bvh.device)
     load_modules(device, __name__)
     at = wp.array(points, dtype=wp.vec3f, device=device)
@@ -34,16 +34,16 @@ def compute_signed_distance(bvh: wp.Mesh, points: np.ndarray, max_distance: floa
 def compute_visible_distance(
     bvh: wp.Mesh, camera: Camera, box: tuple[slice, slice], depth: wp.array, mask: np.ndarray, max_distance: float
 ) -> np.ndarray:
-    """Compute the distance of the visible point at each pixel of a box from a surface: (h, w) float32 [m].
+    """Compute the distance (h, w) float32 [m] between a surface and the visible point at each pixel of a box.
 
-    NaN beyond `max_distance` [m], and where `mask` (h, w) bool is false.
+    NaN beyond `max_distance` [m], and where `mask` (h, w) bool is False.
 
     Parameters
     ----------
     camera, depth
-        Camera and depth of the whole image; z in the camera frame, (H, W) float32 [m] on the surface's device.
+        Camera of the whole image, and its depth (H, W) float32 [m] (z in the camera frame), on the BVH's device.
     box
-        Rows and columns of the box.
+        Rows and columns of the box in the image.
     """
     device = str(bvh.device)
     load_modules(device, __name__)
@@ -67,7 +67,7 @@ def measure_point_distances(
     # output
     distance: wp.array(dtype=wp.float32),
 ):  # fmt: skip
-    """Compute signed distances of a run of points."""
+    """Compute the signed distances of a chunk of points."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         found = wp.mesh_query_point_sign_parity(bvh, points[index], max_distance, RAY_COUNT)
@@ -85,7 +85,7 @@ def measure_visible_distances(
     # output
     distance: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """Compute distances of visible points for a run of the box's pixels; `rays` end at z = 1."""
+    """Compute the distances of the visible points for a chunk of the box's pixels; `rays` have z = 1."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         row = index / distance.shape[1]
@@ -102,11 +102,11 @@ def measure_visible_distances(
 
 RING_DISTANCES = (1e-3, 5e-3, 10e-3, 15e-3)  # Distances of the rings from the surface [m]; the first indicates contact.
 RING_COLOUR = (232.0, 228.0, 204.0)
-"""Colour of rings."""
+"""Colour of rings and of their numbers (RGB)."""
 MIN_RING_LENGTH = 24  # Smallest length of a drawn ring [pixel].
 EDGE_DISTANCE = 3  # Distance of rings from the edge of the ground [pixel].
 NUMBER_GAP = 3  # Gap on all sides of a ring's number [pixel].
-# Side of the square opening that separates numbers from lines [pixel]: thicker than lines, thinner than numbers.
+# Side of the morphological opening that separates numbers from lines [pixel]: between their thicknesses.
 OPENING_SIDE = 9
 MIN_NUMBERED_LENGTH = 80  # Smallest length of a piece of a ring with a number of its own [pixel].
 
@@ -114,18 +114,18 @@ MIN_NUMBERED_LENGTH = 80  # Smallest length of a piece of a ring with a number o
 def draw_rings(
     canvas: np.ndarray, distance: np.ndarray, free_mask: np.ndarray, levels: Sequence[float] = RING_DISTANCES
 ) -> list[str]:
-    """Draw rings with their numbers in millimetres, in place; return the numbers of the rings that are drawn.
+    """Draw rings of equal distance with their numbers in millimetres, in place; return the drawn numbers.
 
-    Each piece that is long enough has its number, and each ring at least one, even over other lines.
+    Each long piece of a ring has a number, and each ring has at least one number, which may cover other lines.
 
     Parameters
     ----------
     canvas
-        Drawing (h, w, 4) uint8.
+        Canvas (h, w, 4) uint8: premultiplied colour, and coverage.
     distance
-        Distance (h, w) float32 [m] from the visible point at each pixel to the hidden surface; NaN without a ring.
+        Distance (h, w) float32 [m] of the visible point at each pixel from the hidden surface; NaN excludes a pixel.
     free_mask
-        (h, w) bool: free places for a number; false at other lines.
+        Mask (h, w) bool of pixels that numbers may cover; False at other lines.
     """
     ground = np.isfinite(distance).astype(np.uint8)
     within = cv2.erode(ground, np.ones((2 * EDGE_DISTANCE + 1,) * 2, np.uint8), borderValue=0) > 0
@@ -153,16 +153,13 @@ def draw_rings(
 
 
 def remove_labels(mask: np.ndarray) -> np.ndarray:
-    """Separate rings (h, w) bool from their numbers, given the mask `mask` (h, w) of both."""
+    """Return the mask (h, w) bool of the rings, without their numbers, given the mask of both."""
     numbers = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OPENING_SIDE,) * 2, np.uint8))
     return mask & (numbers == 0)
 
 
 def _write_on(sheet: np.ndarray, line: np.ndarray, text: str, shut: np.ndarray, written: np.ndarray) -> bool:
-    """Write a number on a line (n, 1, 2), near its centre but not in the mask `shut`; return True if possible.
-
-    The number's box is marked in both masks (h, w) bool. Arrays change in place.
-    """
+    """Write a number on a line (n, 1, 2), as near its centre as `shut` allows; return False if there is no space."""
     (width, height), _ = cv2.getTextSize(text, FONT, TEXT_SCALE, 1)
     middle = len(line) // 2
     for at in sorted(range(0, len(line), 4), key=lambda at: abs(at - middle)):

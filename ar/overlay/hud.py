@@ -1,4 +1,4 @@
-"""Text in the image: a number next to an object, a panel in a corner."""
+"""Text in an image: labels next to objects, and text panels in a corner."""
 
 import itertools
 import math
@@ -18,8 +18,8 @@ FONT = cv2.FONT_HERSHEY_SIMPLEX  # OpenCV font of all text in images.
 WHITE = (244, 244, 240)  # Default text colour (RGB).
 TEXT_SCALE = 0.45  # Default font scale of text in images.
 LINE_SPACING = 18  # Line spacing of text [pixel].
-MAX_BOTTOM_WIDTH = 0.25  # Largest width of text at the bottom, as a share of the image width.
-MAX_TEXT_SHIFT = 48  # Distance from the desired place beyond which text covers thin lines instead [pixel].
+MAX_BOTTOM_WIDTH = 0.25  # Largest width of text at the bottom of the image, as a share of the image width.
+MAX_TEXT_SHIFT = 48  # Distance from the desired position beyond which text covers thin lines instead [pixel].
 # Widths of a panel's lines as shares of the image width; the first that fits is used.
 PANEL_WIDTHS = (0.9, 0.5, 0.36, 0.27, 0.2)
 RETRY_SCALE = 0.85  # Factor on the font scale of a panel in the second try.
@@ -27,7 +27,7 @@ HEAD_ROW = 34  # Top row of the text at the top, below the orientation letter [p
 LETTER_SCALE = 0.6  # Font scale of the orientation letters.
 SIDES = ("RL", "AP", "SI")  # Orientation letters of the positive and negative direction of each RAS axis.
 MIN_OBLIQUE = 0.38  # Smallest component of a unit direction for which a second letter is shown.
-# Allowed line breaks: not after a colon, nor between a name, its number, that number's error and their unit.
+# Allowed line breaks: not after a colon, nor between a name, its number, the number's error and the unit.
 BREAK_PATTERN = re.compile(
     r"\s+(?!(?:moved |reads )?[-+]?\d|\(\d\.|\+- )(?<![:-] )(?<!\d (?=%))(?<!\d (?=(?:mm|s|ms|N|kPa|ml|points)\b))"
 )
@@ -36,9 +36,9 @@ BREAK_PATTERN = re.compile(
 def write_text(
     image: np.ndarray, text: str, position: tuple[int, int], scale: float = 0.5, colour: Sequence[float] = WHITE
 ) -> None:
-    """Write one line of ASCII text into the image (H, W, 3) uint8, its baseline's left end at (column, row).
+    """Write a line of ASCII text into an image (H, W, 3) uint8, in place; its baseline starts at (column, row).
 
-    A dark halo keeps it legible on any ground; the line is moved as needed to be inside the image.
+    A dark halo keeps the text legible on any background; the line is moved if necessary to be inside the image.
     """
     (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
     column = min(max(position[0], 2), max(image.shape[1] - width - 3, 2))
@@ -54,9 +54,9 @@ def write_text(
 def write_text_with_halo(
     canvas: np.ndarray, text: str, position: tuple[int, int], scale: float, colour: Sequence[float] = WHITE
 ) -> None:
-    """Write one line of ASCII text with a dark halo at (column, row), its baseline's left end, in place.
+    """Write a line of ASCII text with a dark halo, in place; its baseline starts at (column, row).
 
-    sheet (h, w, 3) or (h, w, 4) uint8: colour, or colour times coverage, and coverage.
+    `canvas` is an image (h, w, 3) uint8, or (h, w, 4) uint8 with premultiplied colour and coverage.
     """
     (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
     column, row = position
@@ -70,16 +70,16 @@ def write_text_with_halo(
 
 @dataclass(frozen=True, eq=False)
 class Hideable:
-    """Parts of an image that text may hide.
+    """Parts of an image that text may cover if there is no better position.
 
     Parameters
     ----------
     objects
-        (H, W) uint8: above 0 where text hides what should stay visible, as a tool; used if there is no other space.
+        Mask (H, W) uint8 of objects that should stay visible, such as tools; text covers them only if necessary.
     lines
-        (H, W) uint8: above 0 at lines without text, which `needed` text may cover.
+        Mask (H, W) uint8 of lines, which text covers if it is placed with `force`.
     ring_lines
-        (H, W) bool: lines that text covers rather than being farther than `MAX_TEXT_SHIFT` from its desired place.
+        Mask (H, W) bool of lines that text covers if it would otherwise be beyond `MAX_TEXT_SHIFT` from its position.
     """
 
     objects: np.ndarray | None = None
@@ -94,18 +94,18 @@ def place_text(
     image: np.ndarray, occupied: np.ndarray, lines: Sequence[str], position: tuple[int, int],
     scale: float = TEXT_SCALE, colour: Sequence[float] = WHITE, force: bool = False, parts: Hideable = COVER_NOTHING,
 ) -> None:  # fmt: skip
-    """Write lines of ASCII text at the free place closest to `position`, and mark it in `occupied`; both in place.
+    """Write lines of ASCII text at the free position closest to `position`, and mark them in `occupied`, in place.
 
-    Write the most important text first: without space nothing is written, unless it is `force`.
+    Place the most important text first: without free space, nothing is written unless `force`.
 
     Parameters
     ----------
     image, occupied
-        The image (H, W, 3) uint8; (H, W) uint8, above 0 at lines and text.
+        Image (H, W, 3) uint8, and mask (H, W) uint8 of lines and text.
     position
-        Desired column and row of the upper left corner of the lines, as `find_free_position` takes it.
+        Desired column and row of the upper left corner of the lines, as in `find_free_position`.
     parts
-        Parts of the image that the text may hide.
+        Parts of the image that the text may cover.
     """
     if not lines:
         return
@@ -133,9 +133,9 @@ def place_text(
 
 
 def wrap_line(text: str, max_width: float, scale: float = TEXT_SCALE) -> list[str]:
-    """Break a line of text into as few lines as fit into `max_width` [pixel], at allowed breaks, of about equal width.
+    """Break text at allowed breaks into the fewest lines that fit `max_width` [pixel], of about equal width.
 
-    A number stays next to its name, its error and its unit, even if that takes more space.
+    A number stays on one line with its name, error and unit, even if this line becomes too wide.
     """
     return list(_wrap_line(text, max_width, scale))
 
@@ -170,19 +170,19 @@ def _measure_width(text: str, scale: float) -> int:
 
 
 def format_millimetres(length: float, error: float | None = None) -> str:
-    """Format a length [m] in millimetres, with its error bound [m] rounded up if that is finite."""
+    """Format a length [m] in millimetres, with its error bound [m], rounded up, if it is finite."""
     if error is None or not math.isfinite(error):
         return f"{1e3 * length:.1f} mm"
     return f"{1e3 * length:.1f} +- {format_bound(error, 1)}"
 
 
 def format_bound(bound: float, digits: int) -> str:
-    """Format a bound [m] in millimetres, rounded up: at least one unit of the last digit."""
+    """Format a bound [m] in millimetres, rounded up to `digits` decimals and never zero."""
     return f"{max(round_up(1e3 * bound, digits), 10.0**-digits):.{digits}f} mm"
 
 
 def round_up(value: float, digits: int) -> float:
-    """Return the smallest number with `digits` decimals that is >= a value: a bound must not be rounded down."""
+    """Round a value up to `digits` decimals, because a bound must not be rounded down."""
     return math.ceil(round(value * 10**digits, 6)) / 10**digits
 
 
@@ -190,21 +190,21 @@ def draw_text_panel(
     image: np.ndarray, lines: Sequence[str], corner: Corner = "top left", scale: float = 0.45, first_row: int = 0,
     obstacles: Sequence[np.ndarray] = (),
 ) -> np.ndarray:  # fmt: skip
-    """Return a copy of the image (H, W, 3) uint8 with lines of ASCII text on a dark translucent ground in one corner.
+    """Return a copy of an image (H, W, 3) uint8 with lines of ASCII text on a dark, translucent panel in a corner.
 
-    A panel at the top begins `first_row` this row. If there is not enough space, the last lines are left out.
+    A panel at the top starts at `first_row`. If there is too little space, the last lines are left out.
 
     Parameters
     ----------
     obstacles
-        Masks, each (H, W) uint8, above 0 where the panel would hide what should stay visible. The panel is placed as
-        close to its corner as the first mask allows, with narrower or fewer lines if necessary. The next mask is used
-        if not even one line fits; the corner itself if no mask has space.
+        Masks (H, W) uint8 of objects that should stay visible, in order. The panel is placed as close to its corner as
+        the first mask allows, with narrower or fewer lines if necessary. If not even one line fits, the next mask is
+        tried, and finally the corner itself is used.
 
     Raises
     ------
     ValueError
-        An unknown corner.
+        The corner is unknown.
     """
     if corner not in Corner.__args__:
         raise ValueError(f"there is no corner {corner!r}: choose one of {', '.join(Corner.__args__)}.")
@@ -233,7 +233,7 @@ def draw_text_panel(
 
 
 def _compute_size(lines: Sequence[str], scale: float) -> tuple[tuple[int, int], int]:
-    """Compute the width and height of a panel of lines, and its line spacing [pixel]."""
+    """Compute width and height of a text panel, and its line spacing [pixel]."""
     sizes = [cv2.getTextSize(line, FONT, scale, 1)[0] for line in lines]
     step = max(height for _, height in sizes) + BORDER_DISTANCE
     return (max(width for width, _ in sizes) + 2 * BORDER_DISTANCE, step * len(lines) + BORDER_DISTANCE), step
@@ -242,7 +242,7 @@ def _compute_size(lines: Sequence[str], scale: float) -> tuple[tuple[int, int], 
 def _write_panel(
     out: np.ndarray, lines: Sequence[str], at: tuple[int, int], size: tuple[int, int], step: int, scale: float
 ) -> np.ndarray:
-    """Draw lines on a dark ground, with the upper left corner at a column and row, into an image (H, W, 3) uint8."""
+    """Draw a text panel into an image (H, W, 3) uint8 with its upper left corner at `at`; return the image."""
     left, top = at
     ground = out[top : top + size[1], left : left + size[0]]
     ground[:] = ground * 0.35 + np.array([6.0, 9.0, 11.0])
@@ -252,9 +252,9 @@ def _write_panel(
 
 
 def name_direction(direction: np.ndarray) -> str:
-    """Describe a direction (3,) of RAS by orientation letters: "R", or "AS" between two, the larger component first.
+    """Name a direction (3,) in RAS by one or two orientation letters, such as "R" or "AS", larger component first.
 
-    L left, R right, A anterior, P posterior, S superior, I inferior; of the patient.
+    The letters are those of the patient: L left, R right, A anterior, P posterior, S superior, I inferior.
     """
     part = np.asarray(direction, np.float64) / np.linalg.norm(direction)
     axes = [axis for axis in np.argsort(-np.abs(part), kind="stable")[:2] if abs(part[axis]) > MIN_OBLIQUE]
@@ -262,7 +262,7 @@ def name_direction(direction: np.ndarray) -> str:
 
 
 def name_edge_directions(rotation: np.ndarray) -> dict[str, str]:
-    """Return orientation letters of an image's edges: `rotation` (3, 3) from RAS to x right, y down, z forward."""
+    """Return the orientation letters of an image's edges; `rotation` (3, 3) maps RAS to x right, y down, z forward."""
     right, down = np.asarray(rotation)[:2]
     return {
         "left": name_direction(-right),
@@ -273,9 +273,9 @@ def name_edge_directions(rotation: np.ndarray) -> dict[str, str]:
 
 
 def draw_orientation_labels(image: np.ndarray, rotation: np.ndarray, occupied: np.ndarray) -> np.ndarray:
-    """Return a copy of the image (H, W, 3) uint8 with orientation letters at its edges.
+    """Return a copy of an image (H, W, 3) uint8 with orientation letters at its edges.
 
-    rotation (3, 3): of the camera, as `name_edge_directions` takes it; taken (H, W) uint8: above 0 at lines and text.
+    `rotation` (3, 3) is as in `name_edge_directions`; `occupied` (H, W) uint8 is above 0 at lines and text.
     """
     out, occupied = image.copy(), occupied.copy()
     height, width = occupied.shape

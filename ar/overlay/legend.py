@@ -1,4 +1,4 @@
-"""Legend of the overlay's lines in a corner of the image, and the scale of its tint."""
+"""Legend of the overlay's lines, and scale of the depth tint, as insets in an image."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,21 +19,21 @@ TINT_STEP_HEIGHT = 12  # Height of a step of the tint's scale [pixel].
 MIN_IMAGE_WIDTH = 480  # Smallest image width with a legend [pixel].
 GROUND_COLOUR = (200.0, 150.0, 135.0)  # Ground colour under the tint's scale (RGB).
 SHEET_VALUE = 255
-"""Value of `taken` at a legend, a scale or an inset: no panel goes there."""
+"""Value of an inset's pixels in the mask of occupied pixels; no text panel is placed there."""
 
 
 @dataclass(frozen=True)
 class LegendNames:
-    """Names of the overlay's lines in a legend; lines without a name are left out.
+    """Names of the overlay's lines in its legend; lines without a name are not listed.
 
     Parameters
     ----------
     current, margin, initial
-        The hidden surface, the dashed line round it, and its earlier position.
+        Names of the hidden surface, of the dashed error margin round it, and of its earlier position.
     outlines
-        Other surfaces, in the given order.
+        Names of other surfaces, in the order of their outlines.
     motion
-        Name of the length at the bottom: motion of the hidden surface.
+        Name of the length at the bottom of the image, which is the motion of the hidden surface.
     """
 
     current: str = ""
@@ -45,7 +45,7 @@ class LegendNames:
 
 @dataclass(frozen=True)
 class LegendEntry:
-    """Line of a legend: name, colour (3,) in 0 .. 255, strokes and gaps [pixel] (None: solid) and width [pixel]."""
+    """Entry of a legend: name, colour (3,) in 0 .. 255, stroke and gap [pixel] (None: solid) and line width [pixel]."""
 
     name: str
     colour: tuple[float, ...]
@@ -55,7 +55,7 @@ class LegendEntry:
 
 @lru_cache(maxsize=16)
 def draw_legend(entries: tuple[LegendEntry, ...]) -> np.ndarray:
-    """Draw a sheet (h, w, 4) uint8, colour times coverage and coverage: a sample of each line, and its name."""
+    """Draw a legend (h, w, 4) uint8 (premultiplied colour, coverage): a sample of each line, and its name."""
     wide = max(cv2.getTextSize(entry.name, FONT, LEGEND_TEXT_SCALE, 1)[0][0] for entry in entries)
     sheet = np.zeros((LEGEND_LINE_HEIGHT * len(entries), SAMPLE_LENGTH + SAMPLE_GAP + wide + 4, 4), np.uint8)
     for number, entry in enumerate(entries):
@@ -72,7 +72,7 @@ def draw_legend(entries: tuple[LegendEntry, ...]) -> np.ndarray:
 
 @lru_cache(maxsize=4)
 def draw_depth_scale(colour: tuple[float, ...], caption: str) -> np.ndarray:
-    """Draw a sheet (h, w, 4) uint8: the tint of the depth style by depth, with millimetres and a caption."""
+    """Draw the scale (h, w, 4) uint8 of the depth style: tint by depth, with millimetres and a caption."""
     lines = caption.split("\n")
     wide = max(cv2.getTextSize(line, FONT, LEGEND_TEXT_SCALE, 1)[0][0] for line in lines)
     sheet = np.zeros(
@@ -93,16 +93,16 @@ def draw_depth_scale(colour: tuple[float, ...], caption: str) -> np.ndarray:
 
 
 def place_inset(image: np.ndarray, occupied: np.ndarray, inset: np.ndarray, obstacles: np.ndarray) -> bool:
-    """Place a sheet at the right of an image, or else at its left, in free space; return True if there was space.
+    """Place an inset at the right or else the left of an image, in free space; return True if there was space.
 
     Parameters
     ----------
     image, occupied
-        The image (H, W, 3) uint8; (H, W) uint8, above 0 at lines and text. Both change in place.
+        Image (H, W, 3) uint8, and mask (H, W) uint8 of lines and text; both change in place.
     inset
-        (h, w, 4) uint8: colour times coverage, and coverage.
+        Inset (h, w, 4) uint8: premultiplied colour, and coverage.
     obstacles
-        (H, W) uint8: above 0 on what should stay visible, as tools.
+        Mask (H, W) uint8 of objects that must stay visible, such as tools.
     """
     (height, width), (tall, wide) = occupied.shape, inset.shape[:2]
     if width < MIN_IMAGE_WIDTH:
@@ -125,9 +125,9 @@ def place_inset(image: np.ndarray, occupied: np.ndarray, inset: np.ndarray, obst
 
 
 def paste_inset(image: np.ndarray, occupied: np.ndarray, inset: np.ndarray, position: tuple[int, int]) -> None:
-    """Paste a sheet (h, w, 4) uint8 over an image (H, W, 3) uint8 at a column and a row.
+    """Paste an inset (h, w, 4) uint8 over an image (H, W, 3) uint8 at (column, row), in place.
 
-    Its place becomes `SHEET_VALUE`.
+    Its pixels become `SHEET_VALUE` in `occupied`.
     """
     column, row = position
     box = np.s_[row : row + inset.shape[0], column : column + inset.shape[1]]

@@ -1,4 +1,4 @@
-"""Arguments of `composite`: lines and text in addition to a hidden surface, and the cover over it."""
+"""Arguments of `composite`: additional lines and text, and occluders of the hidden surface."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ DEFAULT_NAMES = LegendNames()  # Default legend names.
 
 @dataclass(frozen=True, eq=False)
 class MarkOutline:
-    """Outline of another surface in its layer's colour: a pattern of strokes and gaps [pixel], and a dot.
+    """Outline of another surface in its layer's colour, with a stroke and gap `pattern` [pixel], and a dot.
 
     The dot is at `dot_position` (3,) [m].
     """
@@ -42,9 +42,9 @@ class MarkOutline:
 
 
 def draw_motion(canvas: np.ndarray, camera: Camera, box: tuple[slice, slice], initial: Layer, layer: Layer) -> None:
-    """Draw the dotted earlier outline of the hidden surface, and an arrow from its earlier to its present centroid.
+    """Draw the hidden surface's earlier outline, dotted, and an arrow from the earlier to the present centroid.
 
-    In place, on the sheet of the image's rows and columns `box`, which hold both surfaces.
+    They are drawn in place on the canvas of the image part `box`, which must contain both surfaces.
     """
     there = find_pixel_box(camera, initial.vertices)
     if there is not None:
@@ -62,7 +62,7 @@ def draw_motion(canvas: np.ndarray, camera: Camera, box: tuple[slice, slice], in
 
 @lru_cache(maxsize=4)
 def draw_dotted_outline(camera: Camera, layer: Layer) -> np.ndarray:
-    """Draw the dotted outline of a fixed layer, on the sheet of the box around it; cached for a camera."""
+    """Draw the dotted outline of a fixed layer on a canvas of the box round it; cached for a camera."""
     box = find_pixel_box(camera, layer.vertices)
     assert box is not None
     part = camera.crop_to(*box)
@@ -77,7 +77,7 @@ def draw_dotted_outline(camera: Camera, layer: Layer) -> np.ndarray:
 
 
 def draw_outline(canvas: np.ndarray, camera: Camera, outline: MarkOutline) -> None:
-    """Draw a trace, in place; nothing if its dot is behind the camera or beyond its lens."""
+    """Draw the outline of another surface in place; nothing if its dot is not projected by the camera."""
     (at,), _ = camera.project(np.asarray(outline.dot_position)[None])
     if not np.isfinite(at).all():
         return
@@ -96,17 +96,17 @@ def draw_outline(canvas: np.ndarray, camera: Camera, outline: MarkOutline) -> No
 
 @dataclass(frozen=True, eq=False)
 class Occluders:
-    """Layers and ground over the hidden surface.
+    """Layers over the hidden surface: occluders, and open or closed ground.
 
     Parameters
     ----------
     occluder_ids
-        Ids of the layers (tool, hand) that cover the overlay wherever the image shows them.
+        Ids of the layers (tool, hand) that cover the overlay where the image shows them.
     opening
-        Ground that the surface may be seen through; None: any. Under other ground the outline is broken, nothing shines
-        through, and the image shows a label of that ground if it covers a noticeable share.
+        Open ground, through which the surface may be seen; None: all layers. Under closed ground the outline is broken,
+        the surface does not shine through, and a label is shown if the share of closed ground is large enough.
     occluder_mask
-        (H, W) bool: further occluders, as a hand or cottonoids in a real image.
+        Mask (H, W) bool of further occluders, such as a hand or cottonoids in a camera image.
     """
 
     occluder_ids: Sequence[int] = ()
@@ -116,19 +116,19 @@ class Occluders:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Lines in addition to the hidden surface's outline.
+    """Lines that are drawn in addition to the hidden surface's outline.
 
     Parameters
     ----------
     margin
-        Error bound of the surface, one number or (V,) [m]. If positive, a dashed second outline runs at that distance.
+        Error bound [m] of the surface, one number or (V,); if positive, a dashed outline is drawn at that distance.
     gauge
-        Draws the line from the tip to the hidden surface, and its length in millimetres next to the tip.
+        Gauge whose line is drawn from the tip to the hidden surface, with its length in millimetres; None: no gauge.
     initial
-        Hidden surface before its motion, as in the scan: a dotted grey outline, with an arrow to the present one and
-        the mean motion in millimetres.
+        Hidden surface before its motion, as in the scan: drawn as a dotted grey outline, with an arrow to the present
+        surface and the mean motion in millimetres.
     outlines
-        Outlines of other surfaces, drawn under the hidden one's.
+        Outlines of other surfaces, drawn below that of the hidden surface.
     """
 
     margin: float | np.ndarray = 0.0
@@ -139,22 +139,22 @@ class Marks:
 
 @dataclass(frozen=True, eq=False)
 class ImageText:
-    """Text in the image.
+    """Text that is written into the image.
 
     Parameters
     ----------
     warning
-        Reason why the surface's position is unreliable. It is written at the bottom of the image, see `format_warning`,
-        in any style. The outline is amber and broken. No error is guaranteed: no margin is drawn, and the number next
-        to the tip has no error.
+        Reason why the surface's position is unreliable, written at the bottom of the image in any style
+        (`format_warning`). The outline is then amber and broken. As no error is guaranteed, no margin is drawn, and the
+        number next to the tip has no error.
     header
-        Lines at the top of the image, in any style and over anything.
+        Lines at the top of the image, in any style; they may cover everything.
     legend
-        Names of the lines in the legend, which is drawn if there is space.
+        Names of the lines for the legend, which is drawn if there is space.
     motion
-        Length and error [m] to be written instead of the mean motion, which has none.
+        Length and error [m] to write instead of the mean motion, which has no error; None: the mean motion.
     error
-        Error bound of the surface [m], for the text of the styles that measure; None if not available.
+        Error bound [m] of the surface, for the text of measuring styles; None if not available.
     """
 
     warning: str = ""

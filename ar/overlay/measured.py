@@ -1,4 +1,4 @@
-"""Measuring styles of an image: rings on the ground, a cross-section in an inset, the scale of a tint."""
+"""Measuring styles of an overlay: rings on the ground, a cross-section in an inset, the scale of the depth tint."""
 
 import itertools
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from .styles import Style
 from .text_placement import BORDER_DISTANCE, find_free_position
 from .window import FRONT, LayerRoles
 
-SEARCH_MARGIN = 3e-3  # Search margin beyond the last ring [m].
+SEARCH_MARGIN = 3e-3  # Margin beyond the last ring for which distances are computed [m].
 INSET_WIDTHS = (0.34, 0.27, 0.21)  # Widths of a cut's inset as shares of the image width; the first that fits is used.
 INSET_ASPECT = 0.75  # Height of the inset over its width.
 CUT_STROKES = (3, 5)  # Stroke and gap lengths of the cutting line in the image [pixel].
@@ -28,19 +28,19 @@ SEARCH_HALF_WIDTH = 4.0
 LETTER_EDGE_DISTANCE = 12  # Distance of the cut's letters from the image border and from tools [pixel].
 LETTER_LINE_DISTANCE = 10  # Distance of a letter from the cutting line [pixel].
 HALF_LETTER_SIZE = 6  # Half the size of a letter [pixel].
-NO_ROOM_TEXT = "no room for the cut"  # Text in the image where no place for the inset is free.
+NO_ROOM_TEXT = "no room for the cut"  # Text in the image if there is no space for the inset.
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Measuring style, applied to one image.
+    """Measuring style applied to one image.
 
     Parameters
     ----------
     name
         Name of the hidden surface.
     error
-        Error bound [m]; None if not available.
+        Error bound [m] of the surface; None if not available.
     """
 
     style: Style
@@ -54,12 +54,12 @@ class Measurement:
 
     @property
     def error_text(self) -> str:
-        """Text of the error bound of the measured distances."""
+        """Text with the error bound of the measured distances."""
         return "error not known" if self.error is None else f"error {format_bound(self.error, 1)} (95 %)"
 
     @property
     def extent(self) -> np.ndarray:
-        """Points (n, 3) [m] whose box in the image holds the lines drawn round the silhouette."""
+        """Points (n, 3) [m] whose box in the image contains the rings; no points for other styles."""
         low, high = self.layer.vertices.min(axis=0), self.layer.vertices.max(axis=0)
         if self.style != "rings":
             return np.stack([low, high])[:0]
@@ -68,14 +68,14 @@ class Measurement:
 
     @property
     def plane(self) -> CutPlane:
-        """Plane of a cut."""
+        """Plane of the cross-section."""
         middle = self.layer.vertices.mean(axis=0)
         return build_plane(self.camera, middle, None if self.gauge is None else self.gauge.tip)
 
     def draw(self, canvas: np.ndarray, top_canvas: np.ndarray, box: tuple[slice, slice]) -> None:
-        """Draw the rings, or the cutting line in the image, on the sheet of a box; in place.
+        """Draw the rings, or the cutting line, in place on the canvas of the image part `box`.
 
-        Letters go on the sheet `top_canvas` all lines.
+        Letters of the cutting line are drawn on `top_canvas`, which is above all lines.
         """
         if self.style == "rings":
             free = self.roles.read_roles(self.image.segmentation, box) == 0
@@ -125,9 +125,9 @@ class Measurement:
                     write_text_with_halo(top_canvas, letter, (column - 4, row + 4), TEXT_SCALE, RING_COLOUR)
 
     def draw_insets(self, image: np.ndarray, occupied: np.ndarray, obstacles: np.ndarray, required: np.ndarray) -> None:
-        """Add scale, text or inset of the style to a composite image, in place; arguments as in `place_inset`.
+        """Add the style's scale, text or inset to an image, in place; the other arguments are as in `place_inset`.
 
-        needed (H, W) uint8: above 0 on objects that must stay visible even without other space.
+        `required` (H, W) uint8 is above 0 at objects that an inset must not cover even if there is no other space.
         """
         width = occupied.shape[1]
         if self.style == "depth":

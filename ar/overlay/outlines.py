@@ -1,4 +1,4 @@
-"""Outlines of visible surfaces: projection into the image, drawing, and detection in an image."""
+"""Outlines of surfaces: projection into the image, drawing, and detection in an image for tests."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,23 +11,23 @@ from ..rendering.rasteriser import rasterise_surface
 from .hud import FONT, WHITE
 from .window import BORDER_COLOUR, MAX_EDGE_DISTANCE, SOFT_EDGE_WIDTH
 
-OPAQUE = 255  # Value of a sheet's fourth channel that covers what is under it.
+OPAQUE = 255  # Value of a canvas's fourth channel for complete coverage.
 COARSE_SPACING = 16  # Grid spacing of the coarse search under lens distortion [pixel].
 
 
 def average_colour(colour: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float]:
-    """Compute the mean of colours (3,) or (V, 3), sRGB in [0, 1], as a line colour: whole numbers of 0 .. 255."""
+    """Return the mean of sRGB colours (3,) or (V, 3) in [0, 1] as a line colour: integers in 0 .. 255."""
     red, green, blue = np.rint(255.0 * np.asarray(colour, np.float64).reshape(-1, 3).mean(axis=0)).tolist()
     return red, green, blue
 
 
 def allocate_canvas(camera: Camera) -> np.ndarray:
-    """Create a sheet (h, w, 4) uint8 for lines: colour times coverage, and coverage."""
+    """Allocate a canvas (h, w, 4) uint8 for lines: premultiplied colour, and coverage."""
     return np.zeros((camera.height, camera.width, 4), np.uint8)
 
 
 def join_boxes(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> tuple[slice, slice] | None:
-    """Return the rows and columns of the smallest box that holds two boxes."""
+    """Return the smallest box, as rows and columns, that contains two boxes; None counts as empty."""
     if a is None or b is None:
         return a or b
     rows, columns = (slice(min(i.start, j.start), max(i.stop, j.stop)) for i, j in zip(a, b, strict=True))
@@ -35,9 +35,9 @@ def join_boxes(a: tuple[slice, slice] | None, b: tuple[slice, slice] | None) -> 
 
 
 def find_pixel_box(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | None:
-    """Return the rows and columns of the box of points' pixels (V, 3), widened by `SOFT_EDGE_WIDTH`.
+    """Return the box (rows, columns) of the pixels of points (V, 3) [m], widened by `SOFT_EDGE_WIDTH`.
 
-    None if outside the image.
+    None if the box is outside the image.
     """
     pixels, depth = camera.project(points)
     if not (depth > 0.0).all():
@@ -57,9 +57,9 @@ def find_pixel_box(camera: Camera, points: np.ndarray) -> tuple[slice, slice] | 
 
 
 def find_pixel_corners(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Find pixels (n, 2) whose box holds the image of a surface with points (V, 3) in front of a camera with a lens.
+    """Find pixels (n, 2) whose box contains the image of a surface with points (V, 3) before a camera with a lens.
 
-    A lens bends the lines between points, but not out of the box that holds them in its undistorted image.
+    A lens bends the lines between points, but in the undistorted image they remain inside the points' box.
     """
     ends, _ = replace(camera, lens=None).project(points)
     # Coarse grid first, with a margin of the largest step of the undistorted coordinates.
@@ -79,36 +79,36 @@ def find_pixel_corners(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def _find_inside(straight: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find rows and columns with positions (h, w, 2) between two corners (2,)."""
+    """Return the rows and columns with undistorted positions (h, w, 2) between two corners (2,)."""
     inside = np.all((straight >= low) & (straight <= high), axis=2)
     return np.flatnonzero(np.any(inside, axis=1)), np.flatnonzero(np.any(inside, axis=0))
 
 
 def compute_silhouette(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, device: str = "cpu") -> np.ndarray:
-    """Compute the mask (H, W) bool of pixels whose centres a surface covers. vertices (V, 3) [m], triangles (F, 3).
+    """Compute the mask (H, W) bool of the pixels whose centres a surface covers: vertices (V, 3) [m], triangles (F, 3).
 
-    `device` is the Warp device that draws it.
+    `device` is the Warp device that rasterises the surface.
     """
     return rasterise_surface(camera, vertices, triangles, device=device).mask
 
 
 def compute_iou(a: np.ndarray, b: np.ndarray) -> float:
-    """Compute intersection over union of two masks (H, W); 0 if both are empty."""
+    """Compute the intersection over union of two masks (H, W); 0 if both are empty."""
     union = np.count_nonzero(a | b)
     return float(np.count_nonzero(a & b) / union) if union else 0.0
 
 
 def find_outlines(mask: np.ndarray) -> list[np.ndarray]:
-    """Extract closed outlines of a mask (H, W), each (n, 1, 2) int32 pixels."""
+    """Return the closed outer outlines of a mask (H, W), each as pixels (n, 1, 2) int32."""
     return list(cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0])
 
 
 def draw_dashes(
     canvas: np.ndarray, lines: Sequence[np.ndarray], colour: Sequence[float], pattern: tuple[int, int], width: int = 2
 ) -> None:
-    """Draw outlines, each (n, 1, 2), with strokes and gaps of lengths `pattern` [pixel], in place.
+    """Draw outlines (n, 1, 2) as dashes, in place; `pattern` gives the lengths of stroke and gap [pixel].
 
-    A line of more than one pixel has a dark border. Nothing is drawn along the sheet's edge, where an outline is cut.
+    Lines wider than one pixel have a dark border. Nothing is drawn along the canvas's edge, where outlines are cut.
     """
     stroke, gap = pattern
     lines = [piece for line in lines for piece in clip_to_canvas(line, canvas.shape[1], canvas.shape[0])]
@@ -119,25 +119,25 @@ def draw_dashes(
 
 
 def blend_canvas(image: np.ndarray, canvas: np.ndarray, mask: np.ndarray) -> None:
-    """Draw a sheet (h, w, 4) of lines over an image (h, w, 3) uint8 where a mask (h, w) is True, in place."""
+    """Draw a canvas (h, w, 4) of lines on an image (h, w, 3) uint8 where `mask` (h, w) is True, in place."""
     drawn = mask & (canvas[..., 3] > 0)
     line, left = canvas[drawn, :3], 255 - canvas[drawn, 3:].astype(int)
     image[drawn] = (image[drawn] * left // 255 + line).astype(np.uint8)
 
 
 def clip_to_canvas(outline: np.ndarray, width: int, height: int) -> list[np.ndarray]:
-    """Return the pieces of an outline (n, 1, 2) inside a sheet, away from its edge."""
+    """Return the pieces of an outline (n, 1, 2) inside a canvas, away from the canvas's edge."""
     inside = (outline >= MAX_EDGE_DISTANCE) & (outline < (width - MAX_EDGE_DISTANCE, height - MAX_EDGE_DISTANCE))
     return split_by_mask(outline, inside.all(axis=(1, 2)))
 
 
 def clip_to_mask(outlines: Sequence[np.ndarray], mask: np.ndarray) -> list[np.ndarray]:
-    """Return the pieces of outlines, each (n, 1, 2), whose pixels are in a mask (H, W) bool."""
+    """Return the pieces of outlines (n, 1, 2) whose pixels are in a mask (H, W) bool."""
     return [piece for line in outlines for piece in split_by_mask(line, mask[line[:, 0, 1], line[:, 0, 0]])]
 
 
 def split_by_mask(line: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:
-    """Return the pieces of a line (n, 1, 2) whose points are kept (n,) bool; none for an empty line."""
+    """Return the pieces of a line (n, 1, 2) for which `mask` (n,) is True; [] for an empty line."""
     if not len(line):
         return []
     cuts = np.flatnonzero(np.diff(mask)) + 1
@@ -145,41 +145,41 @@ def split_by_mask(line: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:
 
 
 def shift_shade(colour: Sequence[float]) -> tuple[float, ...]:
-    """Return a shade (3,) slightly different from a colour in 0 .. 255: the outline's colour is the outline's alone."""
+    """Return a colour (3,) in 0 .. 255 slightly changed, so that only the outline has the original colour."""
     return tuple(share + 8.0 if share < 128.0 else share - 8.0 for share in colour)
 
 
-COLOUR_TOLERANCE = 2  # Colour tolerance in each channel: centres of lines have the exact colour, within rounding.
-# Percentile of the outline pixels' distances that is reported [%]: corners and crossings of lines are excluded.
+COLOUR_TOLERANCE = 2  # Colour tolerance in each channel; line centres have the exact colour within rounding.
+# Reported percentile of the outline pixels' distances [%], to exclude corners and crossings of lines.
 DISTANCE_PERCENTILE = 95.0
 CUT_DISTANCE = 5  # Distance from occluders or the image border within which an outline may be cut [pixel].
 LINE_DISTANCE = 6  # Distance from a mask's edge within which lines may be drawn [pixel].
 MIN_PIXELS = 60  # Minimum number of pixels for a share.
-TEXT_MARGIN = 8  # Margin round a line of text without its colour: else "1.5" would be found in "11.5" [pixel].
+TEXT_MARGIN = 8  # Margin round a text that must not have its colour, so that "1.5" is not found in "11.5" [pixel].
 
 
 def measure_outline_distance(
     image: np.ndarray, colour: Sequence[float], silhouette: np.ndarray, occluders: np.ndarray, min_pixels: int = 1,
     gap_length: float = 0.0,
 ) -> float:  # fmt: skip
-    """Compute the distance of the outline drawn in an image from the expected one [pixel].
+    """Compute the distance [pixel] between the outline drawn in an image and the expected outline.
 
-    The larger of two 95th percentiles: from pixels of the colour to the true outline, and from the true outline to
-    them. 0 if nothing of the outline is visible and nothing is drawn, infinite if only one of the two is there.
+    It is the larger of two 95th percentiles: from drawn pixels to the expected outline, and from the expected outline
+    to drawn pixels. 0 if neither is visible, infinite if only one is visible.
 
     Parameters
     ----------
     image, colour
-        The image (H, W, 3) uint8, and the colour (3,) in 0 .. 255 of outlines.
+        Image (H, W, 3) uint8, and the outline's colour (3,) in 0 .. 255.
     silhouette
-        (H, W) bool: the true silhouette.
+        Mask (H, W) bool of the expected silhouette.
     occluders
-        (H, W) bool: objects in front of the overlay.
+        Mask (H, W) bool of objects in front of the overlay.
     min_pixels
-        Smallest number of pixels that counts. Above 1, each outline is compared with all of the other: the visible part
-        of a broken line may be a gap.
+        Smallest number of pixels that counts. Above 1, each outline is compared with the whole other outline, also
+        where that is covered, as the visible part of a broken line may be a gap.
     gap_length
-        Length of the gaps of a broken line [pixel]: the true outline may be half of that from it.
+        Length of the gaps of a broken line [pixel]; half of it is subtracted from distances to drawn pixels.
     """
     found = find_colour(image, colour)
     true = np.zeros(silhouette.shape, np.uint8)
@@ -209,19 +209,19 @@ def find_colour(image: np.ndarray, colour: Sequence[float], tolerance: int = COL
 
 
 def _compute_distance(mask: np.ndarray) -> np.ndarray:
-    """Compute the distance (H, W) of each pixel from the nearest pixel of a mask (H, W) [pixel]."""
+    """Compute the distance (H, W) [pixel] of each pixel from the nearest pixel in a mask (H, W)."""
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def has_text(image: np.ndarray, text: str, scale: float, colour: Sequence[float] = WHITE) -> bool:
-    """Return True if `hud.write` wrote exactly this text at this scale anywhere into the image (H, W, 3) uint8."""
+    """Return True if an image (H, W, 3) uint8 has exactly this text at this scale, as drawn by `hud.write_text`."""
     return find_text(image, text, scale, colour) is not None
 
 
 def find_text(
     image: np.ndarray, text: str, scale: float, colour: Sequence[float] = WHITE
 ) -> tuple[int, int, int, int] | None:
-    """Locate a line of text written by `hud.write`: left, top, right and bottom [pixel]; None if not found."""
+    """Find text drawn by `hud.write_text`; return left, top, right and bottom [pixel], or None if not found."""
     (width, above), below = cv2.getTextSize(text, FONT, scale, 1)
     blank = np.zeros((above + below + 2, width + 2 * TEXT_MARGIN, 3), np.uint8)
     cv2.putText(blank, text, (TEXT_MARGIN, above + 1), FONT, scale, tuple(colour), 1, cv2.LINE_AA)
@@ -243,11 +243,11 @@ def find_text(
 def compute_drawn_share(
     image: np.ndarray, colour: Sequence[float], silhouette: np.ndarray, occluders: np.ndarray
 ) -> float:
-    """Compute the share of a silhouette's outline that has a colour.
+    """Compute the share of a silhouette's outline that has a given colour in an image.
 
     NaN for an outline of fewer than `MIN_PIXELS` pixels.
 
-    Parameters as in `measure_outline_distance`: pixels near occluders and near the border are left out.
+    The parameters are as in `measure_outline_distance`; pixels near occluders and the image border are left out.
     """
     outline = np.zeros(silhouette.shape, np.uint8)
     cv2.drawContours(outline, find_outlines(silhouette), -1, (1,))
@@ -258,7 +258,7 @@ def compute_drawn_share(
 
 
 def compute_changed_share(before: np.ndarray, after: np.ndarray, mask: np.ndarray) -> float:
-    """Compute the share of pixels that differ between images (H, W, 3) uint8, in a mask (H, W) bool without its edge.
+    """Compute the share of pixels in a mask (H, W) bool, without its edge, that differ between images (H, W, 3) uint8.
 
     NaN for fewer than `MIN_PIXELS` pixels.
     """

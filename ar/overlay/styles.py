@@ -1,4 +1,4 @@
-"""Styles of drawing a hidden surface, and the ground it is seen through."""
+"""Styles of drawing a hidden surface, and the layers that it may be seen through."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,25 +17,25 @@ STYLES: Mapping[Style, str] = MappingProxyType(
         "none": "none",
     }
 )
-"""Display names of the styles."""
-MIN_REPORTED_SHARE = 0.1  # Share of the visible silhouette from which the closed ground over it is reported.
-WHOLE_SHARE = 0.9  # Share of the visible silhouette from which closed ground is reported without "partly".
+"""Display names of the styles, by their names in code."""
+MIN_REPORTED_SHARE = 0.1  # Smallest reported share of the silhouette that closed ground covers.
+WHOLE_SHARE = 0.9  # Share of the silhouette above which closed ground is reported without "partly".
 
 
 @dataclass(frozen=True)
 class Opening:
-    """Ground through which a hidden surface may be drawn as if visible.
+    """Layers through which the hidden surface may be drawn as if visible (open ground).
 
-    Elsewhere its outline is broken and nothing shines through.
+    Under other layers (closed ground), the outline is broken and the surface does not shine through.
 
     Parameters
     ----------
     ids
-        Ids of the layers that are such ground, as cortex.
+        Ids of the open layers, such as cortex.
     labels
-        Labels of other layers, as drape, by id.
+        Ids and labels of other layers, such as a drape.
     default_label
-        Label of layers that are not in `labels`.
+        Label of other layers that are not in `labels`.
     """
 
     ids: tuple[int, ...]
@@ -43,9 +43,9 @@ class Opening:
     default_label: str = "not in the open"
 
     def describe(self, pixel_counts: Mapping[int, int]) -> str:
-        """Return the label of the ground in an image; empty if too little of the silhouette is under other layers.
+        """Return the label of the closed ground over the silhouette; empty if its share is too small.
 
-        pixel_counts: pixels of the silhouette by the id of the layer over it, without those in front of the overlay.
+        `pixel_counts` has the number of silhouette pixels by the id of the layer over them, occluders excluded.
         """
         under: dict[str, int] = {}
         for layer, count in pixel_counts.items():

@@ -1,25 +1,25 @@
-"""Placement of text in an image: the free place closest to the desired one."""
+"""Placement of text in an image, at the free position closest to the desired one."""
 
 import cv2
 import numpy as np
 
 BORDER_DISTANCE = 8  # Distance of text from the image border [pixel].
 TEXT_DISTANCE = 6  # Distance of text from lines and other text [pixel].
-GRID_SPACING = 4  # Grid spacing of candidate places [pixel].
-SEARCH_RADII = 64, 256  # Search radii around the desired place [pixel], tried in order before the whole image.
-SIDEWAYS_WEIGHT = 2  # Weight of a sideways distance relative to a vertical one: lines of text go below each other.
+GRID_SPACING = 4  # Grid spacing of candidate positions [pixel].
+SEARCH_RADII = 64, 256  # Search radii round the desired position [pixel], tried in order before the whole image.
+SIDEWAYS_WEIGHT = 2  # Weight of horizontal relative to vertical distances, so that texts are placed below each other.
 
 
 def find_free_position(occupied: np.ndarray, size: tuple[int, int], desired: tuple[int, int]) -> tuple[int, int] | None:
-    """Find the free place for a box closest to the desired one; None if there is no space.
+    """Find the free position of a box that is closest to the desired one; None if there is no space.
 
     Parameters
     ----------
     occupied
-        (H, W) uint8: above 0 where the box must not be.
+        Mask (H, W) uint8: above 0 where the box must not be.
     size, desired
-        Width and height of the box; desired column and row of its upper left corner, which may be outside the image
-        [pixel].
+        Width and height of the box [pixel], and desired column and row of its upper left corner, which may be outside
+        the image.
     """
     (height, width), (wide, tall) = occupied.shape, size
     right, low = width - BORDER_DISTANCE - wide, height - BORDER_DISTANCE - tall
@@ -54,6 +54,6 @@ def find_free_position(occupied: np.ndarray, size: tuple[int, int], desired: tup
 
 
 def list_positions_within(centre: int, max_distance: int, last: int) -> np.ndarray:
-    """List the candidate places PAD, PAD + GRID_SPACING, ... up to `last` that are near a centre."""
+    """List candidate positions BORDER_DISTANCE + k GRID_SPACING up to `last`, within `max_distance` of `centre`."""
     places = np.arange(BORDER_DISTANCE, last + 1, GRID_SPACING)
     return places[np.abs(places - centre) <= max_distance]

@@ -1,4 +1,4 @@
-"""Hidden surface that shines through the ground, which is dimmed round it, and the lines over and under it."""
+"""Hidden surface that shines through the ground, the dimmed ground round it, and lines over and under it."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ DEPTH_STEP = wp.constant(0.005)  # Width of a depth step of the style `depth` [m
 DEPTH_STEP_COUNT = wp.constant(6)  # Number of depth steps of the style `depth`.
 MAX_TINT_OPACITY = wp.constant(0.85)  # Opacity of the tint at the surface.
 MIN_TINT_OPACITY = wp.constant(0.1)  # Opacity of the tint at the last depth step.
-# Roles of a layer: in front of the overlay; ground that nothing shines through.
+# Roles of a layer: in front of the overlay; closed ground, through which nothing shines.
 FRONT, CLOSED_GROUND = wp.constant(1), wp.constant(2)
 # Shading of the ground inside the silhouette.
 WINDOW_SHADING, TINT_SHADING, DEPTH_SHADING = wp.constant(1), wp.constant(2), wp.constant(3)
 SHADES = {"window": WINDOW_SHADING, "fill": TINT_SHADING, "depth": DEPTH_SHADING}
-"""Shading by style; none in other styles."""
+"""Shading of the ground inside the silhouette by style; other styles have none."""
 BORDER_COLOUR = (10.0, 12.0, 12.0)  # Colour of the dark border of lines (RGB).
 BORDER_INK = wp.constant(wp.vec3f(*BORDER_COLOUR))  # Colour of the dark border for kernels.
 
@@ -48,11 +48,11 @@ class OverlayLines:
     Parameters
     ----------
     colour
-        Colour (3,) in 0 .. 255 of the hidden surface's outline, and of its tint.
+        Colour (3,) in 0 .. 255 of the hidden surface's outline and tint.
     is_solid
         True if the outline is drawn as one solid line.
     canvas_below, canvas_above
-        (h, w, 4) uint8: colour times coverage, and coverage, of further lines, under the outline and above it; or None.
+        Further lines (h, w, 4) uint8, premultiplied colour and coverage, below and above the outline; None: no lines.
     """
 
     colour: tuple[float, float, float]
@@ -65,21 +65,21 @@ def draw_overlay(
     images: Pictures, box: tuple[slice, slice], camera: Camera, layer: Layer, surface: RasterisedSurface,
     roles: LayerRoles, style: str, lines: OverlayLines,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Draw an overlay; return the image (H, W, 3) uint8, and the mask of its lines, (h, w) uint8 of the box.
+    """Draw an overlay; return the image (H, W, 3) uint8, and the mask (h, w) uint8 of the lines in the box.
 
     Parameters
     ----------
     images
-        Image to draw into, a batch of one, on its device.
+        Image to draw into, as a batch of one, on its device.
     box, camera
-        Rows and columns of the image in which to draw, and the camera of that part.
+        Rows and columns of the image part to draw in, and the camera of that part.
     layer, surface
-        The surface, and its rendering by that camera, on the same device.
+        Hidden surface, and its rasterised form for that camera, on the image's device.
     roles
-        Parts that stay unchanged, and parts that nothing shines through.
+        Roles of the layers: in front of the overlay, or closed ground.
     style
-        "window" dims the ground round the silhouette, where the surface shines through; "fill" tints it; "depth" the
-        more the closer the surface is to the ground.
+        "window": the surface shines through, and the ground round it is dimmed. "fill": the silhouette is tinted.
+        "depth": it is tinted more where the surface is closer to the ground.
     """
     device = str(images.colour.device)
     load_modules(device, __name__)
@@ -103,16 +103,16 @@ def draw_overlay(
 
 @dataclass(frozen=True, eq=False)
 class LayerRoles:
-    """Roles of an image's parts for an overlay.
+    """Roles of an image's layers for an overlay.
 
     Parameters
     ----------
     front_ids
-        Ids of the layers that stay unchanged: tools.
+        Ids of layers in front of the overlay, which stay unchanged, such as tools.
     open_ids
-        Ids of those that the surface may shine through; None: all.
+        Ids of layers through which the surface may shine; None: all.
     occluder_mask
-        (H, W) bool: further parts that stay unchanged, as a hand in a real image; or None.
+        Mask (H, W) bool of other parts that stay unchanged, such as a hand in a camera image; None: no such parts.
     """
 
     front_ids: tuple[int, ...] = ()
@@ -120,7 +120,7 @@ class LayerRoles:
     occluder_mask: np.ndarray | None = None
 
     def read_roles(self, segmentation: np.ndarray, box: tuple[slice, slice] = np.s_[:, :]) -> np.ndarray:
-        """Return the roles (h, w) uint8, `FRONT`, `CLOSED_GROUND` or 0, in a box of a segmentation (H, W) uint8."""
+        """Return the roles (h, w) uint8 (`FRONT`, `CLOSED_GROUND`, 0) in a box of a segmentation (H, W) uint8."""
         found = cv2.LUT(segmentation[box], build_role_table(self.front_ids, self.open_ids))
         if self.occluder_mask is not None:
             found[self.occluder_mask[box]] = FRONT
@@ -129,7 +129,7 @@ class LayerRoles:
 
 @lru_cache(maxsize=8)
 def build_role_table(front_ids: tuple[int, ...], open_ids: tuple[int, ...] | None) -> np.ndarray:
-    """Return the table (256,) uint8 of roles by the id of a layer: `FRONT`, `CLOSED_GROUND` or 0."""
+    """Build the table (256,) uint8 from a layer's id to its role: `FRONT`, `CLOSED_GROUND` or 0."""
     ids = np.arange(256)
     shut = np.zeros(256, bool) if open_ids is None else ~np.isin(ids, open_ids)
     return np.where(np.isin(ids, front_ids), FRONT, np.where(shut, CLOSED_GROUND, 0)).astype(np.uint8)
@@ -137,21 +137,21 @@ def build_role_table(front_ids: tuple[int, ...], open_ids: tuple[int, ...] | Non
 
 @lru_cache(maxsize=8)
 def get_role_table(front_ids: tuple[int, ...], open_ids: tuple[int, ...] | None, device: str) -> wp.array:
-    """Return `build_role_table` on a device, copied there once."""
+    """Return the table of `build_role_table` on a device; it is copied there once."""
     return wp.array(build_role_table(front_ids, open_ids), dtype=wp.uint8, device=device)
 
 
 def to_flat_canvas(canvas: np.ndarray | None, device: str) -> wp.array:
-    """Copy a sheet (h, w, 4) of lines to a device, flattened; empty if there is none."""
+    """Copy a canvas (h, w, 4) to a device as a flat array; None gives an empty array."""
     if canvas is None:
         return wp.empty(0, dtype=wp.vec4ub, device=device)
     return wp.array(canvas.reshape(-1, 4), dtype=wp.vec4ub, device=device, copy=False)
 
 
 def compute_edge_distance(surface: RasterisedSurface) -> wp.array:
-    """Compute the chamfer distance (h, w) of each pixel from a silhouette's edge [pixel], up to the soft edge's width.
+    """Compute the chamfer distance (h, w) [pixel] of each pixel from the silhouette's edge, up to `CHAMFER_RADIUS`.
 
-    OpenCV computes it on the CPU, kernels with the same result on a GPU.
+    On the CPU it is computed by OpenCV; on a GPU, kernels give the same result.
     """
     device, shape = str(surface.z_buffer.device), surface.z_buffer.shape[1:]
     beside = wp.empty(shape, dtype=wp.uint8, device=device)
@@ -163,7 +163,7 @@ def compute_edge_distance(surface: RasterisedSurface) -> wp.array:
 
 
 def compute_chamfer_distance(non_edge: wp.array, device: str) -> wp.array:
-    """Compute the chamfer distance (h, w) [pixel] from pixels where `non_edge` is 0, up to `CHAMFER_RADIUS`."""
+    """Compute the chamfer distance (h, w) [pixel] from the pixels where `non_edge` is 0, up to `CHAMFER_RADIUS`."""
     aside = wp.empty(non_edge.shape, dtype=wp.int32, device=device)
     distance = wp.empty(non_edge.shape, dtype=wp.float32, device=device)
     launch_in_bands(compute_row_distance, [non_edge], [aside], non_edge.size, device)
@@ -177,7 +177,7 @@ def mark_edges(
     # output
     non_edge: wp.array2d(dtype=wp.uint8),
 ):  # fmt: skip
-    """Mark each pixel: 0 if a surface is visible there but not at one of its four neighbours, else 1."""
+    """Set each edge pixel to 0, others to 1: the surface is visible there, but not at one of its four neighbours."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         row = index / z_buffer.shape[1]
@@ -199,7 +199,7 @@ def compute_row_distance(
     # output
     row_distance: wp.array2d(dtype=wp.int32),
 ):  # fmt: skip
-    """Compute the distance in columns of each pixel from the edge in its own row, at most `CHAMFER_RADIUS`."""
+    """Compute the distance of each pixel to the nearest edge pixel in its row [columns], at most `CHAMFER_RADIUS`."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         row = index / non_edge.shape[1]
@@ -217,7 +217,7 @@ def compute_pixel_distance(
     # output
     distance: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """Compute the chamfer distance: shortest path of straight and diagonal steps from each row's nearest pixel."""
+    """Compute the chamfer distance: the shortest path of straight and diagonal steps to the nearest edge pixel."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         row = index / row_distance.shape[1]
@@ -235,7 +235,7 @@ def compute_pixel_distance(
 def smooth_distance(
     row: wp.int32, column: wp.int32, distance: wp.array2d(dtype=wp.float32), z_buffer: wp.array2d(dtype=wp.uint64)
 ) -> wp.float32:
-    """Signed distance of a pixel from the silhouette, below 0 inside: mean of nine pixels, which hides steps."""
+    """Compute a pixel's signed distance from the silhouette, < 0 inside, as mean of nine pixels to hide steps."""
     total = wp.float32(0.0)
     for i in range(-1, 2):
         for j in range(-1, 2):
@@ -247,7 +247,7 @@ def smooth_distance(
 
 @wp.func
 def blend_over(line: wp.vec4ub, background: wp.vec3f) -> wp.vec3f:
-    """Blend a line (colour times coverage, and coverage) over light."""
+    """Blend a line (premultiplied colour, coverage) over a background colour."""
     left = 1.0 - wp.float32(line[3]) / 255.0
     return left * background + wp.vec3f(wp.float32(line[0]), wp.float32(line[1]), wp.float32(line[2]))
 
@@ -257,9 +257,9 @@ def shade_through_ground(
     p: wp.vec3d, key: wp.uint64, q: wp.array2d(dtype=wp.vec3d), triangles: wp.array(dtype=wp.vec3i),
     appearance: wp.array(dtype=wp.vec4f), ground_depth: wp.float32,
 ) -> wp.vec3f:  # fmt: skip
-    """Compute the light of a hidden surface at a pixel p = (u, v, 1), through the ground at depth `ground_depth` [m].
+    """Compute the light of a hidden surface at a pixel p = (u, v, 1), seen through ground at `ground_depth` [m].
 
-    0 where there is none.
+    The depth below the ground counts as 0 if `ground_depth` is 0.
     """
     t = triangles[unpack_face(key)]
     w = compute_weights_from_corners(p, q[0, t[0]], q[0, t[1]], q[0, t[2]])
@@ -272,7 +272,7 @@ def shade_through_ground(
 
 @wp.func
 def compute_tint_opacity(depth: wp.float32) -> wp.float32:
-    """Strength of the depth style's tint, at a depth under the ground [m]."""
+    """Compute the opacity of the depth style's tint for a depth [m] below the ground."""
     share = wp.clamp(wp.floor(depth / DEPTH_STEP) / wp.float32(DEPTH_STEP_COUNT - 1), 0.0, 1.0)
     return MAX_TINT_OPACITY - (MAX_TINT_OPACITY - MIN_TINT_OPACITY) * share
 
@@ -289,9 +289,9 @@ def composite_pixels(
     # outputs
     image: wp.array2d(dtype=wp.vec3ub), occupied: wp.array2d(dtype=wp.uint8),
 ):  # fmt: skip
-    """Composite pixels begin .. end - 1 of the box; `edge_distance` is that of each to the silhouette's edge [pixel].
+    """Composite pixels begin .. end - 1 of the box; `edge_distance` is that of each pixel from the silhouette's edge.
 
-    `appearance` of the hidden surface's vertices: cosine of their normals to the optical axis, and colour in 0 .. 255.
+    `appearance` has, per vertex of the hidden surface, its normal's cosine to the optical axis and colour in 0 .. 255.
     """
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):

@@ -1,1 +1,1 @@
-"""Browser page: its parts, its clients, and the messages that they may send."""
+"""Browser page: its parts, its clients, and the messages that clients may send."""

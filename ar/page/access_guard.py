@@ -1,8 +1,8 @@
-"""Access guard of the page's server: only the page's clients may connect, with messages of `ar.page.messages`.
+"""Access guard of the page's server: only the page's clients may connect and send messages of `ar.page.messages`.
 
-Any program that reaches the server may send it requests: another page in a user's browser, a name whose owner points it
-at this machine (DNS rebinding), a script. Each request is checked against the page's own address and, if other machines
-can reach it, a secret in the page's address.
+Any program that reaches the server may send requests: another page in a user's browser, a host name that its owner
+points to this machine (DNS rebinding), or a script. Each request is checked against the page's own address and, if
+other machines can reach the server, a secret token in the page's address.
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ class ConnectionLimits:
     max_clients
         Maximum number of connected browsers.
     max_burst, messages_per_second
-        Messages that one client may send at once, and sustained per second; viser's own page sends some 50 a second at
-        most.
+        Maximum number of messages of one client at once, and per second in the long term; viser's own page sends at
+        most some 50 per second.
     updates_per_second
-        Maximum updates per second that the page sends.
+        Maximum number of updates per second that the page sends.
     slice_updates_per_second
-        Maximum updates per second of slices and charts, which take longer to draw.
+        Maximum number of updates per second of slices and charts, which take longer to draw.
     """
 
     max_clients: int = 32
@@ -66,12 +66,12 @@ DEFAULT_LIMITS = ConnectionLimits()  # Default limits of connections.
 
 
 class ViserError(RuntimeError):
-    """Unsupported viser release."""
+    """Error for a viser release that is not supported."""
 
 
 @dataclass(frozen=True)
 class AccessPolicy:
-    """Access policy: `host` that the page is bound to, `token` (None: any program of this machine may connect).
+    """Access policy: `host` of the page, and secret `token` (None: any program on this machine may connect).
 
     `origins` are further addresses of the page, by a proxy or another port, in the form of `format_origin`.
     """
@@ -82,19 +82,19 @@ class AccessPolicy:
 
     @classmethod
     def create(cls, host: str, origins: tuple[str, ...] = ()) -> AccessPolicy:
-        """Build a policy with a fresh token, unless only this machine reaches the host and no proxy leads there.
+        """Build a policy with a new token; without one if only this machine reaches the host and there are no origins.
 
         Raises
         ------
         OSError
-            A host that has no address.
+            The host has no address.
         """
         addresses = [entry[4][0] for entry in socket.getaddrinfo(host, None)]
         near = all(ipaddress.ip_address(str(address).split("%")[0]).is_loopback for address in addresses)
         return cls(host, None if near and not origins else secrets.token_urlsafe(24), origins)
 
     def find_rejection(self, request: Request, address: str, port: int) -> str | None:
-        """Return the reason to reject a request received at an address and a port; None to accept it."""
+        """Return the reason to reject a request received at this address and port; None if it is accepted."""
         names = {"localhost", "127.0.0.1", "[::1]", to_url_host(self.host), to_url_host(address)}
         if self.token is not None:
             names.add(socket.gethostname())
@@ -115,18 +115,18 @@ class AccessPolicy:
         return None
 
     def is_encrypted(self, request: Request) -> bool:
-        """Return True if a request's address is served by https only."""
+        """Return True if the host of a request is served only by https."""
         schemes = [
             each.split(":")[0] for each in self.origins if request.headers.get("Host", "").lower() in list_hosts(each)
         ]
         return set(schemes) == {"https"}
 
     def is_token(self, text: str) -> bool:
-        """Return True if a text is the token; compares in constant time."""
+        """Return True if a text equals the token; the comparison takes constant time."""
         return self.token is not None and hmac.compare_digest(text.encode(), self.token.encode())
 
     def read_tokens(self, request: Request, port: int) -> Iterator[str]:
-        """Yield the tokens of a request, from its address and its cookies."""
+        """Yield the tokens in a request's address and cookies."""
         yield from parse_qs(urlsplit(to_plain_text(request.path)).query).get("token", [])
         for header in request.headers.get_all("Cookie"):
             for pair in to_plain_text(header).split(";"):
@@ -136,7 +136,7 @@ class AccessPolicy:
 
 
 class Connection(ServerConnection):
-    """WebSocket connection of a client: its messages are checked before viser gets them; `controls` finds controls."""
+    """WebSocket connection of a client; messages are checked before viser gets them, with the lookup `controls`."""
 
     def __init__(
         self, *args: Any, controls: Callable[[str], object], limits: ConnectionLimits, **settings: Any
@@ -146,7 +146,7 @@ class Connection(ServerConnection):
         self.credit, self.counted = limits.max_burst, self.loop.time()
 
     def data_received(self, data: bytes) -> None:
-        """Reject requests other than GET, to which websockets would not respond."""
+        """Reject requests other than GET, which websockets would not answer."""
         if self.request is None and not data.startswith(b"GET "[: len(data)]):
             self.transport.write(b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nContent-Length: 0\r\n\r\n")
             self.transport.close()
@@ -154,7 +154,7 @@ class Connection(ServerConnection):
             super().data_received(data)
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """Wait for the next valid message; a malformed message, or too many, closes the connection."""
+        """Wait for the next valid message; malformed or too many messages close the connection."""
         while True:
             message = await super().recv(decode)
             try:
@@ -168,12 +168,12 @@ class Connection(ServerConnection):
                     await self.close(1008, "The message has an invalid format.")
 
     def count_message(self) -> None:
-        """Count a message.
+        """Count a message towards the rate limit.
 
         Raises
         ------
         MessageError
-            The rate limit is exceeded.
+            The client exceeds the rate limit.
         """
         now, limits = self.loop.time(), self.limits
         self.credit = min(limits.max_burst, self.credit + (now - self.counted) * limits.messages_per_second) - 1.0
@@ -183,14 +183,14 @@ class Connection(ServerConnection):
 
 
 class ConnectionLog(logging.Filter):
-    """Log filter for client connections: each message once, without traceback; failed handshakes never."""
+    """Log filter for client connections: it shows each message once, without traceback, and no failed handshakes."""
 
     def __init__(self) -> None:
         super().__init__()
         self.said: set[str] = set()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return True if a record is shown; its traceback is removed."""
+        """Return True if a record is to be shown, and remove its traceback."""
         record.exc_info = None
         text = record.getMessage()
         new = text not in self.said and text != "opening handshake failed"
@@ -200,12 +200,12 @@ class ConnectionLog(logging.Filter):
 
 @dataclass
 class ControlLookup:
-    """Lookup of controls and commands by identifier; empty before viser's server runs."""
+    """Lookup of controls and commands by identifier; it finds nothing before viser's server runs."""
 
     server: viser.ViserServer | None = None
 
     def __call__(self, identifier: str) -> object:
-        """Find a control of all clients, or of one alone, or a command."""
+        """Return the control or command with this identifier, for all clients or for one client; None if not found."""
         if self.server is None:
             return None
         for gui in (self.server.gui, *(client.gui for client in self.server.get_clients().values())):
@@ -217,12 +217,12 @@ class ControlLookup:
 def open_server(
     host: str, port: int, title: str, limits: ConnectionLimits = DEFAULT_LIMITS, origins: tuple[str, ...] = ()
 ) -> tuple[viser.ViserServer, str | None]:
-    """Serve a page; return viser's server and the token that the page's address must carry, if any.
+    """Start viser's server with the guard; return it, and the token of the page's address, or None.
 
     Raises
     ------
-    UnguardedError
-        An unsupported viser release: nothing is served.
+    ViserError
+        The viser release is not supported; no server is started.
     """
     if not viser.__version__.startswith(VISER_VERSION):
         raise ViserError(f"viser {viser.__version__} cannot be guarded: install viser {VISER_VERSION}*.")
@@ -246,7 +246,7 @@ PATCH_LOCK = threading.Lock()  # Lock while websockets' `serve` is replaced.
 
 @contextmanager
 def guard_server(policy: AccessPolicy, controls: ControlLookup, limits: ConnectionLimits) -> Iterator[list[bool]]:
-    """Guard the server that viser opens within this context; the yielded list is non-empty once it is open."""
+    """Guard the server that viser opens within this context; the yielded list is not empty once it is open."""
     opened: list[bool] = []
     serve = websockets.asyncio.server.serve
     log = logging.Logger("page", logging.WARNING)
@@ -269,7 +269,7 @@ def guard_server(policy: AccessPolicy, controls: ControlLookup, limits: Connecti
 def handle_request(
     policy: AccessPolicy, limits: ConnectionLimits, respond: Callable, connection: ServerConnection, request: Request
 ) -> Response | None:
-    """Respond to a request as viser does, if it is accepted; None opens a WebSocket connection."""
+    """Reject a request, or respond as viser does; return None to open a WebSocket connection."""
     address, port = connection.local_address[:2]
     refusal = policy.find_rejection(request, address, port)
     if refusal is not None:
@@ -296,12 +296,12 @@ def handle_request(
 
 
 def format_origin(address: str) -> str:
-    """Write an address of a page as browsers do: scheme and name in lower case, no port that its scheme implies.
+    """Format a page's address as browsers do: lower case, and no port if the scheme implies it.
 
     Raises
     ------
     ValueError
-        A text that is not an address, or has a path, a user or a query.
+        The text is not an address, or has a path, user or query.
     """
     try:
         parts = urlsplit(address)
@@ -323,35 +323,35 @@ def format_origin(address: str) -> str:
 
 
 def list_hosts(origin: str) -> set[str]:
-    """Return the host names of requests to an address, with and without the port that the scheme implies."""
+    """Return the host names of requests to an address, with and without a port that the scheme implies."""
     scheme, _, place = origin.partition("://")
     return {place} if place.rpartition(":")[2].isdecimal() else {place, f"{place}:{DEFAULT_PORTS[scheme]}"}
 
 
 def to_url_host(host: str) -> str:
-    """Write a host as part of an address (IPv6 in brackets)."""
+    """Return a host as it is written in an address, with IPv6 in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 def get_cookie_name(port: int) -> str:
-    """Return the name of a page's cookie; pages on other ports of the same host have others."""
+    """Return the name of a page's cookie, which differs between ports of a host."""
     return f"page-{port}"
 
 
 def to_plain_text(text: str) -> str:
-    """Return a header's text as ASCII; websockets keeps bytes that are no characters."""
+    """Return a header's text as ASCII, because websockets keeps bytes that are not characters."""
     return text.encode("ascii", "replace").decode()
 
 
 def check_address(host: str, port: int) -> None:
-    """Raise if no page can be served: viser would fail on a thread of its own, and its caller wait for ever.
+    """Raise an error if no page can be served there, because viser would fail in another thread and never return.
 
     Raises
     ------
     ValueError
-        A port outside 0 .. 65535.
+        The port is outside 0 .. 65535.
     OSError
-        A host that is not this machine.
+        The host is not this machine.
     """
     if not 0 <= port <= 65535:
         raise ValueError(f"{port} is no port: give 0 .. 65535.")

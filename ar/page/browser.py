@@ -1,8 +1,7 @@
-"""Browser page: camera image, 3-D view next to it, playback, controls and a report, made with viser.
+"""Browser page made with viser: camera image, 3-D view, playback, controls and a report.
 
-`ar.overlay.composite` has already drawn the overlay into the image. The page shows the whole image, as one
-element, so that image and overlay stay aligned in every window. The 3-D view is updated by sending vertices alone.
-`ar.page.style` holds the layout.
+The image already contains the overlay of `ar.overlay.composite`. The page shows it as one element, so that image and
+overlay stay aligned in every window. Updates of the 3-D view send only vertices. `ar.page.style` has the layout.
 """
 
 import threading
@@ -40,14 +39,14 @@ LOCAL_ADDRESSES = ("127.0.0.1", "0.0.0.0", "::1", "::")  # Addresses that this m
 
 
 Shown = tuple[int, np.ndarray, str, int]
-"""Frame number, its image (H, W, 3) uint8, the report next to it (HTML), position of the playback slider."""
+"""Frame number, image (H, W, 3) uint8 of the frame, report next to it (HTML), and position of the playback slider."""
 
 
 class Browser:
-    """Browser screen for any number of clients, who share image and controls.
+    """Browser page for any number of clients, who share image and controls.
 
-    `show`, `move`, `report`, `write` and `put` only note the newest value. They may be called from any thread at any
-    rate. A thread of the page sends it, as often as `ConnectionLimits` allow.
+    `show`, `move`, `report`, `write` and `put` only store the newest value; they may be called from any thread, at any
+    rate. A thread of the page sends the stored values, as often as `ConnectionLimits` allow.
     """
 
     def __init__(
@@ -57,19 +56,19 @@ class Browser:
         signs: Sequence[SceneLabel | SceneImage] = (), limits: ConnectionLimits = DEFAULT_LIMITS,
         origins: tuple[str, ...] = (),
     ) -> None:  # fmt: skip
-        """Start the server; if `port` is taken, the next free one is used, see `address`.
+        """Start the server; if `port` is in use, the next free port is taken, see `address`.
 
-        `words` is HTML under the image, `size` the image's width and height [pixel] until the first arrives. `origins`
-        are further addresses of the page, of a proxy or another port, as written by `access_guard.format_origin`.
+        `words` is HTML below the image. `size` is the image's width and height [pixel] until the first one arrives.
+        `origins` are further addresses of the page, by a proxy or another port, as from `access_guard.format_origin`.
 
         Raises
         ------
         ValueError
-            An invalid port.
+            The port is invalid.
         OSError
-            A host that is not this machine.
-        UnguardedError
-            A viser release that `ar.page.access_guard` does not support.
+            The host is not this machine.
+        ViserError
+            The viser release is not supported by `ar.page.access_guard`.
         """
         check_address(host, port)
         self.limits, self.origins = limits, origins
@@ -108,9 +107,9 @@ class Browser:
         self, bodies: Sequence[SceneSurface], playback: Playback, controls: Sequence[Control | Folder | Note] = (),
         title: str = "sulcus", words: str = "",
     ) -> None:  # fmt: skip
-        """Replace bodies, playback, controls, title and words.
+        """Replace surfaces, playback, controls, title and text of the page.
 
-        Pending updates of the old ones are dropped.
+        Pending updates of the previous ones are dropped.
         """
         with self.sending, self.server.atomic():
             with self.lock:
@@ -136,24 +135,24 @@ class Browser:
 
     @property
     def inputs(self) -> dict[str, viser.GuiInputHandle]:
-        """The controls by their labels."""
+        """Controls by their labels."""
         return self.controls.handles
 
     @property
     def deed(self) -> LastChange | None:
-        """Action of the newest message, for the `changed` that it calls."""
+        """Action of the newest message, for the callback that the message triggers."""
         return self.controls.deed
 
     @property
     def address(self) -> str:
-        """Address of the page as seen from this machine, with the token that other machines need."""
+        """Address of the page for this machine, with the token that other machines need."""
         host = self.server.get_host()
         name = "localhost" if host in LOCAL_ADDRESSES else to_url_host(host)
         return f"http://{name}:{self.server.get_port()}" + (f"/?token={self.token}" if self.token else "")
 
     @property
     def addresses(self) -> list[str]:
-        """Further addresses of the page, with the token."""
+        """Further addresses of the page (`origins`), with the token."""
         return [f"{origin}/?token={self.token}" for origin in self.origins]
 
     @property
@@ -167,9 +166,9 @@ class Browser:
         return self.crowd.here
 
     def show(self, number: int, colour: np.ndarray, words: str, sought: int | None = None) -> None:
-        """Show the image (H, W, 3) uint8 of frame `number`, and its report in HTML.
+        """Show the image (H, W, 3) uint8 of frame `number`, with its report (HTML).
 
-        The playback slider moves to that number, or to `sought`, the target frame, if this frame is on the way to it.
+        The playback slider moves to `number` or, if given, to the target frame `sought`, which this frame precedes.
         """
         with self.lock:
             self.wanted = number, colour, words, number if sought is None else sought
@@ -182,7 +181,7 @@ class Browser:
             self.newest["sight"] = self.send_sight
 
     def send_sight(self) -> None:
-        """Send the image with its report, unless both are shown already."""
+        """Send the image with its report, unless both are already shown."""
         with self.lock:
             _, colour, words, place = wanted = self.wanted
         at = self.shown[3]
@@ -196,22 +195,22 @@ class Browser:
             self.controls.assign(self.frame, place)
 
     def put_sight(self, code: str, words: str) -> None:
-        """Send a `to_data_url` image and words (HTML) at once."""
+        """Send a `to_data_url` image and its text (HTML) immediately."""
         self.sent += 1
         self.sight.content = build_image_element(self.sent, code, keep_numbers_together(words))
         self.recorder.add_image(code)
 
     def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
-        """Show an image (H, W, 3) uint8 of slices, and charts (HTML) of the last seconds, in tabs next to the 3-D view.
+        """Show an image (H, W, 3) uint8 of slices, and charts (HTML), in the tabs next to the 3-D view.
 
-        The page's thread calls `drawn` for them, as often as `ConnectionLimits` allow: intermediate ones are
-        skipped.
+        The page's thread calls `drawn` to compute both, as often as `ConnectionLimits` allow; only the newest `drawn`
+        is called.
         """
         with self.lock:
             self.drawn = drawn
 
     def send_beside(self) -> None:
-        """Draw and send the newest slices, if they are due and a client is connected."""
+        """Draw and send the newest slices and charts, if due and if a client is connected."""
         with self.lock:
             drawn = self.drawn if clock.monotonic() >= self.due and self.visitors else None
             if drawn is None:
@@ -222,7 +221,7 @@ class Browser:
         self.beside.content = build_image_element(self.sent, to_data_url(colour), words, ASIDE_SPOT)
 
     def move(self, name: str, vertices: np.ndarray, triangles: np.ndarray | None = None) -> None:
-        """Replace the vertices (V, 3) [m] of a body in the 3-D view; also the triangles (F, 3) if they changed."""
+        """Replace the vertices (V, 3) [m] of a surface in the 3-D view, and the triangles (F, 3) if they changed."""
         mesh = self.meshes[name]
 
         def send() -> None:
@@ -233,17 +232,17 @@ class Browser:
         self.note(f"body {name}", send)
 
     def tint(self, name: str, colour: tuple[float, float, float]) -> None:
-        """Set the colour (3,) of a body in the 3-D view, sRGB in [0, 1]."""
+        """Set the colour (3,), sRGB in [0, 1], of a surface in the 3-D view."""
         mesh = self.meshes[name]
         self.note(f"colour {name}", lambda: setattr(mesh, "color", tuple(round(255 * part) for part in colour)))
 
     def show_status(self, words: str) -> None:
-        """Show a line (HTML) over the image; empty: none."""
+        """Show a status line (HTML) over the image; an empty text hides it."""
         said = build_element(STATUS, f"<span>{words}</span>") if words else ""
         self.note("status", lambda: setattr(self.line, "content", said))
 
     def show_playback(self, playing: bool) -> None:
-        """Set the button's label to the playback state."""
+        """Set the play/pause button to the playback state `playing`."""
         button, self.playing = self.button, playing
 
         def send() -> None:
@@ -253,9 +252,9 @@ class Browser:
         self.note("button", send)
 
     def show_line(self, line: Callable[[int], str]) -> None:
-        """Show each client a line of Markdown of its own under the report: `line` takes the client's number.
+        """Show each client its own line of Markdown below the report; `line` maps the client's number to the text.
 
-        With several clients it also shows who has control, and the others may request it.
+        If there are several clients, the line also says who has control, and others may request control.
         """
 
         def send() -> None:
@@ -266,10 +265,10 @@ class Browser:
         self.note("lines", lambda: self.server.get_event_loop().call_soon_threadsafe(send))
 
     def put(self, label: str, value: float | str, wanted: Callable[[], bool] | None = None) -> None:
-        """Set a control without calling its `changed`, as when a script moves the tool.
+        """Set a control without calling its `on_change`, for example when a script moves the tool.
 
-        A slider stays within its range. With `wanted` the control is set only if the value differs and `wanted` returns
-        True on the thread that receives the clients' messages.
+        A slider stays within its range. If `wanted` is given, the control is set only if the value differs and `wanted`
+        returns True, in the thread that receives messages.
         """
         control = self.controls.handles[label]
         if isinstance(control, viser.GuiSliderHandle) and not isinstance(value, str):
@@ -277,12 +276,12 @@ class Browser:
         self.note(f"control {label}", lambda: self.controls.assign(control, value, wanted))
 
     def rename(self, label: str, words: str) -> None:
-        """Show other words for a control; an unknown label, such as one of the previous scene, is ignored."""
+        """Show another text for a control; an unknown label, such as one of the previous scene, is ignored."""
         if (control := self.controls.handles.get(label)) is not None:
             self.note(f"words {label}", lambda: setattr(control, "label", words))
 
     def write(self, label: str, words: str) -> None:
-        """Replace the words (HTML) of a note; an empty note is hidden."""
+        """Replace the text (HTML) of a note; an empty note is hidden."""
         folder, text = self.controls.notes[label]
 
         def send() -> None:
@@ -291,18 +290,18 @@ class Browser:
         self.note(f"note {label}", send)
 
     def close(self) -> None:
-        """Stop the page."""
+        """Stop the page's thread and its server."""
         self.closed.set()
         self.sender.join()
         self.server.stop()
 
     def note(self, key: str, send: Callable[[], object]) -> None:
-        """Keep the newest update of each kind for sending."""
+        """Store the newest update of each kind until it is sent."""
         with self.lock:
             self.newest[key] = send
 
     def send(self) -> None:
-        """Send the newest updates until the page is closed; updates of one interval arrive together."""
+        """Send the stored updates until the page is closed; updates of one interval arrive together."""
         while not self.closed.wait(1.0 / self.limits.updates_per_second):
             with self.sending:
                 with self.lock:
@@ -313,7 +312,7 @@ class Browser:
                 self.send_beside()
 
     def add_playback(self, playback: Playback) -> None:
-        """Add a play/pause button and a slider over the frames, if there are any; keys do the same."""
+        """Add a play/pause button and, if there are frames, a slider over them; keys have the same actions."""
         gui, self.playing, seekable = self.server.gui, True, playback.frame_count > 0
         self.button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self.frame = gui.add_slider("frame", 0, max(playback.frame_count - 1, 1), 1, 0, visible=seekable)
@@ -338,7 +337,7 @@ class Browser:
             self.controls.bind_key(ON_KEY, lambda _: step(1))
 
     def add_savers(self) -> None:
-        """Add buttons that download the shown image (every client) and a video (client with control)."""
+        """Add buttons to download the shown image (every client) and to record a video (client with control)."""
         name = self.title.replace(":", "").replace(" ", "-")
         self.saver = self.server.gui.add_button("Save the image", icon=viser.Icon.CAMERA, color="gray")
 
@@ -359,5 +358,5 @@ class Browser:
 
 
 def build_element(name: str, words: str) -> str:
-    """Wrap words in an element with an id, for the style rules."""
+    """Wrap text in an element with an id, for style rules."""
     return f'<div id="{name}">{words}</div>'

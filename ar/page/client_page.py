@@ -1,8 +1,8 @@
-"""HTML document that a browser loads first: viser's own, with this page's title and icon, and usable without WebGL.
+"""HTML document that a browser loads first: viser's, with this page's title and icon, and usable without WebGL.
 
-Viser's client reads the server's messages only while it draws. In a browser without WebGL, a null renderer takes its
-place: image, controls and tabs work, and only the 3-D view is unavailable. Where WebGL is computed by the processor,
-the 3-D view is drawn a few times a second, so that the image keeps its rate.
+Viser's client reads the server's messages only while it draws. In a browser without WebGL, a null renderer replaces it:
+image, controls and tabs work, and only the 3-D view is missing. If WebGL is computed on the CPU, the 3-D view is drawn
+only a few times per second, so that the camera image keeps its frame rate.
 """
 
 import gzip
@@ -17,8 +17,8 @@ ICON = (  # Icon of the page (SVG).
     "<path d='M4 10 Q16 3 28 10' fill='none' stroke='#eee' stroke-width='2' stroke-dasharray='2 2'/></svg>"
 )
 NO_WEBGL_CLASS = "sulcus-without-webgl"
-"""Class of the document's element in a browser without WebGL."""
-SOFTWARE_PERIOD = 150  # Shortest time between two drawings of the 3-D view without a graphics card [ms].
+"""Class of the document's root element in a browser without WebGL."""
+SOFTWARE_PERIOD = 150  # Minimum period of drawing the 3-D view without a graphics card [ms].
 # Each WebGL constant equals its own name here, so that results are looked up by name.
 SCRIPT = """
 (() => {
@@ -83,7 +83,7 @@ SCRIPT = """
 
 @lru_cache(maxsize=4)
 def build_document(document: bytes, is_zipped: bool) -> bytes:
-    """Insert this page's title, icon and script into viser's document."""
+    """Insert this page's title, icon and script into viser's document; return it, compressed if `is_zipped`."""
     text = (gzip.decompress(document) if is_zipped else document).decode()
     icon = f'<link rel="icon" href="data:image/svg+xml,{quote(ICON)}" />'
     script = f"<script>{SCRIPT.replace('WITHOUT', NO_WEBGL_CLASS).replace('PERIOD', str(SOFTWARE_PERIOD))}</script>"

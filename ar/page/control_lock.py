@@ -1,4 +1,4 @@
-"""Clients of a page: which of them has control, what they set, and the line and the buttons of each."""
+"""Clients of a page: the lock that gives one client control, the values that clients set, and their buttons."""
 
 import time as clock
 from collections.abc import Callable, Collection
@@ -12,31 +12,31 @@ from .parts import Control, Dropdown, Folder, Key, LastChange, Note, Slider, Tog
 from .style import NOTE, VIEW_ONLY_STYLE
 
 MAX_IDLE_TIME = 60.0
-"""Idle time of the client with control [s], after which a request for control is granted at once."""
+"""Time [s] without an action of the client with control, after which a request for control is granted at once."""
 
 
 @dataclass
 class ControlLock:
-    """State of the lock: number of the client with control, time of its last action [s], queue of requests."""
+    """State of the control lock: number of the client with control, time [s] of its last action, queue of requests."""
 
     holder: int | None = None
     last_action: float = 0.0
     queue: tuple[int, ...] = ()
 
     def update_clients(self, present: Collection[int], time: float) -> None:
-        """Update the clients present: if the one with control has left, the first in the queue or the oldest has it."""
+        """Update the connected clients; if the holder has left, the first in the queue or the oldest gets control."""
         self.queue = tuple(visitor for visitor in self.queue if visitor in present)
         if self.holder not in present:
             self._give_control((*self.queue, *sorted(present), None)[0], time)
 
     def record_change(self, client: int, time: float) -> bool:
-        """Record that a client sets something; return True if it has control."""
+        """Record that a client changes a setting; return True if the client has control."""
         if client == self.holder:
             self.last_action = time
         return client == self.holder
 
     def request_control(self, client: int, time: float) -> None:
-        """Record that a client requests control."""
+        """Add a client to the queue for control; if the holder is idle, the first in the queue gets control."""
         if client == self.holder or client in self.queue:
             return
         self.queue += (client,)
@@ -44,7 +44,7 @@ class ControlLock:
             self.give_control(time)
 
     def give_control(self, time: float) -> None:
-        """Hand over control to the first client in the queue."""
+        """Give control to the first client in the queue, if any."""
         if self.queue:
             self._give_control(self.queue[0], time)
 
@@ -53,7 +53,7 @@ class ControlLock:
         self.queue = tuple(other for other in self.queue if other != visitor)
 
     def describe_control(self, client: int, present: Collection[int]) -> str:
-        """Return the status line of a client in Markdown; empty with a single client."""
+        """Return a client's status line in Markdown; empty if there is only one client."""
         if len(present) < 2:
             return ""
         if client == self.holder:
@@ -65,7 +65,7 @@ class ControlLock:
 
 @dataclass(frozen=True, eq=False)
 class ClientRow:
-    """Elements that one client sees: line, buttons to request and hand over control, rules that dim the controls."""
+    """Elements that only one client sees: status line, buttons to request and hand over control, style rules."""
 
     line: viser.GuiMarkdownHandle
     request_button: viser.GuiButtonHandle
@@ -74,10 +74,10 @@ class ClientRow:
 
 
 class Clients:
-    """Clients of a page, by their numbers from 1 in order of arrival. Only for viser's own thread."""
+    """Clients of a page, numbered from 1 in order of arrival; to be used only in viser's own thread."""
 
     def __init__(self, server: viser.ViserServer, position: float) -> None:
-        """Build the list; `position` is the position on the page of each client's line."""
+        """Create the list of clients; `position` is the sort order of each client's line on the page."""
         self.server, self.order = server, position
         self.lead = ControlLock()
         self.rows: dict[int, ClientRow] = {}
@@ -88,13 +88,13 @@ class Clients:
         return {identifier + 1 for identifier in self.server.get_clients()}
 
     def record_activity(self, client: viser.ClientHandle) -> bool:
-        """Record that a client acts on the page; return True if it has control."""
+        """Record that a client acts on the page; return True if the client has control."""
         now = clock.monotonic()
         self.lead.update_clients(self.here | {client.client_id + 1}, now)
         return self.lead.record_change(client.client_id + 1, now)
 
     def show_lines(self, format_line: Callable[[int], str]) -> None:
-        """Show each client its own line: the result of `format_line`, then who has control."""
+        """Show each client its own line: the text of `format_line`, then who has control."""
         clients = self.server.get_clients()
         self.rows = {identifier: row for identifier, row in self.rows.items() if identifier in clients}
         here = self.here
@@ -113,7 +113,7 @@ class Clients:
             _set(row.dim_style, "content", "" if leads else VIEW_ONLY_STYLE)
 
     def add_row(self, client: viser.ClientHandle) -> ClientRow:
-        """Add the elements that only this client sees to its page."""
+        """Add the elements that only this client sees; return them."""
         gui, lead = client.gui, self.lead
         ask = gui.add_button("Request control", color="orange", order=self.order + 0.1, visible=False)
         give = gui.add_button("Hand over control", color="orange", order=self.order + 0.2, visible=False)
@@ -131,22 +131,22 @@ class Clients:
 
 
 def _set(handle: object, name: str, value: object) -> None:
-    """Change a property only if it differs: each change is sent."""
+    """Set a property only if it differs, because each change is sent to the client."""
     if getattr(handle, name) != value:
         setattr(handle, name, value)
 
 
 class Inputs:
-    """Controls by their labels. Their callbacks run on the page's own thread.
+    """Controls of a page by label, with callbacks that run in the page's own thread.
 
     Parameters
     ----------
     deed
-        Action of the newest message, for the `changed` that it calls.
+        Action of the newest message, for the callback that the message triggers.
     kept
-        Last value of each control set by the client with control; other clients' values are reset to it.
+        Last value of each control set by the client with control; values of other clients are reset to this value.
     notes
-        Folders and texts of notes by their labels.
+        Folder and text of each note, by label.
     """
 
     def __init__(self, server: viser.ViserServer, clients: Clients) -> None:
@@ -159,7 +159,7 @@ class Inputs:
         self.commands: list[viser.CommandHandle] = []
 
     def clear(self) -> None:
-        """Remove all controls: pending updates have no effect."""
+        """Remove all controls; pending updates then have no effect."""
         for command in self.commands:
             command.remove()
         self.handles, self.kept, self.notes, self.commands = {}, {}, {}, []
@@ -167,9 +167,9 @@ class Inputs:
     def assign(
         self, control: viser.GuiInputHandle, value: float | str, condition: Callable[[], bool] | None = None
     ) -> None:
-        """Set a control on the thread that receives clients' messages: another could overwrite an unread value.
+        """Set a control in the thread that receives messages, as another thread could overwrite an unread value.
 
-        With `condition` it is set only if the value differs and `condition` returns True there.
+        With `condition` the control is set only if the value differs and `condition`, called there, returns True.
         """
 
         def put() -> None:
@@ -181,7 +181,7 @@ class Inputs:
         self.server.get_event_loop().call_soon_threadsafe(put)
 
     def bind_button(self, button: viser.GuiButtonHandle, action: Callable[[viser.ClientHandle], None]) -> None:
-        """Bind a button to an action of the client with control."""
+        """Bind a button to an action, which only the client with control can trigger."""
 
         @button.on_click
         async def pressed(event: viser.GuiEvent) -> None:
@@ -190,7 +190,7 @@ class Inputs:
                 action(event.client)
 
     def bind_key(self, key: Key, action: Callable[[viser.ClientHandle], None]) -> None:
-        """Bind a key of the keyboard to an action of the client with control."""
+        """Bind a key of the keyboard to an action, which only the client with control can trigger."""
         handle = self.server.gui.add_command(key.action.capitalize(), hotkey=key.hotkey)
         self.commands.append(handle)
 
@@ -201,7 +201,7 @@ class Inputs:
                 action(event.client)
 
     def add(self, control: Control | Folder | Note) -> None:
-        """Add a slider, a list, a checkbox, a folder of them, or a folder of words."""
+        """Add a slider, selection, checkbox, note, or folder of these."""
         gui = self.server.gui
         if isinstance(control, Note) and control.is_plain:
             text = gui.add_html(format_note(control.text), visible=bool(control.text))
@@ -230,14 +230,14 @@ class Inputs:
             self.bind_key(control.key, partial(self.select_next, handle, control))
 
     def select_next(self, handle: viser.GuiInputHandle, dropdown: Dropdown, _: viser.ClientHandle) -> None:
-        """Select the next of several names."""
+        """Select the next option of a dropdown, and call its `on_change`."""
         options = dropdown.options
         name = options[(options.index(str(handle.value)) + 1) % len(options)]
         self.assign(handle, name)
         dropdown.on_change(name)
 
     def receive_input(self, control: viser.GuiInputHandle, callback: Callable[[Any], None]) -> None:
-        """Pass on values set by the client with control, on the receiving thread, before anything else there."""
+        """Pass values that the client with control sets to `callback`; reset values that other clients set."""
         self.kept[id(control)] = control.value
 
         @control.on_update
@@ -254,5 +254,5 @@ class Inputs:
 
 
 def format_note(html: str) -> str:
-    """Wrap the words of a note in an element with a class, for the style rules."""
+    """Wrap a note's text (HTML) in an element with a class, for style rules."""
     return f'<div class="{NOTE}">{html}</div>'

@@ -1,9 +1,9 @@
-"""HTML elements of the page: image and text as one message; tabs for slices and the last seconds; keys.
+"""HTML elements of the page: image and text as one message; tabs for slices and charts; keys.
 
-A browser loads images later than it sets text, and drops an image that is replaced before it is loaded. A slow
-browser would show new text next to an old image. Therefore both are hidden until the image is loaded.
+A browser loads an image later than it shows text, and drops an image that is replaced before it is loaded. A slow
+browser would thus show new text next to an old image. Therefore both are hidden until the image is loaded.
 
-Tabs, keys and names of controls exist only in the client's browser: the server does not receive them.
+Tabs, keys and accessible names of controls exist only in the browser; the server does not receive them.
 """
 
 import base64
@@ -20,14 +20,14 @@ from .parts import Key, SceneSurface
 
 JPEG_QUALITY = 88  # JPEG quality of images on the page, 0 to 100.
 PICTURE, SAID, NEXT = "sulcus-picture", "sulcus-said", "sulcus-next"
-"""Ids of the elements that hold the image, the words next to it, and the hidden next ones."""
+"""Ids of the elements with the image, with the text next to it, and with the hidden next image and text."""
 SLICES, HISTORY = "sulcus-slices", "sulcus-history"
-"""Ids of the elements that hold slices of the scan, and charts of the last seconds."""
+"""Ids of the elements with the slices of the scan, and with the charts of the last seconds."""
 
 
 @dataclass(frozen=True)
 class ImageElementIds:
-    """Ids of the elements that show an image and its words, and of those that wait; `alt` describes the image."""
+    """Ids of the elements for an image, its text, and the waiting next ones; `alt` describes the image."""
 
     image: str
     text: str
@@ -35,8 +35,8 @@ class ImageElementIds:
     alt: str
 
 
-MAIN = ImageElementIds(PICTURE, SAID, NEXT, "camera image with overlay")  # Place of the camera image.
-# Place of the slices.
+MAIN = ImageElementIds(PICTURE, SAID, NEXT, "camera image with overlay")  # Elements of the camera image.
+# Elements of the slices.
 ASIDE_SPOT = ImageElementIds(SLICES, HISTORY, "sulcus-next-aside", "axial, coronal and sagittal slices of the scan")
 # Script that shows the next image. If images are loaded out of order, older ones are dropped.
 SWAP = """
@@ -52,7 +52,7 @@ if (number >= Number(picture.dataset.number || 0)) {
 
 
 def keep_numbers_together(html: str) -> str:
-    """Keep numbers on one line with their name, error and unit: replace spaces in words (HTML) by no-break spaces."""
+    """Replace spaces between a number and its name, error or unit in HTML by no-break spaces; return the HTML."""
     return re.sub(
         r"<[^>]*>|\s+",
         lambda part: part[0] if part[0][0] == "<" or BREAK_PATTERN.match(html, part.start()) else "&nbsp;",
@@ -61,13 +61,13 @@ def keep_numbers_together(html: str) -> str:
 
 
 def to_data_url(image: np.ndarray) -> str:
-    """Encode an image (H, W, 3) uint8 as a data URL."""
+    """Encode an image (H, W, 3) uint8 as a data URL with a JPEG."""
     written = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     return f"data:image/jpeg;base64,{base64.b64encode(written.tobytes()).decode()}"
 
 
 def build_image_element(number: int, data_url: str, html: str, ids: ImageElementIds = MAIN) -> str:
-    """Build the element that puts a `to_data_url` image and words (HTML) into their places; `number` counts them."""
+    """Build the element that shows a `to_data_url` image with text (HTML) once it is loaded; `number` counts these."""
     swap = escape(" ".join(SWAP.replace("PICTURE", ids.image).replace("SAID", ids.text).split()))
     # Decoded synchronously: otherwise the words would be painted first.
     image = f'<img alt="{ids.alt}" decoding="sync" data-number="{number}" onload="{swap}" src="{data_url}">'
@@ -75,18 +75,18 @@ def build_image_element(number: int, data_url: str, html: str, ids: ImageElement
 
 
 ASIDE, HELP = "sulcus-aside", "sulcus-keys"
-"""Ids of the elements that hold the tabs with their content, and the list of keys."""
+"""Ids of the elements with the tabs and their content, and with the list of keys."""
 TABS = (("3-D view", "sulcus-tab-view"), ("slices", "sulcus-tab-slices"), ("last 20 s", "sulcus-tab-history"))
 """Labels of the tabs, and ids of their buttons."""
 DETAILS = "sulcus-details"
 """Id of the checkbox that shows the details of a result."""
 OPEN_DETAILS = f'<label class="more" for="{DETAILS}">details</label><div class="details">'
-"""Start of the details of a result: they end with `</div>`, and are shown after a click on the label."""
+"""HTML before the details of a result, which end with `</div>` and are shown after a click on the label."""
 CAPTION = (  # Text under the slices.
     "The scan as it was taken. Dotted: the tumour in the scan; green: now; band: 95 % error of its "
     "outline, by the named source (none: not known). White: tool in the slice; ring: tip outside the slice."
 )
-# Image of one pixel: loading it runs the script, which an element's HTML alone would not.
+# Image of one pixel: when it is loaded, its script runs; a script element in the HTML would not run.
 PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 
 
@@ -99,7 +99,7 @@ STYLE_KEY = Key("s", "S", "s", "next overlay")  # Key that selects the next over
 RECORD_KEY = Key("r", "R", "r", "start or stop recording")  # Key that starts or stops a recording.
 LIVE_KEYS = (PLAY_KEY, STYLE_KEY, RECORD_KEY)  # Keys of a page without frames to seek.
 KEYS = (PLAY_KEY, BACK_KEY, ON_KEY, STYLE_KEY, RECORD_KEY)
-"""Keys that the server receives: of a page with frames to seek (`LIVE_KEYS`: of one without)."""
+"""Keys that the server receives, for a page with frames to seek (`LIVE_KEYS`: without such frames)."""
 # In the 3-D view arrows and letters move the camera: our keys go to viser's own commands alone, which listen on the
 # document's element. Text fields, and sliders that arrows move, keep their keys.
 SCRIPT = """
@@ -133,7 +133,7 @@ if (!window.sulcusKeys) {
 
 
 def build_tabs(keys: Sequence[Key] = KEYS, surfaces: Sequence[SceneSurface] = ()) -> str:
-    """Build the element with the tabs, a legend of bodies, places for slices and charts, and the list of keys."""
+    """Build the element with tabs, legend of surfaces, places for slices and charts, and list of keys."""
     tabs = "".join(
         f'<input type="radio" name="{ASIDE}" id="{name}"{" checked" if number == 0 else ""}>'
         f'<label for="{name}">{words}</label>'

@@ -1,4 +1,4 @@
-"""Chart of the last seconds: readings over time as lines, each with its error as a band."""
+"""Charts of the last seconds: values over time as lines, each with its error as a band."""
 
 import math
 from collections import deque
@@ -14,14 +14,14 @@ LEFT_MARGIN = 44.0  # Left margin of a chart [SVG units].
 TOP_MARGIN = 20.0  # Margin above the curve of a chart [SVG units].
 BOTTOM_MARGIN = 16.0  # Margin below the curve of a chart [SVG units].
 MAX_SAMPLES = 1200  # Maximum number of samples that are kept.
-MAX_DRAWN_SAMPLES = 240  # Maximum number of samples that are drawn: a pixel or two apart.
+MAX_DRAWN_SAMPLES = 240  # Maximum number of samples that are drawn, one or two pixels apart.
 MAX_TIME_GAP = 2.0  # Time gap beyond which samples are not joined [s].
 HALF_DOT_WIDTH = 0.06  # Half the width of an isolated sample [s].
 
 
 @dataclass(frozen=True)
 class Trace:
-    """Line of a chart: its name, unit and colour; `error_source` names the source of its error."""
+    """Line of a chart: name, unit, colour, and name of the source of its error."""
 
     name: str
     unit: str
@@ -31,7 +31,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Sample:
-    """Readings at a time [s]: a value of each line and its error, both in the line's unit; None: not available."""
+    """Sample at a time [s]: value and error of each line, in the line's unit; None where not available."""
 
     time: float
     values: tuple[float | None, ...]
@@ -40,24 +40,24 @@ class Sample:
 
 @dataclass
 class History:
-    """Recent samples of some lines. Samples more than `TIME_SPAN` older than the newest are dropped."""
+    """Recent samples of several lines; samples more than `TIME_SPAN` older than the newest are dropped."""
 
     lines: tuple[Trace, ...]
     samples: deque[Sample] = field(default_factory=lambda: deque(maxlen=MAX_SAMPLES))
 
     def add(self, sample: Sample) -> None:
-        """Append a sample, and drop those older than `TIME_SPAN`."""
+        """Add a sample, and drop samples more than `TIME_SPAN` older."""
         self.samples.append(sample)
         while self.samples[0].time < sample.time - TIME_SPAN:
             self.samples.popleft()
 
     def interrupt_lines(self, time: float) -> None:
-        """Interrupt all lines at a time [s]."""
+        """Interrupt all lines at a time [s], by a sample without values."""
         unknown = (None,) * len(self.lines)
         self.add(Sample(time, unknown, unknown))
 
     def draw_chart(self) -> str:
-        """Draw all lines, one below the other, as an SVG element."""
+        """Draw the charts of all lines, one below the other, as an SVG element."""
         kept = list(self.samples)
         step = max(1, math.ceil(len(kept) / MAX_DRAWN_SAMPLES))
         gaps = [None in each.values for each in kept]
@@ -77,7 +77,7 @@ def _format_newest(samples: Sequence[Sample], number: int) -> str:
 
 
 def _plot(line: Trace, number: int, samples: Sequence[Sample]) -> str:
-    """Draw one line with its scale; dotted where its error is not available, interrupted where its value is not."""
+    """Draw the chart of one line: dotted without an error, interrupted without a value."""
     known = [each for each in samples if each.values[number] is not None]
     top, end = CHART_HEIGHT * number + TOP_MARGIN, samples[-1].time if samples else 0.0
     room = CHART_HEIGHT - TOP_MARGIN - BOTTOM_MARGIN
@@ -128,9 +128,9 @@ def _plot(line: Trace, number: int, samples: Sequence[Sample]) -> str:
 
 
 def split_line(samples: Iterable[Sample], line_index: int) -> list[list[Sample]]:
-    """Split a line into joined pieces, each with or without an error throughout.
+    """Split a line into pieces of successive samples, each completely with or completely without an error.
 
-    They end where the value is not available.
+    A piece ends where the value is not available, or at a time gap.
     """
     found: list[list[Sample]] = []
     last: Sample | None = None
@@ -149,7 +149,7 @@ def split_line(samples: Iterable[Sample], line_index: int) -> list[list[Sample]]
 
 
 def round_up_scale(value: float) -> float:
-    """Return the upper end of a scale for a value: 1, 2 or 5 times a power of ten."""
+    """Return the smallest 1, 2 or 5 times a power of ten that is not below a value, as the end of a scale."""
     if not value > 0.0:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))

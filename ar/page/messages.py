@@ -1,6 +1,6 @@
-"""Messages that a client may send to the page: its camera, a control's new value within range, a key that was hit.
+"""Messages that a client may send to the page: its camera, a control's new value, a key or command.
 
-Messages are untrusted. Those passed on are encoded again from the checked values: nothing else gets through.
+Messages are untrusted. The checked values are encoded again, so that nothing else is passed on.
 """
 
 import math
@@ -10,7 +10,7 @@ from typing import Annotated
 import msgspec
 import viser
 
-MAX_MESSAGE_BYTES = 65536  # Maximum size of a client's message [bytes]: camera and value take some 300.
+MAX_MESSAGE_BYTES = 65536  # Maximum size of a client's message [bytes]; a camera or a value takes some 300.
 RANGE_TOLERANCE = 1e-6  # Tolerance for a browser's rounding, as a share of a slider's range.
 
 Pixels = Annotated[float, msgspec.Meta(ge=0.0, le=65536.0)]
@@ -19,7 +19,7 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class MessageError(ValueError):
-    """Rejected message; `malformed` if its sender is not a page of this server."""
+    """Error for a rejected message; `malformed` is True if no page of this server would send such a message."""
 
     def __init__(self, reason: str, malformed: bool = False) -> None:
         super().__init__(reason)
@@ -27,7 +27,7 @@ class MessageError(ValueError):
 
 
 class PageCamera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", forbid_unknown_fields=True):
-    """Camera of a client, in viser's message format."""
+    """Camera of a client, as a message in viser's format."""
 
     wxyz: tuple[Coordinate, Coordinate, Coordinate, Coordinate]
     position: Vector
@@ -40,26 +40,26 @@ class PageCamera(msgspec.Struct, tag_field="type", tag="ViewerCameraMessage", fo
     up_direction: Vector
 
     def __post_init__(self) -> None:
-        """Reject a camera without a viewing direction."""
+        """Raise ValueError for a camera without a viewing direction."""
         if math.dist(self.position, self.look_at) < 1e-9 or not any(self.up_direction) or not any(self.wxyz):
             raise ValueError("It looks nowhere.")
 
 
 class ControlValue(msgspec.Struct, forbid_unknown_fields=True):
-    """The one property of a control that a client may change."""
+    """New value of a control, which is the only property that a client may change."""
 
     value: bool | int | float | str
 
 
 class ControlSetting(msgspec.Struct, tag_field="type", tag="GuiUpdateMessage", forbid_unknown_fields=True):
-    """Control that a client set, in viser's message format."""
+    """New setting of a control by a client, as a message in viser's format."""
 
     uuid: str
     updates: ControlValue
 
 
 class Command(msgspec.Struct, tag_field="type", tag="CommandTriggerMessage", forbid_unknown_fields=True):
-    """Key that a client hit, or its entry in the list of commands, in viser's message format."""
+    """Command that a client triggered, by its key or in the list of commands, as a message in viser's format."""
 
     uuid: str
 
@@ -68,12 +68,12 @@ DECODER = msgspec.msgpack.Decoder(PageCamera | ControlSetting | Command)  # Deco
 
 
 def check_message(message: str | bytes, find_control: Callable[[str], object]) -> bytes:
-    """Return the checked message, encoded again; `find_control` finds a control or command by its identifier.
+    """Check a message and return it encoded again; `find_control` finds a control or command by its identifier.
 
     Raises
     ------
     MessageError
-        Anything but a camera, a value in the range of an existing control, or an existing command.
+        The message is not a camera, a value in the range of an existing control, or an existing command.
     """
     if isinstance(message, str):
         raise MessageError("it is text", malformed=True)
@@ -91,12 +91,12 @@ def check_message(message: str | bytes, find_control: Callable[[str], object]) -
 
 
 def clamp_value(control: object, value: bool | int | float | str) -> bool | int | float | str:
-    """Return the value that a control takes.
+    """Return the value for a control, clamped to its range within round-off.
 
     Raises
     ------
     MessageError
-        A value of another kind, outside the control's range or not among its options; a control that is not there.
+        The value has another type, is outside the range or not an option, or the control does not exist.
     """
     if isinstance(control, viser.GuiButtonHandle | viser.GuiCheckboxHandle) and isinstance(value, bool):
         return value

@@ -1,4 +1,4 @@
-"""Parts of a page: surfaces and labels in the 3-D view, its first view, playback, controls."""
+"""Parts of a page: surfaces and labels of the 3-D view, initial viewpoint, playback, and controls."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 class SceneSurface:
     """Surface in the 3-D view: vertices (V, 3) [m], triangles (F, 3), colour (3,) sRGB in [0, 1].
 
-    The legend has the colour with the `meaning`, if there is one.
-    The browser computes normals again for each update: some 5,000 vertices for all bodies together stay fluent.
+    If `meaning` is not empty, the legend shows it with the colour. The browser recomputes normals for each update, so
+    all surfaces together should have at most some 5,000 vertices.
     """
 
     name: str
@@ -29,7 +29,7 @@ class SceneSurface:
 
 @dataclass(frozen=True, eq=False)
 class SceneImage:
-    """Image (H, W, 4) uint8 in the 3-D view: centre (3,), edges to its right and downwards (3,) [m]."""
+    """Image (H, W, 4) uint8 in the 3-D view, with its centre (3,) and the edges to its right and bottom (3,) [m]."""
 
     name: str
     image: np.ndarray
@@ -40,7 +40,7 @@ class SceneImage:
 
 @dataclass(frozen=True, eq=False)
 class SceneLabel:
-    """Text label in the 3-D view, at a position (3,) [m]."""
+    """Text label in the 3-D view at `position` (3,) [m]."""
 
     text: str
     position: np.ndarray
@@ -48,9 +48,9 @@ class SceneLabel:
 
 @dataclass(frozen=True)
 class Slider:
-    """Slider for a number; `on_change` receives the number, on the page's own thread, and must return at once.
+    """Slider for a number; `on_change` receives the number in the page's thread, and must return immediately.
 
-    `label` is its name for `Browser.put`; `text` are shown instead of the name, `hint` as a tooltip.
+    `label` is the control's name for `Browser.put`; `text` is shown instead if not empty, `hint` as a tooltip.
     """
 
     label: str
@@ -65,7 +65,7 @@ class Slider:
 
 @dataclass(frozen=True)
 class Key:
-    """Key of the keyboard: its names in JavaScript and in viser, its shown symbol, and its action."""
+    """Key of the keyboard: its names in JavaScript and viser, the symbol shown for it, and its action."""
 
     name: str
     hotkey: Literal["space", "arrowleft", "arrowright", "S", "R"]
@@ -75,7 +75,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Dropdown:
-    """Selection of one of several names; other fields as in `Slider`. A `key` selects the next one."""
+    """Selection of one of several names; the optional `key` selects the next name. Other fields as in `Slider`."""
 
     label: str
     options: tuple[str, ...]
@@ -88,7 +88,7 @@ class Dropdown:
 
 @dataclass(frozen=True)
 class Toggle:
-    """Checkbox; other fields as in `Slider`."""
+    """Checkbox; `on_change` receives its state. Other fields as in `Slider`."""
 
     label: str
     initial: bool
@@ -99,7 +99,7 @@ class Toggle:
 
 @dataclass(frozen=True)
 class Folder:
-    """Folder of controls and notes, closed at first unless it is `is_open`."""
+    """Folder of controls and notes; it is closed initially unless `is_open`."""
 
     label: str
     controls: tuple[Slider | Dropdown | Toggle | Note, ...]
@@ -108,7 +108,7 @@ class Folder:
 
 @dataclass(frozen=True)
 class Note:
-    """Folder of words (HTML) that a user can open, for `Browser.write`; hidden while empty. `is_plain`: no folder."""
+    """Folder with text (HTML), see `Browser.write`; hidden while empty. If `is_plain`, the text has no folder."""
 
     label: str
     text: str = ""
@@ -120,9 +120,9 @@ Control = Slider | Dropdown | Toggle
 
 @dataclass(frozen=True)
 class Playback:
-    """Play, pause and seek over frames 0 .. frames - 1: `on_play` receives whether to play, `on_seek` a frame number.
+    """Playback over frames 0 .. frame_count - 1: `on_play` receives True to play, `on_seek` a frame number.
 
-    With 0 frames, as for a camera, there is no seeking.
+    If `frame_count` is 0, as for a camera, there is no seeking.
     """
 
     frame_count: int
@@ -132,7 +132,7 @@ class Playback:
 
 @dataclass(frozen=True)
 class LastChange:
-    """Last action of a client: its number, from 1, and the label of the control."""
+    """Last action of a client: number of the client, from 1, and label of the control."""
 
     client: int
     label: str
@@ -140,7 +140,7 @@ class LastChange:
 
 @dataclass(frozen=True, eq=False)
 class SceneViewpoint:
-    """Initial viewpoint of the 3-D view: eye, target and up direction, (3,) [m]; vertical field of view [rad]."""
+    """Initial viewpoint of the 3-D view: eye, target and upward direction, (3,) [m]; vertical field of view [rad]."""
 
     eye: np.ndarray
     target: np.ndarray

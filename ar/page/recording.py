@@ -1,4 +1,4 @@
-"""Recording of the page's recent images as a video, and the button that records it."""
+"""Recording of the page's images as a video, and the button that starts and stops it."""
 
 import base64
 import tempfile
@@ -17,38 +17,38 @@ from ..screen import write_movie
 MAX_DURATION = 60.0  # Maximum duration of a recording [s]; it then ends automatically.
 MAX_RECORDING_SIZE = 64_000_000  # Maximum size of a recording [characters of coded images]; it then ends automatically.
 FRAME_RATE = 15.0
-"""Frame rate of a video [1/s]."""
+"""Frame rate of a recorded video [1/s]."""
 RECORD_LABEL, STOP_LABEL, ENCODE_LABEL = "Record", "Stop recording", "Encoding the video ..."
-"""Labels of the button: start, stop, encoding in progress."""
+"""Labels of the button in its three states: ready, recording, encoding."""
 
 
 @dataclass
 class PageRecording:
-    """Images encoded by `to_data_url`, each with its arrival time [s]."""
+    """Recorded images, as data URLs of `to_data_url` with their arrival times [s]."""
 
     start_time: float
     images: list[tuple[float, str]] = field(default_factory=list)
     size: int = 0
 
     def add_image(self, data_url: str, time: float) -> None:
-        """Keep an image, unless it equals the last one, or the recording is full."""
+        """Add an image, unless it equals the last one or the recording is full."""
         if (not self.images or self.images[-1][1] is not data_url) and not self.is_full(time):
             self.images.append((time, data_url))
             self.size += len(data_url)
 
     def is_full(self, time: float) -> bool:
-        """Return True if the recording is full."""
+        """Return True if the recording has reached its maximum duration or size."""
         return time - self.start_time >= MAX_DURATION or self.size >= MAX_RECORDING_SIZE
 
     def encode_video(self, end_time: float) -> bytes:
-        """Return an MP4 video of the recording up to `end_time` [s], in real time; frames have the size of the first.
+        """Return an MP4 video of the recording until `end_time` [s], in real time; frames have the first image's size.
 
         Raises
         ------
         ValueError
-            No recorded images.
+            There are no recorded images.
         OSError
-            Not enough space on the disk.
+            The disk has too little space.
         """
         with tempfile.TemporaryDirectory(prefix="sulcus-") as folder:
             path = Path(folder) / "page.mp4"
@@ -59,7 +59,7 @@ class PageRecording:
 
 
 def replay_images(images: Sequence[tuple[float, str]], end_time: float, rate: float) -> Iterator[np.ndarray]:
-    """Yield the image (H, W, 3) uint8 shown at each step of a clock with `rate` steps a second."""
+    """Yield the image (H, W, 3) uint8 that was shown at each step of a clock with `rate` [1/s], until `end_time`."""
     size: tuple[int, int] | None = None
     for number, (began, code) in enumerate(images):
         until = images[number + 1][0] if number + 1 < len(images) else max(end_time, began)
@@ -78,13 +78,13 @@ def replay_images(images: Sequence[tuple[float, str]], end_time: float, rate: fl
 
 
 def decode_data_url(data_url: str) -> np.ndarray:
-    """Decode an image (H, W, 3) uint8 from a data URL of `to_data_url`."""
+    """Decode a data URL of `to_data_url` to an image (H, W, 3) uint8."""
     written = np.frombuffer(base64.b64decode(data_url.partition(",")[2]), np.uint8)
     return cv2.cvtColor(cv2.imdecode(written, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)  # type: ignore[arg-type]
 
 
 class Recorder:
-    """Recorder of one video at a time. It ends when stopped by the button, when full, or when its client leaves."""
+    """Recorder of one video at a time, until the button is pressed, the recording is full, or its client leaves."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.server = server
@@ -96,7 +96,7 @@ class Recorder:
         self.making = False
 
     def add_button(self, file_name: str) -> viser.GuiButtonHandle:
-        """Add the button to the page; `file_name` is the file name without suffix."""
+        """Add the button to the page and return it; `file_name` is the video's name without suffix."""
         hint = f"record the image as a video (.mp4), at most {MAX_DURATION:.0f} seconds"
         self.button, self.name = (
             self.server.gui.add_button(RECORD_LABEL, hint=hint, icon=viser.Icon.PLAYER_RECORD, color="gray"),
@@ -106,7 +106,7 @@ class Recorder:
         return self.button
 
     def toggle_recording(self, client: viser.ClientHandle, data_url: str) -> None:
-        """Start with a shown `coded` image, or end and send the video."""
+        """Start a recording with the shown image `data_url`, or end the recording and send the video."""
         with self.lock:
             if self.making:
                 return
@@ -118,7 +118,7 @@ class Recorder:
         self.end_recording()
 
     def add_image(self, data_url: str) -> None:
-        """Keep a shown `coded` image, and end the recording once full; discard it if its client has left."""
+        """Add a shown image; end a full recording, and discard a recording whose client has left."""
         with self.lock:
             recording, client = self.recording, self.client
             if recording is None or client is None:
@@ -132,7 +132,7 @@ class Recorder:
             self.end_recording()
 
     def end_recording(self) -> None:
-        """Encode the video on a thread of its own, and send it."""
+        """End the recording; a separate thread encodes the video and sends it."""
         with self.lock:
             recording, client = self.recording, self.client
             self.recording = self.client = None
@@ -145,7 +145,7 @@ class Recorder:
         ).start()
 
     def send_video(self, recording: PageRecording, client: viser.ClientHandle, end_time: float) -> None:
-        """Send the video of the recording; if that fails, report the reason."""
+        """Send the video of a recording to its client; if encoding fails, show the reason."""
         try:
             client.send_file_download(f"{self.name}.mp4", recording.encode_video(end_time), save_immediately=True)
         except (OSError, ValueError) as error:
@@ -156,7 +156,7 @@ class Recorder:
                 self.update_label()
 
     def update_label(self) -> None:
-        """Set the button's label to its next action."""
+        """Set the button's label to the recorder's state."""
         words = ENCODE_LABEL if self.making else RECORD_LABEL if self.recording is None else STOP_LABEL
         button = self.button
         if button is not None and button.label != words:

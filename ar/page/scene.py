@@ -1,4 +1,4 @@
-"""3-D view of a page: surfaces, light, labels, camera, and the panel next to it."""
+"""3-D view of a page: surfaces, light, labels, camera, and the panel next to the view."""
 
 from collections.abc import Sequence
 
@@ -12,12 +12,12 @@ PANEL_WIDTH = 676.0  # Width of the docked panel in browsers that do not support
 
 
 def fill_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, labels: Sequence[SceneLabel | SceneImage]) -> None:
-    """Set up colours, light, labels, images, the panel's place and the first view of the 3-D scene."""
+    """Set up the 3-D view: theme, panel, lights, labels and images, and the initial viewpoint."""
     gui, scene = server.gui, server.scene
     gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
     gui.main_panel.dock_left()
     gui.main_panel.set_width(PANEL_WIDTH)
-    # Two soft lights from the first viewpoint's sides: the page's own four wash the colours out.
+    # Two soft lights from both sides of the initial viewpoint, as viser's four default lights make colours pale.
     scene.configure_default_lights(enabled=False)
     scene.add_light_ambient("/light/ambient", intensity=0.8)
     across = np.cross(np.asarray(viewpoint.target) - viewpoint.eye, viewpoint.up)
@@ -38,7 +38,7 @@ def fill_scene(server: viser.ViserServer, viewpoint: SceneViewpoint, labels: Seq
 
 
 def add_surface(server: viser.ViserServer, surface: SceneSurface) -> viser.MeshHandle:
-    """Add a surface to the 3-D view."""
+    """Add a surface to the 3-D view; return its handle."""
     return server.scene.add_mesh_simple(
         f"/{surface.name}",
         np.asarray(surface.vertices, np.float32),

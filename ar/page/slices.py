@@ -1,4 +1,4 @@
-"""Slices of a scan through a point: axial, coronal and sagittal, with the surfaces that their planes cut."""
+"""Axial, coronal and sagittal slices of a scan through a point, with the outlines of surfaces."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from ..rendering.layer import Layer, Solid
 
 HALF_VIEW = 40e-3  # Half the side of a view [m].
 VIEW_SIDE = 280  # Side of a view [pixel].
-SAMPLING_DISTANCE = 0.8e-3  # Sampling distance of the scan [m]: finer adds nothing.
+SAMPLING_DISTANCE = 0.8e-3  # Sampling distance of the scan [m]; a finer one shows no more detail.
 OUTSIDE_GREY = 26  # Grey level outside the scan.
 MAX_GREY = 190.0  # Maximum grey level of the scan, so that lines stand out.
 BAND_OPACITY = 0.22  # Opacity of the error band.
@@ -31,7 +31,7 @@ SUBPIXEL_BITS = 4  # Number of binary digits of subpixel positions of outlines.
 
 @dataclass(frozen=True)
 class SliceView:
-    """View along an axis of RAS: its right and down directions, as unit vectors (3,)."""
+    """View along a RAS axis, with unit vectors (3,) to the right and downwards."""
 
     name: str
     right: tuple[float, float, float]
@@ -39,16 +39,16 @@ class SliceView:
 
     @property
     def normal(self) -> np.ndarray:
-        """(3,): viewing direction, away from the viewer."""
+        """Viewing direction (3,), pointing away from the viewer."""
         return np.cross(self.right, self.down)
 
     def compute_points(self, centre: np.ndarray, count: int) -> np.ndarray:
-        """Compute positions (count, count, 3) [m] of a square pixel grid round a centre (3,) [m], row by row."""
+        """Compute positions (count, count, 3) [m] of a square pixel grid round `centre` (3,) [m], row by row."""
         steps = HALF_VIEW * ((2.0 * np.arange(count) + 1.0) / count - 1.0)
         return centre + steps[:, None, None] * np.asarray(self.down) + steps[None, :, None] * np.asarray(self.right)
 
     def project_points(self, points: np.ndarray, centre: np.ndarray) -> np.ndarray:
-        """Project positions (n, 3) [m] to columns and rows (n, 2) of a view; whole numbers are pixel centres."""
+        """Project positions (n, 3) [m] to columns and rows (n, 2) of the view; integers are pixel centres."""
         off = (np.asarray(points) - centre) @ np.stack([self.right, self.down], axis=1)
         return (off / HALF_VIEW + 1.0) * (0.5 * VIEW_SIDE) - 0.5
 
@@ -58,27 +58,27 @@ PLANES = (
     SliceView("coronal", (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     SliceView("sagittal", (0.0, -1.0, 0.0), (0.0, 0.0, -1.0)),
 )
-"""Views in radiological convention: the patient's right on the left."""
+"""Views in radiological convention, with the patient's right on the left side."""
 
 
 @dataclass(frozen=True, eq=False)
 class SlicedSurfaces:
-    """Surfaces to cut by the planes.
+    """Surfaces whose outlines are drawn in the slices.
 
     Parameters
     ----------
     current, initial
-        The tumour's surface, deformed and in the scan.
+        Tumour surface, as deformed now and as in the scan.
     error
-        Bound [m] on the distance of every point with a probability of 95 %; None: not available.
+        Bound [m] on the distance of every surface point from its true position, at 95 %; None: not available.
     is_unreliable
-        True if the position is unreliable. Then its outline is amber and broken, and has no band.
+        True if the position is unreliable; the outline is then amber and broken, without an error band.
     others
-        Further surfaces, such as the tool: plain lines of their colours.
+        Further surfaces, such as the tool, drawn as solid lines in their colours.
     tip
-        Position of the tool's contact (3,) [m].
+        Contact position (3,) [m] of the tool; None: no tool.
     error_source
-        Source of the error, in a word.
+        Name of the source of the error, in one word.
     """
 
     current: Layer
@@ -91,15 +91,15 @@ class SlicedSurfaces:
 
 
 def draw_slices(scan: Solid | None, centre: np.ndarray, layers: SlicedSurfaces) -> np.ndarray:
-    """Draw three views (VIEW_SIDE, 3 VIEW_SIDE, 3) uint8 through a centre (3,) [m], side by side.
+    """Draw three views side by side, (VIEW_SIDE, 3 VIEW_SIDE, 3) uint8, through `centre` (3,) [m].
 
-    Plain ground without a scan.
+    If `scan` is None, the background is plain.
     """
     return np.concatenate([draw_view(plane, scan, np.asarray(centre, np.float64), layers) for plane in PLANES], axis=1)
 
 
 def draw_view(plane: SliceView, scan: Solid | None, centre: np.ndarray, layers: SlicedSurfaces) -> np.ndarray:
-    """Draw one view (VIEW_SIDE, VIEW_SIDE, 3) uint8."""
+    """Draw one view (VIEW_SIDE, VIEW_SIDE, 3) uint8, with its lines and text."""
     grey = (
         np.full((VIEW_SIDE, VIEW_SIDE), OUTSIDE_GREY, np.uint8) if scan is None else resample_view(plane, scan, centre)
     )
@@ -138,14 +138,14 @@ def draw_view(plane: SliceView, scan: Solid | None, centre: np.ndarray, layers: 
 
 
 def describe_error_band(layers: SlicedSurfaces) -> str:
-    """Describe the band in a few words."""
+    """Describe the error band in a few words for the view."""
     if layers.is_unreliable or layers.error is None:
         return f"{layers.error_source}: not known"
     return f"{layers.error_source}: within {format_bound(layers.error, 1)}"
 
 
 def resample_view(plane: SliceView, scan: Solid, centre: np.ndarray) -> np.ndarray:
-    """Resample the scan in a view, (VIEW_SIDE, VIEW_SIDE) uint8; `OUTSIDE_GREY` outside it."""
+    """Resample the scan in a view, (VIEW_SIDE, VIEW_SIDE) uint8; pixels outside the scan are `OUTSIDE_GREY`."""
     count = round(2.0 * HALF_VIEW / SAMPLING_DISTANCE)
     matrix = scan.T_index_world
     index = plane.compute_points(centre, count) @ matrix[:3, :3].T + matrix[:3, 3]
@@ -158,7 +158,7 @@ def resample_view(plane: SliceView, scan: Solid, centre: np.ndarray) -> np.ndarr
 
 
 def find_pixels_within(plane: SliceView, centre: np.ndarray, layer: Layer, distance: float) -> np.ndarray:
-    """Compute the mask (VIEW_SIDE, VIEW_SIDE) bool of pixels within a distance (error [m]) of a surface, in 3-D."""
+    """Return the mask (VIEW_SIDE, VIEW_SIDE) of pixels within `distance` [m] of a surface, measured in 3-D."""
     count = VIEW_SIDE // COARSE_SPACING
     if not len(layer.triangles):
         return np.zeros((VIEW_SIDE, VIEW_SIDE), bool)
@@ -172,9 +172,9 @@ def find_pixels_within(plane: SliceView, centre: np.ndarray, layer: Layer, dista
 
 
 def cut_surface(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
-    """Cut a surface by a plane; return lines (n, 3) [m]. A closed line ends at its start.
+    """Cut a surface by a plane; return the cut as lines (n, 3) [m]. A closed line ends at its start.
 
-    vertices (V, 3) [m], triangles (F, 3), point (3,) [m] and normal (3,) of the plane.
+    `vertices` (V, 3) are in metres; the plane is given by `point` (3,) [m] and `normal` (3,).
     """
     height = (np.asarray(vertices) - point) @ normal
     above = height >= 0.0
@@ -192,7 +192,7 @@ def cut_surface(vertices: np.ndarray, triangles: np.ndarray, point: np.ndarray, 
 
 
 def join_segments(segments: np.ndarray) -> list[list[int]]:
-    """Chain segments (n, 2) of numbered points to lines of such numbers; a closed line ends at its start."""
+    """Chain segments (n, 2) of point indices to lines of point indices; a closed line ends at its start."""
     beside: dict[int, list[int]] = defaultdict(list)
     for a, b in segments.tolist():
         beside[a].append(b)
@@ -211,19 +211,19 @@ def join_segments(segments: np.ndarray) -> list[list[int]]:
 
 
 def cut_by_plane(plane: SliceView, layer: Layer, centre: np.ndarray) -> list[np.ndarray]:
-    """Cut a surface by a view's plane; return lines, each (n, 2) as columns and rows."""
+    """Cut a surface by a view's plane; return lines (n, 2) of columns and rows."""
     found = cut_surface(layer.vertices, layer.triangles, centre, plane.normal)
     return [plane.project_points(line, centre) for line in found]
 
 
 def draw_strokes(image: np.ndarray, lines: Sequence[np.ndarray], colour: Sequence[float], width: int = 1) -> None:
-    """Draw lines, each (n, 2), with subpixel accuracy into an image (H, W, 3), in place."""
+    """Draw lines (n, 2) with subpixel accuracy into an image (H, W, 3), in place."""
     fine = [np.rint(line * 2**SUBPIXEL_BITS).astype(np.int32)[:, None] for line in lines]
     cv2.polylines(image, fine, False, tuple(colour), width, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def to_pixel_line(line: np.ndarray) -> np.ndarray:
-    """Resample a line (n, 2) for `draw_dashes`: (m, 1, 2) int32, a pixel apart."""
+    """Resample a line (n, 2) to pixels (m, 1, 2) int32 at a distance of one pixel, for `draw_dashes`."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     steps = np.arange(0.0, along[-1] + 1.0)
     at = np.stack([np.interp(steps, along, line[:, axis]) for axis in (0, 1)], axis=1)
@@ -231,7 +231,7 @@ def to_pixel_line(line: np.ndarray) -> np.ndarray:
 
 
 def mark_tip(image: np.ndarray, plane: SliceView, tip: np.ndarray, centre: np.ndarray) -> None:
-    """Mark a tip (3,) [m], in place: a dot if it is in the plane, else a ring."""
+    """Mark a tip (3,) [m] in place: with a dot if the tip is in the plane, else with a ring."""
     ((column, row),) = np.clip(plane.project_points(tip[None], centre), -1e4, 1e4).round().astype(int).tolist()
     beside = abs(float((tip - centre) @ plane.normal)) > PLANE_TOLERANCE
     cv2.circle(image, (column, row), 5, (12, 14, 16), 1 if beside else -1, cv2.LINE_AA)
@@ -239,7 +239,7 @@ def mark_tip(image: np.ndarray, plane: SliceView, tip: np.ndarray, centre: np.nd
 
 
 def label_view(image: np.ndarray, plane: SliceView, centre: np.ndarray) -> None:
-    """Draw a view's name and position, the orientation labels and a scale bar, in place."""
+    """Draw a view's name, position, orientation letters and scale bar, in place."""
     right, down = np.asarray(plane.right), np.asarray(plane.down)
     axis = int(np.argmax(np.abs(plane.normal)))
     write_text(

@@ -1,17 +1,17 @@
-"""Layout of the page: the image fixed and scaled with the window; words, controls and 3-D view round it.
+"""Layout of the page: the image scales with the window; text, controls and 3-D view are placed round it.
 
-viser places panels in pixels; these rules override its own. Its elements have no names, so they are found by their
-content. In a wide window the controls have two columns, so that all are visible. A browser without `:has()` ignores the
-rules and shows image and controls in one docked panel.
+These style rules replace viser's positions, which are in pixels. Viser's elements have no names, so the rules select
+them by content. In a wide window the controls have two columns, so that all are visible. A browser without `:has()`
+ignores the rules, and shows image and controls in one docked panel.
 """
 
 from .client_page import NO_WEBGL_CLASS
 from .elements import ASIDE, DETAILS, HELP, HISTORY, PICTURE, SAID, SLICES, TABS
 
 PAGE, STATUS = "sulcus", "sulcus-status"
-"""Ids of the elements that hold the words under the image, and the status line over it."""
+"""Ids of the elements with the text below the image, and with the status line over it."""
 NOTE = "sulcus-note"
-"""Class of the words of a note."""
+"""Class of the elements with the text of a note."""
 PANEL = f"div:has(canvas) ~ div:has(#{PAGE})"  # Selector of the panel with the controls.
 VIEW = f"div:has(canvas):has(~ div #{PAGE})"  # Selector of the 3-D view.
 PARTS = f"div:has(> div > #{SAID})"  # Selector of the list of the panel's parts.
@@ -22,7 +22,7 @@ DIMMED = (  # Selectors of controls that are dimmed and receive no pointer event
     "div:has(> button):has(+ div .mantine-Slider-root) > button, div:has(> button) + div:has(> button) > button"
 )
 VIEW_ONLY_STYLE = f"<style>{PARTS} :is({DIMMED}) {{ opacity: 0.45; pointer-events: none }}</style>"
-"""Rules for a client without control."""
+"""Style rules for clients without control, who can only view."""
 
 # Style sheet of the page; names in capitals are replaced by selectors.
 RULES = """
@@ -143,7 +143,7 @@ NOTES { top: auto !important; bottom: 0.5rem; left: calc(var(--w) + 0.5rem) !imp
 
 
 def build_style(aspect: float) -> str:
-    """Build the style element for an image with width / height `aspect`."""
+    """Return the HTML style element for an image with the given width / height `aspect`."""
     rules = RULES
     for name, value in (
         ("WITHOUT", NO_WEBGL_CLASS),

@@ -1,1 +1,1 @@
-"""Rendering of surfaces to lit images."""
+"""Rendering of surfaces to images with a lamp, shadows and textures."""

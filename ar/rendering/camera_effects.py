@@ -1,4 +1,4 @@
-"""Depth of field and shot noise of a camera, applied to rendered colours; depth and segmentation stay as they are."""
+"""Depth of field and shot noise of a camera, added to the colours of an image; depth and ids are unchanged."""
 
 from dataclasses import replace
 
@@ -16,10 +16,10 @@ BLURS = (0.0, 0.7, 1.4, 2.8, 5.6, 11.2)  # Standard deviations of the blurred im
 def add_camera_effects(
     image: Picture, camera: Camera, focus: np.ndarray, aperture: float, noise: float, frame_number: int
 ) -> Picture:
-    """Return an image of a wide lens and a sensor; equal frame numbers give equal noise.
+    """Return an image with the depth of field of a lens and the noise of a sensor; `frame_number` seeds the noise.
 
-    `focus` (3,) [m] is sharp; `aperture` is the diameter of the lens [m]. `noise` is the standard deviation of shot
-    noise [share of white]: displayed values are about the square root of light, so it is equal for dark and bright.
+    The point `focus` (3,) [m] is sharp; `aperture` is the lens diameter [m]. `noise` is the standard deviation of shot
+    noise, as a share of white; displayed values are about the square root of light, so it is equal for dark and bright.
     """
     if aperture == 0.0 and noise == 0.0:
         return image
@@ -36,10 +36,10 @@ def add_camera_effects(
 
 
 def blur_by_depth(image: np.ndarray, depth: np.ndarray, strength: float, focus: float) -> np.ndarray:
-    """Blur colours (H, W, 3) uint8 by their depth (H, W) [m]; 0 is far away.
+    """Blur colours (H, W, 3) uint8 by their depth (H, W) [m], where 0 means infinitely far; return the image.
 
-    The circle of confusion has the diameter strength |1 / depth - 1 / focus| [pixel] (Potmesil, Chakravarty 1981):
-    `strength` is focal length [pixel] times aperture [m]. A Gaussian has half of its radius as standard deviation.
+    The circle of confusion has the diameter strength |1 / depth - 1 / focus| [pixel] (Potmesil, Chakravarty 1981), with
+    `strength` = focal length [pixel] x aperture [m]. The Gaussian's standard deviation is half the circle's radius.
     """
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0.0)
     spread = cv2.GaussianBlur(

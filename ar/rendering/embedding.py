@@ -1,4 +1,4 @@
-"""Fine surface embedded in a coarse one: constant barycentric weights, and depths below it along its normals."""
+"""Fine surface embedded in a coarse one, by constant barycentric weights and depths along the coarse normals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ def embed_vertices(
     # output
     fine: wp.array(dtype=wp.vec3d),
 ):  # fmt: skip
-    """Place fine vertices above the facets of a coarse surface by the height of its rounded facets minus a depth."""
+    """Compute fine vertices above the coarse facets, at the height of the rounded facet minus the vertex's depth."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         c, w = corners[index], weights[index]
@@ -38,25 +38,25 @@ def embed_vertices(
 
 @dataclass(frozen=True, eq=False)
 class EmbeddedSurface:
-    """Fine surface that follows a coarse one, and by default never lies outside its facets.
+    """Fine surface that follows a coarse surface, by default never outside the coarse facets.
 
-    A fine vertex is the interpolated coarse point, moved along the interpolated normal by the height of the rounded
-    facet minus a depth.
+    A fine vertex is the interpolated coarse point, moved along the interpolated normal by the rounded facet's height
+    minus the vertex's depth.
 
     Parameters
     ----------
     coarse
         Triangles (S, 3) of the coarse surface.
     corners, weights
-        Coarse vertices (m, 3) of each fine vertex, and their barycentric weights (m, 3).
+        Coarse vertices (m, 3) that each fine vertex depends on, and their barycentric weights (m, 3).
     triangles
         Triangles (F, 3) of the fine surface.
     depth
-        Depths (m,) [m] below the rounded coarse surface.
+        Depth (m,) [m] of each fine vertex below the rounded coarse surface.
     rounding
-        Share of Phong tessellation (Boubekeur, Alexa 2008) that rounds the coarse facets: 0.5 makes a circle round.
+        Share of Phong tessellation (Boubekeur, Alexa 2008) that rounds the coarse facets; 0.5 makes a circle round.
     max_height
-        Largest height above the coarse facets [m].
+        Largest height [m] of fine vertices above the coarse facets.
     """
 
     coarse: np.ndarray
@@ -75,11 +75,11 @@ class EmbeddedSurface:
         return [wp.array(array, dtype=kind, device="cpu") for array, kind in zip(arrays, kinds, strict=True)]
 
     def interpolate(self, values: np.ndarray) -> np.ndarray:
-        """Return values (m, ...) at the fine vertices of values (n, ...) at the coarse ones."""
+        """Interpolate values (n, ...) at the coarse vertices to values (m, ...) at the fine vertices."""
         return np.einsum("mk,mk...->m...", self.weights, values[self.corners])
 
     def compute_vertices(self, positions: np.ndarray) -> np.ndarray:
-        """Return fine vertices (m, 3) [m] for coarse vertices at positions (n, 3) [m]."""
+        """Compute the fine vertices (m, 3) [m] for positions (n, 3) [m] of the coarse vertices."""
         both = positions, compute_vertex_normals(positions, self.coarse)
         coarse = [wp.array(np.ascontiguousarray(each), dtype=wp.vec3d, device="cpu") for each in both]
         fine = wp.empty(len(self.depth), dtype=wp.vec3d, device="cpu")
@@ -92,9 +92,9 @@ class EmbeddedSurface:
 def build_embedded_surface(
     points: np.ndarray, triangles: np.ndarray, edge_length: Callable[[np.ndarray], np.ndarray]
 ) -> EmbeddedSurface:
-    """Subdivide triangles (S, 3) of points (n, 3) [m] until edges have the `edge_length` [m] at their centres (e, 3).
+    """Subdivide triangles (S, 3) of points (n, 3) [m] until no edge exceeds `edge_length` [m] at its centre.
 
-    The fine surface has no depth. Triangles that share an edge share its vertices.
+    `edge_length` maps centres (e, 3) [m] to lengths (e,). Depths are zero. Neighbouring triangles share vertices.
     """
     coarse, at = triangles, points
     shares = sparse.csr_matrix(sparse.identity(len(points)))
@@ -113,7 +113,7 @@ def build_embedded_surface(
     place = row, np.arange(len(row)) - shares.indptr[row]
     corners, weights = np.zeros((len(at), 3), np.int64), np.zeros((len(at), 3))
     corners[place], weights[place] = shares.indices, shares.data
-    # Neighbours lie next to each other in memory: drawing takes less time.
+    # Neighbours are adjacent in memory, so that drawing takes less time.
     order = np.lexsort([*weights.T, *np.sort(corners, axis=1).T])
     triangles = np.argsort(order)[triangles]
     triangles = triangles[np.argsort(triangles.min(axis=1))]
@@ -121,7 +121,7 @@ def build_embedded_surface(
 
 
 def _split(triangles: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Split triangles (F, 3) at the vertices `middle` (F, 3) of their edges ab, bc, ca; -1 where an edge is whole."""
+    """Split triangles (F, 3) at new vertices `middle` (F, 3) on their edges ab, bc, ca; -1 for an edge without one."""
     count = (middle >= 0).sum(axis=1)
     # One divided edge comes first, one whole edge last.
     first = np.select([count == 1, count == 2], [np.argmax(middle, axis=1), np.argmin(middle, axis=1) + 1], 0)

@@ -1,4 +1,4 @@
-"""Surfaces to render, with their appearance."""
+"""Surfaces to render, with their colour, highlight and texture."""
 
 from dataclasses import dataclass
 
@@ -9,25 +9,25 @@ from .rasteriser import check_mesh
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """Solid texture: a grey volume that the surface cuts, sampled per pixel at the material points `Layer.rest`.
+    """Solid texture: a grey volume, sampled for each pixel at the material points `Layer.rest`.
 
     Parameters
     ----------
     values
-        Values (X, Y, Z) in [0, 1]; the layer's colour is multiplied by a blend from `dark` (0) to white (1).
+        Values (X, Y, Z) in [0, 1]; they multiply the layer's colour by a factor from `dark` (0) to white (1).
     T_index_world
-        (4, 4) affine: voxel index of an undeformed point [m]. Points outside take the value at the border.
+        Affine transform (4, 4) from undeformed points [m] to voxel indices. Points outside get the value at the border.
     dark
         Colour factor (3,) at value 0.
     relief
-        Height [m] of value 1 above value 0: darker is deeper. Shading only; the surface stays.
+        Height [m] of value 1 above value 0, for shading only; the surface itself is unchanged.
     height
-        (X, Y, Z) in [0, 1]: height map of the relief, instead of `values`.
+        Height map (X, Y, Z) in [0, 1] of the relief; None: `values`.
 
     Raises
     ------
     ValueError
-        Not a finite volume of at least 2 voxels a side, or not a (4, 4) transform.
+        The volume is not finite or has fewer than 2 voxels along a side, or the transform is not (4, 4).
     """
 
     values: np.ndarray
@@ -55,29 +55,29 @@ class Solid:
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One surface with its appearance.
+    """Surface to render, with its appearance.
 
     Parameters
     ----------
     name, id
-        Name; number in the segmentation, 1 .. 255 (0 is the background).
+        Name, and number in the segmentation from 1 to 255 (0 is the background).
     vertices, triangles
         Vertices (V, 3) [m] and triangles (F, 3); visible from both sides.
     colour
         Colour (3,) or (V, 3), sRGB in [0, 1].
     gloss, shininess
-        Strength of the wet highlight, 0 .. 1, and its Blinn–Phong exponent.
+        Strength of the wet highlight, from 0 to 1, and its Blinn-Phong exponent.
     solid, rest
-        Solid texture and the material points (V, 3) [m] where it is sampled (the undeformed vertices).
+        Solid texture, and the material points (V, 3) [m] at which it is sampled (the undeformed vertices).
     casts_shadow
-        True if it casts a shadow of the lamp.
+        True if the layer casts a shadow of the lamp.
     still
-        True if it never moves: a `Renderer` draws it once for a camera.
+        True if the layer never moves; a `Renderer` then draws it once per camera.
 
     Raises
     ------
     ValueError
-        Arrays that do not fit together, an id outside 1 .. 255, or a solid texture without `rest`.
+        Arrays do not fit together, the id is outside 1 .. 255, or only one of `solid` and `rest` is given.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Layer:
 
 
 def compute_vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Compute unit vertex normals (V, 3): face normals weighted by area; zero for vertices without a triangle."""
+    """Compute unit vertex normals (V, 3), the area-weighted mean of face normals; zero for vertices without a face."""
     a, b, c = (vertices[triangles[:, k]].T for k in range(3))
     (x, y, z), (u, v, w) = b - a, c - a
     faces = y * w - z * v, z * u - x * w, x * v - y * u

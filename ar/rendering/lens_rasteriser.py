@@ -1,4 +1,4 @@
-"""Undistorted positions of pixels, where the rasteriser tests those of a camera with a lens."""
+"""Undistorted pixel positions, at which the rasteriser tests the pixels of a camera with a lens."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -16,9 +16,9 @@ CELL_PIXELS = 64  # Average number of pixels in a cell of the lookup table.
 class Undistortion:
     """Undistorted pixels of B images, and a lookup table of the pixels in each cell of the undistorted image.
 
-    `pixels` (B, H, W) [pixel], NaN where the lens sees nothing; empty if no camera has a lens. `cells` (B, n, m, 4):
-    bounding box of the pixels in a cell, as first column and row, and last column and row. It is empty if a cell has no
-    pixel. `origin` and `scale` (B,) map an undistorted pixel to its cell: (column, row) = (pixel - corner) scale.
+    `pixels` (B, H, W) [pixel] is NaN where no point is projected, and empty if no camera has a lens. `cells` (B, n, m,
+    4) has the box of the pixels in each cell: first column and row, last column and row (last < first without a pixel).
+    `origin` and `scale` (B,) map an undistorted pixel to its cell: (column, row) = (pixel - origin) scale.
     """
 
     pixels: wp.array3d(dtype=wp.vec2d)
@@ -28,7 +28,7 @@ class Undistortion:
 
 
 def build_undistortion(cameras: Sequence[Camera], device: str) -> Undistortion:
-    """Compute undistorted pixels of cameras of one size; for a camera without a lens, the pixels themselves."""
+    """Compute the undistorted pixels of cameras of equal size; empty if no camera has a lens."""
     if all(camera.lens is None for camera in cameras):
         return build_empty_undistortion(device)
     return get_undistortion(tuple(cameras), device)
@@ -36,7 +36,7 @@ def build_undistortion(cameras: Sequence[Camera], device: str) -> Undistortion:
 
 @lru_cache(maxsize=4)
 def build_empty_undistortion(device: str) -> Undistortion:
-    """Build the empty argument for kernels without a lens."""
+    """Build the empty `Undistortion` that kernels get for cameras without a lens."""
     out = Undistortion()
     out.pixels = wp.empty((0, 0, 0), dtype=wp.vec2d, device=device)
     return out
@@ -44,7 +44,7 @@ def build_empty_undistortion(device: str) -> Undistortion:
 
 @lru_cache(maxsize=4)
 def get_undistortion(cameras: tuple[Camera, ...], device: str) -> Undistortion:
-    """Compute `build_undistortion`, cached: a fixed camera is used in every image, and a part of it by each surface."""
+    """Compute `build_undistortion`, cached for fixed cameras and for image parts that several surfaces use."""
     straight = np.stack([camera.straight for camera in cameras])
     count, height, width = straight.shape[:3]
     side = max(int(np.sqrt(height * width / CELL_PIXELS)), 1)
@@ -72,7 +72,7 @@ def fill_cells(
     # output
     cells: wp.array4d(dtype=wp.int32),
 ):
-    """Extend the box of each pixel's cell, for a run of pixels."""
+    """Extend the box of the cell of each pixel in a chunk of pixels."""
     start = wp.tid() * chunk_size
     height = undistortion.pixels.shape[1]
     width = undistortion.pixels.shape[2]
@@ -93,7 +93,7 @@ def fill_cells(
 
 @wp.func
 def undistort_pixel(image: wp.int32, column: wp.int32, row: wp.int32, pixels: wp.array3d(dtype=wp.vec2d)) -> wp.vec3d:
-    """Return a pixel as (u, v, 1), at its undistorted position."""
+    """Return the undistorted position (u, v, 1) of a pixel."""
     if pixels.shape[0] == 0:
         return wp.vec3d(wp.float64(column), wp.float64(row), wp.float64(1.0))
     at = pixels[image, row, column]
@@ -102,7 +102,7 @@ def undistort_pixel(image: wp.int32, column: wp.int32, row: wp.int32, pixels: wp
 
 @wp.func
 def distort_pixel_box(image: wp.int32, low: wp.vec2d, high: wp.vec2d, undistortion: Undistortion) -> wp.vec4i:
-    """Return the pixel box (first column, first row, last column, last row) of a box of the undistorted image."""
+    """Return the pixel box (first column, first row, last column, last row) of a box in the undistorted image."""
     out = wp.vec4i(2147483647, 2147483647, -1, -1)
     corner = undistortion.origin[image]
     scale = undistortion.scale[image]

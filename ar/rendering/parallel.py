@@ -1,4 +1,4 @@
-"""Multi-threaded CPU kernels: Warp runs a kernel on the calling thread, so each thread gets a band of the image."""
+"""CPU kernels on several threads: Warp runs a kernel on the calling thread, so each thread gets a band of the image."""
 
 import os
 from collections.abc import Callable
@@ -11,16 +11,16 @@ import numpy as np
 import warp as wp
 
 forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
-"""`wp.kernel` without adjoint, launched as wide as the work: images are not differentiated here."""
+"""Decorator `wp.kernel` without backward pass, launched with one thread per item: rendering needs no gradients."""
 
 
 _loading = Lock()
 
 
 def load_modules(device: str, *modules: wp.Module | ModuleType | str) -> None:
-    """Load modules of kernels on a device; those that Warp has not cached are compiled, which takes seconds.
+    """Load kernel modules on a device; modules that Warp has not cached are compiled, which takes seconds.
 
-    One thread does it at a time, and others wait: Warp alone would compile a module once per requesting thread.
+    One thread loads at a time, and others wait: otherwise Warp would compile a module once per thread.
     """
     with _loading:
         for module in modules:
@@ -28,9 +28,9 @@ def load_modules(device: str, *modules: wp.Module | ModuleType | str) -> None:
 
 
 def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, device: str, per_core: int = 1) -> None:
-    """Launch a kernel over `count` independent items; it takes (begin, end, run) first, see `get_chunk_size`.
+    """Launch a kernel over `count` independent items; its first arguments are (begin, end, chunk size).
 
-    On a CPU there are `per_core` bands for each core: several if some items take longer than others.
+    On a CPU there are `per_core` bands per core; several bands balance items of unequal duration.
     """
     run = get_chunk_size(device)
 
@@ -41,14 +41,14 @@ def launch_in_bands(kernel: wp.Kernel, inputs: list, outputs: list, count: int, 
 
 
 def get_chunk_size(device: str) -> int:
-    """Return the number of items per kernel thread: on a CPU each thread copies its arguments, which costs the most."""
+    """Return the number of items per kernel thread: many on a CPU, as copying the arguments for each thread is slow."""
     return 64 if device == "cpu" else 1
 
 
 def run_in_bands(draw: Callable[[int, int], None], count: int, device: str, per_core: int = 1) -> None:
-    """Call `draw(begin, end)` on ranges that cover 0 .. count: `per_core` for each core, on a CPU.
+    """Call `draw(begin, end)` on ranges that cover 0 .. count; on a CPU in parallel, with `per_core` ranges per core.
 
-    The ranges must not write to the same places; the modules of their kernels must be loaded.
+    Calls must not write to the same memory, and the modules of their kernels must be loaded.
     """
     pool, cores = get_workers()
     if device != "cpu" or cores == 1:
@@ -59,9 +59,9 @@ def run_in_bands(draw: Callable[[int, int], None], count: int, device: str, per_
 
 @cache
 def get_workers() -> tuple[ThreadPoolExecutor, int]:
-    """Return the drawing threads and their number: Warp runs a CPU kernel on the calling thread and releases the GIL.
+    """Return the thread pool for drawing and its number of threads; Warp releases the GIL in CPU kernels.
 
-    One, if `OMP_NUM_THREADS` is 1, as for several processes on the same cores.
+    There is one thread if `OMP_NUM_THREADS` is 1, as for several processes that share the cores.
     """
     cores = 1 if os.environ.get("OMP_NUM_THREADS") == "1" else min(os.cpu_count() or 1, 8)
     return ThreadPoolExecutor(cores, thread_name_prefix="raster"), cores

@@ -1,14 +1,14 @@
-"""Z-buffer rasteriser in Warp: the visible triangle at each pixel.
+"""Z-buffer rasteriser in Warp, which finds the visible triangle at each pixel.
 
-Triangles are tested in homogeneous pixel coordinates q = K x_camera = (u w, v w, w), so nothing is ever clipped (Olano
-& Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates"). With p = (u, v, 1):
+Triangles are tested in homogeneous pixel coordinates q = K x_camera = (u w, v w, w), so that no clipping is needed
+(Olano & Greer 1997, "Triangle scan conversion using 2D homogeneous coordinates"). With p = (u, v, 1):
 
     e_a = p . (q_b x q_c); e_b, e_c by cycling      edge functions, of one sign inside
     n = (q_b - q_a) x (q_c - q_a)                   p . n is the sum of the edge functions
     n . q_a / p . n                                 depth
     e / sum e                                       weights on the triangle itself, hence perspective-correct
 
-A lens changes the pixels, not the formulas: p is then the undistorted position of the pixel.
+With a lens the formulas are the same, but p is the undistorted position of the pixel.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from .triangle import compute_edge, compute_triangle_box, compute_weights_from_c
 EMPTY_PIXEL = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 """Value of an empty z-buffer entry."""
 NEAR_PLANE = 1e-3
-"""Near plane [m]: nothing closer to a camera is drawn."""
+"""Depth of the near plane [m]; nothing nearer to a camera is drawn."""
 ROW_THREADS = 8  # Number of threads that share the rows of a triangle on a GPU.
-MIN_PIXELS = 8  # Pixels of an image per triangle above which CPU threads share the rows, below the triangles.
+MIN_PIXELS = 8  # Number of pixels per triangle above which CPU threads divide the rows, not the triangles.
 
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """Visible triangle at each pixel.
+    """Visible triangle at each pixel of an image.
 
-    face (H, W) int32: index of the triangle, -1 where empty. weights (H, W, 3) float32: barycentric weights of the
-    triangle's corners, 0 where empty. depth (H, W) float32 [m]: z in the camera frame, 0 where empty.
+    `face` (H, W) int32 is the triangle's index, -1 where empty. `weights` (H, W, 3) float32 are barycentric weights of
+    its corners, 0 where empty. `depth` (H, W) float32 [m] is z in the camera frame, 0 where empty.
     """
 
     face: np.ndarray
@@ -52,11 +52,11 @@ class Fragments:
 
     @cached_property
     def mask(self) -> np.ndarray:
-        """(H, W) bool: mask of covered pixels."""
+        """Mask (H, W) of the pixels with a triangle."""
         return self.face >= 0
 
     def interpolate(self, triangles: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Interpolate vertex values (V, C) at every pixel, (H, W, C); 0 where empty. triangles (F, 3) as rasterised."""
+        """Interpolate vertex values (V, C) at every pixel (H, W, C), 0 where empty, for the same `triangles` (F, 3)."""
         picture = np.zeros((*self.face.shape, values.shape[1]), values.dtype)
         seen = self.mask
         picture[seen] = np.einsum("nk,nkc->nc", self.weights[seen], values[triangles[self.face[seen]]])
@@ -68,22 +68,22 @@ def rasterise(
 ) -> Fragments:
     """Find the nearest triangle at every pixel centre.
 
-    Both sides of a triangle are visible. A pixel centre on an edge belongs to both neighbours, so shared edges leave no
-    cracks: the z-buffer keeps one, the lower index at equal depth. Triangles without area leave no trace.
+    Both sides of a triangle are visible. A pixel centre on an edge belongs to both neighbours, so that shared edges
+    have no gaps; at equal depth the lower index is kept. Triangles without area are not drawn.
 
     Parameters
     ----------
     vertices, triangles
         World points (V, 3) [m]; vertex indices (F, 3).
     near
-        Minimum drawn depth [m]; triangles may extend through the plane and behind the camera.
+        Smallest depth [m] that is drawn; triangles may extend through this plane and behind the camera.
     device
-        A Warp device.
+        Warp device that computes the fragments.
 
     Raises
     ------
     ValueError
-        Wrong shapes, indices out of range, vertices that are not finite, or near <= 0.
+        Shapes are wrong, indices are out of range, vertices are not finite, or `near` is <= 0.
     """
     found = rasterise_surface(camera, vertices, triangles, near, device)
     shape, rows = (camera.height, camera.width), found.rows
@@ -99,10 +99,10 @@ def rasterise(
 
 @dataclass(frozen=True, eq=False)
 class RasterisedSurface:
-    """Surface in one image, on a device.
+    """Surface rasterised in one image, on a device.
 
-    points (1, V) vec3d: homogeneous, undistorted; triangles (F,) vec3i; nearest (1, H, W): z-buffer of (depth, face);
-    rows: those that may be covered. `build_undistortion` holds the undistorted pixels.
+    `points` (1, V) vec3d are homogeneous pixel coordinates, undistorted; `triangles` (F,) vec3i; `z_buffer` (1, H, W)
+    has (depth, face); only `rows` may be covered. `undistortion` is the result of `build_undistortion`.
     """
 
     points: wp.array
@@ -113,7 +113,7 @@ class RasterisedSurface:
 
     @cached_property
     def mask(self) -> np.ndarray:
-        """(H, W) bool: mask of the pixels whose centres the surface covers."""
+        """Mask (H, W) of the pixels whose centres the surface covers."""
         mask = wp.empty(self.z_buffer.size, dtype=wp.uint8, device=self.z_buffer.device)
         launch_in_bands(mark_covered, [self.z_buffer.flatten()], [mask], mask.size, str(mask.device))
         return mask.numpy().reshape(self.z_buffer.shape[1:]).view(bool)
@@ -122,7 +122,7 @@ class RasterisedSurface:
 def rasterise_surface(
     camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = NEAR_PLANE, device: str = "cpu"
 ) -> RasterisedSurface:
-    """Draw one surface into a z-buffer. Arguments and errors as in `rasterise`."""
+    """Rasterise a surface into a z-buffer; arguments and errors are as in `rasterise`."""
     vertices, triangles = check_mesh(vertices, triangles)
     if not near > 0.0:
         raise ValueError(f"near is {near} m: the near plane must lie in front of the camera.")
@@ -139,7 +139,7 @@ def rasterise_surface(
 
 
 def allocate_z_buffer(count: int, height: int, width: int, device: str) -> wp.array:
-    """Create empty z-buffers (count, height, width) of (depth, face)."""
+    """Allocate empty z-buffers (count, height, width) of (depth, face) on a device."""
     return wp.full((count, height, width), value=EMPTY_PIXEL, dtype=wp.uint64, device=device)
 
 
@@ -147,10 +147,10 @@ def draw_triangles(
     points: wp.array, triangles: wp.array, start: int, rows: slice, z_buffer: wp.array, device: str,
     near: float = NEAR_PLANE, undistortion: Undistortion | None = None,
 ) -> None:  # fmt: skip
-    """Draw the triangles from number `start` on into z-buffers (B, H, W), in some rows.
+    """Draw the triangles from index `start` on into the given rows of z-buffers (B, H, W).
 
-    points (B, V) vec3d: homogeneous, in each image; triangles (F,) vec3i, the same in all images; `undistortion` of the
-    cameras' lenses, if they have any.
+    `points` (B, V) vec3d are homogeneous pixel coordinates in each image. `triangles` (F,) vec3i are the same in all
+    images. `undistortion` is needed if a camera has a lens.
     """
     undistortion = build_empty_undistortion(device) if undistortion is None else undistortion
     load_modules(device, keep_nearest.module)
@@ -178,7 +178,7 @@ def draw_triangles(
 
 
 def find_covered_rows(points: np.ndarray, near: float, height: int) -> tuple[int, int]:
-    """Return the row range of the image that points (V, 3) (u w, v w, w) can cover: all, if one is too near."""
+    """Return the image rows that points (V, 3) (u w, v w, w) may cover: all rows if a point is nearer than `near`."""
     if not len(points):
         return 0, 0
     if points[:, 2].min() < near:
@@ -189,7 +189,7 @@ def find_covered_rows(points: np.ndarray, near: float, height: int) -> tuple[int
 
 
 def check_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert to vertices (V, 3) float64 and triangles (F, 3) int32; ValueError with the reason for an invalid mesh."""
+    """Return vertices (V, 3) as float64 and triangles (F, 3) as int32; ValueError if the mesh is invalid."""
     vertices = np.asarray(vertices, np.float64)
     triangles = np.asarray(triangles, np.int32)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
@@ -203,19 +203,19 @@ def check_mesh(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray,
 
 @wp.func
 def unpack_depth(key: wp.uint64) -> wp.float32:
-    """Return the depth in an entry of the z-buffer."""
+    """Return the depth [m] in an entry of the z-buffer."""
     return wp.cast(wp.uint32(key >> wp.uint64(32)), wp.float32)
 
 
 @wp.func
 def unpack_face(key: wp.uint64) -> wp.int32:
-    """Return the face in an entry of the z-buffer."""
+    """Return the face index in an entry of the z-buffer."""
     return wp.int32(key & wp.uint64(0xFFFFFFFF))
 
 
 @wp.func
 def clip_row_span(slope: wp.float64, offset: wp.float64, span: wp.vec2d) -> wp.vec2d:
-    """Restrict a row's span to slope u + offset >= 0, with a margin: each pixel is tested again."""
+    """Restrict a row's span to slope u + offset >= 0, with a margin, as each pixel is tested again."""
     slack = wp.float64(1.0e-3)
     if slope > wp.float64(0.0):
         return wp.vec2d(wp.max(span[0], -offset / slope - slack), span[1])
@@ -230,10 +230,10 @@ def draw_triangle(
     near: wp.float64, begin: wp.int32, end: wp.int32, part: wp.int32, part_count: wp.int32, undistortion: Undistortion,
     z_buffer: wp.array3d(dtype=wp.uint64),
 ):  # fmt: skip
-    """Keep, at each pixel centre inside triangle `face`, the minimum of (depth, face).
+    """Update the z-buffer at each pixel centre in triangle `face` with the minimum of (depth, face).
 
-    Only in the rows begin + part, begin + part + parts, ... below end. Both fit in 64 bits, because the bits of
-    positive floats sort as the floats do. With a lens a pixel is tested at its undistorted position.
+    Only rows begin + part, begin + part + part_count, ... below `end` are drawn. Depth and face share 64 bits, because
+    bits of positive floats sort like the floats. With a lens, a pixel is tested at its undistorted position.
     """
     t = triangles[face]
     a = q[image, t[0]]
@@ -301,7 +301,7 @@ def keep_nearest(
     # outputs
     z_buffer: wp.array3d(dtype=wp.uint64),
 ):  # fmt: skip
-    """Draw a run of triangles in one image, each in a part of the rows begin .. end - 1."""
+    """Draw a chunk of triangles into the z-buffer of one image, in one part of the rows begin .. end - 1."""
     picture, chunk, part = wp.tid()
     start = first + chunk * chunk_size
     for face in range(start, wp.min(start + chunk_size, triangles.shape[0])):
@@ -314,7 +314,7 @@ def mark_covered(
     # output
     mask: wp.array(dtype=wp.uint8),
 ):  # fmt: skip
-    """Set each pixel: 1 if a surface is visible."""
+    """Set the mask of each pixel to 1 if a surface is visible, else 0."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         mask[index] = wp.uint8(wp.where(z_buffer[index] != EMPTY_PIXEL, 1, 0))
@@ -328,7 +328,7 @@ def read_nearest(
     # outputs
     face: wp.array2d(dtype=wp.int32), weights: wp.array2d(dtype=wp.vec3f), depth: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """Read the visible face, its barycentric weights and its depth at each pixel, from `first_row` on."""
+    """Read face, barycentric weights and depth at each pixel from the z-buffer; row 0 is `first_row` of the image."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         row = index / z_buffer.shape[1]

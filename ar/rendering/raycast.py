@@ -1,4 +1,4 @@
-"""Reference for tests of the rasteriser: the same result by casting one ray per pixel into a BVH."""
+"""Reference for tests of the rasteriser: fragments computed by casting one ray per pixel into a BVH."""
 
 import numpy as np
 import warp as wp
@@ -9,7 +9,7 @@ from .rasteriser import Fragments, check_mesh
 
 
 def raycast(camera: Camera, vertices: np.ndarray, triangles: np.ndarray, near: float = 1e-3) -> Fragments:
-    """Find the nearest triangle at every pixel centre, as `rasterise`, on the CPU and several times slower."""
+    """Find the nearest triangle at every pixel centre, as `rasterise`, but on the CPU and several times slower."""
     vertices, triangles = check_mesh(vertices, triangles)
     shape = camera.height, camera.width
     if not len(triangles):
@@ -34,7 +34,7 @@ def cast_rays(
     # outputs
     face: wp.array2d(dtype=wp.int32), weights: wp.array2d(dtype=wp.vec3f), depth: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """Cast one ray from the near plane on."""
+    """Cast the ray of one pixel, starting at the near plane; write face, weights and depth."""
     row, column = wp.tid()
     ray = rays[row, column]
     length = wp.length(ray)

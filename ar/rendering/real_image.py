@@ -1,4 +1,4 @@
-"""Real and enlarged images instead of rendered ones, and the round field of view of an operating microscope."""
+"""Images that are not rendered (camera images, enlarged images), and the round field of view of a microscope."""
 
 from collections.abc import Sequence
 
@@ -18,12 +18,12 @@ SOFT_EDGE_SHARE = wp.constant(0.12)  # Width of the field's soft edge as a share
 def add_vignette(image: Picture, radius_ratio: float) -> Picture:
     """Darken an image outside the radius `radius_ratio` x half its longer side; depths and ids are unchanged.
 
-    Its colours change in place, on their device.
+    The colours change in place, on the image's device.
 
     Raises
     ------
     ValueError
-        A field that is not a number above 0.
+        `radius_ratio` is not a finite number above 0.
     """
     if not 0.0 < radius_ratio < float("inf"):
         raise ValueError(f"a round field has a radius above 0, not {radius_ratio}.")
@@ -42,7 +42,7 @@ def darken_outside_radius(
     # output
     image: wp.array3d(dtype=wp.vec3ub),
 ):  # fmt: skip
-    """Darken a run of the pixels begin .. end - 1 beyond a radius [pixel] about the centre of each image."""
+    """Darken pixels begin .. end - 1 beyond `radius` [pixel] round each image's centre, a chunk per thread."""
     start = begin + wp.tid() * chunk_size
     height = image.shape[1]
     width = image.shape[2]
@@ -67,19 +67,19 @@ def darken_outside_radius(
 def build_real_image(
     image: np.ndarray, camera: Camera, layers: Sequence[Layer], box: tuple[slice, slice], device: str = "cpu"
 ) -> Picture:
-    """Combine a camera image (H, W, 3) uint8 with the depth and segmentation of layers that should be visible.
+    """Combine a camera image (H, W, 3) uint8 with depth and segmentation computed from layers; return the image.
 
     Parameters
     ----------
     layers
-        Known surfaces of the scene; their positions and ids are used. The nearest one is visible.
+        Known surfaces of the scene, of which positions and ids are used; at each pixel the nearest layer counts.
     box
-        Rows and columns in which layers are drawn; elsewhere depth is not available.
+        Rows and columns in which layers are rasterised; outside, depth and ids are 0.
 
     Raises
     ------
     ValueError
-        An image of another size than the camera's.
+        The image does not have the camera's size.
     """
     if image.shape != (camera.height, camera.width, 3):
         raise ValueError(f"the image is {image.shape}, the camera {(camera.height, camera.width, 3)}.")
@@ -96,7 +96,7 @@ def build_real_image(
 
 
 def scale_image(image: Picture, width: int, height: int) -> Picture:
-    """Return an image on more pixels: colours interpolated, depths and ids of the nearest pixel."""
+    """Return the image at another size: colours are interpolated, depths and ids are taken from the nearest pixel."""
     size, device = (width, height), str(image.drawn.colour.device)
     depth, segmentation = (
         cv2.resize(values, size, interpolation=cv2.INTER_NEAREST) for values in (image.depth, image.segmentation)
@@ -105,7 +105,7 @@ def scale_image(image: Picture, width: int, height: int) -> Picture:
 
 
 def _upload_picture(colour: np.ndarray, depth: np.ndarray, segmentation: np.ndarray, device: str) -> Picture:
-    """Move an image (H, W, 3) uint8 with depth (H, W) float32 and segmentation (H, W) uint8 to a device."""
+    """Copy colour (H, W, 3) uint8, depth (H, W) float32 and segmentation (H, W) uint8 to a device; return the image."""
     arrays = (
         wp.array(np.ascontiguousarray(values)[None], dtype=dtype, device=device, copy=False)
         for values, dtype in ((colour, wp.vec3ub), (depth, wp.float32), (segmentation, wp.uint8))

@@ -1,4 +1,4 @@
-"""Renderer: from surfaces, a camera and a lamp to a lit image."""
+"""Renderer of layers to images, as seen by a camera under a lamp."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,10 +28,10 @@ SHADOW_PIXELS = 384  # Side of the shadow map [pixel].
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Images of several cameras, on the device that drew them; `.numpy()` of an array copies it to the host.
+    """Images of several cameras, on the device that rendered them; `.numpy()` of an array copies it to the host.
 
-    colour (B, H, W) vec3ub: in NumPy (B, H, W, 3) uint8; depth (B, H, W) float32 [m] and segmentation (B, H, W) uint8
-    are as in `Picture`.
+    `colour` (B, H, W) vec3ub is (B, H, W, 3) uint8 in NumPy. `depth` (B, H, W) float32 [m] and `segmentation` (B, H, W)
+    uint8 are as in `Picture`.
     """
 
     colour: wp.array
@@ -40,38 +40,38 @@ class Pictures:
 
     @property
     def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
-        """Colour, depth and segmentation."""
+        """The arrays colour, depth and segmentation."""
         return self.colour, self.depth, self.segmentation
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """Image of one camera; arrays are copied from the device on first use."""
+    """Image of one camera; its arrays are copied from the device on first use."""
 
     drawn: Pictures
 
     @cached_property
     def colour(self) -> np.ndarray:
-        """(H, W, 3) uint8, sRGB."""
+        """Colour (H, W, 3) uint8, sRGB."""
         return self.drawn.colour.numpy()[0]
 
     @cached_property
     def depth(self) -> np.ndarray:
-        """(H, W) float32 [m]: z in the camera frame, 0 where nothing is seen."""
+        """Depth (H, W) float32 [m]: z in the camera frame, 0 without a surface."""
         return self.drawn.depth.numpy()[0]
 
     @cached_property
     def segmentation(self) -> np.ndarray:
-        """(H, W) uint8: the id of the visible layer, 0 where nothing is seen."""
+        """Id (H, W) uint8 of the visible layer, 0 without a surface."""
         return self.drawn.segmentation.numpy()[0]
 
 
 @dataclass(frozen=True, eq=False)
 class StaticBackground:
-    """Image of the fixed layers for one camera, without shadows.
+    """Image of the fixed layers for one camera, without shadows, to draw moving layers on.
 
-    `surface` holds the positions of all layers when the z-buffer was drawn; `shadow_positions` (H W) is the shadow map
-    position of each pixel.
+    `surface` has the vertices of all layers when `z_buffer` was drawn. `shadow_positions` (H W) is the position of each
+    pixel in the shadow map.
     """
 
     camera: Camera
@@ -85,7 +85,7 @@ class StaticBackground:
 class Lamp:
     """Surgical lamp: a spot light with a soft edge.
 
-    position, target (3,) [m]; radius [m] of the lit circle at the target; strength and ambient light, scene-linear.
+    `position` and `target` (3,), and the lit circle's `radius` at the target, are in metres; the light is scene-linear.
     """
 
     position: np.ndarray
@@ -95,7 +95,7 @@ class Lamp:
     ambient: float = 0.16
 
     def build_camera(self) -> Camera:
-        """Return the camera at the lamp, for the shadow map."""
+        """Return the camera at the lamp's position, with which the shadow map is drawn."""
         axis = np.asarray(self.target) - self.position
         angle = np.arctan(self.radius / np.linalg.norm(axis))
         side = np.eye(3)[np.argmin(np.abs(axis))]
@@ -105,19 +105,19 @@ class Lamp:
 
 
 def build_lamp(camera: Camera, target: np.ndarray, radius: float = 0.06) -> Lamp:
-    """Build a lamp above the camera's left shoulder, aimed at `target` (3,) [m]: shadows fall next to the tool."""
+    """Build a lamp above and left of the camera, aimed at `target` (3,) [m], so that shadows fall next to the tool."""
     distance = np.linalg.norm(np.asarray(target) - camera.centre)
     right, down = camera.T_camera_world[0, :3], camera.T_camera_world[1, :3]
     return Lamp(camera.centre - distance * (0.45 * right + 0.3 * down), np.asarray(target), radius)
 
 
 def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> Picture:
-    """Draw layers as seen by a camera under a lamp. For repeated drawing of the same layers use a `Renderer`.
+    """Render layers as seen by a camera under a lamp; to render the same layers repeatedly, use a `Renderer`.
 
     Raises
     ------
     ValueError
-        Two layers of different names with one id.
+        Layers of different names have the same id.
 
     Examples
     --------
@@ -132,14 +132,13 @@ def render(camera: Camera, layers: Sequence[Layer], lamp: Lamp, device: str = "c
 
 
 class Renderer:
-    """Layers under a lamp, prepared once and drawn any number of times; from one thread at a time.
+    """Renderer of layers under a lamp: prepared once, used for any number of images, from one thread at a time.
 
-    The image of fixed layers is cached from a camera's second image on: a camera that moves has no second image,
-    so nothing is cached.
+    If the same camera is used again, the image of the fixed layers is cached, starting with its second image.
     """
 
     def __init__(self, layers: Sequence[Layer], lamp: Lamp, device: str = "cpu") -> None:
-        """Copy the layers to a Warp device; ValueError if two of different names have one id."""
+        """Copy the layers to a Warp device; ValueError if layers of different names have the same id."""
         load_modules(device, shade_pixels.module, place_vertices.module)
         self.device, self.stack = device, LayerStack(layers, device)
         self.light, self.lamp_camera = to_light(lamp), lamp.build_camera()
@@ -150,12 +149,12 @@ class Renderer:
         self.backdrop: StaticBackground | None = None
 
     def render(self, camera: Camera, vertices: Sequence[np.ndarray]) -> Picture:
-        """Render the image of a camera; vertices (V, 3) [m]: of each moving layer, in order.
+        """Render the image of a camera; `vertices` are those (V, 3) [m] of each moving layer, in order.
 
         Raises
         ------
         ValueError
-            Vertices of other shapes than the layers'.
+            The vertices have other shapes than the layers.
         """
         moved = self.stack.copy_vertices(np.concatenate([np.zeros((0, 3)), *vertices])[None])
         stays, self.seen_by = camera is self.seen_by, camera
@@ -163,20 +162,20 @@ class Renderer:
         return Picture(self._draw_images([camera], moved, backdrop))
 
     def render_batch(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
-        """Render images of cameras of one size; nothing leaves the device.
+        """Render images of cameras of equal size; the images remain on the device.
 
         Parameters
         ----------
         vertices
-            (B, n, 3) [m]: of all moving layers, one after the other, in each image. A Warp array (B, n) of `vec3d` on
-            this device is used without a copy, and must be finite.
+            Vertices (B, n, 3) [m] of all moving layers, one layer after the other, for each image. A Warp array (B, n)
+            of `vec3d` on this device is used without a copy, and must be finite.
         cameras
-            B of them, or one for all images.
+            B cameras, or one camera for all images.
 
         Raises
         ------
         ValueError
-            Other shapes, another number of cameras, or cameras of several sizes.
+            Shapes are wrong, the number of cameras is neither 1 nor B, or cameras have different sizes.
         """
         moved = self.stack.copy_vertices(vertices)
         count = moved.shape[0]
@@ -187,7 +186,7 @@ class Renderer:
         return self._draw_images([*cameras] * (count // len(cameras)), moved, None)
 
     def _draw_images(self, cameras: Sequence[Camera], moved: wp.array, backdrop: StaticBackground | None) -> Pictures:
-        """Draw every image, upon the backdrop if there is one."""
+        """Draw the image of each camera, on the static background if given."""
         count, height, width = len(cameras), cameras[0].height, cameras[0].width
         if count * max(height * width, SHADOW_PIXELS**2) >= 2**31:
             raise ValueError(f"{count} images of {width} x {height} are too many at once: draw fewer.")
@@ -212,7 +211,7 @@ class Renderer:
         self, cameras: Sequence[Camera], placed: PlacedSurface, nearest: wp.array, casting: wp.array, still: int,
         lit_at: wp.array, through: Undistortion, pictures: Pictures,
     ) -> None:  # fmt: skip
-        """Shade the pixels of the z-buffers, with shadows of the `casting` triangles, into images with a background."""
+        """Shade the pixels of z-buffers into images with a background; `casting` triangles cast shadows."""
         count, height, width = nearest.shape
         shadow = self._draw_shadow(placed, casting)
         inputs = [
@@ -224,7 +223,7 @@ class Renderer:
         launch_in_bands(shade_pixels, inputs, outputs, count * height * width, self.device, per_core=4)
 
     def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: PlacedSurface, since: int) -> None:
-        """Project the vertices from number `since` on in each image."""
+        """Place the vertices from index `since` on in each image."""
         stack = self.stack
         matrices = wp.array([compute_projection(camera) for camera in cameras], dtype=wp.mat44d, device=self.device)
         inputs = [
@@ -235,13 +234,13 @@ class Renderer:
         launch_in_bands(place_vertices, inputs, [placed], len(cameras) * (stack.vertices - since), self.device)
 
     def _find_rows(self, seen: wp.array, since: int, height: int) -> slice:
-        """Return the rows that vertices from number `since` on can cover: on a GPU all, as a test would take longer."""
+        """Return the rows that vertices from index `since` on may cover; on a GPU all rows, as a test takes longer."""
         if self.device != "cpu":
             return slice(0, height)
         return slice(*find_covered_rows(seen.numpy()[:, since:].reshape(-1, 3), NEAR_PLANE, height))
 
     def _draw_shadow(self, placed: PlacedSurface, casting: wp.array) -> Shadow:
-        """Draw the shadow map of each image."""
+        """Draw the shadow map of each image; return the maps."""
         count, tiles = placed.lamp_points.shape[0], SHADOW_PIXELS // int(TILE_SIDE)
         shadow = Shadow()
         shadow.size = SHADOW_PIXELS
@@ -256,7 +255,7 @@ class Renderer:
         return wp.array([camera.centre for camera in cameras], dtype=wp.vec3f, device=self.device)
 
     def _get_backdrop(self, camera: Camera, moved: wp.array) -> StaticBackground:
-        """Return the image of the fixed layers for a camera; that of the last camera is cached."""
+        """Return the image of the fixed layers for a camera; the last one is cached."""
         if self.backdrop is not None and self.backdrop.camera is camera:
             return self.backdrop
         stack, height, width = self.stack, camera.height, camera.width
@@ -278,7 +277,7 @@ class Renderer:
 
 
 def allocate_images(count: int, height: int, width: int, device: str) -> Pictures:
-    """Create images with the background only."""
+    """Allocate `count` images that show only the background."""
     shape = count, height, width
     colour = wp.empty(shape, dtype=wp.vec3ub, device=device)
     for row in range(count):
@@ -288,7 +287,7 @@ def allocate_images(count: int, height: int, width: int, device: str) -> Picture
 
 
 def copy_surface(surface: PlacedSurface) -> PlacedSurface:
-    """Copy the arrays."""
+    """Return a copy of a placed surface with all its arrays."""
     out = PlacedSurface()
     for name in ("camera_points", "lamp_points", "vertices", "normals"):
         setattr(out, name, wp.clone(getattr(surface, name)))
@@ -296,14 +295,14 @@ def copy_surface(surface: PlacedSurface) -> PlacedSurface:
 
 
 def compute_projection(camera: Camera) -> np.ndarray:
-    """Build the matrix (4, 4) that maps a world point (x, 1) [m] to (u w, v w, w, 1)."""
+    """Compute the matrix (4, 4) from a world point (x, 1) [m] to homogeneous pixel coordinates (u w, v w, w, 1)."""
     P = np.eye(4)
     P[:3] = camera.K @ camera.T_camera_world[:3]
     return P
 
 
 def to_light(lamp: Lamp) -> Light:
-    """Convert the lamp for the kernel."""
+    """Convert a lamp to the struct that kernels use."""
     camera = lamp.build_camera()
     axis = np.asarray(lamp.target) - lamp.position
     light = Light()
@@ -311,14 +310,14 @@ def to_light(lamp: Lamp) -> Light:
     angle = np.arctan(lamp.radius / np.linalg.norm(axis))
     light.outer, light.steepness = float(np.cos(angle)), float(1.0 / (np.cos(0.55 * angle) - np.cos(angle)))
     light.strength, light.ambient, light.P = lamp.strength, lamp.ambient, wp.mat44f(compute_projection(camera))
-    # The offset equals the filter width: then the surface itself is never under the filter, at any slant to the lamp.
+    # The offset equals the filter width, so that the surface itself is never under the filter, at any slant.
     light.offset = float(1.05 * (HALF_SOFT_WIDTH + 0.5) * np.linalg.norm(axis) / camera.K[0, 0])
     return light
 
 
 @lru_cache(maxsize=4)
 def draw_background(width: int, height: int, device: str) -> wp.array:
-    """Draw the background (H, W, 3) uint8 on a device: a drape, brighter in the centre."""
+    """Draw the background (H, W, 3) uint8, a drape that is brighter in the centre, on a device."""
     y, x = np.mgrid[-1.0 : 1.0 : height * 1j, -1.0 : 1.0 : width * 1j]
     fall = 1.0 - 0.45 * np.clip(np.hypot(x, y) / np.sqrt(2.0), 0.0, 1.0)
     return wp.array((255.0 * fall[..., None] * DRAPE_COLOUR).astype(np.uint8), dtype=wp.vec3ub, device=device)
@@ -326,7 +325,7 @@ def draw_background(width: int, height: int, device: str) -> wp.array:
 
 @lru_cache(maxsize=1)
 def build_tone_curve() -> np.ndarray:
-    """Compute the table (4096,) uint8 from scene-linear light to display: filmic (Narkowicz 2016), then gamma 2."""
+    """Compute the table (4096,) uint8 from scene-linear light to displayed values: filmic (Narkowicz 2016), gamma 2."""
     x = np.linspace(0.0, float(WHITE_LEVEL), 4096)
     filmic = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
     return (255.0 * np.sqrt(filmic) + 0.5).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Colour of visible points under the lamp: deferred shading in Warp, one launch for all images."""
+"""Deferred shading in Warp: colour of the visible points under the lamp, for all images in one launch."""
 
 import warp as wp
 
@@ -19,19 +19,19 @@ WHITE_LEVEL = wp.constant(4.0)  # Scene-linear light displayed as white.
 
 @wp.func
 def normalise(v: wp.vec3f) -> wp.vec3f:
-    """Compute v / |v| with one division; the library's has three, and this is half of the work at a pixel."""
+    """Compute v / |v| with one division instead of Warp's three; this is half of the work per pixel."""
     return v * (1.0 / wp.sqrt(wp.dot(v, v) + 1.0e-30))
 
 
 @wp.func
 def interpolate(w: wp.vec3f, a: wp.vec3f, b: wp.vec3f, c: wp.vec3f) -> wp.vec3f:
-    """Interpolate values at a triangle's corners by barycentric weights w."""
+    """Interpolate the values a, b, c at a triangle's corners with barycentric weights w."""
     return w[0] * a + w[1] * b + w[2] * c
 
 
 @wp.func
 def sample_texture(texels: wp.array(dtype=wp.vec4f), first: wp.int32, size: wp.vec3i, index: wp.vec3f) -> wp.vec4f:
-    """Sample (value, gradient) trilinearly at a voxel index, clamped to the border."""
+    """Sample (value, gradient) of a solid texture trilinearly at a voxel index, which is clamped to the border."""
     x = wp.clamp(index[0], 0.0, wp.float32(size[0] - 1))
     y = wp.clamp(index[1], 0.0, wp.float32(size[1] - 1))
     z = wp.clamp(index[2], 0.0, wp.float32(size[2] - 1))
@@ -54,7 +54,7 @@ def sample_texture(texels: wp.array(dtype=wp.vec4f), first: wp.int32, size: wp.v
 
 @wp.func
 def gather_face_corners(image: wp.int32, face: wp.int32, surfaces: Surfaces, placed: PlacedSurface) -> FaceCorners:
-    """Gather the data of a face for its pixels: neighbouring pixels mostly need the same."""
+    """Gather the data of a face, which neighbouring pixels share."""
     t = surfaces.triangles[face]
     qa = placed.camera_points[image, t[0]]
     qb = placed.camera_points[image, t[1]]
@@ -83,7 +83,7 @@ def gather_face_corners(image: wp.int32, face: wp.int32, surfaces: Surfaces, pla
 def compute_visible_point(
     p: wp.vec3d, corners: FaceCorners, shading: LayerShading, texels: wp.array(dtype=wp.vec4f), eye: wp.vec3f
 ) -> VisiblePoint:
-    """Compute the point of a face visible at a pixel p = (u, v, 1)."""
+    """Compute the point of a face that is visible at a pixel p = (u, v, 1), with its normal and base colour."""
     w = compute_weights_from_edges(p, corners.edge_b, corners.edge_c, corners.normal)
     out = VisiblePoint()
     out.position = interpolate(w, corners.a, corners.b, corners.c)
@@ -105,7 +105,7 @@ def compute_visible_point(
 
 @wp.func
 def compute_shadow_position(position: wp.vec3f, normal: wp.vec3f, light: Light) -> wp.vec3f:
-    """Compute the shadow map position of a point: column, row, depth [m] (not above 0 behind the lamp)."""
+    """Compute column, row and depth [m] of a point in the shadow map; the depth is <= 0 behind the lamp."""
     above = position + light.offset * normal
     q = light.P * wp.vec4f(above[0], above[1], above[2], 1.0)
     if q[2] <= 0.0:
@@ -116,9 +116,9 @@ def compute_shadow_position(position: wp.vec3f, normal: wp.vec3f, light: Light) 
 
 @wp.func
 def compute_lit_share(image: wp.int32, position: wp.vec3f, shadow: Shadow) -> wp.float32:
-    """Compute the lamp's share at a point: percentage-closer filter of the shadow map (Reeves et al. 1987).
+    """Compute the share of the lamp's light at a point by percentage-closer filtering (Reeves et al. 1987).
 
-    The smallest and largest depth of the tiles under the filter decide most points at once.
+    For most points, the depth bounds of the tiles under the filter give the result without filtering.
     """
     column = wp.int32(position[0] + 0.5)
     row = wp.int32(position[1] + 0.5)
@@ -163,15 +163,15 @@ def compute_lit_share(image: wp.int32, position: wp.vec3f, shadow: Shadow) -> wp
 
 @wp.func
 def apply_tone_curve(light: wp.float32, curve: wp.array(dtype=wp.uint8)) -> wp.uint8:
-    """Map scene-linear light to an 8-bit value by the table `curve`, which spans 0 .. BRIGHTEST."""
+    """Map scene-linear light to an 8-bit value by the table `curve`, which spans 0 .. WHITE_LEVEL."""
     return curve[wp.int32(wp.min(light * (1.0 / WHITE_LEVEL), 1.0) * wp.float32(curve.shape[0] - 1))]
 
 
 @wp.func
 def compute_light(point: VisiblePoint, shading: LayerShading, light: Light, lit_share: wp.float32) -> wp.vec3f:
-    """Compute scene-linear light from a point that a share of the lamp reaches.
+    """Compute the scene-linear light from a point that receives `lit_share` of the lamp's light.
 
-    It is base (ambient + wrapped Lambert) + Schlick's Fresnel x a Gaussian lobe, inside a lit circle with a soft edge.
+    The light is base (ambient + wrapped Lambert) + Schlick's Fresnel x Gaussian lobe, in a lit circle with a soft edge.
     """
     ray = normalise(light.position - point.position)
     rim = wp.clamp((-wp.dot(ray, light.axis) - light.outer) * light.steepness, 0.0, 1.0)
@@ -196,7 +196,7 @@ def compute_shadow_depths(
     # output
     shadow: Shadow,
 ):  # fmt: skip
-    """Compute the shadow maps' depths, and their minimum and maximum in a run of the tiles begin .. end - 1."""
+    """Compute the depths of shadow maps, and their minimum and maximum in each of a chunk of tiles."""
     start = begin + wp.tid() * chunk_size
     tiles = shadow.size / TILE_SIDE
     for index in range(start, wp.min(start + chunk_size, end)):
@@ -225,7 +225,7 @@ def compute_shadow_positions(
     # outputs
     positions: wp.array(dtype=wp.vec3f),
 ):  # fmt: skip
-    """Compute the shadow map position of each pixel of one image, flat (H W)."""
+    """Compute the position in the shadow map of each pixel of one image, flat (H W)."""
     start = begin + wp.tid() * chunk_size
     for index in range(start, wp.min(start + chunk_size, end)):
         row = index / width
@@ -249,10 +249,10 @@ def shade_pixels(
     # outputs
     colour: wp.array(dtype=wp.vec3ub), depth: wp.array(dtype=wp.float32), segmentation: wp.array(dtype=wp.uint8),
 ):  # fmt: skip
-    """Shade a run of the pixels begin .. end - 1 of all images; these are flat (B H W), and of `size` = H W pixels.
+    """Shade a chunk of the pixels begin .. end - 1 of all images, flat (B H W), with `size` = H W pixels each.
 
-    The outputs hold the background, and the first `static_faces` without shadows. They are unchanged unless a shadow
-    falls on them; `shadow_positions` (H W) is the shadow map position of each of their pixels.
+    The outputs already contain the background and the first `static_faces` faces without shadows. Their pixels change
+    only if a shadow falls on them; `shadow_positions` (H W) are the positions of these pixels in the shadow map.
     """
     start = begin + wp.tid() * chunk_size
     picture = start / size

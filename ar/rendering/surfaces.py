@@ -1,4 +1,4 @@
-"""Layers as one surface on a device: fixed topology, appearance and textures, separate from moving vertices."""
+"""Layers combined to one surface on a device: topology, appearance and textures, separate from moving vertices."""
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
@@ -12,11 +12,11 @@ from .parallel import forward_kernel
 
 @wp.struct
 class Light:
-    """Lamp as seen by the kernel.
+    """Lamp for the kernels.
 
-    It has a position [m], a unit axis, the cosine of the lit cone's angle, the steepness of its soft edge, a strength
-    and an ambient share. `P` maps a world point to (u w, v w, w) in the shadow map, which is sampled `offset` [m] above
-    the surface.
+    The lamp has a position [m], a unit axis, the cosine of the lit cone's angle, the steepness of the soft edge, a
+    strength and an ambient share. `P` maps a world point to (u w, v w, w) in the shadow map, which is sampled `offset`
+    [m] above the surface.
     """
 
     position: wp.vec3f
@@ -31,7 +31,7 @@ class Light:
 
 @wp.struct
 class LayerShading:
-    """Appearance of a layer: number, highlight, solid texture (first texel, size, transform, dark end, relief [m])."""
+    """Appearance of a layer: id, highlight, solid texture (first texel, size, transform, dark colour, relief [m])."""
 
     id: wp.uint8
     gloss: wp.float32
@@ -46,10 +46,10 @@ class LayerShading:
 
 @wp.struct
 class Surfaces:
-    """All layers as one surface, the same in every image.
+    """All layers combined to one surface, which is the same in every image.
 
-    `triangles` (F,), `shading_index` of each, `shadings` of the layers; `colours` (V,) scene-linear, `rest` (V,) [m];
-    `texels` (T,) of all solid textures, one after the other: value and gradient.
+    `triangles` (F,) have a `shading_index` into `shadings`, one per layer. Vertices have scene-linear `colours` (V,)
+    and undeformed positions `rest` (V,) [m]. `texels` (T,) are those of all solid textures: value and gradient.
     """
 
     triangles: wp.array(dtype=wp.vec3i)
@@ -62,7 +62,7 @@ class Surfaces:
 
 @wp.struct
 class PlacedSurface:
-    """Surface in each image (B, V): homogeneous as seen by the camera, and by the lamp, in the world, normals."""
+    """Vertices (B, V) in each image: homogeneous pixels of camera and lamp, world positions [m], and normals."""
 
     camera_points: wp.array2d(dtype=wp.vec3d)
     lamp_points: wp.array2d(dtype=wp.vec3d)
@@ -72,9 +72,9 @@ class PlacedSurface:
 
 @wp.struct
 class Shadow:
-    """Shadow maps, flat (B N N): depth [m], infinite where empty; and the minimum and maximum of each tile.
+    """Shadow maps, flat (B N N): depths [m], infinite where empty, and their minimum and maximum in each tile.
 
-    `size` is N, and there are N / TILE tiles along each side.
+    `size` is N; there are N / TILE_SIDE tiles along each side.
     """
 
     size: wp.int32
@@ -84,7 +84,7 @@ class Shadow:
 
 @wp.struct
 class FaceCorners:
-    """Data of a face for its pixels: edges and normal in the image for the weights, and values to interpolate."""
+    """Data of a face that its pixels need: edges and normal in the image, and corner values to interpolate."""
 
     edge_b: wp.vec3d
     edge_c: wp.vec3d
@@ -106,7 +106,7 @@ class FaceCorners:
 
 @wp.struct
 class VisiblePoint:
-    """Visible point of a pixel: position [m], unit directions to the viewer and of the normal, base colour."""
+    """Point visible at a pixel: position [m], unit direction to the viewer, unit normal, base colour."""
 
     position: wp.vec3f
     view: wp.vec3f
@@ -115,7 +115,7 @@ class VisiblePoint:
 
 
 def list_vertex_faces(triangles: np.ndarray, vertex_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """List the faces at each vertex: start of each list (count + 1,), and the faces (3 F,), int32."""
+    """Return the start (count + 1,) of each vertex's faces, and all these faces (3 F,), vertex by vertex, int32."""
     corners = triangles.reshape(-1)
     begins = np.concatenate([[0], np.cumsum(np.bincount(corners, minlength=vertex_count))])
     return begins.astype(np.int32), (np.argsort(corners, kind="stable") // 3).astype(np.int32)
@@ -125,7 +125,7 @@ def list_vertex_faces(triangles: np.ndarray, vertex_count: int) -> tuple[np.ndar
 def get_vertex_position(
     image: wp.int32, vertex: wp.int32, fixed: wp.array(dtype=wp.vec3d), moving: wp.array2d(dtype=wp.vec3d)
 ) -> wp.vec3d:
-    """Return the position of a vertex [m]: those of fixed layers come first."""
+    """Return the position [m] of a vertex in an image; vertices of fixed layers come first."""
     if vertex < fixed.shape[0]:
         return fixed[vertex]
     return moving[image, vertex - fixed.shape[0]]
@@ -133,7 +133,7 @@ def get_vertex_position(
 
 @wp.func
 def project_point(P: wp.mat44d, x: wp.vec3d) -> wp.vec3d:
-    """Project a point to homogeneous pixel coordinates (u w, v w, w)."""
+    """Project a point x to homogeneous pixel coordinates (u w, v w, w) by a matrix P."""
     q = P * wp.vec4d(x[0], x[1], x[2], wp.float64(1.0))
     return wp.vec3d(q[0], q[1], q[2])
 
@@ -146,7 +146,7 @@ def place_vertices(
     # output
     placed: PlacedSurface,
 ):  # fmt: skip
-    """Place each vertex from number `first` on, in each image; normals are the faces' weighted by area."""
+    """Place the vertices from `first` on in each image; normals are area-weighted means of face normals."""
     start = begin + wp.tid() * chunk_size
     each = placed.camera_points.shape[1] - first
     for index in range(start, wp.min(start + chunk_size, end)):
@@ -171,14 +171,14 @@ def place_vertices(
 
 
 class LayerStack:
-    """Layers one after the other, fixed ones first.
+    """Layers combined to one surface on a device, fixed layers first.
 
-    `still` (S,) [m] are the vertices that never move, `still_faces` the number of their triangles. `casting` (C,) are
-    the triangles that cast shadows; `around` and `faces` are as in `list_vertex_faces`.
+    `still` (S,) [m] are the vertices that never move, and `still_faces` is the number of their triangles. `casting`
+    (C,) are the triangles that cast shadows. `around` and `faces` are the arrays of `list_vertex_faces`.
     """
 
     def __init__(self, layers: Sequence[Layer], device: str) -> None:
-        """Copy the layers to a device; ValueError if two of different names have one id."""
+        """Copy the layers to a device; ValueError if layers of different names have the same id."""
         ids = {(layer.name, layer.id) for layer in layers}
         if len({number for _, number in ids}) < len(ids):
             raise ValueError(f"layers have the names and ids {sorted(ids)}: give each name its own id.")
@@ -216,7 +216,7 @@ class LayerStack:
         Raises
         ------
         ValueError
-            An array of another shape, or numbers that are not finite.
+            The array has another shape, or is not finite.
         """
         count = self.vertices - self.still_vertices
         if isinstance(vertices, wp.array):
@@ -230,7 +230,7 @@ class LayerStack:
         return wp.array(vertices, dtype=wp.vec3d, device=self.device)
 
     def allocate_placed(self, count: int) -> PlacedSurface:
-        """Allocate positions of the surface in `count` images."""
+        """Allocate the arrays of the placed surface in `count` images."""
         placed, shape = PlacedSurface(), (count, self.vertices)
         placed.camera_points, placed.lamp_points = (
             wp.empty(shape, dtype=wp.vec3d, device=self.device) for _ in range(2)
@@ -240,7 +240,7 @@ class LayerStack:
 
 
 def collect_textures(layers: Sequence[Layer], device: str) -> tuple[wp.array, list[LayerShading]]:
-    """Build the texels of all solid textures, and the appearance of the layers."""
+    """Return the texels of all solid textures on a device, and the appearance of each layer."""
     solids = list(dict.fromkeys(layer.solid for layer in layers if layer.solid is not None))
     begins = np.cumsum([0, *(solid.values.size for solid in solids)])
     looks = []
@@ -258,8 +258,8 @@ def collect_textures(layers: Sequence[Layer], device: str) -> tuple[wp.array, li
 
 @lru_cache(maxsize=4)
 def to_texels(solids: tuple[Solid, ...], device: str) -> wp.array:
-    """Copy solid textures to the device, one after the other."""
+    """Copy the texels of solid textures to a device, one texture after the other."""
     each = [solid.texels.reshape(-1, 4) for solid in solids]
-    # A single one, as of a scan, is large: on the CPU it is used without a copy.
+    # A single texture, such as a scan, is large: on the CPU it is used without a copy.
     texels = each[0] if len(each) == 1 else np.concatenate([np.zeros((0, 4), np.float32), *each])
     return wp.array(texels, dtype=wp.vec4f, device=device, copy=False)

@@ -1,1 +1,1 @@
-"""Stereo vision: rectification, disparity and depth, tracked points."""
+"""Stereo vision: rectification, disparity and depth, and tracking of points between images."""

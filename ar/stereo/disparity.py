@@ -1,10 +1,10 @@
-"""Depth from stereo pairs: photometric alignment of the windows, matching along rows, and the error of each match.
+"""Depth from stereo pairs: contrast normalisation, matching along rows, and the error of each match.
 
-Points are also tracked into a later image: coarse search, sub-pixel matching, forward-backward check.
+Points are also tracked into a later image: coarse search, subpixel matching, forward-backward check.
 
-Hirschmüller 2008, "Stereo processing by semiglobal matching and mutual information", IEEE Trans. Pattern Anal. Mach.
-Intell. 30:328-341, gives whole pixels. Lucas, Kanade 1981, "An iterative image registration technique", Proc. IJCAI
-674-679, gives the sub-pixel part, and its error from the image gradient.
+Whole-pixel disparities are from Hirschmüller 2008, "Stereo processing by semiglobal matching and mutual information",
+IEEE Trans. Pattern Anal. Mach. Intell. 30:328-341. The subpixel part, and its error from the image gradient, are from
+Lucas, Kanade 1981, "An iterative image registration technique", Proc. IJCAI 674-679.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ DEVIATION_RATIO = float(np.sqrt(0.5 * np.pi))
 class StereoSettings:
     """Settings of `compute_stereo_view` and `triangulate_cloud`."""
 
-    # Side of the square for local normalisation of grey levels [m]: lamps differ between eyes and positions.
+    # Side of the square for local normalisation of grey levels [m], as light differs between eyes and positions.
     normalisation_side: float = 2.5e-3
     normalised_contrast: float = 60.0  # Contrast after normalisation [grey level].
     halving_contrast: float = 6.0  # Contrast of a square at which normalisation is halved [grey level].
@@ -38,7 +38,7 @@ class StereoSettings:
     subpixel_criteria: tuple[int, float] = (15, 0.01)
     max_subpixel_shift: float = 2.0  # Largest difference of the subpixel match from the whole pixel [pixel].
     max_row_shift: float = 1.0  # Largest difference of the subpixel match from its row [pixel].
-    # Median row difference of the eyes above which the calibration is of other cameras [pixel].
+    # Median row difference of the eyes above which the calibration does not fit the cameras [pixel].
     max_row_difference: float = 0.7
     # Lower bound of the disparity's standard deviation [pixel], from rendered images: light differs between eyes.
     min_sigma: float = 0.12
@@ -46,28 +46,28 @@ class StereoSettings:
     correlation_factor: float = 2.0
     glare_brightness: int = 200  # Glare: smallest brightness [grey level].
     glare_saturation: float = 0.12  # Glare: largest saturation [share of the maximum channel].
-    hidden_margin: int = 3  # Glare and covered parts: margin that is also hidden [pixel].
-    # Smallest standard deviation in a square, noise included [grey level]: below, moving highlights would match.
+    hidden_margin: int = 3  # Margin round glare and tools that is also excluded [pixel].
+    # Smallest standard deviation in a square, noise included [grey level]; below it, moving highlights would match.
     min_texture: float = 5.0
     dark_level: float = 12.0  # Mean grey level of an eye's window below which the eye is dark.
 
 
 @dataclass(frozen=True, eq=False)
 class StereoView:
-    """View of both cameras at the same time.
+    """Rectified windows of both cameras at the same time, and their disparity.
 
     Parameters
     ----------
     geometry
-        Geometry of the stereo pair.
+        Geometry of the rectified stereo pair.
     left, right
-        Windows (size, size) uint8, normalised.
+        Windows (size, size) uint8 with normalised contrast.
     invalid
-        Mask (size, size) bool of the left window: tools, glare, and too little texture.
+        Mask (size, size) bool of the left window's pixels with tools, glare, or too little texture.
     invalid_right
-        Mask of tools and glare in the right window.
+        Mask (size, size) bool of the right window's pixels with tools or glare.
     settings
-        Settings of its matches.
+        Settings of the matching.
     """
 
     geometry: RectifiedPair
@@ -79,7 +79,7 @@ class StereoView:
 
     @cached_property
     def disparity(self) -> np.ndarray:
-        """(size, size) float32 [pixel] to a whole pixel or better; NaN where nothing is matched."""
+        """Disparity (size, size) float32 [pixel], accurate to a pixel or better; NaN without a match."""
         settings = self.settings
         reach = int(np.ceil(self.geometry.depth_disparity / self.geometry.depth**2 * settings.depth_range))
         # OpenCV takes multiples of 16.
@@ -95,12 +95,12 @@ class StereoView:
 
     @cached_property
     def slope(self) -> np.ndarray:
-        """(size, size): sum over a point's square of the left window's squared gradient along rows, per pixel^2."""
+        """Squared gradient (size, size) of the left window along rows, summed in a square round each pixel."""
         slope = cv2.Sobel(self.left, cv2.CV_32F, 1, 0, scale=0.125)
         return cv2.boxFilter(slope * slope, -1, 2 * (self.settings.subpixel_side,), normalize=False)
 
     def sample_field(self, pixels: np.ndarray, field: np.ndarray) -> np.ndarray:
-        """Return values (n,) of a field (size, size) at the pixels nearest to (n, 2); NaN or True beyond its border."""
+        """Return values (n,) of a field (size, size) at the pixels nearest to `pixels` (n, 2); NaN or True outside."""
         here = np.nan_to_num(np.round(pixels).clip(-1.0, self.geometry.size), nan=-1.0).astype(int)
         inside = np.all((here >= 0) & (here < self.geometry.size), axis=1)
         here = np.where(inside[:, None], here, 0)
@@ -110,16 +110,16 @@ class StereoView:
 
 @dataclass(frozen=True, eq=False)
 class StereoCloud:
-    """Points with stereo depth.
+    """Points with depth from stereo, and the error of the depth.
 
     Parameters
     ----------
     indices
-        (k,): numbers of the requested pixels.
+        Indices (k,) of the points among the requested pixels.
     points
         World points (k, 3) [m].
     sigma
-        (k,) [m]: standard deviation of the depth's error; lateral errors are smaller.
+        Standard deviation (k,) [m] of each depth; lateral errors are smaller.
     """
 
     indices: np.ndarray
@@ -131,12 +131,12 @@ def compute_stereo_view(
     geometry: RectifiedPair, left: np.ndarray, right: np.ndarray,
     tool_masks: tuple[np.ndarray, np.ndarray] | None = None, settings: StereoSettings = StereoSettings(),
 ) -> StereoView:  # fmt: skip
-    """Build the stereo view of two images (H, W, 3) uint8; `tool_masks` holds the masks of a tool in each, (H, W) bool.
+    """Build the stereo view of images (H, W, 3) uint8; `tool_masks` are masks (H, W) bool of tools, one per image.
 
     Raises
     ------
     ValueError
-        A dark image.
+        An image is dark.
     """
     windows = geometry.rectify(left, right)
     greys = [cv2.cvtColor(window, cv2.COLOR_RGB2GRAY) for window in windows]
@@ -154,23 +154,23 @@ def compute_stereo_view(
 
 
 def find_glare(window: np.ndarray, settings: StereoSettings) -> np.ndarray:
-    """Return the mask (H, W) bool of bright pixels without colour in an image (H, W, 3) uint8."""
+    """Return the mask (H, W) bool of bright, colourless pixels in an image (H, W, 3) uint8."""
     red, green, blue = cv2.split(window)
     most, least = cv2.max(cv2.max(red, green), blue), cv2.min(cv2.min(red, green), blue)
     return (most >= settings.glare_brightness) & (most - least < settings.glare_saturation * most)
 
 
 def grow_mask(mask: np.ndarray, margin: int) -> np.ndarray:
-    """Dilate a mask (H, W) bool by `margin` pixels."""
+    """Return the mask (H, W) bool dilated by `margin` pixels."""
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)) > 0
 
 
 def equalise_contrast(
     grey: np.ndarray, mask: np.ndarray, window_size: int, settings: StereoSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Normalise grey levels (H, W) uint8 by the mean and standard deviation in a square of `window_size` pixels a side.
+    """Normalise grey levels (H, W) uint8 by mean and standard deviation in a square of side `window_size` [pixel].
 
-    Pixels that are covered (H, W) bool are excluded, and become grey. The standard deviation (H, W) is returned too.
+    Pixels in `mask` (H, W) bool are excluded, and become grey. Return the image and the standard deviation (H, W).
     """
     part = np.where(mask, np.float32(0.0), np.float32(1.0))
     count = np.maximum(cv2.blur(part, (window_size, window_size)), np.float32(1e-3))
@@ -183,12 +183,12 @@ def equalise_contrast(
 
 
 def triangulate_cloud(view: StereoView, pixels: np.ndarray) -> StereoCloud:
-    """Compute 3-D points at pixels (n, 2) of the left window that the right camera also sees.
+    """Compute world points at pixels (n, 2) of the left window, as far as the right camera sees these points.
 
     Raises
     ------
     ValueError
-        Rows of the two images that do not correspond: cameras other than the calibrated ones.
+        Rows of the two windows do not correspond, so the cameras are not the calibrated ones.
     """
     rough, settings = view.sample_field(pixels, view.disparity), view.settings
     which = np.flatnonzero(np.isfinite(rough))
@@ -231,16 +231,16 @@ class FlowSettings:
     max_return_distance: float = 1.0  # Largest distance from the start after tracking forward and back [pixel].
     neighbour_count: int = 8  # Number of neighbours whose median motion a point is compared with.
     max_relative_deviation: float = 4.0  # Largest deviation from the neighbours' median [standard deviations].
-    # Largest deviation from the neighbours' median motion [m]; the larger of it and `max_relative_deviation` applies.
+    # Largest deviation from the neighbours' median motion [m], if larger than by `max_relative_deviation`.
     max_motion_deviation: float = 0.5e-3
 
 
 def track_pixels(
     previous: StereoView, current: StereoView, pixels: np.ndarray, settings: FlowSettings = FlowSettings()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track the pixels (n, 2) of one left window into another; return the numbers (k,) found, and positions (k, 2).
+    """Track pixels (n, 2) of one left window into another; return the indices (k,) found and their positions (k, 2).
 
-    Both windows have the same resolution and target, so that pixels have equal size.
+    Both windows must have the same resolution and target, so that their pixels have equal size.
     """
     guess, alike = _find_coarse(previous, current, pixels, settings)
     which = np.nonzero(alike > settings.min_correlation)[0]
@@ -257,7 +257,7 @@ def track_pixels(
 def find_consistent_motions(
     positions: np.ndarray, motions: np.ndarray, settings: FlowSettings = FlowSettings()
 ) -> np.ndarray:
-    """Return the mask (n,) of motions (n, 3) [m] at positions (n, 3) [m] that agree with those of their neighbours."""
+    """Return the mask (n,) of the motions (n, 3) [m] at positions (n, 3) [m] that agree with neighbouring motions."""
     if len(positions) <= settings.neighbour_count:
         return np.ones(len(positions), bool)
     near = motions[np.asarray(KDTree(positions).query(positions, settings.neighbour_count + 1)[1])[:, 1:]]
@@ -271,7 +271,7 @@ def find_consistent_motions(
 def _find_coarse(
     before: StereoView, now: StereoView, pixels: np.ndarray, settings: FlowSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find pixels (n, 2) again to a coarse pixel, (n, 2), by template matching, with correlations (n,)."""
+    """Find pixels (n, 2) in a later view by coarse template matching; return positions (n, 2), correlations (n,)."""
     size, half = before.geometry.size, settings.half_template
     share = before.geometry.depth / before.geometry.focal / settings.coarse_pixel
     few = max(1, round(share * size))
@@ -295,7 +295,7 @@ def _find_coarse(
 def _track_pixels(
     one: np.ndarray, other: np.ndarray, start: np.ndarray, guess: np.ndarray, settings: FlowSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track pixels (n, 2) float32 of a window into another from a guess (n, 2); return positions, success (n,)."""
+    """Track pixels `start` (n, 2) float32 to another window from `guess` (n, 2); return positions and success (n,)."""
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, *settings.flow_criteria)
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         one, other, start, guess.copy(), winSize=2 * (settings.flow_side,), maxLevel=settings.flow_levels,

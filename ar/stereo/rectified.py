@@ -1,4 +1,4 @@
-"""Rectification of stereo pairs: windows around the target, whose rows correspond."""
+"""Rectification of stereo pairs: windows round a target, with corresponding rows."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,29 +8,29 @@ import numpy as np
 
 from ..optics.camera import Camera
 
-# Smallest share of the baseline along the left eye's rows: the right eye is to the right of the left one.
+# Smallest share of the baseline along the left eye's rows, as the right eye must be to the right of the left eye.
 MIN_BASELINE_SHARE = 0.9
 Maps = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class RectifiedPair:
-    """Rectified windows of a stereo pair. Points at the target's depth have the same position in both.
+    """Rectified windows of a stereo pair; points at the target's depth have the same position in both windows.
 
     Fusiello, Trucco, Verri 2000, "A compact algorithm for rectification of stereo pairs", Mach. Vis. Appl. 12:16-22.
 
     Parameters
     ----------
     T_window_world
-        Transform (4, 4) to positions [m] in the left camera's rectified frame, whose x axis points to the right camera.
+        Transform (4, 4) from the world to the left camera's rectified frame [m]; its x axis points to the right camera.
     focal, principal
         Focal length and principal point (2,) of the left window [pixel].
     baseline, depth
-        Distance between the cameras; distance from there to the target along the axis [m].
+        Distance between the cameras, and depth of the target along the rectified axis [m].
     size
         Side length of a window [pixel].
     maps
-        Image positions of the window's pixels, of the left and of the right camera.
+        Image positions of the windows' pixels, for the left and for the right camera.
     """
 
     T_window_world: np.ndarray
@@ -42,26 +42,26 @@ class RectifiedPair:
     maps: tuple[Maps, Maps]
 
     def rectify(self, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rectify images (H, W, ...) uint8 of both eyes to windows (size, size, ...), black beyond their borders."""
+        """Rectify images (H, W, ...) uint8 of both eyes to windows (size, size, ...), black outside the images."""
         one, other = self.maps
         return cv2.remap(left, *one, cv2.INTER_LINEAR), cv2.remap(right, *other, cv2.INTER_LINEAR)
 
     @property
     def depth_disparity(self) -> float:
-        """Disparity [pixel] times depth [m], both without the target's offset."""
+        """Product of depth [m] and disparity [pixel], for a disparity that is 0 at infinity."""
         return self.focal * self.baseline
 
     def compute_disparity(self, depth: np.ndarray) -> np.ndarray:
-        """Compute the disparity [pixel] of a depth [m]: shift to the left in the right window, 0 at the target."""
+        """Compute disparities [pixel] of depths [m]: shift to the left in the right window, 0 at the target."""
         return self.depth_disparity / depth - self.depth_disparity / self.depth
 
     def project_points(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project world points (n, 3) [m] to pixels (n, 2) of the left window, and disparities (n,)."""
+        """Project world points (n, 3) [m] to pixels (n, 2) of the left window; return also their disparities (n,)."""
         at = points @ self.T_window_world[:3, :3].T + self.T_window_world[:3, 3]
         return self.focal * at[:, :2] / at[:, 2:] + self.principal, self.compute_disparity(at[:, 2])
 
     def compute_points(self, pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-        """Compute world points (n, 3) [m] at pixels (n, 2) of the left window with disparities (n,)."""
+        """Compute the world points (n, 3) [m] at pixels (n, 2) of the left window with given disparities (n,)."""
         depth = self.compute_depths(disparity)
         ray = np.column_stack([(pixels - self.principal) / self.focal, np.ones(len(pixels))])
         return (depth[:, None] * ray - self.T_window_world[:3, 3]) @ self.T_window_world[:3, :3]
@@ -75,12 +75,12 @@ class RectifiedPair:
 def build_rectification(
     left: Camera, right: Camera, target: tuple[float, float, float], half_width: float, pixels_per_metre: float
 ) -> RectifiedPair:
-    """Rectify about a target [m]: windows of `half_width` [m] and `pixels_per_metre`, both at its depth.
+    """Rectify round a target [m]: windows with `half_width` [m] and `pixels_per_metre`, both at the target's depth.
 
     Raises
     ------
     ValueError
-        Eyes that are not side by side, the left one on the left; a target that is not ahead of them.
+        The right eye is not to the right of the left eye, or the target is not in front of both.
     """
     between = right.centre - left.centre
     baseline = float(np.linalg.norm(between))

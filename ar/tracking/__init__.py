@@ -1,1 +1,1 @@
-"""Printed targets: layout, detection in camera images, and poses of camera and tool computed from them."""
+"""Printed targets: their layout, detection in camera images, and poses of camera and tool computed from images."""

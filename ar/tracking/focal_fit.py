@@ -1,4 +1,4 @@
-"""Check of a calibration's focal length against images: markers of known geometry determine it."""
+"""Check of a calibrated focal length against images of markers with known geometry."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,8 +10,8 @@ from ..optics.camera import Camera
 from .pose import PoseSettings, compute_pose_residual
 from .targets import DetectedCorners, Target
 
-MAX_RELATIVE_ERROR = 0.05  # Relative error above which a focal length differs.
-# Error above which a focal length differs [standard deviations], if it exceeds MAX_RELATIVE_ERROR as well.
+MAX_RELATIVE_ERROR = 0.05  # Relative difference above which a focal length may be wrong.
+# Difference above which a focal length is wrong [standard deviations], if above MAX_RELATIVE_ERROR as well.
 MAX_DEVIATIONS = 6.0
 
 
@@ -27,25 +27,25 @@ class FocalFitSettings:
 
 @dataclass(frozen=True)
 class FocalFit:
-    """Factor on a camera's focal lengths that fits markers best, and its standard deviation."""
+    """Factor on a camera's focal lengths that fits observed markers best, and its standard deviation `deviation`."""
 
     factor: float
     deviation: float
 
     @property
     def is_significant(self) -> bool:
-        """True if the difference of the focal length is significant."""
+        """True if the factor differs significantly from 1: the calibrated focal length is wrong."""
         return abs(self.factor - 1.0) > max(MAX_RELATIVE_ERROR, MAX_DEVIATIONS * self.deviation)
 
 
 def fit_focal_length(
     camera: Camera, observed: Sequence[tuple[Target, DetectedCorners]], settings: FocalFitSettings = FocalFitSettings()
 ) -> FocalFit | None:
-    """Estimate the factor on both focal lengths that fits targets' corners best; None: too few corners.
+    """Estimate the factor on both focal lengths that fits targets' corners best; None if there are too few corners.
 
-    Each target has its best-fitting pose. The deviation is that of least squares, from the curvature of the sum at its
-    minimum and the residual variance of corners. Source: Triggs et al. 2000, "Bundle adjustment: a modern synthesis",
-    section 6.1.
+    Each target has its best-fitting pose. The standard deviation is that of least squares: from the curvature of the
+    sum of squares at its minimum and the residual variance. Source: Triggs et al. 2000, "Bundle adjustment: a modern
+    synthesis", section 6.1.
     """
     enough = [(target, corners) for target, corners in observed if len(corners.points) >= settings.min_corners]
     freedom = sum(2 * len(corners.points) - 6 for _, corners in enough) - 1

@@ -1,4 +1,4 @@
-"""Image sequences of one camera, grey or in colour, from a folder or a video of unknown origin."""
+"""Image sequences of one camera from a folder or a video of unknown origin, grey or in colour."""
 
 import os
 import re
@@ -15,7 +15,7 @@ from PIL import Image
 
 from ..optics.calibration import MAX_IMAGE_SIDE
 
-MAX_IMAGES = 300  # Maximum number of images used, spread evenly over all.
+MAX_IMAGES = 300  # Maximum number of images read by `read_images`, evenly spread.
 MAX_PIXELS = 64_000_000  # Maximum number of pixels of an image.
 MAX_FILE_BYTES = 256_000_000  # Maximum size of an image file [bytes].
 NUMBER_PATTERN = re.compile(r"([0-9]+)")  # Pattern of a number in a file name, to sort by.
@@ -31,18 +31,18 @@ TOO_LARGE_ERROR = (
 
 @dataclass(frozen=True, eq=False)
 class NamedImage:
-    """Image with name and time.
+    """Image with a name and a time.
 
     Parameters
     ----------
     name
-        Name of its file, or the number of its frame.
+        File name, or number of the video frame.
     grey
         Grey image (H, W) uint8.
     time
-        Time in the video [s]; 0 for a file.
+        Time [s] in the video or sequence; 0 for a single file.
     colour
-        Colour image (H, W, 3) uint8 sRGB, if requested.
+        Colour image (H, W, 3) uint8 sRGB; None if not requested.
     """
 
     name: str
@@ -52,12 +52,12 @@ class NamedImage:
 
 
 def read_images(path: Path) -> Iterator[NamedImage]:
-    """Read at most `MAX_IMAGES` of the PNG and JPEG files of a folder, or of the frames of a video, in their order.
+    """Read at most `MAX_IMAGES` images of a folder (PNG, JPEG) or frames of a video, evenly spread, in order.
 
     Raises
     ------
     ValueError
-        No such file, a folder without images, a file that is not a video or image, or an image that is too large.
+        The file does not exist, the folder has no images, a file is not a readable video or image, or is too large.
     """
     if path.is_dir():
         files = _list_files(path)
@@ -66,12 +66,12 @@ def read_images(path: Path) -> Iterator[NamedImage]:
 
 
 def read_video(path: Path, rate: float, with_colour: bool = False, first_frame: int = 0) -> Iterator[NamedImage]:
-    """Read every image, from the `first_frame` on, of a video or of a folder, with its time [s].
+    """Read all images of a video or a folder from image `first_frame` on, with their times [s].
 
-    The order in a folder is that of the numbers in the names. Pixels are used as stored: a video's orientation metadata
-    and EXIF are ignored.
+    Images of a folder are ordered by the numbers in their names. Pixels are used as stored: orientation metadata of
+    videos and EXIF are ignored.
 
-    `rate` is the frame rate [1/s] of a folder; a video has its own times. `with_colour` requests colour images.
+    `rate` is the frame rate [1/s] of a folder; a video has its own times. If `with_colour`, images also have colour.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def read_video(path: Path, rate: float, with_colour: bool = False, first_frame: 
 
 
 def count_frames(path: Path) -> int:
-    """Count the images that `read_video` yields; for a video this is its metadata, which may be wrong.
+    """Count the images that `read_video` yields; for a video the count is from its metadata, which may be wrong.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def count_frames(path: Path) -> int:
 
 
 def to_named_image(name: str, colour: np.ndarray, time: float) -> NamedImage:
-    """Build a named image from colour (H, W, 3) uint8 sRGB, with its grey image."""
+    """Build a named image from a colour image (H, W, 3) uint8 sRGB; its grey image is computed."""
     return NamedImage(name, cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), time, colour)
 
 
@@ -126,7 +126,7 @@ def _list_files(folder: Path) -> list[Path]:
 
 
 def _split_name(path: Path) -> list[tuple[str, str]]:
-    """Split a file's name into numbers, each with the words before it; words at the end have the number -1."""
+    """Split a file name into pairs of text and the number after it; text at the end has the number -1."""
     *pairs, end = NUMBER_PATTERN.split(f"/{path.stem.casefold()}")
     return [*zip(pairs[::2], pairs[1::2], strict=True), (end, "-1")]
 
@@ -140,12 +140,12 @@ def _apply_sign(numbered: tuple[str, str], plain: set[str]) -> tuple[str, int]:
 
 @cache
 def _warn_once(text: str) -> None:
-    """Warn once of each text."""
+    """Emit a warning, but each text only once."""
     warnings.warn(text, stacklevel=1)
 
 
 def _read(path: Path, kind: str = "L") -> np.ndarray:
-    """Read an image as stored, grey or RGB; EXIF orientation is ignored, since the lens is not turned either."""
+    """Read an image as stored, grey ("L") or "RGB"; EXIF orientation is ignored, as calibrations use stored pixels."""
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path}: is larger than {MAX_FILE_BYTES / 1e6:.0f} MB. Remove it, or write it smaller.")
     try:
@@ -164,7 +164,7 @@ def _read(path: Path, kind: str = "L") -> np.ndarray:
 
 
 def _read_video_frames(path: Path, step: int | None, colour: bool = False, first: int = 0) -> Iterator[NamedImage]:
-    """Read one in `step` frames of a video from the `first` on; None: a step that gives `MAX_IMAGES` frames."""
+    """Yield every `step`-th frame of a video from the `first` on; None: a step that gives `MAX_IMAGES` frames."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file. {REMEDY}")
     video = _open_video(path)
@@ -198,7 +198,7 @@ def _read_video_frames(path: Path, step: int | None, colour: bool = False, first
 
 
 def _open_video(path: Path) -> cv2.VideoCapture:
-    """Open a video silently: errors are reported by an exception, not by FFmpeg and OpenCV on the console."""
+    """Open a video without console output of FFmpeg and OpenCV; the caller reports errors as exceptions."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read at the first video of a process
     logging = cv2.utils.logging  # type: ignore[attr-defined]
     before = logging.setLogLevel(logging.LOG_LEVEL_ERROR)
@@ -211,7 +211,7 @@ def _open_video(path: Path) -> cv2.VideoCapture:
 
 
 def _describe_flaw(path: Path) -> str:
-    """Describe why a file is not a video, by its first bytes."""
+    """Describe the reason why a file is not a video, from its first bytes."""
     with path.open("rb") as file:
         first = file.read(8)
     if not first:
@@ -222,7 +222,7 @@ def _describe_flaw(path: Path) -> str:
 
 
 def _spread(count: int) -> list[int]:
-    """Select at most `MAX_IMAGES` of the numbers below `count`, evenly spaced."""
+    """Return at most `MAX_IMAGES` integers below `count`, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, MAX_IMAGES)).round().astype(int)).tolist()
 
 
@@ -232,7 +232,7 @@ def _check_size(path: Path, width: int, height: int) -> None:
 
 
 def read_frame_rate(path: Path) -> float | None:
-    """Return the frame rate [1/s] in a video's metadata; None for a folder, or if not given."""
+    """Return the frame rate [1/s] from a video's metadata; None for a folder, or if the video has none."""
     if not path.is_file():
         return None
     video = _open_video(path)

@@ -1,4 +1,4 @@
-"""Views of the calibration board, and the intrinsics of a camera computed from them, with their errors."""
+"""Camera intrinsics from views of the calibration board, with their covariance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class IntrinsicsSettings:
     """Settings of `find_board`, `choose_views` and `calibrate_intrinsics`."""
 
     min_corners: int = 8  # Minimum number of corners in a view.
-    min_lines: int = 3  # Minimum number of the board's rows and of its columns with corners in a view.
+    min_lines: int = 3  # Minimum number of corner rows and of corner columns of the board in a view.
     min_sharpness: float = 0.6  # Sharpness below which a view is left out, as a share of the median.
     min_views: int = 8  # Minimum number of views for a calibration.
     outlier_ratio: float = 3.0  # Ratio of a view's error to the median error above which it is left out.
@@ -28,18 +28,18 @@ class IntrinsicsSettings:
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
-    """Corners of the board detected in one image.
+    """Corners of the calibration board in one image.
 
     Parameters
     ----------
     name
         Name of the image.
     points
-        Points (n, 3) on the board [m].
+        Corners (n, 3) [m] in the board's frame.
     pixels
         Detected positions (n, 2) [pixel].
     sharpness
-        Steepest slope of its edges, as a share of their contrast [1/pixel].
+        Steepest grey-level slope at edges, relative to their contrast [1/pixel].
     """
 
     name: str
@@ -49,7 +49,7 @@ class BoardView:
 
     @cached_property
     def homography(self) -> np.ndarray:
-        """(3, 3): homography from board positions [m] to pixels, without lens distortion; NaN if not found."""
+        """Homography (3, 3) from board positions [m] to pixels, without lens distortion; NaN if not found."""
         centred = self.points[:, :2] - self.points[:, :2].mean(axis=0)
         found = cv2.findHomography(centred, self.pixels)[0]
         if found is None:
@@ -62,9 +62,9 @@ class BoardView:
 def find_board(
     detector: Detector, name: str, grey: np.ndarray, settings: IntrinsicsSettings = IntrinsicsSettings()
 ) -> BoardView | None:
-    """Detect the detector's board in an image (H, W) uint8.
+    """Detect the detector's board in an image (H, W) uint8; return its corners as a view.
 
-    None if too few of its corners are visible, or all are in one or two rows.
+    None if too few corners are visible, or if they are in fewer than three rows or columns.
     """
     (board,) = detector.targets
     seen = detector.detect(grey).get(board.name)
@@ -78,7 +78,7 @@ def find_board(
 
 
 def _compute_sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
-    """Compute the sharpness of the image part that holds the pixels (n, 2): the smaller of columns and rows."""
+    """Compute the sharpness of the image part with the pixels (n, 2): the smaller value of rows and columns."""
     low, high = np.floor(pixels.min(axis=0)).astype(int), np.ceil(pixels.max(axis=0)).astype(int) + 1
     part = grey[max(low[1], 0) : high[1], max(low[0], 0) : high[0]].astype(np.float32)
     dark, bright = np.percentile(part, [5.0, 95.0])
@@ -89,10 +89,10 @@ def _compute_sharpness(grey: np.ndarray, pixels: np.ndarray) -> float:
 def choose_views(
     views: Sequence[BoardView], face: Face, max_views: int, settings: IntrinsicsSettings = IntrinsicsSettings()
 ) -> list[BoardView]:
-    """Select at most `max_views` of the sharp views, each as different from the views before it as possible.
+    """Select at most `max_views` sharp views that differ as much as possible.
 
     Views are compared by the position of the board's outline in the image. Gonzalez (1985), "Clustering to minimize the
-    maximum intercluster distance": the farthest view from all chosen ones comes next.
+    maximum intercluster distance": the view farthest from all chosen views is chosen next.
     """
     median = np.median([view.sharpness for view in views]) if views else 0.0
     sharp = [view for view in views if view.sharpness >= settings.min_sharpness * median]
@@ -109,10 +109,10 @@ def choose_views(
 
 
 def measure_tilt_range(views: Sequence[BoardView], width: int, height: int) -> float:
-    """Compute the largest angle [rad] between planes of the board in two views, by their vanishing lines.
+    """Compute the largest angle [rad] between the board's planes in two views, from their vanishing lines.
 
-    The focal length, which is not known yet, is taken as the longer side of the image. Hartley and Zisserman (2004),
-    "Multiple View Geometry", section 8.6: a plane's normal is K^T of its vanishing line.
+    The focal length, which is not yet known, is approximated by the image's longer side. Hartley and Zisserman (2004),
+    "Multiple View Geometry", section 8.6: a plane's normal is K^T times its vanishing line.
     """
     middle = np.array(
         [[max(width, height), 0.0, 0.5 * width], [0.0, max(width, height), 0.5 * height], [0.0, 0.0, 1.0]]
@@ -124,7 +124,7 @@ def measure_tilt_range(views: Sequence[BoardView], width: int, height: int) -> f
 
 
 def measure_covered_share(views: Sequence[BoardView], width: int, height: int) -> float:
-    """Compute the share of an image that is inside the convex hull of the corners of at least one view."""
+    """Compute the share of the image area inside the convex hull of the corners of at least one view."""
     mask = np.zeros((height, width), np.uint8)
     for view in views:
         cv2.fillConvexPoly(mask, np.rint(cv2.convexHull(view.pixels.astype(np.float32))).astype(np.int32), (1,))
@@ -135,7 +135,7 @@ POSE_COLUMNS = slice(0, 6)  # Columns of OpenCV's derivatives: rotation and tran
 # Columns of OpenCV's derivatives: focal lengths, principal point and five coefficients of the lens.
 INTRINSIC_COLUMNS = slice(6, 15)
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-"""Parameters in the order of the covariance; focal lengths and principal point [pixel]."""
+"""Parameters in the order of the covariance; focal lengths and principal point are in pixels."""
 # Remedy in error messages.
 REMEDY = "Tilt the board by 20 to 45 degrees to all sides, near and far, and also in the image's corners."
 
@@ -143,21 +143,21 @@ REMEDY = "Tilt the board by 20 to 45 degrees to all sides, near and far, and als
 def compute_calibration_error(
     camera: Camera, T_camera_target: np.ndarray, corners: np.ndarray, point: np.ndarray, covariance: np.ndarray
 ) -> np.ndarray:
-    """Propagate a calibration's covariance to a target point: (3, 3) [m^2] in the camera's frame.
+    """Propagate a calibration's covariance to a point of a target: covariance (3, 3) [m^2] in the camera's frame.
 
-    The pose absorbs most of a calibration error, as target and point are seen by the same camera. The remainder is
-    computed by the derivatives of the projection: as far as it is observable, across the line of sight.
+    The fitted pose compensates most of a calibration error, as the same camera sees target and point. The remaining
+    error is computed from derivatives of the projection, and only across the line of sight, where it is observable.
 
     Parameters
     ----------
     camera
         Camera that took the image; its pose is ignored.
     T_camera_target
-        (4, 4) [m]: fitted to the corners by this camera.
+        Pose (4, 4) [m], fitted to the corners with this camera.
     corners, point
         Corners (n, 3) and point (3,) [m] in the target's frame.
     covariance
-        Covariance (9, 9) of `ar.tracking.intrinsics.PARAMETERS`.
+        Covariance (9, 9) of the camera's `PARAMETERS`.
     """
     distortion = np.pad(np.ravel(camera.distortion), (0, 5))[: max(5, np.size(camera.distortion))]
     turn = cv2.Rodrigues(T_camera_target[:3, :3])[0]
@@ -173,26 +173,26 @@ def compute_calibration_error(
 
 
 def to_parameters(calibration: Calibration) -> np.ndarray:
-    """Return a calibration's values (9,) of `PARAMETERS`."""
+    """Return the values (9,) of a calibration, in the order of `PARAMETERS`."""
     return np.array([*calibration.focal, *calibration.principal, *calibration.lens.coefficients[:5]])
 
 
 @dataclass(frozen=True, eq=False)
 class Intrinsics:
-    """Calibrated camera.
+    """Calibrated intrinsics of a camera, with their errors.
 
     Parameters
     ----------
     calibration
-        The camera.
+        Calibration of the camera.
     covariance
         Covariance (9, 9) of `PARAMETERS`.
     rms
         Root mean square distance [pixel] between detected and projected corners, over all views used.
     used_views, excluded_views
-        Names of views: those used, and those whose errors were too large.
+        Names of the used views, and of those excluded for large errors.
     covered_share
-        Share of the image that is inside the corners of a view.
+        Share of the image that is inside the corners of at least one view.
     """
 
     calibration: Calibration
@@ -204,12 +204,12 @@ class Intrinsics:
 
     @property
     def parameters(self) -> np.ndarray:
-        """(9,) of `PARAMETERS`."""
+        """Values (9,) of `PARAMETERS`."""
         return to_parameters(self.calibration)
 
     @property
     def deviations(self) -> np.ndarray:
-        """(9,) standard deviations of `PARAMETERS`."""
+        """Standard deviations (9,) of `PARAMETERS`."""
         return np.sqrt(np.diag(self.covariance))
 
 
@@ -217,15 +217,15 @@ def calibrate_intrinsics(
     views: Sequence[BoardView], width: int, height: int, name: str = "",
     settings: IntrinsicsSettings = IntrinsicsSettings(),
 ) -> Intrinsics:  # fmt: skip
-    """Calibrate the camera of these views, taken in images of `width` x `height`.
+    """Calibrate a camera from views of the board in images of `width` x `height` pixels.
 
-    Zhang (2000), "A flexible new technique for camera calibration", by OpenCV; a lens of Brown and Conrady with five
-    coefficients. Views that fit much worse than the others are left out, and the camera is calibrated again.
+    The method is Zhang (2000), "A flexible new technique for camera calibration", by OpenCV, with five coefficients of
+    a Brown-Conrady lens. Views that fit much worse than the others are excluded, and the calibration is repeated.
 
     Raises
     ------
     ValueError
-        Too few views, all from one direction, or views that determine no camera.
+        There are too few views, all are from one direction, or they do not determine the camera.
     """
     kept, excluded = list(views), []
     while True:
@@ -252,7 +252,7 @@ def calibrate_intrinsics(
 def _check_views(
     views: Sequence[BoardView], excluded: int, width: int, height: int, settings: IntrinsicsSettings
 ) -> None:
-    """Raise ValueError for views that do not determine a camera."""
+    """Raise ValueError if the views do not determine a camera."""
     if len(views) < settings.min_views:
         without = f", and {excluded} more fit badly" if excluded else ""
         raise ValueError(
@@ -270,7 +270,7 @@ def _check_views(
 def _solve_views(
     views: Sequence[BoardView], width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]], np.ndarray]:
-    """Solve for K (3, 3), five coefficients, and each view's rotation vector, translation (3,), rms error [pixel]."""
+    """Compute K (3, 3), five lens coefficients, each view's pose (rotation vector, translation), rms errors [pixel]."""
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
     try:
@@ -289,10 +289,10 @@ def _solve_views(
 def compute_intrinsics_covariance(
     calibration: Calibration, views: Sequence[BoardView], poses: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> tuple[np.ndarray, float]:
-    """Compute the covariance (9, 9) of `PARAMETERS` at the least-squares solution, and the rms distance [pixel].
+    """Compute the covariance (9, 9) of `PARAMETERS` at the least-squares solution, and the rms residual [pixel].
 
-    The normal equations have nine parameters of the camera and six of each view. A Schur complement eliminates those of
-    the views, with A and B the pixels' derivatives by the camera's parameters and by the view's:
+    The normal equations have nine parameters of the camera and six of each view. A Schur complement eliminates the
+    views; A and B are the derivatives of pixels by the parameters of the camera and of the view:
 
         S = sum over views of A^T A - A^T B (B^T B)^-1 B^T A.
 

@@ -1,4 +1,4 @@
-"""Live images of a camera of this machine."""
+"""Live images of a camera that is connected to this machine."""
 
 import threading
 import time as clock
@@ -15,14 +15,14 @@ RETRY_PAUSE = 0.05  # Pause between two tries [s].
 
 
 class FrameSource(Protocol):
-    """Source of images: `cv2.VideoCapture`, or a replacement."""
+    """Source of images: `cv2.VideoCapture` or a replacement, as for tests."""
 
     def isOpened(self) -> bool:
         """Return True if the source is open."""
         ...
 
     def read(self) -> tuple[bool, np.ndarray | None]:
-        """Return True if an image arrived, and the image (H, W, 3) uint8 in BGR order."""
+        """Return True and the image (H, W, 3) uint8 in BGR order; False if no image arrived."""
         ...
 
     def release(self) -> None:
@@ -31,7 +31,7 @@ class FrameSource(Protocol):
 
 
 def open_camera(number: int, width: int, height: int) -> FrameSource:
-    """Open the camera of this machine with a number, for images of a size, without buffering."""
+    """Open the camera with this device number, for images of the given size, with a buffer of one image."""
     camera = cv2.VideoCapture(number)
     camera.set(cv2.CAP_PROP_FRAME_WIDTH, width)
     camera.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
@@ -42,9 +42,9 @@ def open_camera(number: int, width: int, height: int) -> FrameSource:
 def read_camera_images(
     source: FrameSource, name: str, reopen: Callable[[], FrameSource], now: Callable[[], float] = clock.perf_counter
 ) -> Generator[NamedImage | None]:
-    """Yield images of a camera, each with its arrival time [s] by `now`; None if there was none.
+    """Yield images of a camera, each with its arrival time [s] by the clock `now`; yield None if there is no image.
 
-    A camera that stops responding is released, and opened `reopen` until it responds.
+    A camera that stops responding is released, and opened again by `reopen` until it responds.
     """
     failed = 0
     try:
@@ -65,15 +65,15 @@ def read_camera_images(
 
 
 def read_newest_images(images: Generator[NamedImage | None], timeout: float) -> Iterator[NamedImage | None]:
-    """Yield the newest image at each request; None if none arrived within `timeout` [s].
+    """Yield the newest image at each request; yield None if none arrives within `timeout` [s].
 
-    A separate thread reads the images; those that arrive between requests are dropped. The thread ends, and closes the
-    images, when this iterator ends.
+    A separate thread reads `images`; those that arrive between requests are dropped. The thread ends and closes
+    `images` when this iterator ends.
 
     Raises
     ------
     Exception
-        Any exception of the images.
+        Any exception that `images` raises.
     """
     waiting: list[NamedImage] = []
     ended: list[BaseException | None] = []

@@ -1,4 +1,4 @@
-"""A4 pages to print the targets, exact in millimetres, and the list of targets for other programs."""
+"""A4 pages for printing the targets at exact size, and a description of the targets for other programs."""
 
 import io
 from collections.abc import Sequence
@@ -41,16 +41,16 @@ PRINT_INSTRUCTIONS = (  # Instructions on each page.
 
 @dataclass(frozen=True, eq=False)
 class PlacedFace:
-    """Face at its place on a page.
+    """Face of a target at its position on a page.
 
     Parameters
     ----------
     face
         Face to print.
     left, top
-        Distances of its left and upper side from the page's upper left corner [mm], without its border.
+        Distances [mm] of the face's left and upper side (border excluded) from the page's upper left corner.
     quarter_turns
-        Quarter turns clockwise.
+        Number of clockwise quarter turns of the face.
     """
 
     face: Face
@@ -61,16 +61,16 @@ class PlacedFace:
 
 @dataclass(frozen=True, eq=False)
 class PrintedPage:
-    """One page.
+    """Page to print, with the faces of one target.
 
     Parameters
     ----------
     name
-        Name of its target.
+        Name of the page's target.
     pixels
-        Image (H, W) uint8, 0 or 255, `PER_MM` per millimetre.
+        Image (H, W) uint8 with values 0 or 255, `PER_MM` pixels per millimetre.
     faces
-        Faces on it.
+        Faces on the page.
     """
 
     name: str
@@ -79,7 +79,7 @@ class PrintedPage:
 
 
 def build_printed_pages() -> tuple[PrintedPage, ...]:
-    """Draw the pages of the tool's cube, the patient's reference and the calibration board."""
+    """Draw the pages of the tool's cube, the patient's reference and the calibration board; return all three."""
     cube, plate, board = list_targets()
     return _draw_cube_page(cube), _draw_plate_page(plate), _draw_board_page(board)
 
@@ -92,28 +92,28 @@ def to_face_name(face: Face) -> str:
 
 
 def to_png(page: PrintedPage) -> bytes:
-    """Encode a page as a PNG of one bit a pixel, with its resolution."""
+    """Encode a page as a PNG with one bit per pixel and its resolution."""
     said = PngInfo()
     said.add_text("Source", PROGRAM_NAME)
     return _encode_pages([page], "PNG", dpi=(DPI, DPI), pnginfo=said)
 
 
 def to_pdf(pages: Sequence[PrintedPage]) -> bytes:
-    """Encode pages as one PDF, each as large as its paper."""
+    """Encode pages as one PDF file, each at the size of its paper."""
     return _encode_pages(pages, "PDF", resolution=DPI, creator=PROGRAM_NAME, title="Targets of sulcus")
 
 
 def get_dictionary_name() -> str:
-    """Return OpenCV's name of the markers' dictionary."""
+    """Return OpenCV's name of the marker dictionary."""
     names = [name for name in dir(cv2.aruco) if name.startswith("DICT_")]
     return next(name for name in names if getattr(cv2.aruco, name) == MARKER_DICTIONARY)
 
 
 def describe_targets() -> dict:
-    """List all targets for JSON, in millimetres: sizes, markers, and positions of corners in the target's frame.
+    """Return a description of all targets for JSON, in millimetres: sizes, markers, and corners in the target's frame.
 
-    Corners are the inner ones of the chessboard in OpenCV's order, row by row as the face is seen. The outline is that
-    of the squares, clockwise from the upper left.
+    Corners are the inner chessboard corners in OpenCV's order, row by row as seen from the front. The outline is that
+    of the chessboard, clockwise from the upper left corner.
     """
     return {
         "format": "sulcus targets 1",
@@ -140,12 +140,12 @@ def _describe_face(face: Face) -> dict:
 
 
 def _to_millimetres(metres: float | np.ndarray):
-    """Convert to millimetres, rounded to the nanometre: a float, or lists of floats."""
+    """Convert metres to millimetres, rounded to the nanometre; return a float or lists of floats."""
     return (np.round(1e3 * np.asarray(metres), 6) + 0.0).tolist()
 
 
 def _draw_cube_page(target: Target) -> PrintedPage:
-    """Draw the three faces so that they fold into a corner of the cube: +z above +x, and +y to the right of it."""
+    """Draw the three faces as a net that folds to a corner of the cube: +z above +x, and +y to the right of +x."""
     along_x, along_y, along_z = target.faces
     wide, border = _to_millimetres(along_x.size[0] + 2.0 * BORDER_WIDTH), _to_millimetres(BORDER_WIDTH)
     left, top = 57.0, 118.0
@@ -180,7 +180,7 @@ def _draw_cube_page(target: Target) -> PrintedPage:
 
 
 def _draw_plate_page(target: Target) -> PrintedPage:
-    """Draw one face with its border, to be cut out."""
+    """Draw the page of the patient's reference: one face with its border, to cut out."""
     (face,) = target.faces
     wide, border = _to_millimetres(face.size[0] + 2.0 * BORDER_WIDTH), _to_millimetres(BORDER_WIDTH)
     left, top = 0.5 * (A4[0] - wide), 110.0
@@ -202,7 +202,7 @@ def _draw_plate_page(target: Target) -> PrintedPage:
 
 
 def _draw_board_page(target: Target) -> PrintedPage:
-    """Draw the board across the page; nothing is cut."""
+    """Draw the page of the calibration board in landscape format, without cutting lines."""
     (face,) = target.faces
     page, ink = _create_page((A4[1], A4[0]))
     placed = PlacedFace(face, 0.5 * (A4[1] - _to_millimetres(face.size[0])) + 20.0, 7.0)
@@ -220,7 +220,7 @@ def _compose_page(
     target: Target, page: Image.Image, ink: ImageDraw.ImageDraw, placed: tuple[PlacedFace, ...], said: Sequence[str],
     rulers: tuple[tuple[float, float], tuple[float, float]],
 ) -> PrintedPage:  # fmt: skip
-    """Finish an upright page: title, text, and rulers down and right from two places."""
+    """Complete a portrait page: add the title, the text and two rulers, which start at the positions `rulers` [mm]."""
     _write(ink, f"sulcus: {target.name}", 15.0, 14.0, TITLE_HEIGHT)
     _write_paragraph(ink, said, 15.0, 25.0)
     _draw_ruler(ink, *rulers[0], down=True)
@@ -229,7 +229,7 @@ def _compose_page(
 
 
 def _describe_sizes(target: Target) -> tuple[str, str]:
-    """Describe the faces: squares and markers."""
+    """Describe the sizes of the squares and the numbers of the markers of a target, in two lines."""
     face, ids = target.faces[0], np.concatenate([each.ids for each in target.faces])
     return (
         f"Each face has {face.columns} x {face.rows} squares of {_to_millimetres(face.square):g} mm, "
@@ -239,7 +239,7 @@ def _describe_sizes(target: Target) -> tuple[str, str]:
 
 
 def _create_page(size: tuple[float, float]) -> tuple[Image.Image, ImageDraw.ImageDraw]:
-    """Create white paper of (width, height) [mm], and the object that draws on it."""
+    """Create a white page of (width, height) [mm]; return it and the object that draws on it."""
     page = Image.new("1", (_to_pixels(size[0]), _to_pixels(size[1])), 1)
     return page, ImageDraw.Draw(page)
 
@@ -261,7 +261,7 @@ def _write_paragraph(ink: ImageDraw.ImageDraw, lines: Sequence[str], left: float
 def _draw_line(
     ink: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[float, float], dash: float = 0.0
 ) -> None:
-    """Draw a line between positions [mm], with dashes and gaps of a length; 0: solid."""
+    """Draw a line between two positions [mm]; `dash` is the length [mm] of dashes and gaps, 0 for a solid line."""
     start_, end_ = np.array(start), np.array(end)
     pieces = max(2 * round(np.hypot(*(end_ - start_)) / (2.0 * dash)) + 1, 1) if dash else 1
     at = start_ + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end_ - start_)
@@ -270,7 +270,7 @@ def _draw_line(
 
 
 def _draw_ruler(ink: ImageDraw.ImageDraw, left: float, top: float, down: bool) -> None:
-    """Draw a ruler with a mark every 10 mm, from a position to the right or down."""
+    """Draw a ruler with a mark every 10 mm, from a position downwards or to the right."""
     along, across = (
         (np.array([0.0, 1.0]), np.array([1.0, 0.0])) if down else (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     )
@@ -286,7 +286,7 @@ def _draw_ruler(ink: ImageDraw.ImageDraw, left: float, top: float, down: bool) -
 
 
 def _draw_bar(ink: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> None:
-    """Draw a line along a side of the page, whose centre is exact: `LINE_WIDTH` is a multiple of two pixels."""
+    """Draw a line parallel to a page side, centred exactly, as `LINE_WIDTH` is a multiple of two pixels."""
     half = _to_pixels(LINE_WIDTH) // 2
     low, high = np.minimum(start, end), np.maximum(start, end)
     ink.rectangle([*(_to_pixels(at) - half for at in low), *(_to_pixels(at) + half - 1 for at in high)], fill=0)
@@ -301,7 +301,7 @@ def _read_pixels(page: Image.Image) -> np.ndarray:
 
 
 def _encode_pages(pages: Sequence[PrintedPage], form: str, **how: object) -> bytes:
-    """Encode pages with Pillow as one image file, or several in one file."""
+    """Encode one page as an image file, or several pages in one file, with Pillow."""
     first, *others = [Image.fromarray(page.pixels).convert("1", dither=Image.Dither.NONE) for page in pages]
     more = {"save_all": True, "append_images": others} if others else {}
     file = io.BytesIO()

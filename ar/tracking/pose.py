@@ -1,4 +1,4 @@
-"""Poses of targets from their corners, with covariances, and tracking of targets from image to image."""
+"""Poses of targets from their corners, with covariances, and tracking of targets over images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class PoseSettings:
     min_corners: int = 6  # Minimum number of corners of a pose.
     min_deviation: float = 0.1  # Lower bound of the residual's standard deviation [pixel].
     max_residual: float = 1.0  # Largest rms residual of a pose [pixel].
-    min_chi2_excess: float = 30.0  # Excess of chi^2 over the best pose that excludes another pose.
+    min_chi2_excess: float = 30.0  # Difference of chi^2 to the best pose beyond which another pose is excluded.
     turn_tolerance: float = np.radians(2.0)  # Rotation within which two poses count as equal [rad].
     shift_tolerance: float = 1e-3  # Distance within which two poses count as equal [m].
     # Largest rotation from the previous pose that selects one of two poses [rad]; the other must be twice as far.
@@ -29,7 +29,7 @@ class PoseSettings:
 
 
 class PoseStatus(Enum):
-    """Result of a target's detection in an image, as readable text."""
+    """Result of the pose estimation of a target in an image, as readable text."""
 
     GOOD = "seen"
     LOST = "lost: too few corners are seen"
@@ -39,19 +39,19 @@ class PoseStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of a target in the camera's frame, or in that of another target.
+    """Pose of a target in the camera's frame, or in the frame of another target.
 
     Parameters
     ----------
     T_camera_target
         Pose (4, 4) [m].
     covariance
-        Covariance (6, 6) of a translation in the camera frame [m] and a rotation about the target's origin in its axes
-        [rad].
+        Covariance (6, 6) of translation [m] and rotation [rad] about the target's origin, both in the axes of the
+        camera frame.
     residual
         Root mean square distance [pixel] between detected and projected corners.
     corners
-        Number of corners.
+        Number of corners used.
     """
 
     T_camera_target: np.ndarray
@@ -60,7 +60,7 @@ class Pose:
     corners: int
 
     def transform_to(self, other: Pose) -> Pose:
-        """Transform this pose to the frame of another target in the same image; the covariance includes both errors."""
+        """Return this pose in the frame of another target of the same image; the covariance includes both errors."""
         into, away = other.T_camera_target[:3, :3].T, self.T_camera_target[:3, 3] - other.T_camera_target[:3, 3]
         none = np.zeros((3, 3))
         own = np.block([[into, none], [none, into]])
@@ -70,7 +70,7 @@ class Pose:
         return Pose(T, covariance, max(self.residual, other.residual), min(self.corners, other.corners))
 
     def transform_point(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a point of the target (3,) [m] in the camera's frame (3,) [m], and its covariance (3, 3) [m^2]."""
+        """Transform a point (3,) [m] of the target to the camera's frame; return it and its covariance (3, 3) [m^2]."""
         arm = self.T_camera_target[:3, :3] @ point
         slope = np.hstack([np.eye(3), -build_cross_matrices(arm)])
         return arm + self.T_camera_target[:3, 3], slope @ self.covariance @ slope.T
@@ -80,20 +80,20 @@ def find_pose(
     camera: Camera, target: Target, corners: DetectedCorners | None, previous: np.ndarray | None = None,
     settings: PoseSettings = PoseSettings(),
 ) -> tuple[PoseStatus, Pose | None]:  # fmt: skip
-    """Estimate the pose of a target; no pose is returned if it is uncertain or ambiguous.
+    """Estimate the pose of a target; return its status and the pose, which is None if uncertain or ambiguous.
 
-    Every face has two poses that mirror each other (Schweighofer, Pinz 2006, "Robust pose estimation from a planar
-    target", IEEE Trans. Pattern Anal. Mach. Intell. 28:2024-2030). Each is fitted to all corners. A pose is returned if
-    no other one fits about as well, or if a pose just `previous` distinguishes them.
+    From each face, two mirrored poses can be computed (Schweighofer, Pinz 2006, "Robust pose estimation from a planar
+    target", IEEE Trans. Pattern Anal. Mach. Intell. 28:2024-2030). Each is refined to all corners. The best pose is
+    returned if no other pose fits about as well; else the pose nearest to `previous`, if clearly nearest.
 
     Parameters
     ----------
     camera
         Camera that took the image; its pose is ignored.
     corners
-        Corners of `target`, from `Detector.detect`; None: none.
+        Corners of `target` from `Detector.detect`; None if there are none.
     previous
-        Previous T_camera_target (4, 4), if it was certain.
+        Last certain pose T_camera_target (4, 4); None if there is none.
     """
     if corners is None or len(corners.points) < settings.min_corners:
         return PoseStatus.LOST, None
@@ -121,12 +121,12 @@ def find_pose(
 
 
 def compute_pose_residual(camera: Camera, target: Target, corners: DetectedCorners) -> float:
-    """Return the smallest sum of squared distances [pixel^2] of a target's corners over its poses; inf if none."""
+    """Return the smallest sum of squared corner distances [pixel^2] of all candidate poses; inf if there are none."""
     return min((squares for _, squares in _fit_candidates(camera, target, corners)), default=np.inf)
 
 
 def _fit_candidates(camera: Camera, target: Target, corners: DetectedCorners) -> list[tuple[np.ndarray, float]]:
-    """Compute candidate poses (4, 4), and their sums of squared distances of all corners [pixel^2]."""
+    """Compute candidate poses (4, 4), each with the sum of squared distances of all corners [pixel^2]."""
     out = []
     for number in np.unique(corners.face):
         rows = corners.face == number
@@ -145,7 +145,7 @@ def _fit_candidates(camera: Camera, target: Target, corners: DetectedCorners) ->
 
 
 def _refine_pose(camera: Camera, corners: DetectedCorners, T: np.ndarray) -> tuple[np.ndarray, float]:
-    """Refine a pose T (4, 4) to all corners; return it and the sum of squares [pixel^2]."""
+    """Refine a pose T (4, 4) to all corners; return the pose and the sum of squared distances [pixel^2]."""
     turn, shift = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3].reshape(3, 1).copy()
     turn, shift = cv2.solvePnPRefineLM(corners.points, corners.pixels, camera.K, camera.distortion, turn, shift)
     pixels = cv2.projectPoints(corners.points, turn, shift, camera.K, camera.distortion)[0].reshape(-1, 2)
@@ -153,7 +153,7 @@ def _refine_pose(camera: Camera, corners: DetectedCorners, T: np.ndarray) -> tup
 
 
 def _is_facing_camera(target: Target, corners: DetectedCorners, T: np.ndarray) -> bool:
-    """Return True if every face with corners is seen from its front, and is before the camera."""
+    """Return True if all faces with detected corners face the camera and are in front of it."""
     for number in np.unique(corners.face):
         T_camera_face = T @ target.faces[number].T_target_face
         if T_camera_face[2, 3] <= 0.0 or not is_seen_from_front(T_camera_face):
@@ -162,7 +162,7 @@ def _is_facing_camera(target: Target, corners: DetectedCorners, T: np.ndarray) -
 
 
 def _compute_covariance(camera: Camera, T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Compute the covariance (6, 6) for corners of unit variance."""
+    """Compute the pose covariance (6, 6) for corner errors of variance 1 [pixel^2]."""
     arm = points @ T[:3, :3].T
     slopes = cv2.projectPoints(arm + T[:3, 3], np.zeros(3), np.zeros(3), camera.K, camera.distortion)[1][:, 3:6]
     by_place = slopes.reshape(-1, 2, 3)
@@ -177,7 +177,7 @@ def _build_rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
 
 
 def _turn(one: np.ndarray, other: np.ndarray) -> float:
-    """Compute the angle [rad] between two poses."""
+    """Compute the rotation angle [rad] between two poses."""
     return float(compute_rotation_angles(one[:3, :3] @ other[:3, :3].T))
 
 
@@ -192,7 +192,7 @@ class TrackerSettings:
 
     search_margin: float = 0.4  # Search margin round a target's last outline, as a share of its size.
     min_search_margin: float = 32.0  # Minimum search margin round a target's last outline [pixel].
-    max_pose_age: int = 5  # Age after which a pose is not used as the start [images].
+    max_pose_age: int = 5  # Age up to which a pose is used to predict the next [images].
     search_interval: int = 3  # Interval of searches for lost targets [images].
     pose: PoseSettings = PoseSettings()
 
@@ -206,11 +206,11 @@ class TrackedTargets:
     number
         Number of the image.
     statuses
-        Result of each target.
+        Status of each target.
     poses
-        Poses of the targets that are certain.
+        Poses of the targets whose pose is certain.
     last_poses
-        The last certain pose (4, 4) of each target that had one, and the number of its image.
+        Last certain pose (4, 4) of each target, with the number of its image.
     """
 
     number: int
@@ -221,7 +221,7 @@ class TrackedTargets:
 
 @dataclass(frozen=True, eq=False)
 class Tracker:
-    """Tracker of targets in the images of one camera.
+    """Tracker of targets in successive images of one camera.
 
     Parameters
     ----------
@@ -243,12 +243,12 @@ class Tracker:
         object.__setattr__(self, "_detector", Detector(self.targets))
 
     def track(self, grey: np.ndarray, previous: TrackedTargets | None = None) -> TrackedTargets:
-        """Track the targets in an image (H, W) uint8 of the camera's size; `previous` is the previous result.
+        """Find the targets in an image (H, W) uint8 of the camera's size; `previous` is the result of the last image.
 
         Raises
         ------
         ValueError
-            An image of another size or kind.
+            The image has another size or type.
         """
         check_image_size(grey, self.camera.width, self.camera.height)
         number = 0 if previous is None else previous.number + 1
@@ -268,7 +268,7 @@ class Tracker:
     def _detect_corners(
         self, grey: np.ndarray, number: int, last: Mapping[str, tuple[np.ndarray, int]]
     ) -> dict[str, DetectedCorners]:
-        """Detect corners near the last poses, or in the whole image if just lost, and at intervals while lost."""
+        """Detect corners near the last poses; search lost targets in the whole image, at once and at intervals."""
         settings, found = self.settings, dict[str, DetectedCorners]()
         for target in self.targets:
             if target.name in last:
@@ -286,12 +286,12 @@ class Tracker:
 
 
 def check_image_size(grey: np.ndarray, width: int, height: int) -> None:
-    """Check that an image has the camera's size.
+    """Check that an image has the camera's size and 8-bit grey pixels.
 
     Raises
     ------
     ValueError
-        An image of another size or kind.
+        The image has another size or type.
     """
     if grey.shape != (height, width) or grey.dtype != np.uint8:
         raise ValueError(

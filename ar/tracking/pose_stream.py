@@ -1,4 +1,4 @@
-"""Poses of an external tracker: interpolation between samples, and the time offset of its clock."""
+"""Pose streams of an external tracker: interpolation between samples, and the time offset of its clock."""
 
 from dataclasses import dataclass
 
@@ -33,7 +33,7 @@ class ClockSettings:
 
 
 def unwrap_times(times: np.ndarray) -> np.ndarray:
-    """Unwrap times (n,) [s] of a 24-hour clock at midnight; times of other clocks are unchanged."""
+    """Add days to times (n,) [s] of a 24-hour clock after midnight; times of other clocks are unchanged."""
     back = np.diff(times) < -0.5 * DAY_SECONDS
     return times + DAY_SECONDS * np.concatenate([[0], np.cumsum(back)]) if _is_time_of_day(times) else times
 
@@ -44,19 +44,19 @@ def _is_time_of_day(times: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class PoseStream:
-    """Poses of a body in its tracker's frame.
+    """Samples of the pose of a body in its tracker's frame.
 
     Parameters
     ----------
     times
-        Times (n,) [s] of the tracker's clock, ascending.
+        Ascending times (n,) [s] on the tracker's clock.
     poses
-        (n, 4, 4) [m]: T_tracker_body.
+        Poses T_tracker_body (n, 4, 4) [m].
     covariances
-        Covariances (n, 6, 6) of translation [m] in the tracker frame and rotation [rad] about the body's origin in its
-        axes.
+        Covariances (n, 6, 6) of translation [m] and rotation [rad] about the body's origin, both in the axes of the
+        tracker frame.
     has_daily_clock
-        True if the clock restarts after 24 hours: then times are defined up to whole days.
+        True if the clock restarts after 24 hours; times are then known up to whole days.
     """
 
     times: np.ndarray
@@ -65,11 +65,11 @@ class PoseStream:
     has_daily_clock: bool = False
 
     def interpolate(self, time: float) -> Pose | None:
-        """Interpolate the pose at a time [s], with constant velocity between two samples; None if there is none.
+        """Interpolate the pose at a time [s], at constant velocity between two samples; None if not available.
 
-        Gaps longer than `MAX_GAP` are not interpolated. After a sample without a successor, the last motion is
-        extrapolated for `MAX_EXTRAPOLATION`. The covariance includes the interpolation error for a body that
-        accelerates as observed here.
+        Gaps longer than `MAX_GAP` are not interpolated. After the last sample of the stream or before such a gap, the
+        motion is extrapolated for at most `MAX_EXTRAPOLATION`. The covariance includes the interpolation error, for a
+        body that accelerates as in the neighbouring samples.
         """
         time = self.to_stream_time(time)
         first = int(np.searchsorted(self.times, time + TIME_TOLERANCE, side="right")) - 1
@@ -87,13 +87,13 @@ class PoseStream:
         return self._interpolate_pose(first, second, time)
 
     def compute_age(self, time: float) -> float:
-        """Return the time [s] since the last sample before `time`; infinite before the first."""
+        """Return the time [s] from the last sample before `time` to `time`; infinite before the first sample."""
         time = self.to_stream_time(time)
         first = int(np.searchsorted(self.times, time, side="right")) - 1
         return np.inf if first < 0 else float(time - self.times[first])
 
     def to_stream_time(self, time: float) -> float:
-        """Convert a time [s] to this stream's clock: for a 24-hour clock, to the day nearest to its samples."""
+        """Convert a time [s] to this stream's clock; a 24-hour clock gets the day nearest to the samples."""
         if not self.has_daily_clock:
             return time
         middle = 0.5 * float(self.times[0] + self.times[-1])
@@ -112,7 +112,7 @@ class PoseStream:
         return Pose(T, own + np.diag(np.repeat(bent**2, 3)), 0.0, 0)
 
     def _compute_acceleration(self, first: int, second: int) -> np.ndarray:
-        """Compute the largest acceleration (2,) round two samples, of translations [m/s^2] and rotations [rad/s^2]."""
+        """Compute the largest accelerations (2,) near two samples: translation [m/s^2], rotation [rad/s^2]."""
         low, high = max(0, first - 1), min(len(self.times), second + 2)
         times, poses = self.times[low:high], self.poses[low:high]
         steps = np.diff(times)
@@ -127,12 +127,12 @@ class PoseStream:
 
 
 def build_pose_stream(times: np.ndarray, poses: np.ndarray, covariances: np.ndarray) -> PoseStream:
-    """Build a stream from a tracker's samples; a 24-hour clock is unwrapped at midnight.
+    """Build a stream from a tracker's samples; times of a 24-hour clock are unwrapped at midnight.
 
     Raises
     ------
     ValueError
-        No sample, or times that do not ascend.
+        There are no samples, or the times do not ascend.
     """
     if not len(times):
         raise ValueError("holds no pose: record some while both bodies are seen.")
@@ -145,7 +145,7 @@ def build_pose_stream(times: np.ndarray, poses: np.ndarray, covariances: np.ndar
 
 @dataclass(frozen=True)
 class Clock:
-    """Clock offset: the tracker's time is the images' time + `offset` [s], with standard deviation `error` [s]."""
+    """Offset of clocks: tracker time = image time + `offset` [s]; `error` is the offset's standard deviation [s]."""
 
     offset: float = 0.0
     error: float = 0.0
@@ -155,15 +155,15 @@ def estimate_clock_offset(
     times: np.ndarray, positions: np.ndarray, tracker_times: np.ndarray, tracker_positions: np.ndarray,
     settings: ClockSettings = ClockSettings(),
 ) -> Clock:  # fmt: skip
-    """Estimate the time offset between a point's motion in images (n,) [s], (n, 3) [m], and by a tracker (m,), (m, 3).
+    """Estimate a tracker's clock offset from a point's motion in images (n, 3) [m] and by the tracker (m, 3) [m].
 
-    Both points may differ by a constant. The error is that of least squares, from the scatter of residuals.
+    Positions, with times [s], may differ by a constant. The error is that of least squares, from scatter of residuals.
 
     Raises
     ------
     ValueError
-        Too few images, motion that is too small, no offset with poses for all images, or two offsets that fit about as
-        well.
+        There are too few images, the motion is too small, no offset has poses for all images, or two offsets fit about
+        equally well.
     """
     if len(times) < settings.min_images:
         raise ValueError(
@@ -203,7 +203,7 @@ def _refine_offset(
     offset: float, times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray,
     settings: ClockSettings,
 ) -> tuple[Clock, float]:  # fmt: skip
-    """Refine an offset by Gauss-Newton; return it and the remaining sum of squares [m^2]."""
+    """Refine an offset by Gauss-Newton; return the clock and the remaining sum of squares [m^2]."""
     low, high = samples[0] - times[0], samples[-1] - times[-1]
     speed, off = np.zeros_like(places), np.zeros_like(places)
     for _ in range(settings.max_iterations):
@@ -226,7 +226,7 @@ def _refine_offset(
 
 
 def _compute_differences(at: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Compute differences (n, 3) of positions from those of samples at times (n,), without their mean; NaN in gaps."""
+    """Compute differences (n, 3) of interpolated samples and `places` at times (n,), minus their mean; NaN in gaps."""
     there = np.column_stack([np.interp(at, samples, column) for column in others.T])
     after = np.searchsorted(samples, at).clip(1, len(samples) - 1)
     there[samples[after] - samples[after - 1] > MAX_GAP] = np.nan

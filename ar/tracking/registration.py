@@ -1,4 +1,4 @@
-"""Registration of the scan to the patient's reference: from pairs of points and a surface, with covariance."""
+"""Registration of the scan to the patient's reference from point pairs and surface points, with covariance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MIN_PAIRS = 3  # Minimum number of pairs of points.
 LEVEL = 0.95  # Confidence level of the registration's error.
 
 Nearest = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Map from scan points (n, 3) [m] to the closest surface points (n, 3) [m] and unit normals (n, 3) there."""
+"""Function from scan points (n, 3) [m] to closest surface points (n, 3) [m] and their unit normals (n, 3)."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class RegistrationSettings:
     """Settings of `register_points`, `refine_registration` and `compute_pair_residuals`."""
 
     min_surface_points: int = 20  # Minimum number of points on the surface.
-    min_rms: float = 0.1e-3  # Lower bound of rms residuals in ratios [m]: error of a touched point.
+    min_rms: float = 0.1e-3  # Lower bound of rms residuals in ratios [m]: the error of a touched point.
     max_rms: float = 5e-3  # Largest rms residual of pairs and of surface points [m].
-    # Smallest ratio of the second to the largest spread of points: below, the points are on a line.
+    # Smallest ratio of the second to the largest spread of points; below it, the points are on a line.
     min_spread_ratio: float = 0.05
     max_size_log_ratio: float = 0.1  # Largest absolute log-ratio of the sizes of two point sets.
     min_spread: float = 5e-3  # Smallest spread of points on a head [m].
@@ -37,16 +37,16 @@ class RegistrationSettings:
 
 @dataclass(frozen=True, eq=False)
 class RegisteredScan:
-    """Scan that a registration was made for.
+    """Scan for which a registration was computed.
 
     Parameters
     ----------
     digest
-        Digest of the meshed body.
+        Digest of the scan's anatomy.
     bounds
-        (2, 3) [m]: smallest and largest coordinates of its surface in the scan.
+        Smallest and largest coordinates (2, 3) [m] of the anatomy's surface in the scan.
     target
-        (3,) [m]: centre of the displayed target.
+        Centre (3,) [m] of the displayed target.
     """
 
     digest: str
@@ -54,29 +54,29 @@ class RegisteredScan:
     target: np.ndarray
 
     def compute_distance(self, other: RegisteredScan) -> float:
-        """Compute the largest distance between two bodies' bounds and targets [m]."""
+        """Compute the largest distance [m] between bounds or targets of two scans."""
         return float(max(np.abs(self.bounds - other.bounds).max(), np.linalg.norm(self.target - other.target)))
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Pose of the scan in the frame of the patient's reference.
+    """Pose of the scan in the frame of the patient's reference, with its error.
 
     Parameters
     ----------
     T_patient_scan
-        (4, 4) [m]: maps positions in the scan, RAS, to the frame of the reference.
+        Transform (4, 4) [m] from positions in the scan, RAS, to the frame of the reference.
     covariance
-        Covariance (6, 6) of a translation in the reference's frame [m] and a rotation about `centre` in its axes [rad].
-        It is widened for few points, so that the 95 % ellipsoid by chi^2 has its nominal coverage.
+        Covariance (6, 6) of translation [m] and rotation [rad] about `centre`, both in the axes of the reference's
+        frame. It is widened for few points, so that the 95 % ellipsoid by chi^2 has its nominal coverage.
     centre
-        (3,) [m]: centroid of the points, in the scan.
+        Centroid (3,) [m] of the scan's points.
     rms
-        Root mean square residual distance [m] of the pairs.
+        Root mean square residual distance [m] of the point pairs.
     pair_count, surface_count
-        Number of pairs, and number of surface points.
+        Number of point pairs, and number of surface points.
     scan
-        Scan that the registration was made for, if known.
+        Scan for which the registration was computed; None if not known.
     """
 
     T_patient_scan: np.ndarray
@@ -88,7 +88,7 @@ class Registration:
     scan: RegisteredScan | None = None
 
     def transform_point(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return a scan position (3,) [m] in the reference's frame (3,) [m], and its covariance (3, 3) [m^2]."""
+        """Transform a scan position (3,) [m] to the reference's frame; return it and its covariance (3, 3) [m^2]."""
         T = self.T_patient_scan
         slope = np.hstack([np.eye(3), -build_cross_matrices(T[:3, :3] @ (point - self.centre))])
         return T[:3, :3] @ point + T[:3, 3], slope @ self.covariance @ slope.T
@@ -97,17 +97,17 @@ class Registration:
 def register_points(
     scan_points: np.ndarray, patient_points: np.ndarray, settings: RegistrationSettings = RegistrationSettings()
 ) -> Registration:
-    """Fit the rigid motion from points of the scan (n, 3) [m] to their positions in the reference's frame (n, 3) [m].
+    """Fit the rigid motion from scan points (n, 3) [m] to the same points (n, 3) [m] in the reference's frame.
 
     Least squares (Horn 1987, "Closed-form solution of absolute orientation using unit quaternions", J. Opt. Soc. Am. A
-    4:629-642). The covariance is that of the linear problem, as in Fitzpatrick, West, Maurer (1998), "Predicting error
-    in rigid-body point-based registration", IEEE Trans. Med. Imaging 17:694-702.
+    4:629-642). The covariance is that of the linearised problem, as in Fitzpatrick, West, Maurer (1998), "Predicting
+    error in rigid-body point-based registration", IEEE Trans. Med. Imaging 17:694-702.
 
     Raises
     ------
     ValueError
-        Fewer than three pairs, points on a line, or two sets of different size. A mirrored set, two pairs that are
-        swapped, one that fits far worse than the others, or pairs that fit no rigid motion.
+        There are fewer than three pairs, points are on a line, or the two sets differ in size; one set is mirrored, two
+        pairs are swapped, one pair fits far worse than the others, or the pairs fit no rigid motion.
     """
     _check_shape(scan_points, patient_points, settings)
     T, off = _fit_rigid(scan_points, patient_points)
@@ -122,16 +122,16 @@ def refine_registration(
     scan_points: np.ndarray, patient_points: np.ndarray, surface_points: np.ndarray, find_nearest: Nearest,
     settings: RegistrationSettings = RegistrationSettings(),
 ) -> Registration:  # fmt: skip
-    """Fit as in `register_points`, with additional `surface_points` (m, 3) [m], in the reference's frame.
+    """Fit as `register_points`, with additional `surface_points` (m, 3) [m] in the reference's frame.
 
-    Pairs (n, 3) and distances from the surface's tangent planes (Chen, Medioni 1992, "Object modelling by registration
-    of multiple range images") are weighted by their own scatter. A surface that moved since the scan biases the result.
+    Residuals of pairs, and distances from tangent planes of the surface (Chen, Medioni 1992, "Object modelling by
+    registration of multiple range images"), are weighted by their scatter. Surface motion after the scan causes bias.
 
     Raises
     ------
     ValueError
-        See `register_points`; too few points, or points that remain farther than 5 mm from the surface (root mean
-        square).
+        See `register_points`; there are too few surface points, or their root mean square distance from the surface
+        remains above 5 mm.
     """
     if len(surface_points) < settings.min_surface_points:
         raise ValueError(
@@ -171,7 +171,7 @@ def refine_registration(
 
 
 def _check_shape(scan: np.ndarray, patient: np.ndarray, settings: RegistrationSettings) -> None:
-    """Raise ValueError for points that determine no rigid motion."""
+    """Raise ValueError if the point sets do not determine a rigid motion."""
     if len(scan) < MIN_PAIRS:
         raise ValueError(f"{len(scan)} pairs are too few: touch {MIN_PAIRS} points or more, better six.")
     sizes = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (scan, patient)]
@@ -188,7 +188,7 @@ def _check_shape(scan: np.ndarray, patient: np.ndarray, settings: RegistrationSe
 
 
 def _check_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray, settings: RegistrationSettings) -> None:
-    """Raise ValueError for a mirrored set, one wrong pair among good ones, and pairs that do not fit."""
+    """Raise ValueError for a mirrored set, a single wrong pair, two swapped pairs, or pairs that do not fit."""
     rms = _compute_rms(off)
     mirrored = _compute_rms(_fit_rigid(scan * [-1.0, 1.0, 1.0], patient)[1])
     if settings.min_residual_ratio * max(mirrored, settings.min_rms) < rms:
@@ -220,7 +220,7 @@ def _check_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray, settings:
 
 
 def _compute_swapped_rms(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[int, int], float]:
-    """Compute the rms residual [m] with the patient's points of two pairs swapped, by these two pairs."""
+    """Compute rms residuals [m] after swapping the patient's points of two pairs; return each by the pairs' indices."""
     out = {}
     for pair in combinations(range(len(scan)), 2):
         other = patient.copy()
@@ -230,7 +230,7 @@ def _compute_swapped_rms(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[in
 
 
 def _fit_rigid(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit T_patient_scan (4, 4); return it and the residuals (n, 3) [m]."""
+    """Fit T_patient_scan (4, 4); return the transform and the residuals (n, 3) [m]."""
     middle, there = scan.mean(axis=0), patient.mean(axis=0)
     T = np.eye(4)
     u, _, v = np.linalg.svd((patient - there).T @ (scan - middle))
@@ -240,7 +240,7 @@ def _fit_rigid(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def compute_jacobian(T: np.ndarray, points: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Compute the Jacobian (3 n, 6) of scan positions (n, 3), in the reference, by shift and turn about `centre`."""
+    """Compute the Jacobian (3 n, 6) of transformed points (n, 3) by translation and rotation about `centre`."""
     arms = (points - centre) @ T[:3, :3].T
     return np.concatenate(
         [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -build_cross_matrices(arms)], axis=2
@@ -248,13 +248,13 @@ def compute_jacobian(T: np.ndarray, points: np.ndarray, centre: np.ndarray) -> n
 
 
 def _widen_covariance(normal: np.ndarray, freedom: int) -> np.ndarray:
-    """Compute the covariance (6, 6) of a normal matrix, widened because its scatter is estimated from few numbers."""
+    """Invert a normal matrix to a covariance (6, 6), widened as its scatter has few degrees of freedom (`freedom`)."""
     inverse = 3.0 * f.ppf(LEVEL, 3, freedom) / chi2.ppf(LEVEL, 3) * np.linalg.inv(normal)
     return 0.5 * (inverse + inverse.T)
 
 
 def _scatter(off: np.ndarray, freedom: int, settings: RegistrationSettings) -> float:
-    """Estimate the residuals' standard deviation along one axis [m], at least `RegistrationSettings.min_rms`."""
+    """Estimate the standard deviation [m] of residuals along an axis, at least `RegistrationSettings.min_rms`."""
     return max(float(np.sqrt((off**2).sum() / freedom)), settings.min_rms)
 
 
@@ -262,24 +262,24 @@ def _compute_rms(off: np.ndarray) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-FALSE_ALARM_RATE = 0.05  # False-alarm rate: share of valid point sets with a pair reported as suspect.
+FALSE_ALARM_RATE = 0.05  # Share of valid point sets in which a pair is reported as an outlier.
 
 
 @dataclass(frozen=True, eq=False)
 class PairResiduals:
-    """Residuals of n pairs of points.
+    """Residuals of n point pairs, to find an outlier.
 
     Parameters
     ----------
     residuals
-        Residual distances (n,) [m] in the registration by all pairs.
+        Residual distances (n,) [m] in the registration with all pairs.
     held_out
-        Residual distances (n,) [m] in the registration by the other pairs.
+        Residual distance (n,) [m] of each pair in the registration without this pair.
     studentised
-        `held_out` (n,) divided by its standard deviation as predicted from the others' scatter. NaN for three pairs,
-        from which scatter cannot be estimated.
+        `held_out` (n,) over its standard deviation, predicted from the other pairs' scatter; NaN for three pairs, from
+        which scatter cannot be estimated.
     p_value
-        Probability that a set without outliers has a residual as large as the largest of these; NaN for three pairs.
+        Probability that a set without outliers has a largest residual at least this large; NaN for three pairs.
     """
 
     residuals: np.ndarray
@@ -289,23 +289,23 @@ class PairResiduals:
 
     @property
     def worst_pair(self) -> int:
-        """Index of the pair that fits the other pairs worst."""
+        """Index of the pair that fits worst to the other pairs."""
         return int(np.argmax(self.held_out if np.isnan(self.studentised).any() else self.studentised))
 
     @property
     def has_outlier(self) -> bool:
-        """True if the worst pair fits worse than in all but `FALSE_ALARM_RATE` of valid sets."""
+        """True if the worst pair is an outlier, at a false-alarm rate of `FALSE_ALARM_RATE`."""
         return self.p_value < FALSE_ALARM_RATE
 
 
 def compute_pair_residuals(
     scan_points: np.ndarray, patient_points: np.ndarray, settings: RegistrationSettings = RegistrationSettings()
 ) -> PairResiduals:
-    """Compute residuals of pairs of points (n, 3) [m], in the scan and in the reference's frame.
+    """Compute the residuals of point pairs (n, 3) [m], in the scan and in the reference's frame.
 
-    Externally studentised residuals, of three coordinates each (Cook, Weisberg 1982, "Residuals and influence in
-    regression"). Their squares are F-distributed with 3 and 3 n - 9 degrees of freedom. The p-value of the worst pair
-    has a Bonferroni correction.
+    The residuals are externally studentised, with three coordinates each (Cook, Weisberg 1982, "Residuals and influence
+    in regression"). Their squares are F-distributed with 3 and 3 n - 9 degrees of freedom. The worst pair's p-value has
+    a Bonferroni correction.
 
     Raises
     ------

@@ -1,11 +1,11 @@
-"""Rotations and rigid motions as matrices: angles, axes and validation."""
+"""Rotations and rigid motions as matrices: conversions, angles, and validation."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 
 def build_cross_matrices(vectors: np.ndarray) -> np.ndarray:
-    """Build matrices (..., 3, 3) of the cross product with vectors (..., 3) from the left."""
+    """Build the matrices (..., 3, 3) of the cross product with `vectors` (..., 3) from the left."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     none = np.zeros_like(x)
     return np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*vectors.shape, 3)
@@ -17,7 +17,7 @@ def compute_rotation_angles(rotations: np.ndarray) -> np.ndarray:
 
 
 def move_rigidly(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Apply `step` (6,), a shift [m] and a rotation [rad] about T `centre` (3,) [m], to a rigid motion T (4, 4)."""
+    """Apply `step` (6,), shift [m] and rotation [rad] about the moved `centre` (3,) [m], to a motion T (4, 4)."""
     out = np.eye(4)
     out[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ T[:3, :3]
     out[:3, 3] = T[:3, :3] @ centre + T[:3, 3] + step[:3] - out[:3, :3] @ centre
@@ -25,7 +25,7 @@ def move_rigidly(T: np.ndarray, centre: np.ndarray, step: np.ndarray) -> np.ndar
 
 
 def is_rigid(T: np.ndarray, tolerance: float) -> bool:
-    """Return True if a matrix (4, 4) is a rigid motion; R^T R may differ from 1 by less than `tolerance`."""
+    """Return True if T (4, 4) is a rigid motion; entries of R^T R - 1 must be below `tolerance`."""
     if T.shape != (4, 4) or not np.isfinite(T).all() or not np.array_equal(T[3], [0.0, 0.0, 0.0, 1.0]):
         return False
     turn = T[:3, :3]
@@ -38,7 +38,7 @@ def to_rotation_vectors(rotations: np.ndarray) -> np.ndarray:
 
 
 def list_conventions(poses: np.ndarray) -> dict[str, np.ndarray]:
-    """Return poses (n, 4, 4) by convention: as given, and reinterpreted under other quaternion conventions."""
+    """Return poses (n, 4, 4) by quaternion convention: as given, and reinterpreted under other conventions."""
     read = Rotation.from_matrix(poses[:, :3, :3])
     forms = {"": read, "as w, x, y, z": Rotation.from_quat(np.roll(read.as_quat(), -1, axis=1)), "inverted": read.inv()}
     found = {how: poses.copy() for how in forms}

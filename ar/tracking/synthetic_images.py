@@ -1,4 +1,4 @@
-"""Synthetic camera images of printed targets and time stamps, for tests with known poses."""
+"""Synthetic camera images of printed targets, and time stamps in images, for tests with known poses."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,18 +17,18 @@ INK, PAPER = 25.0, 225.0  # Grey levels of black ink and white paper.
 
 
 def render_targets(image: np.ndarray, camera: Camera, targets: Sequence[tuple[Target, np.ndarray]]) -> np.ndarray:
-    """Render targets in front of an image (H, W) or (H, W, 3) uint8, sharp and evenly lit.
+    """Render targets in front of a background image (H, W) or (H, W, 3) uint8, sharp and evenly lit; return the image.
 
-    Every pixel is the mean of `SAMPLES_PER_SIDE`^2 rays, each traced through the lens to the first face that it meets.
+    Every pixel is the mean of `SAMPLES_PER_SIDE`^2 rays, traced through the lens to the first face on their way.
 
     Parameters
     ----------
     image
-        Background.
+        Background image.
     camera
         Camera with its pose in the world.
     targets
-        Targets, each with its T_world_target (4, 4).
+        Targets, each with its pose T_world_target (4, 4) [m].
     """
     own = replace(camera, T_camera_world=np.eye(4))
     placed = [
@@ -76,26 +76,26 @@ def _draw_face(face: Face) -> np.ndarray:
 
 
 def _widen_side(side: slice, size: int) -> slice:
-    """Widen a side to at least two pixels of an image with `size` pixels: fewer have no gradient."""
+    """Widen a slice to at least two pixels within `size` pixels, as a gradient needs two."""
     start = min(side.start, size - 2)
     return slice(start, max(side.stop, start + 2))
 
 
 def _compute_shifts() -> np.ndarray:
-    """Compute offsets (n, 2) of the samples of a pixel from its centre."""
+    """Compute the offsets (n, 2) [pixel] of a pixel's samples from its centre."""
     middles = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE - 0.5
     return np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
 
 
 def _sample_edge(face: Face) -> np.ndarray:
-    """Sample points (n, 3) [m] along the edge of a face's border, in its own frame."""
+    """Sample points (n, 3) [m] along the outer edge of a face's border, in the face's frame."""
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * (0.5 * face.size + BORDER_WIDTH)
     edge = np.concatenate([np.linspace(a, b, 9) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
     return np.column_stack([edge + 0.5 * face.size, np.zeros(len(edge))])
 
 
 def _sample_grey(face: Face, printed: np.ndarray, on_face: np.ndarray) -> np.ndarray:
-    """Sample grey values (...) at positions (..., 2) [m] of a `printed` face, NaN outside its border."""
+    """Sample grey levels (...) at positions (..., 2) [m] on the `printed` image of a face; NaN outside its border."""
     pixels = (on_face * (TEXTURE_PIXELS / face.square) - 0.5).astype(np.float32)
     paper = cv2.remap(
         printed, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=255.0
@@ -113,17 +113,17 @@ TIME_UNIT = 1e-4  # Unit of the time [s].
 CHECK_BITS = 8  # Number of bits of the time's checksum.
 CELL_COUNT = len(START_CELLS) + TIME_BITS + CHECK_BITS  # Number of cells of a strip.
 STRIP_WIDTH = CELL_SIDE * CELL_COUNT
-"""Width of a strip [pixel]."""
+"""Width of a time stamp's strip of cells [pixel]."""
 MAX_BLACK, MIN_WHITE = 90.0, 165.0  # Grey levels below which a cell is black, and above which it is white.
 
 
 def stamp_time(image: np.ndarray, time: float) -> np.ndarray:
-    """Return a copy of an image (H, W, 3) or (H, W) uint8 with a time [s] in its upper right corner.
+    """Return a copy of an image (H, W, 3) or (H, W) uint8 with a time stamp [s] in its upper right corner.
 
     Raises
     ------
     ValueError
-        A time that is negative or longer than five days, or an image that is too narrow.
+        The time is negative or longer than five days, or the image is too small.
     """
     count = round(time / TIME_UNIT) if np.isfinite(time) else -1
     if not 0 <= count < 2**TIME_BITS:
@@ -140,7 +140,7 @@ def stamp_time(image: np.ndarray, time: float) -> np.ndarray:
 
 
 def read_time_stamp(grey: np.ndarray) -> float | None:
-    """Read the time [s] in the upper right corner of an image (H, W) uint8; None if there is none, or a damaged one."""
+    """Read the time stamp [s] in the upper right corner of an image (H, W) uint8; None if missing or damaged."""
     if grey.shape[0] < CELL_SIDE or grey.shape[1] < STRIP_WIDTH:
         return None
     cells = grey[CELL_BORDER : CELL_SIDE - CELL_BORDER, -STRIP_WIDTH:].reshape(
@@ -164,5 +164,5 @@ def _from_bits(bits: list[int]) -> int:
 
 
 def _check(count: int) -> int:
-    """Compute an 8-bit checksum of a time: bytes weighted by odd numbers, so that swapped bytes are detected."""
+    """Compute an 8-bit checksum of a time: bytes are weighted by different odd numbers, which detects swapped bytes."""
     return (0xA5 + sum((2 * k + 3) * byte for k, byte in enumerate(count.to_bytes(TIME_BITS // 8, "big")))) % 256

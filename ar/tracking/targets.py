@@ -1,7 +1,7 @@
-"""Printed targets: the tool's cube, the patient's reference, the calibration board; and their corners in an image.
+"""Printed targets (tool cube, patient reference, calibration board), and detection of their corners in an image.
 
-Every face is a ChArUco board of odd by odd squares, whose corners are those of a chessboard. OpenCV's error is a
-tenth of a pixel for them, and a fifth for the markers' own corners, which are always detected too far inwards.
+Every face is a ChArUco board with odd numbers of squares; its corners are the inner corners of the chessboard. OpenCV
+detects these with an error of 0.1 pixel. The error of the markers' own corners is 0.2 pixel, biased inwards.
 """
 
 from collections.abc import Sequence
@@ -16,26 +16,26 @@ from ..optics.camera import Camera
 MARKER_DICTIONARY = cv2.aruco.DICT_4X4_250  # ArUco dictionary of the targets.
 MARKER_RATIO = 0.75  # Side of a marker as a share of its square.
 Window = tuple[slice, slice]
-"""Rows and columns of an image, with start and stop."""
-# Smallest and largest width of the adaptive threshold's window [pixel], for all and for known targets.
+"""Rows and columns of an image part, as slices with start and stop."""
+# Smallest and largest width of the adaptive threshold's window [pixel]: for searching, and for tracking.
 SEARCH_WINDOWS, TRACKING_WINDOWS = (5, 25), (15, 15)
 MIN_PART_SIDE = 16  # Smallest side of an image part that can hold a marker [pixel].
 
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """One printed face: a chessboard with a marker in every second square.
+    """Printed face of a target: a chessboard with a marker in every second square.
 
     Parameters
     ----------
     columns, rows
-        Squares, both odd.
+        Numbers of squares, both odd.
     square
         Side of a square [m].
     first_marker
-        Number of its first marker in the dictionary; the others follow.
+        Number of the face's first marker in the dictionary; the other numbers follow.
     T_target_face
-        (4, 4): the face's frame has its origin in the upper left corner, x to the right, y down, z into the target.
+        Pose (4, 4) [m] of the face; its frame has its origin in the upper left corner, x right, y down, z inwards.
     """
 
     columns: int
@@ -46,17 +46,17 @@ class Face:
 
     @property
     def ids(self) -> np.ndarray:
-        """Numbers of its markers (n,)."""
+        """Numbers (n,) of the face's markers in the dictionary."""
         return self.first_marker + np.arange(self.columns * self.rows // 2)
 
     @property
     def size(self) -> np.ndarray:
-        """Width and height (2,) [m]."""
+        """Width and height (2,) [m] of the chessboard."""
         return self.square * np.array([self.columns, self.rows])
 
     @cached_property
     def board(self) -> cv2.aruco.CharucoBoard:
-        """ChArUco board as an object of OpenCV, in metres."""
+        """ChArUco board as an OpenCV object, in metres."""
         dictionary = cv2.aruco.getPredefinedDictionary(MARKER_DICTIONARY)
         return cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.square, MARKER_RATIO * self.square, dictionary, self.ids
@@ -64,18 +64,18 @@ class Face:
 
     @cached_property
     def corners(self) -> np.ndarray:
-        """Inner corners of the chessboard in the target's frame (n, 3) [m], in OpenCV's order."""
+        """Inner corners (n, 3) [m] of the chessboard in the target's frame, in OpenCV's order."""
         own = np.asarray(self.board.getChessboardCorners(), np.float64).reshape(-1, 3)
         return own @ self.T_target_face[:3, :3].T + self.T_target_face[:3, 3]
 
     @property
     def outline(self) -> np.ndarray:
-        """Four corners in the target's frame (4, 3) [m], clockwise in the image, from the upper left one."""
+        """Outer corners (4, 3) [m] of the chessboard in the target's frame, clockwise from the upper left one."""
         own = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]])
         return (own * [*self.size, 1.0]) @ self.T_target_face[:3, :3].T + self.T_target_face[:3, 3]
 
     def draw(self, square_pixels: int) -> np.ndarray:
-        """Draw the print (H, W) uint8, `square_pixels` along each side of a square, which are a multiple of 8."""
+        """Draw the face (H, W) uint8, with `square_pixels` along a square's side, which must be a multiple of 8."""
         return np.asarray(
             self.board.generateImage((square_pixels * self.columns, square_pixels * self.rows), marginSize=0)
         )
@@ -83,14 +83,14 @@ class Face:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Rigid body with printed faces.
+    """Rigid body with printed faces, whose pose a camera can determine.
 
     Parameters
     ----------
     name
-        Name in files and messages.
+        Name of the target in files and messages.
     faces
-        Faces, each with its own markers.
+        Faces of the target, each with its own markers.
     """
 
     name: str
@@ -98,12 +98,12 @@ class Target:
 
     @property
     def outline(self) -> np.ndarray:
-        """Corners of all faces in the target's frame (n, 3) [m]."""
+        """Outer corners (n, 3) [m] of all faces in the target's frame."""
         return np.concatenate([face.outline for face in self.faces])
 
 
 def is_seen_from_front(T_camera_face: np.ndarray) -> bool:
-    """Return True if a face at a pose (4, 4) turns its print to the camera."""
+    """Return True if the camera sees the printed side of a face with pose `T_camera_face` (4, 4)."""
     return bool(T_camera_face[:3, 2] @ T_camera_face[:3, 3] > 0.0)
 
 
@@ -114,10 +114,10 @@ TIP_DISTANCE = 150e-3  # Distance of the tool's tip from the centre of its cube 
 
 @lru_cache
 def build_tool_cube() -> Target:
-    """Build a cube of three faces, 48 mm wide with borders; its frame has its origin in the centre, z along the shaft.
+    """Build the tool's cube, 48 mm wide, with three faces; its frame has its origin in the centre, z along the shaft.
 
-    The faces look along +x, +y and +z, so that a camera before the corner between them sees all three. The tool's tip
-    is nominally at (0, 0, -150) mm.
+    The faces point along +x, +y and +z, so that a camera opposite their common corner sees all three. The tool's tip is
+    nominally at (0, 0, -150) mm.
     """
     half, wide = 2.5 * CUBE_SQUARE, 2.5 * CUBE_SQUARE + BORDER_WIDTH
     # Columns: right and down of a face as it is seen from outside, and into the cube.
@@ -137,33 +137,33 @@ def build_tool_cube() -> Target:
 
 @lru_cache
 def build_patient_reference() -> Target:
-    """Build a plate of 60 mm to be fixed next to the craniotomy; its frame is the face's own, z into the plate."""
+    """Build the patient's reference, a plate of 60 mm to fix next to the craniotomy; its frame is that of its face."""
     return Target("patient", (Face(5, 5, 12e-3, 36, np.eye(4)),))
 
 
 @lru_cache
 def build_calibration_board() -> Target:
-    """Build a board of 9 x 7 squares of 24 mm, which fits A4; its frame is the face's own."""
+    """Build the calibration board of 9 x 7 squares of 24 mm, which fits on A4; its frame is that of its face."""
     return Target("board", (Face(9, 7, 24e-3, 48, np.eye(4)),))
 
 
 def list_targets() -> tuple[Target, Target, Target]:
-    """Build the tool's cube, the patient's reference and the calibration board."""
+    """Return the tool's cube, the patient's reference and the calibration board."""
     return build_tool_cube(), build_patient_reference(), build_calibration_board()
 
 
 @dataclass(frozen=True, eq=False)
 class DetectedCorners:
-    """Detected corners of one target.
+    """Corners of one target that were detected in an image.
 
     Parameters
     ----------
     points
-        Points (n, 3) [m] in the target's frame.
+        Corners (n, 3) [m] in the target's frame.
     pixels
-        Detected positions (n, 2).
+        Detected positions (n, 2) [pixel] of these corners.
     face
-        Number of the face (n,) of each corner.
+        Index (n,) of the face that each corner belongs to.
     """
 
     points: np.ndarray
@@ -173,7 +173,7 @@ class DetectedCorners:
 
 @dataclass(frozen=True, eq=False)
 class Detector:
-    """Detector of targets' corners. Markers are detected once; each face's corners follow from its own.
+    """Detector of target corners in images: markers are detected once, and give the corners of each face.
 
     Parameters
     ----------
@@ -202,9 +202,9 @@ class Detector:
         object.__setattr__(self, "_boards", boards)
 
     def detect(self, grey: np.ndarray, names: Sequence[str] = ()) -> dict[str, DetectedCorners]:
-        """Detect corners in an image (H, W) uint8, by the target's name; targets without visible corners are left out.
+        """Detect corners in an image (H, W) uint8; return them by target name, without targets that are not visible.
 
-        Only targets of these `names` are detected; without names, all.
+        Only targets with the given `names` are detected; without names, all targets.
         """
         corners, known = _detect_markers(self._thorough, self.targets, np.ascontiguousarray(grey))
         wanted = [target for target in self.targets if not names or target.name in names]
@@ -212,7 +212,7 @@ class Detector:
         return {name: each for name, each in found.items() if len(each.points)}
 
     def detect_in_window(self, target: Target, grey: np.ndarray, window: Window) -> DetectedCorners | None:
-        """Detect corners of one target in a window of an image (H, W) uint8, if any: faster, with one threshold."""
+        """Detect a target's corners in a window of an image (H, W) uint8, faster than `detect`; None without any."""
         part = np.ascontiguousarray(grey[window])
         if min(part.shape) < MIN_PART_SIDE:
             return None
@@ -222,7 +222,7 @@ class Detector:
     def _interpolate_corners(
         self, target: Target, grey: np.ndarray, markers: np.ndarray, ids: np.ndarray
     ) -> DetectedCorners:
-        """Interpolate the chessboards' corners of a target between its markers, (n, 1, 4, 2) of numbers (n,)."""
+        """Interpolate a target's chessboard corners from its markers' corners (n, 1, 4, 2) with numbers `ids` (n,)."""
         points, pixels, on = [np.zeros((0, 3))], [np.zeros((0, 2))], [np.zeros(0, int)]
         for number, face in enumerate(target.faces):
             mine = np.isin(ids, face.ids)
@@ -240,9 +240,9 @@ class Detector:
 
 
 def find_window(camera: Camera, points: np.ndarray, relative_margin: float, min_margin: float) -> Window | None:
-    """Return rows and columns round points (n, 3) [m] in a camera's frame; None if they are out of view.
+    """Return the image part round points (n, 3) [m] in the camera's frame; None if they are out of view.
 
-    The margin is `relative_margin` x their extent, at least `min_margin` pixels. The camera is at the world's origin.
+    The margin is `relative_margin` x the points' extent, at least `min_margin` pixels. The camera is at the origin.
     """
     pixels = camera.project(points)[0]
     pixels = pixels[~np.isnan(pixels).any(axis=1)]
@@ -258,25 +258,25 @@ def find_window(camera: Camera, points: np.ndarray, relative_margin: float, min_
 def _detect_markers(
     detector: cv2.aruco.ArucoDetector, targets: Sequence[Target], grey: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Detect corners (n, 1, 4, 2) [pixel] of markers in an image, and their numbers (n,)."""
+    """Detect markers in an image; return their corners (n, 1, 4, 2) [pixel] and their numbers (n,)."""
     corners, ids, _ = detector.detectMarkers(grey)
     which = np.zeros(0, int) if ids is None else np.asarray(ids, int).reshape(-1)
     return np.asarray(corners, np.float32).reshape(-1, 1, 4, 2), _list_numbers(targets)[which]
 
 
 def _list_numbers(targets: Sequence[Target]) -> np.ndarray:
-    """Return the marker numbers (n,) of targets, sorted."""
+    """Return the sorted marker numbers (n,) of targets."""
     return np.sort(np.concatenate([face.ids for target in targets for face in target.faces]))
 
 
 def _build_dictionary(targets: Sequence[Target]) -> cv2.aruco.Dictionary:
-    """Return a dictionary of the targets' markers alone: comparing candidates with each takes most of the time."""
+    """Return a dictionary with only the targets' markers, because comparing with each marker takes most of the time."""
     whole = cv2.aruco.getPredefinedDictionary(MARKER_DICTIONARY)
     return cv2.aruco.Dictionary(whole.bytesList[_list_numbers(targets)], whole.markerSize)
 
 
 def _build_parameters(least: int, most: int) -> cv2.aruco.DetectorParameters:
-    """Build detector parameters with threshold windows of two widths [pixel], or of one."""
+    """Build detector parameters with the threshold window widths `least` and `most` [pixel]."""
     found = cv2.aruco.DetectorParameters()
     found.adaptiveThreshWinSizeMin, found.adaptiveThreshWinSizeMax = least, most
     found.adaptiveThreshWinSizeStep = max(most - least, 1)

@@ -1,4 +1,4 @@
-"""Calibration of a tracker: hand-eye calibration of its camera, and pivot calibration of a tool's tip."""
+"""Calibration of a tracker: hand-eye calibration of a camera, and pivot calibration of a tool's tip."""
 
 from dataclasses import dataclass
 
@@ -19,32 +19,32 @@ class HandEyeSettings:
     """Settings of `solve_hand_eye`."""
 
     min_poses: int = 4  # Minimum number of pairs of poses.
-    # Smallest rotation of a motion that is used [rad]: the axis of a smaller one is uncertain.
+    # Smallest rotation of a motion that is used [rad]; the axis of a smaller rotation is uncertain.
     min_turn: float = np.radians(8.0)
-    # Largest rotation of a motion that is used [rad]: near pi, the sign of its axis is uncertain.
+    # Largest rotation of a motion that is used [rad]; near pi the sign of its axis is uncertain.
     max_turn: float = np.radians(170.0)
     # Smallest root mean square angle of the axes from their closest common axis [rad].
     min_axis_spread: float = np.radians(8.0)
     max_motions: int = 2000  # Maximum number of motions, the largest first.
-    max_poses: int = 300  # Maximum number of poses whose pairs are all examined, spread evenly over all.
+    max_poses: int = 300  # Maximum number of poses, evenly spread, of which all pairs are examined.
 
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """Pose of the second body in the first.
+    """Result of a hand-eye calibration: pose of the second body in the first.
 
     Parameters
     ----------
     X
-        (4, 4): x_first = X x_second [m].
+        Transform (4, 4) [m]: x_first = X x_second.
     rotation_error, translation_error
-        Root mean square residuals of the motions: angle [rad] and distance [m] between A X and X B.
+        Root mean square over motions of the angle [rad] and of the distance [m] between A X and X B.
     motion_count
         Number of motions used.
     axis_spread
         Root mean square angle [rad] of the motions' axes from their closest common axis.
     distances
-        Root mean square (n,) `translation_error` of the motions from and to each pose [m]; 0 for poses without any.
+        Root mean square translation residuals (n,) [m] of the motions from and to each pose; 0 without motions.
     """
 
     X: np.ndarray
@@ -56,7 +56,7 @@ class HandEye:
 
     @property
     def misfit(self) -> str:
-        """Description of residuals and their limits; empty within the limits."""
+        """Description of residuals above their limits; empty if both are within their limits."""
         if self.rotation_error <= MAX_RESIDUAL_TURN and self.translation_error <= MAX_RESIDUAL_SHIFT:
             return ""
         angle, distance = np.degrees(self.rotation_error), 1e3 * self.translation_error
@@ -65,15 +65,15 @@ class HandEye:
 
 
 def solve_hand_eye(poses_a: np.ndarray, poses_b: np.ndarray, settings: HandEyeSettings = HandEyeSettings()) -> HandEye:
-    """Compute X with A X = X B for all motions A and B of two bodies, given by poses (n, 4, 4) [m] in their trackers.
+    """Compute X with A X = X B for all motions A and B of two bodies, from their poses (n, 4, 4) [m] in their trackers.
 
-    Motions lead from pose i to pose j: A = P_i^-1 P_j of the first, B = Q_i^-1 Q_j of the second. Daniilidis (1999),
+    Between poses i and j, the first body's motion is A = P_i^-1 P_j, the second's B = Q_i^-1 Q_j. Daniilidis (1999),
     "Hand-eye calibration using dual quaternions", equations 31 to 38: X is in the null space of a 6 m x 8 matrix.
 
     Raises
     ------
     ValueError
-        Different numbers of poses, too few, too small rotations, or axes that are all parallel.
+        The numbers of poses differ, there are too few poses, rotations are too small, or all axes are parallel.
     """
     if len(poses_a) != len(poses_b):
         raise ValueError(f"{len(poses_a)} and {len(poses_b)} poses: give both bodies' poses at the same times.")
@@ -102,7 +102,7 @@ def solve_hand_eye(poses_a: np.ndarray, poses_b: np.ndarray, settings: HandEyeSe
 def _select_motions(
     first: np.ndarray, second: np.ndarray, settings: HandEyeSettings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Select motions of both bodies (m, 4, 4) with the largest rotations, and the poses (2, m) that they connect."""
+    """Select the motions (m, 4, 4) of both bodies with the largest rotations; return also their pose indices (2, m)."""
     kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), settings.max_poses)).round().astype(int))
     start, end = np.triu_indices(len(kept), 1)
     A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
@@ -118,7 +118,7 @@ def _select_motions(
 
 
 def to_dual_quaternions(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Convert rigid motions (n, 4, 4) to real and dual parts (n, 4), scalars first and >= 0; the dual is t q / 2."""
+    """Convert rigid motions (n, 4, 4) to dual quaternions: real and dual parts (n, 4), real scalars first and >= 0."""
     R = T[:, :3, :3]
     # Bar-Itzhack (2000), "New method for extracting the quaternion": an eigenvector, whatever the angle.
     N = np.empty((len(T), 4, 4))
@@ -132,14 +132,14 @@ def to_dual_quaternions(T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _multiply_quaternions(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Multiply quaternions (..., 4), scalars first."""
+    """Multiply quaternions (..., 4) with the scalar first."""
     scalar = p[..., :1] * q[..., :1] - (p[..., 1:] * q[..., 1:]).sum(axis=-1, keepdims=True)
     vector = p[..., :1] * q[..., 1:] + q[..., :1] * p[..., 1:] + np.cross(p[..., 1:], q[..., 1:])
     return np.concatenate([scalar, vector], axis=-1)
 
 
 def _solve_transform(a: np.ndarray, a_dual: np.ndarray, b: np.ndarray, b_dual: np.ndarray) -> np.ndarray:
-    """Solve for X (4, 4) from real and dual parts (m, 4) of motions."""
+    """Solve for X (4, 4), given real and dual parts (m, 4) of both bodies' motions."""
     rows = np.zeros((len(a), 6, 8))
     for place, one, other in ((0, a, b), (3, a_dual, b_dual)):
         rows[:, place : place + 3, 0] = (one - other)[:, 1:]
@@ -178,22 +178,22 @@ MAX_RMS = 3e-3
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """Calibrated tip.
+    """Result of a pivot calibration: tip of a tool.
 
     Parameters
     ----------
     tip
-        Tip (3,) [m] in the tool's frame.
+        Position (3,) [m] of the tip in the tool's frame.
     centre
-        Pivot point (3,) [m] in the frame of the poses.
+        Position (3,) [m] of the fixed pivot point in the tracker's frame.
     covariance
-        Covariance (6, 6) of tip and centre [m^2].
+        Joint covariance (6, 6) [m^2] of `tip` and `centre`.
     rms
         Root mean square distance [m] between the centre and the tip at each pose.
     tilt
-        Root mean square rotation angle [rad] of the direction in the tool that rotated least.
+        Root mean square rotation angle [rad] of the direction in the tool with the least rotation.
     distances
-        Distances (n,) between the centre and the tip at each pose [m].
+        Distance (n,) [m] between the centre and the tip for each pose.
     """
 
     tip: np.ndarray
@@ -205,21 +205,21 @@ class Pivot:
 
     @property
     def misfit(self) -> str:
-        """Description of the residual and its limit; empty within the limit."""
+        """Description of a residual above its limit; empty if it is within the limit."""
         if self.rms <= MAX_RMS:
             return ""
         return f"the tip moves by {1e3 * self.rms:.1f} mm (rms): at most {1e3 * MAX_RMS:.0f} mm are required"
 
 
 def calibrate_pivot(poses: np.ndarray) -> Pivot:
-    """Compute the tip from poses of the tool (n, 4, 4) [m], x_world = T x_tool: all R_i tip + p_i coincide.
+    """Compute the tip from poses T (n, 4, 4) [m] of a tool, x_world = T x_tool, so that all R_i tip + p_i coincide.
 
-    Algebraic least squares. Yaniv (2015), "Which pivot calibration?", the one-step method: R_i tip - centre = -p_i.
+    Algebraic least squares: the one-step method of Yaniv (2015), "Which pivot calibration?", R_i tip - centre = -p_i.
 
     Raises
     ------
     ValueError
-        Too few poses, or too little rotation.
+        There are too few poses, or the tool rotates too little.
     """
     count = len(poses)
     if count < MIN_PIVOT_POSES:

@@ -1,1 +1,1 @@
-"""Sampled loads, their FEM results, and the files that store both."""
+"""Data sets: sampled loads, their FEM results, and the files that store both."""

@@ -1,4 +1,4 @@
-"""Descriptions of the arrays of a data set, stored as attributes, so that the file is readable without this project."""
+"""Descriptions of a data set's arrays, stored as HDF5 attributes, so that other programs can read the file."""
 
 from dataclasses import dataclass
 
@@ -25,14 +25,14 @@ CHECKSUM_MEANING = (  # Meaning of the checksums.
 
 @dataclass(frozen=True)
 class ArrayInfo:
-    """Unit, axes in order with ; between, and meaning of an array; vectors and points are in the frame RAS."""
+    """Description of an array: unit, names of its axes in order (separated by ;), and meaning. Vectors are in RAS."""
 
     unit: str
     axes: str
     text: str
 
     def write_to(self, array: h5py.Dataset) -> None:
-        """Write the description to an array's attributes."""
+        """Write the description to the attributes of an HDF5 array."""
         array.attrs.update(unit=self.unit, axes=self.axes, meaning=self.text)
         if "RAS" in self.axes:
             array.attrs["frame"] = "RAS"
@@ -90,7 +90,7 @@ MEANINGS = {  # Meanings of all arrays, by their path in the file.
 
 
 def describe_arrays(file: h5py.File) -> None:
-    """Write the description of every array and group to its attributes."""
+    """Write the descriptions of all arrays and groups to their attributes in the file."""
     for name, text in GROUP_DESCRIPTIONS.items():
         file.require_group(name).attrs["meaning"] = text
 

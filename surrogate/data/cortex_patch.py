@@ -1,4 +1,4 @@
-"""Open cortex as a surface for sampling: areas, inward normals, and the edge that a footprint must not cross."""
+"""Open cortex as a surface for sampling: areas, inward normals, and the edge that no footprint may cross."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def build_barycentric_lattice(subdivisions: int) -> np.ndarray:
-    """Compute corner coordinates (n^2, 3) of the centres of a triangle's equal pieces, n `subdivisions` an edge."""
+    """Compute barycentric coordinates (n^2, 3) of the centres of n^2 equal subtriangles; n is `subdivisions`."""
     upright = [(i + 1.0 / 3.0, j + 1.0 / 3.0) for i in range(subdivisions) for j in range(subdivisions - i)]
     turned = [(i + 2.0 / 3.0, j + 2.0 / 3.0) for i in range(subdivisions - 1) for j in range(subdivisions - 1 - i)]
     share = np.array(upright + turned) / subdivisions
@@ -29,16 +29,16 @@ def build_barycentric_lattice(subdivisions: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Triangles of `Anatomy.open_surface`.
+    """Open cortex: the triangles of `Anatomy.open_surface`.
 
     Parameters
     ----------
     nodes
-        Sorted mesh vertices (m,) of the patch: those that a footprint inside it loads.
+        Sorted mesh vertices (m,) of the patch, which are those that a footprint inside the patch loads.
     triangles
-        Triangles (S, 3) of positions in `nodes`, oriented outwards.
+        Triangles (S, 3) as indices into `nodes`, oriented outwards.
     points
-        Positions (m, 3) [m], RAS.
+        Positions (m, 3) [m] of `nodes`, RAS.
     """
 
     nodes: np.ndarray
@@ -52,12 +52,12 @@ class Patch:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """Unit inward normals (m, 3) at the nodes, area-weighted."""
+        """Area-weighted unit inward normals (m, 3) at the nodes."""
         return -compute_vertex_normals(self.points, self.triangles)
 
     @cached_property
     def contact_surface(self) -> ContactSurface:
-        """Contact surface of the patch."""
+        """Contact surface of the patch, on the CPU, for footprints and nearest points."""
         # Warp is imported only for pressing tools, not for reading a model.
         from sim.discretisation.footprint import ContactSurface
         from sim.runtime.device import find_device
@@ -66,15 +66,15 @@ class Patch:
 
     @cached_property
     def boundary_edges(self) -> np.ndarray:
-        """Edges (E, 2, 3) [m] that belong to one triangle only."""
+        """End points (E, 2, 3) [m] of the edges that belong to one triangle only."""
         return find_border_edges(self.points, self.triangles)
 
     def compute_edge_distance(self, points: np.ndarray) -> np.ndarray:
-        """Compute distances (B,) [m] from `points` (B, 3) to the edge."""
+        """Compute the distances (B,) [m] of `points` (B, 3) from the patch's edge."""
         return compute_edge_distances(self.boundary_edges, points)
 
     def place_points(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Map uniform numbers (n, 3) to points (n, 3) [m], uniform by area, and their unit inward normals (n, 3)."""
+        """Map uniform random numbers (n, 3) to area-uniform points (n, 3) [m] and their unit inward normals (n, 3)."""
         total = np.cumsum(self.areas)
         triangle = self.triangles[np.searchsorted(total, uniform[:, 0] * total[-1], side="right")]
         root = np.sqrt(uniform[:, 1])
@@ -83,11 +83,11 @@ class Patch:
         return point, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def find_normals(self, points: np.ndarray) -> np.ndarray:
-        """Return unit inward normals (B, 3) of the patch nodes nearest to `points` (B, 3) [m]."""
+        """Return the unit inward normals (B, 3) at the nodes nearest to `points` (B, 3) [m]."""
         return take_rows(compute_squared_distances(points, self.points).argmin(axis=1), self.normals)
 
     def compute_coverage(self, centres: np.ndarray, radius: float) -> float:
-        """Compute the area share within `radius` [m] of one of the `centres` (k, 3) [m], by 16 points a triangle."""
+        """Compute the area share within `radius` [m] of any of the `centres` (k, 3) [m], by 16 points a triangle."""
         share = build_barycentric_lattice(4)
         samples = np.einsum("qc,scx->sqx", share, self.points[self.triangles])
         inside = find_nearest(samples.reshape(-1, 3), centres)[1].reshape(len(samples), -1) <= radius
@@ -100,7 +100,7 @@ def open_patch(anatomy: Anatomy) -> Patch:
     Raises
     ------
     InputError
-        A craniotomy without a whole triangle.
+        No triangle of the surface is completely inside the craniotomy.
     """
     if not len(anatomy.open_surface):
         raise InputError("the anatomy has no open cortex for a tool to touch: make one with a wider --craniotomy.")
@@ -109,6 +109,6 @@ def open_patch(anatomy: Anatomy) -> Patch:
 
 
 def find_nearest(points: np.ndarray, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest of the `sites` (n, 3) to each of the `points` (B, 3): its number (B,), and its distance (B,)."""
+    """Return index (B,) and distance (B,) of the nearest of the `sites` (n, 3) to each of the `points` (B, 3)."""
     squared = compute_squared_distances(points, sites)
     return squared.argmin(axis=1), np.sqrt(squared.min(axis=1))

@@ -1,10 +1,10 @@
 """Data sets: loads, the displacement of every vertex, and their provenance. HDF5, SI units, RAS.
 
-Layout: `anatomy/` the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/`, each with `displacement`
-(n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` belongs to `loads/`. `unit/` holds
-the small-strain response [m/N] to a unit force at every node `unit/node` of the open cortex, along x, then y, then z.
-Data of poses have no `unit/`, but `answers/reaction` (n, tools, 6), which older files lack. Attributes of each array
-describe it (`array_meanings`).
+Layout: `anatomy/` has the body; `loads/CAUSE/` the arrays of each cause; `answers/` and `unit/` have the arrays
+`displacement` (n, V, 3) float32 [m], `outcome`, `iterations`, `residual`, `checksum`. `answers/` has a result for each
+load. `unit/` has small-strain responses [m/N] to a unit force at every node `unit/node` of the open cortex, along x,
+then y, then z. Data of poses have no `unit/`, but `answers/reaction` (n, tools, 6), which older files lack. Each array
+has attributes that describe it (`array_meanings`).
 """
 
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ CAUSES: dict[str, type[Cause]] = {  # Types of loads that a data set may contain
     kind.__name__: kind for kind in (Pushed, Displaced, Nodal, Prescribed, Posture, Touching)
 }
 FORMAT = "sulcus data 2"  # Name and version of the file format.
-OLD_FORMAT = "sulcus data 1"  # Format without checksums, with flags of the finished rows: can be read, but not resumed.
+OLD_FORMAT = "sulcus data 1"  # Format with flags of finished rows instead of checksums: can be read, not resumed.
 MESH = ("nodes", "tets", "region", "middles")  # Names of a mesh's arrays; linear meshes have no `middles`.
 CONDITIONS = ("held", "slide_normal", "craniotomy")  # Names of the boundary conditions; `held`: `Anatomy.fixed`.
 SEAL_ATTRIBUTE = "digest of these attributes"  # Attribute that contains the hash of all other texts.
@@ -44,30 +44,30 @@ REMEDY = "Make it with `sulcus simulate`."  # Remedy in error messages.
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Finished data set; displacements stay in the file until they are read.
+    """Finished data set; displacements remain in the file until they are read.
 
     Parameters
     ----------
     path
-        HDF5 file.
+        HDF5 file of the data set.
     anatomy
-        Anatomy that was deformed.
+        Anatomy of the simulation.
     loads
-        n load cases.
+        Loads of n load cases.
     outcome
-        n outcomes; the rows of failed cases hold no equilibrium under the whole load.
+        Outcomes of the n cases; displacements of failed cases are not an equilibrium under the whole load.
     iterations, residual
-        Iterations and residual of each load (n,).
+        Solver iterations and final residual of each case (n,).
     unit_good
-        (3 m,) bool: the unit responses that converged.
+        Mask (3 m,) of the unit responses that converged.
     provenance
         Effects, accuracy, preset, seed, versions: as text.
 
     Raises
     ------
     InputError
-        Columns of another length than the loads, residuals of good cases that are not positive numbers, an invalid
-        tool.
+        A column has another length than the loads, a residual of a converged case is not a finite number >= 0, or the
+        tool is invalid.
     """
 
     path: Path
@@ -101,16 +101,16 @@ class Dataset:
 
     @cached_property
     def tool(self) -> BuiltIn | None:
-        """Tool of the poses; None for pushes."""
+        """Tool whose poses are the loads; None for pushes."""
         return read_tool_statement(self.provenance.get("shape"), self.provenance.get("ball"))
 
     @property
     def good(self) -> np.ndarray:
-        """(n,) bool: the cases that converged."""
+        """Mask (n,) of the load cases that converged."""
         return np.array([outcome.good for outcome in self.outcome], bool)
 
     def estimate_seconds(self, each: str, count: int) -> float | None:
-        """Return the time of `count` solves of `each` kind, "load" or "unit response" [s]; None if not recorded."""
+        """Return the time [s] of `count` solves of a kind, "load" or "unit response"; None if not recorded."""
         try:
             found = count * float(self.provenance[f"seconds a {each}"])
         except (KeyError, ValueError):
@@ -123,19 +123,19 @@ class Dataset:
         Raises
         ------
         InputError
-            Damaged rows, or impossible displacements.
+            Rows are damaged, or displacements are impossibly large.
         """
         return self._read_rows("answers", nodes, self.good, 1.0)
 
     def read_reaction(self) -> np.ndarray | None:
-        """Read the force [N] and moment [N m] that each tool exerts, (n, tools, 6); None if not available.
+        """Read each tool's force on the body [N] and its moment [N m] (n, tools, 6); None if not available.
 
-        They are missing for pushes, in files of earlier versions, and from deformers that do not compute them.
+        Reactions are not available for pushes, in older files, and from deformers that do not compute them.
 
         Raises
         ------
         InputError
-            Damaged rows.
+            Rows are damaged.
         """
         with wrap_errors(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
             if "answers/reaction" not in file:
@@ -151,7 +151,7 @@ class Dataset:
         return found if np.isfinite(found[self.good]).all() else None
 
     def compute_unit_response(self, nodes: np.ndarray) -> np.ndarray:
-        """Read small-strain responses (3 m, k, 3) float32 [m/N] of the vertices `nodes` (k,).
+        """Read the small-strain responses (3 m, k, 3) float32 [m/N] of the vertices `nodes` (k,) to unit forces.
 
         Raises
         ------
@@ -161,7 +161,7 @@ class Dataset:
         return self._read_rows("unit", nodes, self.unit_good, CHECK_FORCE)
 
     def _read_rows(self, group: str, nodes: np.ndarray, good: np.ndarray, force: float) -> np.ndarray:
-        """Read some vertices' displacements, and check that `good` rows move less than possible under a `force`."""
+        """Read displacements of `nodes`; check that `good` rows move less than is possible under `force` [N]."""
         size = float(np.linalg.norm(np.ptp(self.anatomy.mesh.nodes, axis=0)))
         chosen, damaged, absurd = [], [], []
         with wrap_errors(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
@@ -195,12 +195,12 @@ def _format_damaged(path: Path, lost: np.ndarray, group: str) -> str:
 
 
 def read_dataset(path: str | Path) -> Dataset:
-    """Read a data set written by `simulate`.
+    """Read a finished data set that `simulate` wrote.
 
     Raises
     ------
     InputError
-        A file that is missing, unfinished, damaged, not HDF5, or not a data set of this project.
+        The file is missing, unfinished, damaged, not HDF5, or not a data set of this project.
     """
     path = to_path(path)
     if not path.is_file():
@@ -239,12 +239,12 @@ def read_dataset(path: str | Path) -> Dataset:
 
 
 def read_provenance(file: h5py.File) -> dict[str, str]:
-    """Read the provenance of a file, as text.
+    """Read the provenance texts of a file, and check their digest.
 
     Raises
     ------
     InputError
-        Texts that do not match the stored digest.
+        The texts do not match the stored digest.
     """
     stated = {name: str(value) for name, value in file.attrs.items()}
     if stated.get("format") == FORMAT and stated.pop(SEAL_ATTRIBUTE, None) != compute_texts_digest(stated):
@@ -253,17 +253,17 @@ def read_provenance(file: h5py.File) -> dict[str, str]:
 
 
 def write_provenance(file: h5py.File, provenance: Mapping[str, str]) -> None:
-    """Store the provenance in a file."""
+    """Store provenance texts as attributes of a file, with their digest."""
     file.attrs.update({**provenance, SEAL_ATTRIBUTE: compute_texts_digest(provenance)})
 
 
 def compute_texts_digest(texts: Mapping[str, str]) -> str:
-    """Compute the hash of texts and their names."""
+    """Compute the digest of texts and of their names."""
     return compute_digest(np.frombuffer(repr(sorted(texts.items())).encode(), np.uint8))
 
 
 def read_rows(file: h5py.File, group: str, vertex_count: int, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Read rows `first` to `last` (`get_row_type`) of `answers` or `unit`, and the mask (B,) of valid checksums."""
+    """Read rows `first` to `last` of `answers` or `unit` (`get_row_dtype`), and the mask (B,) of valid checksums."""
     here = slice(first, last)
     displacement = read_array(file, f"{group}/displacement", "f", (None, vertex_count, 3))
     known = f"{group}/reaction" in file
@@ -280,7 +280,7 @@ def read_rows(file: h5py.File, group: str, vertex_count: int, first: int, last: 
 
 
 def write_embedded_anatomy(file: h5py.File, anatomy: Anatomy) -> None:
-    """Store the anatomy, so that training needs no other file."""
+    """Store the anatomy in a data set, so that training needs no other file."""
     group = file.create_group("anatomy")  # groups that HDF5 creates implicitly have a date
     for name, array in zip(MESH, anatomy.mesh.arrays, strict=False):
         group[name] = array
@@ -295,7 +295,7 @@ def read_embedded_anatomy(file: h5py.File) -> Anatomy:
     Raises
     ------
     InputError
-        Arrays that do not match the stored digest.
+        The arrays do not match the stored digest.
     """
     array = {name: read_array(file, f"anatomy/{name}", "fiu")[:] for name in MESH if f"anatomy/{name}" in file}
     anatomy = Anatomy(TetMesh(**array), *(read_array(file, f"anatomy/{name}", "fb")[:] for name in CONDITIONS))
@@ -305,12 +305,12 @@ def read_embedded_anatomy(file: h5py.File) -> Anatomy:
 
 
 def write_loads(file: h5py.File, loads: Loads) -> None:
-    """Store every cause's arrays under the cause's name, and the time.
+    """Store the arrays of every cause in a group with the cause's name, and the times.
 
     Raises
     ------
     InputError
-        Causes that `read_loads` could not read: of another kind, or several of one.
+        `read_loads` could not read the causes: a cause of another kind, or two of one kind.
     """
     group = file.create_group("loads")
     for cause in loads.causes:
@@ -330,7 +330,7 @@ def read_loads(file: h5py.File) -> Loads:
     Raises
     ------
     InputError
-        Loads that do not match the stored digest.
+        The loads do not match the stored digest.
     """
     causes = tuple(
         kind(**{item.name: read_array(file, f"loads/{name}/{item.name}", "f")[:] for item in fields(kind)})
@@ -344,7 +344,7 @@ def read_loads(file: h5py.File) -> Loads:
 
 
 def compute_loads_digest(loads: Loads) -> str:
-    """Compute the hash of every cause's arrays, and of the time."""
+    """Compute the digest of the arrays of all causes and of the times."""
     names = ",".join(sorted(type(cause).__name__ for cause in loads.causes)).encode()
     ordered = sorted(loads.causes, key=lambda cause: type(cause).__name__)
     arrays = [getattr(cause, item.name) for cause in ordered for item in fields(cause)]
@@ -352,7 +352,7 @@ def compute_loads_digest(loads: Loads) -> str:
 
 
 def read_outcomes(file: h5py.File, group: str) -> tuple[Outcome, ...]:
-    """Read the solver outcomes of `answers` or `unit`."""
+    """Read the solver outcome of each row of `answers` or `unit`."""
     return tuple(Outcome[name.decode()] for name in read_array(file, f"{group}/outcome", "S")[:])
 
 
@@ -360,14 +360,14 @@ def read_array(
     file: h5py.File, name: str, dtype_kinds: str, shape: tuple[int | None, ...] | None = None,
     max_bytes: int = MAX_ARRAY_BYTES,
 ) -> h5py.Dataset:  # fmt: skip
-    """Return an array in the file, of one of the NumPy `dtype_kinds`, and of a shape if given (None: any length).
+    """Return an array in the file, with a NumPy kind in `dtype_kinds` and, if given, a `shape` (None: any length).
 
-    Without a shape, its length is given by the file alone: then it has at most `max_bytes` bytes.
+    Without `shape`, the array's length is known from the file only, so its size is limited to `max_bytes`.
 
     Raises
     ------
     InputError
-        No array has that name, or it is of another kind or shape, or declares more than such a file can hold.
+        There is no such array in the file, it has another kind or shape, or it is larger than the file can contain.
     """
     found = file.get(name)
     if (

@@ -1,7 +1,7 @@
-"""Poses of a rigid tool as pushes: deepest point on the undeformed cortex, and depth.
+"""Conversion of a rigid tool's poses to pushes: a point on the undeformed cortex, and a depth.
 
-A tool's pose is tracked while its force is unknown. Without friction the deformation depends on the tool's pose, not on
-its path. For the regressors depth replaces force: both are zero if nothing moves.
+A tool's pose is tracked, its force is not measured. Without friction the deformation depends on the tool's pose, not on
+its path. Regressors use depth instead of force, as both are zero if nothing moves.
 """
 
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ from .cortex_patch import Patch
 from .tool_loads import build_rotations_about
 
 SURFACE_TOLERANCE = 1e-6  # Distance of a point from the surface below which the surface's normal is used [m].
-SAMPLE_SPACING = 1.0  # Spacing of a core's sample points [radii].
+SAMPLE_SPACING = 1.0  # Maximum spacing of a core's sample points [radii].
 MAX_ROD_SAMPLES = 6  # Number of samples along a rod from its end.
 
 
 @dataclass(frozen=True, eq=False)
 class Indented(Pushed):
-    """Indentations by a rod or a blade, which depend on its orientation too.
+    """Indentations by a rod or a blade, which also depend on the tool's orientation.
 
-    axes (B, 3, 3) are the tool's, as columns; offset (B, 3) [m] is from the indented point, point + force, to the
-    centre of the tool's core. The footprint is the rod's radius, or that of a ball round the blade.
+    `axes` (B, 3, 3) has the tool's axes as columns. `offset` (B, 3) [m] points from the indented point, `point` +
+    `force`, to the centre of the tool's core. `footprint` is the radius of the rod, or of a ball round the blade.
     """
 
     axes: np.ndarray
@@ -34,7 +34,7 @@ class Indented(Pushed):
 
 @dataclass(frozen=True, eq=False)
 class Relaxing(Pushed):
-    """Indentations of tissue that has lost the share relaxed (B,) of its resistance to a change of shape."""
+    """Indentations of tissue that has lost the share `relaxed` (B,) of its shear resistance."""
 
     relaxed: np.ndarray
 
@@ -47,23 +47,23 @@ class RelaxingIndented(Indented):
 
 
 def add_relaxation(pushes: Pushed, relaxed_share: np.ndarray) -> Pushed:
-    """Return the same indentations in tissue relaxed by shares (B,)."""
+    """Return the same indentations in tissue that has relaxed by the shares `relaxed_share` (B,)."""
     kind = RelaxingIndented if isinstance(pushes, Indented) else Relaxing
     return kind(**vars(pushes), relaxed=relaxed_share)
 
 
 def get_relaxation(pushes: Pushed) -> np.ndarray | None:
-    """Return the relaxed share of tissue (B,); None if it does not relax."""
+    """Return the relaxed shares (B,) of the tissue; None if the tissue does not relax."""
     return pushes.relaxed if isinstance(pushes, Relaxing | RelaxingIndented) else None
 
 
 def get_poses(loads: Loads, tool: BuiltIn) -> np.ndarray:
-    """Return T_world_tool (B, 4, 4) of one tool, from `Touching` loads of it alone or a blade's `Retracted` loads.
+    """Return poses T_world_tool (B, 4, 4) from `Touching` loads of a single tool, or `Retracted` loads of a blade.
 
     Raises
     ------
     InputError
-        Loads of another kind.
+        The loads have other causes, or several tools.
     """
     touching, retracted = loads.get_only(Touching), loads.get_only(Retracted)
     if touching is not None and touching.pose.shape[1] == 1:
@@ -80,14 +80,14 @@ def get_poses(loads: Loads, tool: BuiltIn) -> np.ndarray:
 
 
 def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
-    """Convert one tool's poses to pushes: point (B, 3) [m] nearest to its foot, normal depth as force [m], radius.
+    """Convert one tool's poses to pushes: nearest point (B, 3) [m], normal depth as force [m], radius.
 
-    The foot is the centre of a ball, of a rod's lower end, or of a blade. A tool without contact has depth zero.
+    The point is nearest to the foot: the centre of a ball, or of a rod's or blade's lower end. Depth 0: no contact.
 
     Raises
     ------
     InputError
-        Loads that are not the poses of one tool.
+        The loads are not the poses of one tool.
     """
     pose, core = get_poses(loads, tool), get_core(tool)
     foot = pose[:, :3, 3] + pose[:, :3, :3] @ (core.centre - [0.0, 0.0, core.half[2]])
@@ -111,14 +111,14 @@ def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
 
 
 def _compute_signed_distances(patch: Patch, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest places (n, 3) on the undeformed cortex to points (n, 3), and their signed distances (n,) [m]."""
+    """Return the points (n, 3) of the undeformed cortex nearest to `points` (n, 3), and signed distances (n,) [m]."""
     near = patch.contact_surface.find_nearest(points, np.full(len(points), np.inf))[0]
     away = near - points
     return near, np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, patch.find_normals(near)))
 
 
 def _sample_core(core: Core) -> np.ndarray:
-    """Sample points (k, 3) [m] of a core in the tool's frame, border included; of a rod, near its lower end."""
+    """Sample points (k, 3) [m] of a core and its border, in the tool's frame; of a rod, only near its lower end."""
     steps = np.ceil(2.0 * core.half / (SAMPLE_SPACING * core.radius)).astype(int)
     low, high = core.centre - core.half, core.centre + core.half
     if steps[2] > MAX_ROD_SAMPLES:
@@ -128,12 +128,12 @@ def _sample_core(core: Core) -> np.ndarray:
 
 
 def get_only_pushes(loads: Loads) -> Pushed:
-    """Return the pushes of loads without other causes.
+    """Return the `Pushed` loads, if the loads have no other cause.
 
     Raises
     ------
     InputError
-        Loads of another kind.
+        The loads have another cause.
     """
     pushed = loads.get_only(Pushed)
     if pushed is None:

@@ -1,7 +1,7 @@
-"""Load histories in relaxing tissue: a tool is brought in and then held.
+"""Load histories in relaxing tissue: a tool moves to its pose, and then stays there.
 
-A load of a pose at a time [s] is such a history. The tool arrives within `APPROACH_TIME`, or within the time if that is
-shorter, and stays in place until the time.
+A load that is a pose with a time [s] stands for such a history. The tool arrives within `APPROACH_TIME`, or within the
+load's time if that is shorter, and stays in place until that time.
 """
 
 from collections.abc import Iterable, Mapping
@@ -20,30 +20,30 @@ APPROACH_TIME = 1.0
 HISTORY = (
     f"the tool came within {APPROACH_TIME:g} s, or within the load's time if that is shorter, and stayed until then"
 )
-"""Description of the rows of such a data set."""
+"""Description of the load histories of a data set, for its provenance."""
 MIN_TIME = 0.05  # Smallest sampled time [s].
 MAX_TIME = 100.0  # Largest sampled time [s].
 
 
 def sample_times(count: int, seed: int) -> np.ndarray:
-    """Sample times (count,) [s] of histories, uniform in their logarithm; time i does not depend on count.
+    """Sample log-uniform times (count,) [s] of load histories; time i does not depend on `count`.
 
-    Scenes last a few seconds; slower relaxation matters for a tool that stays.
+    Scenes last a few seconds; the longer times are for tools that stay in place.
     """
     source = np.random.Generator(np.random.Philox(key=[seed, 1]))
     return MIN_TIME * (MAX_TIME / MIN_TIME) ** source.random(count)
 
 
 def get_relaxation_series(effects: Iterable[Effect]) -> Pairs:
-    """Return the Prony series of the effects' tissue; () if it does not relax."""
+    """Return the Prony series of the tissue among the effects; () if the tissue does not relax."""
     defaults = (effect.default for effect in effects if isinstance(effect, Elasticity))
     return next((tissue.prony for tissue in defaults if tissue is not None), ())
 
 
 def solve_histories(deformer: Deformer, loads: Loads) -> Deformation:
-    """Solve histories of B loads: two time steps, of which the second is skipped while a tool still arrives.
+    """Solve the histories of B loads in two time steps: arrival and stay of the tool.
 
-    A tool without an equilibrium in the first step is not held further, and its result has that outcome.
+    The second step is skipped for tools that still arrive, or that have no equilibrium in the first step.
     """
     first = deformer.deform(Loads(loads.causes, np.minimum(loads.times, APPROACH_TIME)))
     stay = np.flatnonzero([good.good for good in first.outcome] & (loads.times > APPROACH_TIME))
@@ -56,9 +56,9 @@ def solve_histories(deformer: Deformer, loads: Loads) -> Deformation:
 
 
 def compute_decayed_coefficients(series: Pairs, times: np.ndarray) -> np.ndarray:
-    """Compute the remainder (B, n) of each coefficient g of a Prony series after histories of B durations [s].
+    """Compute the decayed coefficients (B, n) of a Prony series of n pairs, after histories of B durations [s].
 
-    As in the FEM, a load that arrives within a time step acts for half of the step.
+    As in FEM, a load that arrives during a time step acts for half of the step.
     """
     coming = np.minimum(times, APPROACH_TIME)
     g, tau = np.array(series).T
@@ -66,7 +66,7 @@ def compute_decayed_coefficients(series: Pairs, times: np.ndarray) -> np.ndarray
 
 
 def read_prony_series(provenance: Mapping[str, str]) -> Pairs:
-    """Read the Prony series of a data set of histories from its provenance; () for other data."""
+    """Read the Prony series from the provenance of a data set of histories; return () for other data."""
     if "history" not in provenance or "tissue" not in provenance:
         return ()
     if provenance["history"] != HISTORY:

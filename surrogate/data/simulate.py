@@ -1,4 +1,4 @@
-"""Simulation of a data set with a deformer, batch by batch, so that a killed run resumes."""
+"""Simulation of a data set with a deformer in batches, so that an interrupted run resumes."""
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -47,13 +47,13 @@ HDF5_VERSIONS = ("v108", "v108")
 UNKNOWN_RATE = "not known"  # width of a formatted number
 RATE_KEYS = {"unit": "seconds a unit response", "answers": "seconds a load"}  # Provenance keys of the solver's rates.
 CREATION_KEYS = ("date", *RATE_KEYS.values())
-"""Provenance entries that differ each time a data set is made."""
+"""Provenance keys whose values differ each time a data set is created."""
 T = TypeVar("T")  # Type of the solved rows.
 
 
 @dataclass(frozen=True)
 class SimulatedRows:
-    """Rows of unit responses and of loads that one call solved, and the seconds of each, with writing."""
+    """Numbers of unit responses and loads that one call solved, and the wall time [s] of each, writing included."""
 
     unit_count: int = 0
     load_count: int = 0
@@ -62,22 +62,22 @@ class SimulatedRows:
 
     @property
     def total(self) -> int:
-        """Total number of rows."""
+        """Total number of rows that the call solved."""
         return self.unit_count + self.load_count
 
 
 @dataclass(frozen=True, eq=False)
 class SimulationPlan:
-    """Requested unit responses and loads, in batches.
+    """Unit responses and loads to solve, divided into batches.
 
     Parameters
     ----------
     anatomy
         Anatomy to solve.
     loads
-        See `simulate`.
+        Loads to solve.
     nodes
-        Vertices (m,) with a unit force; none if the loads are poses.
+        Vertices (m,) to which a unit force is applied; empty if the loads are poses.
     batch_size
         Number of rows that are solved together.
     """
@@ -88,26 +88,26 @@ class SimulationPlan:
     batch_size: int
 
     def get_row_type(self, group: str) -> np.dtype:
-        """Return the row type of a group."""
+        """Return the dtype of the rows of a group, `unit` or `answers`."""
         return get_row_dtype(len(self.anatomy.mesh.nodes), count_posed_tools(self.loads) if group == "answers" else 0)
 
     @property
     def row_counts(self) -> dict[str, int]:
-        """Number of rows of each group."""
+        """Number of rows of each group, `unit` and `answers`."""
         return {"unit": 3 * len(self.nodes), "answers": len(self.loads)}
 
     @property
     def batches(self) -> list[Batch]:
-        """Group and first row of every batch."""
+        """Batches, each as its group and first row."""
         return [(name, first) for name, rows in self.row_counts.items() for first in range(0, rows, self.batch_size)]
 
     def list_rows(self, batch: Batch) -> np.ndarray:
-        """Return the numbers of a batch's rows."""
+        """Return the row numbers of a batch."""
         name, first = batch
         return np.arange(first, min(first + self.batch_size, self.row_counts[name]))
 
     def build_task(self, batch: Batch) -> LoadBatch:
-        """Build the task that solves a batch."""
+        """Build the task that solves a batch, with its rows and loads."""
         rows = self.list_rows(batch)
         return LoadBatch(batch, rows, None if batch[0] == "unit" else self.loads.select(rows))
 
@@ -116,32 +116,32 @@ def simulate(
     path: str | Path, deformer: Deformer | SolverPool, loads: Loads, provenance: Mapping[str, str], batch: int = 64,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> SimulatedRows:  # fmt: skip
-    """Solve every load, and the unit forces on the open cortex unless the loads are poses, into an HDF5 file.
+    """Solve all loads, and unit forces on the open cortex unless the loads are poses; write an HDF5 file.
 
-    Batches are written to `PATH.partial` (`journal`), where a kill at any moment loses at most one. The same call
-    resumes with the same batches, so that the result has the same bytes but for its date. Damaged batches are solved
-    again. The HDF5 file is written last, atomically. More loads of the same sampling extend a finished file, and
-    damaged rows of a finished file are solved again.
+    Finished batches are stored in `PATH.partial` (`journal`), so that an interruption loses at most one. The same call
+    resumes with the same batches; apart from the date, the resulting file has the same bytes. Damaged batches are
+    solved again. The HDF5 file is written last, atomically. A finished file is extended if more loads of the same
+    sampling are given, and its damaged rows are solved again.
 
     Parameters
     ----------
     deformer
-        Deformer of `loads` and `Nodal` loads at every vertex; a `SolverPool` has one on each of several devices.
+        Deformer that solves `loads` and `Nodal` loads for all vertices, or a `SolverPool` of such deformers.
     provenance
-        Texts that must agree for a run to resume.
+        Texts that must equal those of the interrupted run or finished file.
     progress
         Called with the number of finished rows and their total after every batch.
 
     Raises
     ------
     InputError
-        A batch below one, a file that holds something else or is being written, a folder that cannot be written to or
-        has too little space. A solver pool that lost a process.
+        The batch is below one, the file has other content or is being written, the folder is not writable or has too
+        little space, or a solver pool lost a process.
 
     Warns
     -----
     DamageWarning
-        Finished rows that are damaged.
+        Some finished rows are damaged; they are solved again.
     """
     path = Path(path)
     if batch < 1:
@@ -180,7 +180,7 @@ def _fill(
     journal: Journal, work: SimulationPlan, deformer: Deformer | SolverPool, finished: set[Batch],
     progress: Callable[[int, int], None],
 ) -> dict[str, int]:  # fmt: skip
-    """Solve the batches that are in neither file. A second thread writes a batch while the next is solved."""
+    """Solve the batches that neither the journal nor the finished file has; return the numbers of solved rows."""
     known = [batch for batch in work.batches if batch in finished or batch in journal]
     total, done = sum(work.row_counts.values()), sum(len(work.list_rows(batch)) for batch in known)
     solved = dict.fromkeys(work.row_counts, 0)
@@ -203,9 +203,9 @@ def _fill(
 
 
 def _compute_rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
-    """Compute the wall time per solve [s] of each newly solved kind; other kinds keep the value of the finished file.
+    """Compute wall times per solve [s] of the groups solved now; other groups keep the values of the finished file.
 
-    All texts have the same width, so that the file size does not depend on the number of runs.
+    All texts have the same width, so that the file size does not depend on the number of interruptions.
     """
     before: dict[str, str] = {}
     if path.exists():
@@ -221,7 +221,7 @@ def _compute_rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, 
 
 
 def _write(path: Path, work: SimulationPlan, stated: Mapping[str, str], journal: Journal) -> None:
-    """Write the data set: batches of the journal, and those of the finished file that it replaces."""
+    """Write the data set from batches in the journal and in the finished file that it replaces."""
     with write_stream_atomically(path, path.suffix) as stream, h5py.File(stream, "w", libver=HDF5_VERSIONS) as file:
         facts = {
             "title": FILE_DESCRIPTION,
@@ -262,7 +262,7 @@ def _write(path: Path, work: SimulationPlan, stated: Mapping[str, str], journal:
 
 
 def _compute_ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
-    """Yield the result of each batch, in order; a second thread computes the next meanwhile."""
+    """Yield each batch with its result, in order, while a second thread computes the next result."""
     with ThreadPoolExecutor(1) as maker:
         coming = [maker.submit(made, batch) for batch in batches[:1]]
         for batch, following in zip(batches, [*batches[1:], None], strict=True):
@@ -273,7 +273,7 @@ def _compute_ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iter
 
 
 def _read_kept_rows(path: Path, work: SimulationPlan, batch: Batch) -> np.ndarray:
-    """Read a batch's rows from a finished file, checked again for damage."""
+    """Read a batch's rows from a finished file, and check them for damage again."""
     with h5py.File(path, "r") as before:
         rows, good = _read_batch(before, work, batch)
     if not good.all():
@@ -282,20 +282,20 @@ def _read_kept_rows(path: Path, work: SimulationPlan, batch: Batch) -> np.ndarra
 
 
 def _describe_tool(loads: Loads, stated: Mapping[str, str]) -> str:
-    """Describe the tool or force in a sentence."""
+    """Describe the tool or the force of the loads, as text for the file."""
     if loads.get(Touching) is None:
         return "a force on a round footprint that stays with the tissue: see loads/Pushed"
     return f"the rigid tool {stated.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
 
 
 def _read_batch(file: h5py.File, work: SimulationPlan, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
-    """Read a batch's rows from a finished file, and the mask of undamaged rows."""
+    """Read a batch's rows from a finished file; return the rows and the mask of undamaged ones."""
     rows = work.list_rows(batch)
     return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
 
 
 def _read_earlier_loads(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
-    """Read the loads of a finished file; check that they and `loads` share their first rows, and the provenance."""
+    """Read the loads of a finished file; check that its first loads and provenance equal those of this call."""
     with wrap_errors(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
         recorded = read_provenance(file)
         if recorded.get("format") == OLD_FORMAT:
@@ -309,7 +309,7 @@ def _read_earlier_loads(path: Path, stated: Mapping[str, str], loads: Loads) -> 
 
 
 def _has_same_body(path: Path, work: SimulationPlan) -> bool:
-    """Return True if the body in a finished file is undamaged."""
+    """Return True if the anatomy in a finished file is undamaged and that of the plan."""
     with h5py.File(path, "r") as file:
         try:
             return read_embedded_anatomy(file).digest == work.anatomy.digest
@@ -318,9 +318,9 @@ def _has_same_body(path: Path, work: SimulationPlan) -> bool:
 
 
 def _find_whole_batches(path: Path, work: SimulationPlan) -> set[Batch]:
-    """Return the batches that a finished file holds undamaged.
+    """Return the batches with undamaged rows in a finished file.
 
-    A last short batch is excluded, unless it is the last again: it would have been solved in another batch.
+    A short last batch of the file is used only if it is also the plan's last: else its rows belong to a longer batch.
     """
     held, damaged = set(), []
     with wrap_errors(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:

@@ -1,4 +1,4 @@
-"""Solvers of a data set's loads: FEM in this process, or a process with its own FEM on each of several devices."""
+"""Solvers of a data set's loads: FEM in this process, or in one process for each of several devices."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -23,7 +23,7 @@ from .tasks import SolverPool
 
 @dataclass(frozen=True, eq=False)
 class LazyFem:
-    """FEM that is built on first use: a `Deformer`.
+    """`Deformer` that builds its FEM on first use.
 
     Parameters
     ----------
@@ -46,18 +46,18 @@ class LazyFem:
 
     @cached_property
     def fem(self) -> Fem:
-        """FEM, built on first use."""
+        """FEM of the anatomy, built on first use."""
         return Fem(self.anatomy, self.effects, self.accuracy, self.device, self.batch, self.element)
 
     @property
     def required_memory(self) -> MemoryEstimate | None:
-        """Required GPU memory; None on the CPU."""
+        """Estimate of the required GPU memory; None on the CPU."""
         return estimate_fem_memory(
             self.anatomy, self.element, self.accuracy, self.device, self.batch, self.load_count, self.process_count
         )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Solve as `Fem.deform`; poses in relaxing tissue are histories, as in `solve_histories`."""
+        """Solve as `Fem.deform`; poses in relaxing tissue are solved as histories (`solve_histories`)."""
         if start is None and get_relaxation_series(self.effects) and loads.get(Touching) is not None:
             result = solve_histories(self.fem, loads)
             return result if at is None else result.restrict(at)
@@ -66,7 +66,7 @@ class LazyFem:
 
 @dataclass(frozen=True, eq=False)
 class Solver:
-    """Deformer of the loads, its element, its description, and the number of loads that are solved together."""
+    """Deformer for the loads of a data set, with its element, its description, and the number of loads per batch."""
 
     deformer: Deformer | SolverPool
     element: str
@@ -76,17 +76,17 @@ class Solver:
 
 @contextmanager
 def open_solvers(fem: LazyFem, devices: Sequence[str], report: Callable[[str], object]) -> Iterator[Solver]:
-    """Open FEM solvers on each of the devices; with one device the solver is in this process.
+    """Open FEM solvers on each of the devices, as a context manager; one device is used in this process.
 
-    Without `batch`, the largest size that fits is used. Several GPUs then get equal numbers of batches. `report` first
-    receives the required memory of each GPU.
+    If `fem.batch` is None, the largest batch size that fits in memory is used, and GPUs get equal numbers of batches.
+    `report` first receives a description of the memory that each GPU requires.
 
     Raises
     ------
     InputError
-        See `Fem`; a GPU with too little memory.
-    LostError
-        A process that was killed.
+        See `Fem`, or a GPU has too little memory.
+    LostProcessError
+        A process was killed.
     """
     if len(devices) == 1:
         own = replace(fem, device=devices[0])
@@ -105,17 +105,17 @@ def open_solvers(fem: LazyFem, devices: Sequence[str], report: Callable[[str], o
 
 
 def place_on_device(device: str, fem: LazyFem) -> LazyFem:
-    """Return the FEM of a device."""
+    """Return a copy of the FEM for another device."""
     return replace(fem, device=device)
 
 
 def estimate_memory(fem: LazyFem, task: None) -> MemoryEstimate | None:
-    """Return the GPU memory that the FEM needs."""
+    """Return the estimate of the GPU memory that the FEM needs; None on the CPU."""
     return fem.required_memory
 
 
 def describe_fem_task(asked: LazyFem, task: None) -> tuple[str, str, int]:
-    """Return the FEM's element, description and batch size, after a check that it fits in memory."""
+    """Check that the FEM fits in memory, and return its element, description and batch size."""
     if asked.required_memory is None:  # on the CPU: before a file is created that keeps its batch
         fem = asked.fem
         check_fits(
@@ -125,7 +125,7 @@ def describe_fem_task(asked: LazyFem, task: None) -> tuple[str, str, int]:
 
 
 def choose_even_batch(max_batch: int, load_count: int, device_count: int) -> int:
-    """Compute the batch size, at most `max_batch`, of equally many batches per device; the last may be smaller."""
+    """Return the batch size <= `max_batch` that gives all devices equally many batches; the last may be smaller."""
     rounds = -(-load_count // (max(max_batch, 1) * device_count))
     return max(1, -(-load_count // (max(rounds, 1) * device_count)))
 

@@ -1,4 +1,4 @@
-"""Splits of a data set's loads: by direction of the force, and by disc of the cortex."""
+"""Splits of a data set's loads into training and test loads, by disc of the cortex or by direction of the force."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from .cortex_patch import Patch, find_nearest
 from .encode import split_forces
 from .tool_loads import find_perpendiculars, select_spread
 
-CALIBRATION_STRIDE = 4  # One of this many loads is set aside from every split to calibrate bounds.
+CALIBRATION_STRIDE = 4  # One in this many loads is set aside, before any split, to calibrate bounds.
 MAX_CALIBRATION_LOADS = 2000  # Maximum number of loads set aside to calibrate bounds.
 SECTOR_COUNT = 8  # Number of sectors, of which two opposite ones are held out.
 MIN_SECTOR_ANGLE = 10.0  # Angle to the normal below which a force is in no sector [deg].
@@ -30,7 +30,7 @@ class DiscSettings:
 
 @dataclass(frozen=True, eq=False)
 class DiscSplit:
-    """Held-out discs of the cortex.
+    """Split of loads by held-out discs of the cortex.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class DiscSplit:
     radius
         Radius of each disc [m].
     disc_index
-        Number (B,) of the disc that contains a load's point, -1 for the training loads, -2 for unused ones.
+        Index (B,) of the disc that contains a load's point; -1 for training loads, -2 for unused loads.
     area_share
         Share of the patch's area that the discs cover.
     """
@@ -51,20 +51,20 @@ class DiscSplit:
 
     @property
     def test_mask(self) -> np.ndarray:
-        """(B,) bool: mask of the test loads."""
+        """Mask (B,) of the test loads."""
         return self.disc_index >= 0
 
     @property
     def training_mask(self) -> np.ndarray:
-        """(B,) bool: mask of the training loads."""
+        """Mask (B,) of the training loads."""
         return self.disc_index == -1
 
     def is_covered(self, points: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of points (n, 3) [m] in a disc, where a scored model must not be given any data."""
+        """Return the mask (n,) of points (n, 3) [m] inside a disc; a scored model must not use data there."""
         return find_nearest(points, self.centres)[1] <= self.radius
 
     def summarise(self) -> str:
-        """Describe the held-out loads in one line [mm]."""
+        """Describe the discs and the numbers of test and training loads in one line."""
         return (
             f"{len(self.centres)} discs of {1e3 * self.radius:g} mm radius ({100 * self.area_share:.0f} % of the open "
             f"cortex) left out: {int(self.test_mask.sum())} loads to test, {int(self.training_mask.sum())} to train on"
@@ -72,16 +72,16 @@ class DiscSplit:
 
 
 def hold_out_discs(points: np.ndarray, patch: Patch, settings: DiscSettings = DiscSettings()) -> DiscSplit:
-    """Hold out discs of 6 mm radius round distant load points (B, 3) [m]: at least 6, and 15 % of the patch.
+    """Hold out 6 mm discs round load points (B, 3) [m] far from each other: at least 6, and 15 % of the patch.
 
-    No disc beyond the sixth is taken if it would leave fewer than half of the loads to train on. At a small craniotomy,
-    where six discs take more than half, the discs shrink, as far as that helps. Six of the few positions of the preset
-    `seed` are more than half in any case.
+    Discs beyond the sixth are added only while at least half of the loads remain for training. At a small craniotomy,
+    where six discs contain more than half of the loads, smaller radii are used. The few positions of the preset `seed`
+    exceed half at any radius.
 
     Raises
     ------
     InputError
-        Fewer than seven positions.
+        The loads have fewer than seven positions.
     """
     order = select_spread(points, settings.max_positions) if len(points) else np.zeros(0, int)
     if len(order) < settings.min_discs + 1:
@@ -115,18 +115,18 @@ def _split(points: np.ndarray, centres: np.ndarray, patch: Patch, radius: float)
 
 @dataclass(frozen=True, eq=False)
 class SectorSplit(DiscSplit):
-    """Held-out sectors of tangential direction.
+    """Split of loads by held-out sectors of the force's tangential direction.
 
-    As `DiscSplit`, but `centres` are unit directions (k, 3), and `radius` is half the width of a sector [rad]. `disc`
-    is the number of the sector that a load's force is in, and `share` a part of the circle.
+    Fields are as in `DiscSplit`, but `centres` are unit directions (k, 3), `radius` is half the angle of a sector
+    [rad], `disc_index` is the index of a load's sector, and `area_share` is the held-out share of the circle.
     """
 
     def is_covered(self, points: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of held-out points: none, as directions are held out."""
+        """Return a mask (n,) of False: no point is held out, only directions."""
         return np.zeros(len(points), bool)
 
     def summarise(self) -> str:
-        """Describe the held-out loads in one line [degrees]."""
+        """Describe the sectors and the numbers of test and training loads in one line."""
         return (
             f"{len(self.centres)} sectors of {2.0 * np.degrees(self.radius):g} degrees round the cortex's normal left "
             f"out: {int(self.test_mask.sum())} loads to test, {int(self.training_mask.sum())} to train on"
@@ -134,14 +134,14 @@ class SectorSplit(DiscSplit):
 
 
 def hold_out_sectors(pushes: Pushed, patch: Patch) -> SectorSplit:
-    """Hold out two opposite sectors of 45 degrees of the tangential direction of forces on the open cortex.
+    """Hold out two opposite 45-degree sectors of the tangential direction of the forces.
 
-    Forces within 10 degrees of the mean inward normal are training loads: they have almost no tangential direction.
+    Forces within 10 degrees of the mean inward normal are training loads, as their tangential direction is unreliable.
 
     Raises
     ------
     InputError
-        No load in the sectors, or none outside.
+        No load is inside the sectors, or none outside.
     """
     axis = patch.normals.mean(axis=0)
     axis /= np.linalg.norm(axis)

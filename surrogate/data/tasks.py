@@ -1,4 +1,4 @@
-"""Batches of a data set, and their solution: by one deformer in this process, or one on each of several devices."""
+"""Batches of a data set, solved by one deformer in this process or by a pool of processes on several devices."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ UNIT_FORCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LoadBatch:
-    """Batch, the numbers of its rows (B,), and their loads; None for unit responses."""
+    """Batch of a data set, with the numbers of its rows (B,) and their loads; `loads` is None for unit responses."""
 
     batch: Batch
     rows: np.ndarray
@@ -30,14 +30,14 @@ class LoadBatch:
 
 @dataclass(frozen=True, eq=False)
 class SolverPool:
-    """Processes that each have a deformer of the same body."""
+    """Pool of processes, each with its own deformer of the same anatomy."""
 
     anatomy: Anatomy
     processes: Sequence[ChildProcess]
 
 
 def solve_batches(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -> Iterator[tuple[LoadBatch, bytes]]:
-    """Yield each task with its rows from `solve_batch`: in order in this process, in any order from a pool."""
+    """Solve batches and yield each with its rows as bytes: in order without a pool, in any order with a pool."""
     if isinstance(deformer, SolverPool):
         yield from map_unordered(deformer.processes, solve_batch, tasks)
     else:
@@ -46,7 +46,7 @@ def solve_batches(deformer: Deformer | SolverPool, tasks: Iterable[LoadBatch]) -
 
 
 def solve_batch(deformer: Deformer, task: LoadBatch) -> bytes:
-    """Solve a batch (`solution_rows.get_row_type`). Every batch starts undeformed, independent of earlier ones."""
+    """Solve a batch from the undeformed state, independent of other batches; return its rows (`to_rows`) as bytes."""
     anatomy = deformer.anatomy
     unit = task.loads is None
     loads = build_unit_loads(anatomy, task.rows) if task.loads is None else task.loads
@@ -55,13 +55,13 @@ def solve_batch(deformer: Deformer, task: LoadBatch) -> bytes:
 
 
 def count_posed_tools(loads: Loads) -> int:
-    """Return the number of tools that the loads move by pose, whose reactions are stored; 0 for pushes."""
+    """Return the number of tools that the loads move by pose, with stored reactions; 0 for pushes."""
     touching = loads.get(Touching)
     return 0 if touching is None else touching.pose.shape[1]
 
 
 def build_unit_loads(anatomy: Anatomy, rows: np.ndarray) -> Loads:
-    """Build loads of `UNIT_FORCE` at open-cortex node row // 3 along axis row % 3, for each of `rows` (B,)."""
+    """Build loads of `UNIT_FORCE`: at open-cortex node row // 3, along axis row % 3, for each of `rows` (B,)."""
     force = np.zeros((len(rows), len(anatomy.mesh.nodes), 3))
     force[np.arange(len(rows)), open_patch(anatomy).nodes[rows // 3], rows % 3] = UNIT_FORCE
     return Loads((Nodal(force),))

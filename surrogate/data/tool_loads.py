@@ -1,4 +1,4 @@
-"""Sampling of loads as made by surgical tools: position, force, direction and footprint."""
+"""Sampling of loads by surgical tools: position, force, direction and footprint radius."""
 
 from dataclasses import dataclass, replace
 
@@ -14,11 +14,11 @@ from .cortex_patch import Patch, find_nearest, open_patch
 MAX_ATTEMPTS = 2000  # Maximum number of draws of a load.
 BLOCK_LOADS = 8192  # Number of loads sampled together: larger blocks take more memory and no less time.
 NUMBERS_PER_LOAD = 8  # Number of random numbers of a load in each attempt.
-MAX_DEPTH = 15e-3  # Largest depth of a tool [m]: beyond, it perforates.
-MAX_PRESSURE = 8e3  # Largest mean contact pressure [Pa]: beyond, a tool perforates; tissue harm begins at 2.7-4 kPa.
+MAX_DEPTH = 15e-3  # Largest depth of a tool [m]; a deeper tool perforates the tissue.
+MAX_PRESSURE = 8e3  # Largest mean contact pressure [Pa]; above it a tool perforates. Damage begins at 2.7-4 kPa.
 # E* = E / (1 - nu^2) of the default tissue: Hertz's depth 3 F / (4 E* r) estimates a load's depth before it is solved.
 PLANE_MODULUS = BRAIN.young / (1.0 - BRAIN.poisson**2)
-LATTICE_SIZE = 200  # Number of radii and of forces of a tool at which its nominal loads are counted.
+LATTICE_SIZE = 200  # Number of radii and of forces of a tool in the grid of its nominal loads.
 
 
 @dataclass(frozen=True)
@@ -30,15 +30,15 @@ class ToolLoadRange:
     name
         Name for `--preset`.
     radius_range
-        Smallest and largest radius [m], uniform between; a plate counts as the disc of its area.
+        Smallest and largest radius [m], sampled uniformly; a plate is represented by a disc of equal area.
     force_range
-        Smallest and largest force [N], log-uniform between unless `is_uniform`: then uniform.
+        Smallest and largest force [N], sampled log-uniformly, or uniformly if `is_uniform`.
     pressure_range
-        Smallest and largest mean contact pressure F / (pi r^2) [Pa]; a sample outside is repeated.
+        Smallest and largest mean contact pressure F / (pi r^2) [Pa]; samples outside are rejected and repeated.
     max_depth
-        Largest depth by Hertz's formula [m]; a deeper sample is repeated.
+        Largest depth by Hertz's formula [m]; deeper samples are rejected and repeated.
     max_angle
-        Largest angle [rad] between the force and the inward normal; uniform by solid angle.
+        Largest angle [rad] between the force and the inward normal; directions are uniform by solid angle.
     """
 
     name: str
@@ -50,7 +50,7 @@ class ToolLoadRange:
     is_uniform: bool = False
 
     def is_surgical(self, force: np.ndarray, radius: np.ndarray) -> np.ndarray:
-        """Return the mask (n,) of surgical pressures and estimated depths; forces (n,) [N], radii (n,) [m]."""
+        """Return the mask (n,) of forces (n,) [N] with radii (n,) [m] that have an allowed pressure and Hertz depth."""
         pressure = force / (np.pi * radius**2)
         depth = 3.0 * force / (4.0 * PLANE_MODULUS * radius)
         return (self.pressure_range[0] <= pressure) & (pressure <= self.pressure_range[1]) & (depth <= self.max_depth)
@@ -72,21 +72,21 @@ BRUTAL = ToolLoadRange(
 )
 PRESETS = (*TOOLS, "mixed", "seed", BRUTAL.name)  # Names of all presets.
 OVERLOAD_PRESETS = ("seed", BRUTAL.name)
-"""Presets whose loads strain tissue beyond measurements on brain: their equilibria are stored all the same."""
+"""Presets whose loads strain tissue beyond measurements on brain; their solutions are stored nevertheless."""
 
 
 def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
-    """Sample `count` loads on the open cortex; load i depends on the preset, the anatomy, the seed and i alone.
+    """Sample `count` loads on the open cortex; load i depends only on the preset, the anatomy, the seed and i.
 
-    `mixed` samples the tool first; `brutal` is far beyond surgery. `seed` is the protocol of Tonutti, Gras, Yang 2017,
-    Artif. Intell. Med. 80:39-47, in an order shuffled by the seed: at most 22,000 loads, of which fewer are returned
-    when `count` is larger.
+    `mixed` first samples the tool; `brutal` is far beyond surgery. `seed` is the protocol of Tonutti, Gras, Yang 2017,
+    Artif. Intell. Med. 80:39-47, in an order shuffled by `seed`: it has at most 22,000 loads, so that a larger `count`
+    returns fewer.
 
     Raises
     ------
     InputError
-        Unknown preset, a count below one, a negative seed, an anatomy without open cortex or (for `seed`) without
-        tumour, or a patch too small for the tool.
+        The preset is unknown, the count is below one, the seed is negative, the anatomy has no open cortex or (for
+        `seed`) no tumour, or the patch is too small for the tool.
 
     Examples
     --------
@@ -109,23 +109,23 @@ def draw(preset: str, anatomy: Anatomy, count: int, seed: int) -> Loads:
 
 
 def sample_pushes(tool: ToolLoadRange, patch: Patch, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sample positions of a tool, and its unit directions, (count, 3) each: as `draw`, for any force."""
+    """Sample positions (count, 3) [m] and unit directions (count, 3) of a tool as `draw`, without pressure limits."""
     free = replace(tool, pressure_range=(0.0, np.inf), max_depth=np.inf)
     rows = _sample_in_blocks([free], patch, count, seed)
     return rows[:, :3], rows[:, 3:6] / np.linalg.norm(rows[:, 3:6], axis=1, keepdims=True)
 
 
 def _sample_in_blocks(tools: list[ToolLoadRange], patch: Patch, count: int, seed: int) -> np.ndarray:
-    """Sample point [m], force [N] and footprint [m] of each load: (count, 7)."""
+    """Sample `count` loads of randomly chosen tools as rows (count, 7): point [m], force [N], footprint radius [m]."""
     key = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
     blocks = [range(first, min(first + BLOCK_LOADS, count)) for first in range(0, count, BLOCK_LOADS)]
     return np.concatenate([_sample_block(tools, patch, key, block) for block in blocks])
 
 
 def compute_rejected_share(preset: str) -> float:
-    """Compute the share of a preset's nominal loads, by radius and force, that are not sampled: too strong or too deep.
+    """Compute the share of a preset's nominal loads, on a grid of radii and forces, that are too strong or too deep.
 
-    No model is trained on these loads. Zero for other presets.
+    These loads are not sampled, so no model is trained on them. The share is zero for presets without such limits.
     """
     tools = {**{name: [tool] for name, tool in TOOLS.items()}, "mixed": list(TOOLS.values())}.get(preset, [])
     middles = (np.arange(LATTICE_SIZE) + 0.5) / LATTICE_SIZE
@@ -141,7 +141,7 @@ def compute_rejected_share(preset: str) -> float:
 
 
 def describe_rejected(preset: str) -> str:
-    """Describe the share of rejected loads; empty if it is zero."""
+    """Describe the share of a preset's rejected loads in a sentence; empty if the share is zero."""
     share = compute_rejected_share(preset)
     return (
         f"{100.0 * share:.0f} % of the nominal loads of {preset} exceed the pressure or depth of surgery: they are not "
@@ -152,7 +152,7 @@ def describe_rejected(preset: str) -> str:
 
 
 def _sample_block(tools: list[ToolLoadRange], patch: Patch, key: int, block: range) -> np.ndarray:
-    """Sample point [m], force [N] and footprint [m] of each load of a block: (n, 7)."""
+    """Sample the loads of a block as rows (n, 7): point [m], force [N], footprint radius [m]."""
     kind = (len(tools) * _generate_uniform(key, 0, block)[:, -1]).astype(int)
     out = np.zeros((len(block), 7))
     for number, tool in enumerate(tools):
@@ -162,10 +162,10 @@ def _sample_block(tools: list[ToolLoadRange], patch: Patch, key: int, block: ran
 
 
 def _generate_uniform(key: int, attempt: int, block: range) -> np.ndarray:
-    """Generate numbers (n, NUMBERS_PER_LOAD) in [0, 1) of each load of a block.
+    """Generate uniform random numbers (n, NUMBERS_PER_LOAD) in [0, 1), one row for each load of a block.
 
-    Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": a load's counter gives its numbers
-    without those of earlier loads.
+    Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": a counter-based generator, so that a
+    load's numbers do not require those of earlier loads.
     """
     source = np.random.Philox(key=np.array([key, attempt], np.uint64))
     source.advance(block.start * NUMBERS_PER_LOAD // 4)  # each count gives four numbers
@@ -173,7 +173,7 @@ def _generate_uniform(key: int, attempt: int, block: range) -> np.ndarray:
 
 
 def _sample_tool(tool: ToolLoadRange, patch: Patch, key: int, block: range, rows: np.ndarray) -> np.ndarray:
-    """Sample as `_sample_block`, for one tool and some rows (k,) of the block; rejected loads are sampled again."""
+    """Sample `rows` (k,) of a block as `_sample_block`, for one tool; rejected loads are sampled again."""
     out, waiting = np.zeros((len(block), 7)), rows
     for attempt in range(MAX_ATTEMPTS):
         if not len(waiting):
@@ -200,12 +200,12 @@ def _sample_tool(tool: ToolLoadRange, patch: Patch, key: int, block: range, rows
 
 
 def interpolate_range(limits: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
-    """Interpolate between two ends, by uniform numbers (n,) in [0, 1)."""
+    """Map uniform random numbers (n,) in [0, 1) linearly to the range between two limits."""
     return limits[0] + (limits[1] - limits[0]) * uniform
 
 
 def _sample_in_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
-    """Sample unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniform by solid angle."""
+    """Sample unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniformly by solid angle."""
     cosine = (1.0 - uniform[:, 0] * (1.0 - np.cos(angle)))[:, None]
     around = (2.0 * np.pi * uniform[:, 1])[:, None]
     first, second = find_perpendiculars(axis)
@@ -214,14 +214,14 @@ def _sample_in_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.n
 
 
 def find_perpendiculars(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute two unit vectors (n, 3) each, perpendicular to unit vectors `axis` (n, 3) and to each other."""
+    """Compute two unit vectors (n, 3) that are perpendicular to unit vectors `axis` (n, 3) and to each other."""
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return first, np.cross(axis, first)
 
 
 def build_rotations_about(shaft: np.ndarray) -> np.ndarray:
-    """Build rotations (n, 3, 3) whose z are unit vectors `shaft` (n, 3), with arbitrary turns about them."""
+    """Build rotations (n, 3, 3) with z axes `shaft` (n, 3), which are unit vectors, and arbitrary x axes."""
     return np.stack([*find_perpendiculars(shaft), shaft], axis=2)
 
 
@@ -230,18 +230,18 @@ PUBLISHED_FORCES = np.linspace(0.10, 1.05, 20)  # Forces of the published loads 
 
 @dataclass(frozen=True)
 class PublishedSettings:
-    """Settings of the published loads."""
+    """Settings of the published loads, which the preset `seed` samples."""
 
     position_count: int = 11  # Number of positions of the published loads.
     direction_count: int = 100  # Number of directions of the published loads.
-    radius: float = 7e-3  # Radius of the area of one free surface node of the published mesh [m].
+    radius: float = 7e-3  # Radius of a disc with the area of one free surface node of the published mesh [m].
     max_angle: float = np.pi / 3.0  # Largest angle between a published force and the inward normal [rad].
 
 
 def _place_published_loads(
     anatomy: Anatomy, patch: Patch, count: int, seed: int, settings: PublishedSettings = PublishedSettings()
 ) -> Loads:
-    """Build `build_published_loads` at 11 positions of the open cortex, 20-28 mm from the tumour's centre."""
+    """Build `build_published_loads` at 11 nodes of the open cortex, 20-28 mm from the tumour's centre."""
     if not len(anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour, so no position is 20-28 mm from it: choose another --preset.")
     centre = anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0)
@@ -262,10 +262,10 @@ def _place_published_loads(
 def build_published_loads(
     patch: Patch, positions: np.ndarray, count: int, seed: int, settings: PublishedSettings = PublishedSettings()
 ) -> Loads:
-    """Build the published loads: `positions` (m, 3) [m] x 100 directions x 20 sizes, shuffled, at most `count`.
+    """Build the published loads, shuffled: `positions` (m, 3) [m] x 100 directions x 20 forces; return at most `count`.
 
-    The authors draw their directions at random: a spherical Fibonacci lattice within 60 degrees of the inward normal
-    replaces them.
+    The authors sample directions at random; here they are a spherical Fibonacci lattice within 60 degrees of the inward
+    normal.
     """
     golden = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(settings.direction_count) / (2.0 * np.pi)
     lattice = np.column_stack([(np.arange(settings.direction_count) + 0.5) / settings.direction_count, golden % 1.0])
@@ -280,9 +280,9 @@ def build_published_loads(
 
 
 def select_spread(points: np.ndarray, count: int) -> np.ndarray:
-    """Select at most `count` of the `points` (n, 3) by farthest-point sampling; return their numbers (k,).
+    """Select at most `count` of the `points` (n, 3) by farthest-point sampling; return their indices (k,).
 
-    The first one is nearest to the mean, so that the result depends on the points alone. Gonzalez 1985, Theor. Comput.
+    The first point is nearest to the mean, so that the result depends only on the points. Gonzalez 1985, Theor. Comput.
     Sci. 38:293-306.
     """
     chosen = [int(find_nearest(points.mean(axis=0, keepdims=True), points)[0][0])]

@@ -1,4 +1,4 @@
-"""Sampling of surgical poses of a rigid tool: position, direction and depth."""
+"""Sampling of a rigid tool's poses as in surgery: position, direction and depth."""
 
 from dataclasses import dataclass, replace
 
@@ -21,24 +21,24 @@ class ToolPoseSettings:
     """Settings of `draw_poses`."""
 
     min_depth_ratio: float = 0.05  # Smallest depth as a share of the tool's radius.
-    # Largest depth of a ball as a share of its radius: deeper, a ball without shaft would be swallowed.
+    # Largest depth of a ball as a share of its radius; a deeper ball, which has no shaft, would be covered by tissue.
     max_ball_depth: float = 0.9
     max_rod_depth: float = 2.0  # Largest depth of a rod [radii].
     max_blade_depth: float = 2.0 / 3.0  # Largest depth of a blade [widths].
     max_blade_tilt: float = np.radians(20.0)  # Largest tilt of a blade [rad].
     contact_tolerance: float = 1e-6  # Distance that counts as contact when a tool is lowered [m].
     max_steps: int = 200  # Maximum number of steps when a tool is lowered.
-    sample_rows: int = 4  # Rows of surface sample points in a triangle when a tool is lowered.
+    sample_rows: int = 4  # Subdivisions of a triangle's edges for surface sample points when a tool is lowered.
     min_search_radius: float = 10e-3  # Lower bound of a third of the search radius round the tool [m].
 
 
 def choose_ball(preset: str) -> Ball:
-    """Return the ball that represents a round tool, with the mean of the tool's radii.
+    """Return the ball that represents a round tool: its radius is the mean of the preset's smallest and largest.
 
     Raises
     ------
     InputError
-        A preset that is not one round tool.
+        The preset is not a round tool.
     """
     if preset not in BALL_PRESETS:
         raise InputError(
@@ -52,18 +52,18 @@ def draw_poses(
     preset: str, anatomy: Anatomy, count: int, seed: int, tool: BuiltIn | None = None,
     settings: ToolPoseSettings = ToolPoseSettings(),
 ) -> Loads:  # fmt: skip
-    """Sample `count` poses of a tool, pressed into the open cortex; load i is reproducible as in `surrogate.draw`.
+    """Sample `count` poses of a tool that presses on the open cortex; pose i does not depend on `count`, as in `draw`.
 
-    Positions are uniform by area, and the tool's end is inside the edge. For a ball, positions and directions are those
-    of the preset's forces. Depths are uniform from 0.05 to 0.9 of the radius, and limited to the depth of the preset's
-    tool. Rods and blades move straight along their shaft from the first contact. The rotation about the shaft is
-    random. Rods tilt as the preset's tool, with depths of up to two radii. Blades tilt by up to 20 degrees, with
-    depths of up to two thirds of their width.
+    Positions are uniform by area, with the tool's end inside the craniotomy's edge. A ball has the positions and
+    directions of the preset's forces; its depth is uniform from 0.05 to 0.9 of its radius, limited to the preset's
+    depth. Rods and blades move straight along their shaft from the first contact, with a random rotation about it. Rods
+    tilt as the preset's tool, with depths of up to two radii. Blades tilt by up to 20 degrees, with depths of up to two
+    thirds of their width.
 
     Parameters
     ----------
     tool
-        Tool; default: the ball that represents the preset.
+        Tool; None: the ball that represents the preset.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def draw_poses(
 
 
 def compute_poses(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.ndarray) -> Touching:
-    """Compute poses of a ball: first contact at point (B, 3) [m] with inward normal (B, 3), then motion (B, 3)."""
+    """Compute a ball's poses: `motion` (B, 3) from first contact at `point` (B, 3) [m] with inward `normal` (B, 3)."""
     shaft = -motion / np.linalg.norm(motion, axis=1, keepdims=True)
     pose = np.zeros((len(point), 1, 4, 4))
     pose[:, 0, 3, 3] = 1.0
@@ -102,7 +102,7 @@ def compute_poses(ball: Ball, point: np.ndarray, normal: np.ndarray, motion: np.
 
 
 def _build_rotations(shaft: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Build rotations (B, 3, 3) whose z is `shaft` (B, 3), turned about it by angles (B,) [rad]."""
+    """Build rotations (B, 3, 3) with z axis `shaft` (B, 3), turned about this axis by `angle` (B,) [rad]."""
     first, second = find_perpendiculars(shaft)
     x = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
     return np.stack([x, np.cross(shaft, x), shaft], axis=2)
@@ -112,10 +112,10 @@ def _move_to_contact(
     tool: Capsule | Spatula, patch: Patch, point: np.ndarray, rotation: np.ndarray, depth: np.ndarray,
     settings: ToolPoseSettings,
 ) -> Touching:  # fmt: skip
-    """Lower a tool along its shaft over point (B, 3) until contact, and on by depth (B,) [m]; return the poses.
+    """Lower a tool along its shaft towards `point` (B, 3) until contact, then by `depth` (B,) [m]; return the poses.
 
-    Each step is the distance to the surface's nearest point (Hart 1996, "Sphere tracing", Visual Comput. 12:527-545).
-    The surface is sampled by `ToolPoseSettings.sample_rows`^2 points a triangle.
+    Each step is the distance to the nearest point of the surface (Hart 1996, "Sphere tracing", Visual Comput.
+    12:527-545). The surface is sampled by `ToolPoseSettings.sample_rows`^2 points a triangle.
     """
     share = build_barycentric_lattice(settings.sample_rows)
     surface = np.einsum("qc,scx->sqx", share, patch.points[patch.triangles]).reshape(-1, 3)

@@ -1,1 +1,1 @@
-"""Errors of models, and the empirical coverage of their bounds."""
+"""Errors of models relative to FEM, and the empirical coverage of their bounds."""

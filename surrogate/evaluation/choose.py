@@ -1,4 +1,4 @@
-"""Selection of a deformer by error limit or time limit, and the Pareto front of error and time."""
+"""Selection of a deformer by an error limit or a time limit, and the Pareto front of error and time."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from sim.errors import InputError
 
 @dataclass(frozen=True)
 class ModelCandidate:
-    """Name of a deformer, its reported error [mm], the median time of one load [ms], and a remark on both."""
+    """Deformer to choose from: name, reported error [mm], median time of one load [ms], and a remark on both."""
 
     name: str
     error_mm: float
@@ -21,7 +21,7 @@ class ModelCandidate:
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """Selected deformer, and a sentence with the reason."""
+    """Selected deformer, and the reason for the selection as a sentence."""
 
     candidate: ModelCandidate
     reason: str
@@ -30,14 +30,14 @@ class ModelChoice:
 def choose_model(
     candidates: Sequence[ModelCandidate], max_error_mm: float | None = None, max_time_ms: float | None = None
 ) -> ModelChoice:
-    """Select the fastest deformer within an error limit; without one, the most accurate within a time limit.
+    """Select the fastest deformer within an error limit or, without one, the most accurate within a time limit.
 
-    If both limits are given, both are satisfied.
+    If both limits are given, the selected deformer is the fastest that satisfies both.
 
     Raises
     ------
     InputError
-        No deformer within the limits, or no limit; an error or a time that is not positive.
+        No deformer satisfies the limits, no limit is given, or a limit is not positive.
     """
     given = {"mm": max_error_mm, "ms": max_time_ms}
     bounds = [f"{bound:g} {unit}" for unit, bound in given.items() if bound is not None]
@@ -71,7 +71,7 @@ def _get_time(offer: ModelCandidate) -> tuple[float, float]:
 
 
 def find_pareto_front(points: Mapping[str, tuple[float, float]]) -> frozenset[str]:
-    """Return the names on the Pareto front of two numbers (smaller is better), equals included."""
+    """Return the names of the points on the Pareto front of (time, error), equal points included; smaller is better."""
     return frozenset(
         name
         for name, (time, error) in points.items()

@@ -1,4 +1,4 @@
-"""Empirical coverage of a model's bounds on loads that it was not trained on."""
+"""Empirical coverage of a model's error bounds on loads that the model was not trained on."""
 
 from dataclasses import dataclass
 from operator import attrgetter
@@ -15,26 +15,26 @@ from ..model.learned import Learned
 
 FORCE_CLASSES = 10  # Number of classes of force for which coverage is reported.
 Shares = tuple[float | None, ...]
-"""Share of loads within their bounds for each of `conformal.LEVELS`; None where bounds give no guarantee."""
+"""Share of loads with an error within the bound, for each of `conformal.LEVELS`; None for infinite bounds."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Bounds and errors over n loads.
+    """Empirical coverage of a model's bounds over n loads, with median bound and error.
 
     Parameters
     ----------
     loads
-        n.
+        Number n of loads.
     shares
-        Empirical coverage for `conformal.LEVELS`; None if there were too few calibration loads for a guarantee. The
-        error is the maximum over the tumour, or that of the distance from tip to tumour.
+        Empirical coverage for each of `conformal.LEVELS`; None if too few calibration loads give no guarantee. The
+        error is the maximum over the tumour, or the error of the tip-tumour distance.
     tenths
-        Coverage at the first level, by deciles of the force, from weak to strong.
+        Coverage at the first level by decile of the force, in ascending order.
     bound_mm, error_mm
-        Medians over the loads of the bound at the first level, and of the error [mm].
+        Medians over the loads [mm]: of the bound at the first level, and of the error.
     extrapolated
-        Number of loads that the model marks as outside its training.
+        Number of loads that the model marks as outside its training range.
     """
 
     loads: int
@@ -55,12 +55,12 @@ class Coverage:
 
 
 def compute_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverage:
-    """Compute the coverage of a model's bounds, by displacements `truth` (B, n, 3) [m] of the tumour's vertices.
+    """Compute the coverage of a model's bounds, given the tumour's FEM displacements `truth` (B, n, 3) [m].
 
     Raises
     ------
     InputError
-        A model without bounds, or fewer loads than deciles.
+        The model has no bounds, or there are fewer loads than deciles.
     """
     if model.bounds is None:
         raise InputError("this model has no calibrated bounds: train it on a data set with more loads.")
@@ -71,12 +71,12 @@ def compute_coverage(model: Learned, loads: Loads, truth: np.ndarray) -> Coverag
 
 
 def measure_distance_coverage(model: Learned, loads: Loads, reference: np.ndarray) -> Coverage:
-    """Compute the coverage of the bound of a model's distance, by the FEM distances `reference` (B,) [m].
+    """Compute the coverage of a model's distance bounds, given the FEM distances `reference` (B,) [m].
 
     Raises
     ------
     InputError
-        A model without a bound of its distance, or fewer loads than deciles.
+        The model has no bound of its distance, or there are fewer loads than deciles.
     """
     if model.tip is None or model.tip.bound is None:
         raise InputError("this model has no calibrated bound of its distance: train it again, with enough loads.")
@@ -92,7 +92,7 @@ def _check_load_count(loads: Loads) -> None:
 
 
 def measure_coverage_shares(error: np.ndarray, bound: np.ndarray) -> Shares:
-    """Compute shares of errors (B,) within bounds (levels, B) of the same unit; None if all bounds are infinite."""
+    """Compute the share of errors (B,) within `bound` (levels, B) for each level; None if all bounds are infinite."""
     promised = ~np.isposinf(bound)
     return tuple(
         float((error <= row)[some].mean()) if some.any() else None for row, some in zip(bound, promised, strict=True)
@@ -100,7 +100,7 @@ def measure_coverage_shares(error: np.ndarray, bound: np.ndarray) -> Shares:
 
 
 def format_coverage(covered: Shares) -> str:
-    """Describe the coverage at each level."""
+    """Format the empirical coverage at each level as text."""
     shares = zip(covered, LEVELS, strict=True)
     return ", ".join(
         f"no guarantee at {100 * level:g} %" if share is None else f"{100 * share:.1f} % at {100 * level:g} %"
@@ -109,7 +109,7 @@ def format_coverage(covered: Shares) -> str:
 
 
 def measure_coverage(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
-    """Compute the coverage of errors (B,) [m] by bounds (2, B) [m], overall and by deciles of force (B,) [N]."""
+    """Compute the coverage of errors (B,) [m] by bounds (2, B) [m], for all loads and by decile of force (B,) [N]."""
     covered = error <= bound[0]
     by_force = np.array_split(np.argsort(force, kind="stable"), FORCE_CLASSES)
     return Coverage(

@@ -1,4 +1,4 @@
-"""Errors of a model on the loads of a data set: displacement and tool force."""
+"""Errors of a model on the loads of a data set, for displacement and tool force, and its wall time."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -19,21 +19,21 @@ from .coverage import Shares, format_coverage, measure_coverage_shares
 
 @dataclass(frozen=True)
 class SolveCounts:
-    """Solves by kind, and their wall time.
+    """Numbers of FEM solves by kind, and their wall time.
 
     Parameters
     ----------
     loads
-        Nonlinear solves: the training loads.
+        Number of nonlinear solves, one for each training load.
     units
-        Linear solves of unit forces at nodes of the cortex.
+        Number of linear solves of unit forces at nodes of the cortex.
     series
-        Linear solves of the power series: places x radii x terms.
+        Number of linear solves of the power series: positions x radii x terms.
     inside
-        Number of those for the tumour inside held-out discs.
+        Number of linear solves for the tumour with forces inside held-out discs.
     seconds
-        Duration of all these solves [s], on the machine that ran them; None if it is not recorded, or if an
-        interrupted run was resumed.
+        Wall time of all these solves [s], on the machine that computed them; None if not recorded, or if an interrupted
+        run was resumed.
     """
 
     loads: int
@@ -55,20 +55,20 @@ T = TypeVar("T")  # Type of a deformer's input.
 
 @dataclass(frozen=True)
 class ForceScore:
-    """Error of a tool's force vector, over n loads under which it presses.
+    """Error of a tool's force vector, over the n loads with a force above zero.
 
     Parameters
     ----------
     loads
         Number n of loads.
     force
-        Mean of the FEM forces [N].
+        Mean magnitude of the FEM forces [N].
     mean
         Mean error [N].
     mean_percent, p95_percent
-        Mean and 95th percentile of the errors divided by the load's force [%].
+        Mean and 95th percentile of error / FEM force of the same load [%].
     shares
-        Empirical coverage of the bound, see `Coverage`; None without a bound.
+        Empirical coverage of the bound, as in `Coverage`; None without a bound.
     bound
         Median of the bound at the first level [N]; None without a bound.
     """
@@ -92,17 +92,17 @@ class ForceScore:
 
 
 def compute_force_errors(predicted: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Compute the norms (B,) [N] of the differences between forces (B, 3)."""
+    """Compute the norms (B,) [N] of the differences between predicted and reference forces (B, 3)."""
     return np.linalg.norm(predicted - reference, axis=1)
 
 
 def score_forces(error: np.ndarray, reference: np.ndarray, bound: np.ndarray | None = None) -> ForceScore:
-    """Score errors (B,) [N] of true forces (B, 3) [N], with bounds (2, B) [N] if there are any.
+    """Score errors (B,) [N] of forces, given the FEM forces `reference` (B, 3) [N] and bounds (2, B) [N], if any.
 
     Raises
     ------
     InputError
-        Loads under which no tool presses.
+        All reference forces are zero.
     """
     size = np.linalg.norm(reference, axis=1)
     some = size > 0.0
@@ -125,31 +125,31 @@ def score_forces(error: np.ndarray, reference: np.ndarray, bound: np.ndarray | N
 
 
 def compare_forces(model: Learned, loads: Loads, reference: np.ndarray) -> ForceScore:
-    """Score a model's forces relative to FEM forces (B, 3) [N]."""
+    """Score a model's tool forces relative to the FEM forces `reference` (B, 3) [N]."""
     result = model.deform(loads, at=model.anatomy.tumour_nodes)
     return score_forces(compute_force_errors(result.reaction[:, 0, :3], reference), reference, result.reaction_bound)
 
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of a prediction relative to the reference over every load x vertex.
+    """Errors of a deformer relative to FEM over all loads and vertices, and its wall time.
 
     Parameters
     ----------
     name
         Name of the deformer.
     mean_mm, p95_mm, p999_mm, max_mm
-        Mean, percentiles and maximum [mm]; p999 is None for fewer than `MIN_LOADS_FOR_P999` loads.
+        Mean, percentiles and maximum of errors [mm]; p999 is None for fewer than `MIN_LOADS_FOR_P999` loads.
     mean_percent, p95_percent, p999_percent, max_percent
-        Statistics of errors divided by the load's motion, the mean displacement of the reference's vertices [%].
+        The same statistics of error / mean displacement of the vertices under the same load [%].
     worst_mean_mm, worst_p95_mm, worst_p999_mm
-        Mean and percentiles over loads of the maximum vertex error of each load [mm]; the largest is `max_mm`.
+        Mean and percentiles over loads of the maximum vertex error [mm]; the maximum over loads is `max_mm`.
     microseconds
-        Median wall time of `deform` for one load at a time [us], its bound and limits included, warm-up excluded.
+        Median wall time of `deform` for a single load [us], with bounds and checks, without warm-up.
     bare_microseconds
-        Median wall time of the model alone in NumPy [us], which compares model types; None for other deformers.
+        Median wall time of the model alone in NumPy [us], to compare model types; None for other deformers.
     solves
-        Number of FEM solves that the deformer depends on, if known.
+        Numbers of FEM solves that the deformer depends on; None if not available.
     """
 
     name: str
@@ -170,14 +170,14 @@ class Score:
 
 
 def compute_point_errors(deformer: Deformer, loads: Loads, reference: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Compute errors (B, n) [m] of a deformer relative to `reference` (B, n, 3) [m] at `nodes` (n,)."""
+    """Compute a deformer's errors (B, n) [m] relative to `reference` (B, n, 3) [m] at the vertices `nodes` (n,)."""
     return np.linalg.norm(deformer.deform(loads, at=nodes).displacement - reference, axis=2)
 
 
 def score(
     name: str, deformer: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray, solves: SolveCounts | None = None
 ) -> Score:
-    """Score a deformer relative to `truth` (B, n, 3) [m] at the vertices `nodes` (n,)."""
+    """Score a deformer relative to FEM displacements `truth` (B, n, 3) [m] of the vertices `nodes` (n,)."""
     distance = compute_point_errors(deformer, loads, truth, nodes)
     motion = np.linalg.norm(truth, axis=2).mean(axis=1, keepdims=True)
     return Score(
@@ -192,7 +192,7 @@ def score(
 
 
 def time_model_alone(deformer: Deformer, loads: Loads) -> float | None:
-    """Measure the median wall time [us] of a trained model alone, of one load at a time; None for other deformers."""
+    """Measure the median wall time [us] of a trained model alone for a single load; None for other deformers."""
     if not isinstance(deformer, Learned):
         return None
     single = [
@@ -205,13 +205,13 @@ def time_model_alone(deformer: Deformer, loads: Loads) -> float | None:
 
 
 def time_single_loads(deformer: Deformer, loads: Loads, nodes: np.ndarray, count: int) -> list[float]:
-    """Measure wall times [s] of `count` solves of one load at a time, cycling through the loads, warm-up excluded."""
+    """Measure wall times [s] of `count` solves of single loads, cycling through the loads, without warm-up."""
     single = [loads.select(slice(row, row + 1)) for row in np.arange(WARM_UP_LOADS + count) % len(loads)]
     return _measure_times(lambda one: deformer.deform(one, at=nodes), single)
 
 
 def _measure_times(result: Callable[[T], object], single: Iterable[T]) -> list[float]:
-    """Measure wall times [s] of one call after the other, without the warm-up."""
+    """Measure the wall time [s] of each call of `result`, without the warm-up calls."""
     seconds = []
     for one in single:
         begun = time.perf_counter()
@@ -221,12 +221,12 @@ def _measure_times(result: Callable[[T], object], single: Iterable[T]) -> list[f
 
 
 def find_best_score(scores: Sequence[Score]) -> Score:
-    """Return the score with the smallest mean error."""
+    """Return the score with the smallest mean error in mm."""
     return min(scores, key=lambda row: row.mean_mm)
 
 
 def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
-    """Format the scores, the best of several, and the solves that model types depend on, if known."""
+    """Format the scores as a table, with the best one and the FEM solves of each model type, if known."""
     head = (
         "          mm, all vertices                | mm, a load's worst vertex  | % of motion                 "
         "| us, NumPy model\n"
@@ -250,12 +250,12 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
 
 
 def _format_number(value: float | None, form: str) -> str:
-    """Format a number, or a dash in its column."""
+    """Format a number by `form`; None gives a dash of the same width."""
     return f"{'-':>{form.split('.')[0]}}" if value is None else f"{value:{form}}"
 
 
 def _solve_lines(scores: Sequence[Score]) -> list[str]:
-    """Format the solves of each model type, as lines."""
+    """Format the numbers of FEM solves of each model type as lines; empty if none is known."""
     known = [(row.name, row.solves) for row in scores if row.solves is not None]
     if not known:
         return []
@@ -273,7 +273,7 @@ def _solve_lines(scores: Sequence[Score]) -> list[str]:
 
 
 def compute_statistics(values: np.ndarray) -> tuple[float, float, float | None, float]:
-    """Compute mean, 95th and 99.9th percentile (None for too few loads), and maximum of values (B, ...) of B loads."""
+    """Compute mean, 95th and 99.9th percentile (None for few loads), and maximum of values (B, ...) of B loads."""
     p95, p999 = np.percentile(values, (95.0, 99.9))
     return (
         float(values.mean()),

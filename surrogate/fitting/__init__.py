@@ -1,1 +1,1 @@
-"""Estimation of a patient's tissue from observations of the open cortex in several frames."""
+"""Estimation of a patient's tissue parameters from observations of the open cortex in several frames."""

@@ -1,4 +1,4 @@
-"""Estimation of a patient's tissue from several frames: sum of their log evidence in each tissue."""
+"""Estimation of a patient's tissue from several frames, by the sum of their log evidence for each candidate tissue."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -36,10 +36,10 @@ from .responses import POISSONS, RATIOS, TOOL_FORCE, Responses, build_drainage_l
 from .tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue
 
 EXPONENTS = (9.5, 19.0)
-"""Candidate -m of Ogden's law, equally probable: tissue stiffens with indentation, so a dent alone gives no E."""
+"""Candidate exponents -m of Ogden's law, equally probable; tissue stiffens with depth, so a dent alone gives no E."""
 YOUNGS = np.geomspace(300.0, 12000.0, 300)
 """Candidate Young's moduli [Pa] at small strain, equally probable."""
-# Equally probable normal quantiles of a force reading [standard deviations].
+# Equally probable quantiles of a force reading's normal error [standard deviations].
 READING_QUANTILES = np.array([-1.4, -0.7, 0.0, 0.7, 1.4])
 
 
@@ -47,13 +47,13 @@ READING_QUANTILES = np.array([-1.4, -0.7, 0.0, 0.7, 1.4])
 class ModulusSettings:
     """Settings of `estimate_young_moduli`."""
 
-    # Solved forces as multiples of the force that linear tissue would need.
+    # Forces to solve, as multiples of the force that linear tissue would need.
     force_multiples: tuple[float, ...] = (0.6, 1.2, 2.2, 3.6, 5.5)
     # Ratio of the force on finer or quadratic meshes to that on a command's mesh, for the same dent: 1.08 to 1.16 on
     # the template (docs/notes/fit_experiments.md).
     mesh_force_ratio: float = 1.11
     modulus_deviation: float = 0.45  # Standard deviation of the logarithm of a modulus due to further errors.
-    iterations: int = 3  # Number of iterations that recompute the errors from the estimated dent.
+    iterations: int = 3  # Number of iterations that update the model error from the estimated dent.
     modulus_samples: int = 101  # Number of samples of a modulus.
 
 
@@ -62,12 +62,12 @@ def estimate_young_moduli(
     device: str = "auto", progress: Callable[[int, int], object] = lambda done, total: None,
     settings: ModulusSettings = ModulusSettings(),
 ) -> np.ndarray:  # fmt: skip
-    """Sample Young's moduli (k,) [Pa] of the brain, equally probable; empty if no force was measured.
+    """Sample equally probable Young's moduli (k,) [Pa] of the brain; empty if no force was measured.
 
     Raises
     ------
     InputError
-        A force that FEM cannot reach.
+        FEM cannot reach a measured force.
     """
     columns = np.cumsum([0, *[3 * len(frame.tools) for frame in frames]])
     read = [number for number, frame in enumerate(frames) if any(tool.force is not None for tool in frame.tools)]
@@ -91,7 +91,7 @@ def _compute_log_likelihood(
     anatomy: Anatomy, tool: Tool, evidence: Evidence, tissue: FittedTissue, pressed: Responses, own: slice,
     device: str, settings: ModulusSettings,
 ) -> np.ndarray:  # fmt: skip
-    """Compute the log-likelihood of one force reading for each of `YOUNGS`."""
+    """Compute the log-likelihood (len(YOUNGS),) of one force reading for each candidate modulus."""
     name = max(tissue.skulls, key=lambda skull: tissue.skulls[skull])
     skull, (_, poisson, _), (_, ratio, _) = "slide" if name == SEPARATING_SKULL else name, tissue.poisson, tissue.ratio
     nearest = int(np.abs(POISSONS - poisson).argmin()), int(np.abs(np.log(RATIOS / ratio)).argmin())
@@ -126,7 +126,7 @@ def _solve_dents(
     anatomy: Anatomy, tool: Tool, group: Group, evidence: Evidence, pressed: Responses, sizes: np.ndarray,
     direction: np.ndarray, device: str,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Solve forces in tissue of modulus `YOUNG`; return converged ones (k,) [N] and their observations (k, m) [m]."""
+    """Solve forces on tissue of modulus `YOUNG`; return the converged forces (k,) [N] and observed dents (k, m) [m]."""
     loads = build_force_loads(
         anatomy, find_contact_point(anatomy, tool)[None], np.array([tool.radius]), sizes[:, None] * direction
     )
@@ -143,10 +143,10 @@ def fit_tissue(
     progress: Callable[[str, int, int], object] = lambda stage, done, total: None,
     left_out: Sequence[np.ndarray] | None = None,
 ) -> FittedTissue:  # fmt: skip
-    """Estimate the tissue of a locator's anatomy from some frames.
+    """Estimate the tissue of a locator's anatomy from observed frames.
 
-    Points that no others support are removed: `left_out`, or by `find_unsupported_points`. Those in `folder` are read.
-    `progress` receives a stage, the number of its parts done, and their total.
+    Outliers are removed: the points in `left_out` (one array per frame), or those of `find_unsupported_points`. FEM
+    responses stored in `folder` are reused. `progress` receives a stage, the number of its parts done, and their total.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def fit_tissue_from_responses(
     locator: Locator, frames: Sequence[ObservedFrame], drainage: Responses | None, pressing: Responses | None,
     device: str = "auto", progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> FittedTissue:  # fmt: skip
-    """Estimate the tissue as `fit_tissue`, from solved responses; `progress` receives the number of forces done."""
+    """Estimate the tissue as `fit_tissue`, from given FEM responses; `progress` receives the number of forces done."""
     with limit_to_one_thread():  # matrix products are small
         probability = compute_probability(compute_tissue_likelihood(locator, frames, drainage, pressing))
     tissue = FittedTissue(locator.anatomy.digest, len(frames), probability, np.zeros(0))
@@ -183,14 +183,14 @@ def fit_tissue_from_responses(
 
 
 def list_fitted_regions(locator: Locator) -> tuple[Region, ...]:
-    """Return the regions of a locator other than the tumour, whose stiffness is estimated."""
+    """Return the locator's regions of known stiffness, without the tumour, whose stiffness is estimated."""
     return tuple(one for one in locator.regions if one.label != TUMOUR_LABEL)
 
 
 def compute_tissue_likelihood(
     locator: Locator, frames: Sequence[ObservedFrame], drainage: Responses | None, pressing: Responses | None
 ) -> np.ndarray:
-    """Compute the log-likelihood (skulls, poissons, ratios) of all frames in the solved tissues."""
+    """Compute the log-likelihood (skulls, poissons, ratios) of all frames for each candidate tissue."""
     total, first = np.zeros((1, len(POISSONS), len(RATIOS))), 0
     for frame in frames:
         evidence, last = to_evidence(locator.anatomy, frame.observation), first + 3 * len(frame.tools)
@@ -203,7 +203,7 @@ def compute_tissue_likelihood(
 
 
 def compute_probability(log_likelihood: np.ndarray) -> np.ndarray:
-    """Interpolate probabilities to the fine grid: logarithms are smooth in log ratio and in compressibility."""
+    """Interpolate log-likelihoods to `FINE_POISSONS` and `FINE_RATIOS`; return probabilities with sum 1."""
     fine = CubicSpline(np.log(RATIOS), log_likelihood, axis=2)(np.log(FINE_RATIOS))
     order = np.argsort(1.0 - 2.0 * POISSONS)
     x, want = (1.0 - 2.0 * POISSONS)[order], 1.0 - 2.0 * FINE_POISSONS

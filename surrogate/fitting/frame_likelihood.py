@@ -1,4 +1,4 @@
-"""Likelihood of one frame in each tissue: Gaussian in the unknown sizes of the tissue's own motions, and in errors."""
+"""Likelihood of a frame for each candidate tissue: Gaussian in the sizes of its motions and in the errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ LIKELIHOOD = LikelihoodSettings()
 
 
 def compute_drainage_likelihood(drainage: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
-    """Compute the log-likelihood (skulls, poissons, ratios) of a frame with drained fluid."""
+    """Compute the log-likelihood (skulls, poissons, ratios) of a frame in which fluid has drained."""
     lower, seen = factorise_errors(evidence)
     rows = {name: predict_observation(drainage, name, evidence) for name in SOLVED_SKULLS}
     own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
@@ -50,9 +50,9 @@ def compute_drainage_likelihood(drainage: Responses, prior: MotionPrior, evidenc
 
 
 def compute_pressing_likelihood(pressing: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
-    """Compute the log-likelihood (skulls, 1, 1) of a frame with tools: its `columns` (k,) of the responses.
+    """Compute the log-likelihood (skulls, 1, 1) of a frame with tools, given `columns` (k,) of the responses.
 
-    Dents of tools determine the skull only: their information on Poisson's ratio and stiffness ratio is mostly
+    Dents by tools determine only the skull model. Their information on Poisson's ratio and stiffness ratio is mostly
     nonlinear stiffening, which linear responses lack.
     """
     lower, seen = factorise_errors(evidence)
@@ -65,7 +65,7 @@ def compute_pressing_likelihood(pressing: Responses, columns: np.ndarray, eviden
 
 
 def predict_observation(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
-    """Compute the observed displacements (poissons, ratios, loads, m) [m] of responses."""
+    """Compute the displacements (poissons, ratios, loads, m) [m] of responses along the axes of the evidence."""
     column = np.searchsorted(responses.nodes, evidence.location.vertices)
     motion = responses.motion[skull][..., column, :]
     return np.einsum("prlmki,mk,mi->prlm", motion, evidence.location.weights, evidence.axis, optimize=True)
@@ -76,10 +76,10 @@ def _compute_size(rows: np.ndarray) -> float:
 
 
 def factorise_errors(evidence: Evidence, expected_motion: np.ndarray | None = None) -> tuple[np.ndarray, float]:
-    """Compute the Cholesky factor (m, m) of the covariance of all errors, and the root mean square observation [m].
+    """Compute the Cholesky factor (m, m) of the total error covariance, and the root mean square observation [m].
 
-    The model error is a share of the motion `expected_motion` (m,) [m]; None: of the observation, noise included. Then
-    points that seem to move farther are down-weighted, so that motions are underestimated.
+    The model error is a share of `expected_motion` (m,) [m]; None: of the observed motion, which includes noise. Points
+    with larger apparent motion then have less weight, so that motions are underestimated.
     """
     value = evidence.motion if expected_motion is None else expected_motion
     length = np.sqrt(np.bincount(evidence.point, value**2))[evidence.point]
@@ -99,7 +99,7 @@ def whiten_columns(cholesky: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
-    """Compute log evidence (poissons, ratios) of motions (poissons, ratios, loads, m) of joint size 1."""
+    """Compute log evidence (poissons, ratios) of motions (poissons, ratios, loads, m), scaled to a mean size of 1."""
     motion = seen * whiten_columns(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
     gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(lower, evidence.motion)
     logs = []
@@ -111,12 +111,12 @@ def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarra
 
 
 def find_unsupported_points(locator: Locator, frames: Sequence[ObservedFrame]) -> tuple[np.ndarray, ...]:
-    """Return the point numbers (k,), from 0, that `Locator.locate` rejects in each frame.
+    """Return for each frame the indices (k,) of the points that `Locator.locate` rejects as outliers.
 
     Raises
     ------
     InputError
-        A frame that no cause explains, or of which more than a third is rejected.
+        No cause explains a frame, or more than a third of its points are rejected.
     """
     found = []
     for number, frame in enumerate(frames, start=1):
@@ -128,7 +128,7 @@ def find_unsupported_points(locator: Locator, frames: Sequence[ObservedFrame]) -
 
 
 def remove_points(frames: Sequence[ObservedFrame], point_numbers: Sequence[np.ndarray]) -> list[ObservedFrame]:
-    """Remove points of given numbers (k,) from each frame of points with correspondences."""
+    """Remove the points with given indices (k,) from each frame; points must have correspondences."""
     return [
         _remove_points(frame, numbers) if len(numbers) else frame
         for frame, numbers in zip(frames, point_numbers, strict=True)

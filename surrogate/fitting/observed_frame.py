@@ -1,4 +1,4 @@
-"""Frames with observed points and tools, and the CSV table of those tools."""
+"""Observed frames with their points and pressing tools, and the CSV table of the tools."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from ..locating.observation import LIMITS, Observation, to_evidence
 from ..locating.observed_files import PLACE, SIGMA, read_columns
 
 DEFAULT_RADIUS = 6e-3
-"""Default radius of the disc on which a tool presses [m]."""
+"""Default radius [m] of the disc on which a tool presses."""
 RADIUS_RANGE = (0.5e-3, 30e-3)  # Smallest and largest tool radius [m].
 MAX_FORCE = 10.0  # Largest force of a tool on a brain [N].
 FORCE_SIGMA = 0.1
-"""Default standard deviation of a measured force, relative to it."""
+"""Default standard deviation of a measured force, as a share of the force."""
 # Column names: number of the frame, radius of the tool, force.
 FRAME_COLUMN, RADIUS_COLUMN, FORCE_COLUMN = "frame", "radius", "force"
-ALLOWED_COLUMNS = {  # Allowed columns after the position, and columns with optional cells.
+ALLOWED_COLUMNS = {  # Allowed combinations of columns.
     (FRAME_COLUMN, *PLACE, *more)
     for more in (
         (),
@@ -39,16 +39,16 @@ OPTIONAL_COLUMNS = (RADIUS_COLUMN, FORCE_COLUMN, SIGMA)  # Columns whose cells m
 
 @dataclass(frozen=True)
 class Tool:
-    """Tool that presses on the open cortex.
+    """Observed tool that presses on the open cortex.
 
     Parameters
     ----------
     tip
-        Contact position (3,) [m], RAS.
+        Contact position (3,) [m] of the tool's tip, RAS.
     radius
-        [m] of the disc on which it presses.
+        Radius [m] of the disc on which the tool presses.
     force, sigma
-        Force [N], and its standard deviation; None: not measured.
+        Force [N] and its standard deviation [N]; None: not measured.
     """
 
     tip: tuple[float, float, float]
@@ -59,20 +59,20 @@ class Tool:
 
 @dataclass(frozen=True, eq=False)
 class ObservedFrame:
-    """Observation, and the tools that pressed during it; without tools, fluid has drained."""
+    """Observation and the tools that pressed during the observation; in a frame without tools, fluid has drained."""
 
     observation: Observation
     tools: tuple[Tool, ...] = ()
 
 
 def check_frames(anatomy: Anatomy, frames: Sequence[ObservedFrame]) -> None:
-    """Check that frames are usable for an anatomy.
+    """Check that frames can be used to fit the tissue of an anatomy.
 
     Raises
     ------
     InputError
-        No frames; the same frame twice; errors of `to_evidence`; clouds; tools that are off the open cortex, too wide,
-        or with an invalid force.
+        There are no frames, or two equal ones; a frame is invalid for `to_evidence` or a point cloud; a tool is far
+        from the open cortex, or has an invalid radius or force.
     """
     if not frames:
         raise InputError("there is no frame to fit tissue to: give what was seen of the open cortex, a file a frame.")
@@ -95,7 +95,7 @@ def check_frames(anatomy: Anatomy, frames: Sequence[ObservedFrame]) -> None:
 
 
 def find_contact_point(anatomy: Anatomy, tool: Tool) -> np.ndarray:
-    """Return the point (3,) [m] of the undeformed open cortex nearest to a tool's tip."""
+    """Return the point (3,) [m] of the undeformed open cortex that is nearest to a tool's tip."""
     return find_closest_points(np.array([tool.tip]), open_cortex(anatomy).corners).point[0]
 
 
@@ -123,14 +123,14 @@ def _check(anatomy: Anatomy, tool: Tool) -> None:
 
 
 def read_tools(path: str | Path, frames: int) -> tuple[tuple[Tool, ...], ...]:
-    """Read `frame,x,y,z[,radius][,force[,sigma]]`: the tools of each of `frames` frames, which count from 1.
+    """Read a CSV table `frame,x,y,z[,radius][,force[,sigma]]`: the tools of each of `frames` frames, numbered from 1.
 
-    Cells of radius, force and sigma may be empty: the default radius, and a force that was not measured.
+    Cells of radius, force and sigma may be empty: then the radius is the default, and the force is not measured.
 
     Raises
     ------
     InputError
-        A file that is missing or not such a table; a frame that does not exist.
+        The file is missing or not such a table, or a frame number does not exist.
     """
     columns = read_columns(path, ALLOWED_COLUMNS, OPTIONAL_COLUMNS)
     found: list[list[Tool]] = [[] for _ in range(frames)]

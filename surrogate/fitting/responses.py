@@ -1,4 +1,4 @@
-"""Responses of linear tissue to drained fluid and to forces, for each tissue, as basis of the likelihood."""
+"""FEM responses of linear tissue to drained fluid and to forces, for each candidate tissue."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,31 +23,31 @@ from ..locating.regions import Region, build_tissue
 from ..model.kept_arrays import get_cache_path, load_cached_arrays
 
 RATIOS = np.geomspace(0.4, 3.2, 4)
-"""Candidate ratios of tumour to brain stiffness, for which FEM is solved."""
+"""Candidate ratios of tumour to brain stiffness for which FEM is solved."""
 POISSONS = np.array([0.45, 0.47, 0.4945])
-"""Candidate Poisson's ratios of brain and tumour."""
+"""Candidate Poisson's ratios of brain and tumour for which FEM is solved."""
 SOLVED_SKULLS = ("bonded", "slide")
-"""Skulls for which FEM is solved; one that separates keeps contact under a tool, as sliding contact does."""
+"""Skull models for which FEM is solved; a separating skull keeps contact under a tool, as `slide` does."""
 TOOL_FORCE = 0.01
-"""Tool force along each axis [N]."""
+"""Force of a tool along each axis [N]."""
 POSTURE_COUNT = 6  # Number of head positions.
-FLUID_LEVELS = (0.7, 0.4, 0.15)  # Shares of the remaining fluid in each head position.
+FLUID_LEVELS = (0.7, 0.4, 0.15)  # Shares of the fluid that remain in each head position.
 SEED = 5  # Random seed of the head positions.
 ACCURACY = Accuracy(tolerance=1e-3)  # Accuracy of the FEM results.
 
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """Motions of some vertices by loads of one kind.
+    """Displacements of some vertices under loads of one kind, for each candidate tissue.
 
     Parameters
     ----------
     nodes
         Sorted mesh vertices (n,).
     motion
-        Displacements by skull (poissons, ratios, loads, n, 3) [m], with the tissue stiffness of `locating.causes`.
+        Displacements (poissons, ratios, loads, n, 3) [m] by skull model, for the brain's stiffness `causes.YOUNG`.
     regions
-        Known regions that were included.
+        Regions of known stiffness that were included.
     """
 
     nodes: np.ndarray
@@ -56,7 +56,7 @@ class Responses:
 
 
 def build_drainage_loads(anatomy: Anatomy) -> Loads:
-    """Build loads of drained fluid for sampled head positions."""
+    """Build loads of drained fluid for sampled directions of gravity and several fluid levels."""
     down = sample_gravity_directions(
         np.random.default_rng(SEED), open_cortex(anatomy).axis, replace(USUAL_CAUSES, drainages=POSTURE_COUNT)
     )
@@ -70,7 +70,7 @@ def build_drainage_loads(anatomy: Anatomy) -> Loads:
 def build_force_loads(
     anatomy: Anatomy, point: np.ndarray, radius: np.ndarray, force: np.ndarray | None = None
 ) -> Loads:
-    """Build forces (n, 3) [N] on discs round points (k, 3) with radii (k,) [m]; None: along each axis of each point."""
+    """Build forces (n, 3) [N] on discs of radii (k,) [m] round points (k, 3); None: one along each axis, per point."""
     some = TOOL_FORCE * np.tile(np.eye(3), (len(point), 1)) if force is None else force
     each, count = len(some) // len(point), len(some)
     pushed = Pushed(np.repeat(point, each, axis=0), some, np.repeat(radius, each))
@@ -83,9 +83,9 @@ def solve_responses(
     anatomy: Anatomy, loads: Loads, device: str = "auto", folder: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None, regions: tuple[Region, ...] = (),
 ) -> Responses:  # fmt: skip
-    """Solve each tissue, with known `regions`. Results for the same loads in `folder` are read.
+    """Solve the loads for each candidate tissue, with known `regions`; results stored in `folder` are reused.
 
-    `progress` receives the number of tissues done and their total.
+    `progress` receives the number of candidate tissues done and their total.
     """
     nodes, found = find_observed_nodes(anatomy), []
     every = list(product(SOLVED_SKULLS, POISSONS, RATIOS))
@@ -103,7 +103,7 @@ def _get_motions(
     anatomy: Anatomy, nodes: np.ndarray, loads: Loads, tissue: tuple[str, float, float, tuple[Region, ...]],
     device: str, folder: Path | None,
 ) -> np.ndarray:  # fmt: skip
-    """Read motions (loads, n, 3) [m] of one tissue from the folder, or compute and store them."""
+    """Read the displacements (loads, n, 3) [m] for one tissue from the folder, or compute and store them."""
     numbers = [array for cause in loads.causes for array in vars(cause).values()]
     stated = anatomy.digest, recommend_element(anatomy.mesh), tissue, ACCURACY, compute_digest(*numbers)
     path = get_cache_path(folder, "", device, *stated)

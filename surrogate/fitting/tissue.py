@@ -1,4 +1,4 @@
-"""Fitted tissue, in memory and as a JSON file."""
+"""Fitted tissue of a patient, in memory and as a JSON file."""
 
 import json
 from dataclasses import dataclass
@@ -12,32 +12,32 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import wrap_errors
 
 FINE_RATIOS = np.geomspace(0.4, 3.2, 33)
-"""Ratios of tumour to brain stiffness, equally probable a priori."""
+"""Ratios of tumour to brain stiffness in the posterior, equally probable a priori."""
 FINE_POISSONS = np.linspace(0.45, 0.4945, 13)
-"""Poisson's ratios, equally probable a priori."""
+"""Poisson's ratios in the posterior, equally probable a priori."""
 CLASSES = {"compressible": (0.0, 0.4725), "nearly incompressible": (0.4725, 0.5)}
-"""Two classes of Poisson's ratio, equally probable a priori."""
+"""Two classes of Poisson's ratio by their limits, equally probable a priori."""
 INTERVAL_PROBABILITIES = (0.025, 0.5, 0.975)  # Probabilities of the reported quantiles: lower end, median, upper end.
-MAX_WIDTH_RATIO = 0.85  # Log-width of an interval, relative to the prior's, above which it is uninformative.
-MIN_PROBABILITY_SHIFT = 0.15  # Largest difference of probabilities from the prior's below which they are uninformative.
+MAX_WIDTH_RATIO = 0.85  # Log-width of an interval, relative to the prior range, above which it is uninformative.
+MIN_PROBABILITY_SHIFT = 0.15  # Maximum change of probabilities from the prior below which they are uninformative.
 FORMAT = "sulcus tissue 1"  # Name and version of the file format.
 SUFFIX = ".tissue.json"  # Ending of the file, next to the anatomy.
 
 
 @dataclass(frozen=True, eq=False)
 class FittedTissue:
-    """Posterior of a patient's tissue.
+    """Posterior distribution of a patient's tissue.
 
     Parameters
     ----------
     anatomy
         Digest of the anatomy.
     frames
-        Number of frames.
+        Number of observed frames.
     probability
-        Probability (skulls, poissons, ratios), with sum 1, of `sim.effects.SKULLS`, `FINE_POISSONS` and `FINE_RATIOS`.
+        Joint probability (skulls, poissons, ratios) of `sim.effects.SKULLS`, `FINE_POISSONS` and `FINE_RATIOS`.
     young
-        Samples (k,) of the brain's Young's modulus [Pa], equally probable; empty if no force was measured.
+        Equally probable samples (k,) of the brain's Young's modulus [Pa]; empty if no force was measured.
     """
 
     anatomy: str
@@ -47,31 +47,31 @@ class FittedTissue:
 
     @property
     def ratio(self) -> tuple[float, float, float]:
-        """Stiffness of the tumour over the brain's: 2.5, 50 and 97.5 % quantiles."""
+        """Ratio of tumour to brain stiffness: 2.5, 50 and 97.5 % quantiles."""
         low, middle, high = np.exp(_compute_quantiles(np.log(FINE_RATIOS), self.probability.sum(axis=(0, 1))))
         return float(low), float(middle), float(high)
 
     @property
     def skulls(self) -> dict[str, float]:
-        """Probability of each skull."""
+        """Probability of each skull model, by name."""
         return dict(zip(SKULLS, self.probability.sum(axis=(1, 2)).tolist(), strict=True))
 
     @property
     def classes(self) -> dict[str, float]:
-        """Probability of each of `CLASSES` of Poisson's ratio."""
+        """Probability of each of the two `CLASSES` of Poisson's ratio, by name."""
         share = self.probability.sum(axis=(0, 2))
         low = float(share @ (CLASSES["compressible"][1] > FINE_POISSONS))
         return dict(zip(CLASSES, (low, 1.0 - low), strict=True))
 
     @property
     def poisson(self) -> tuple[float, float, float]:
-        """Poisson's ratio: quantiles as in `ratio`."""
+        """Poisson's ratio: 2.5, 50 and 97.5 % quantiles."""
         low, middle, high = _compute_quantiles(FINE_POISSONS, self.probability.sum(axis=(0, 2)))
         return float(low), float(middle), float(high)
 
     @property
     def stiffness(self) -> tuple[float, float, float] | None:
-        """Young's modulus of the brain at small strain [Pa]: quantiles as in `ratio`; None if no force was measured."""
+        """Young's modulus of the brain at small strain [Pa]: quantiles as `ratio`; None if no force was measured."""
         if not len(self.young):
             return None
         low, middle, high = np.quantile(self.young, INTERVAL_PROBABILITIES)
@@ -79,7 +79,7 @@ class FittedTissue:
 
     @property
     def not_known(self) -> list[str]:
-        """Quantities that the frames do not determine."""
+        """Names of the quantities that the frames do not determine."""
         low, _, high = self.ratio
         found = (
             []
@@ -94,7 +94,7 @@ class FittedTissue:
     def sample(
         self, count: int, seed: int = 0, skulls: tuple[str, ...] = tuple(SKULLS)
     ) -> tuple[list[str], np.ndarray, np.ndarray]:
-        """Sample `count` triples of skull, Poisson's ratio and stiffness ratio, restricted to some skulls."""
+        """Sample `count` triples of skull, Poisson's ratio and stiffness ratio; `skulls` are the allowed skulls."""
         random = np.random.default_rng([seed, 2])
         allowed = np.array([name in skulls for name in SKULLS])
         share = (self.probability * allowed[:, None, None]).ravel()
@@ -113,12 +113,12 @@ def _compute_quantiles(values: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def to_tissue_path(anatomy: str | Path) -> Path:
-    """Return the path of an anatomy's fitted tissue: MESH.tissue.json next to MESH.vtu."""
+    """Return the path of an anatomy's fitted tissue: MESH.tissue.json, next to MESH.vtu."""
     return Path(anatomy).with_suffix(SUFFIX)
 
 
 def save_tissue(path: str | Path, tissue: FittedTissue) -> None:
-    """Write fitted tissue atomically."""
+    """Write fitted tissue to a JSON file, atomically."""
     stored = {
         "format": FORMAT, "anatomy": tissue.anatomy, "frames": tissue.frames, "skull": list(SKULLS),
         "poisson": FINE_POISSONS.tolist(), "ratio": FINE_RATIOS.tolist(),
@@ -129,12 +129,12 @@ def save_tissue(path: str | Path, tissue: FittedTissue) -> None:
 
 
 def load_tissue(path: str | Path, digest: str) -> FittedTissue:
-    """Read the fitted tissue of the anatomy of a `digest`.
+    """Read fitted tissue from a file, for the anatomy with the given `digest`.
 
     Raises
     ------
     InputError
-        A file that is missing, not of this version, damaged, or of another anatomy.
+        The file is missing, of another version, damaged, or for another anatomy.
     """
     with wrap_errors(path, "fitted tissue", "Make it again by `sulcus fit`."):
         stored = json.loads(Path(path).read_text(encoding="utf-8-sig"))

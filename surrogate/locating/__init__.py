@@ -1,1 +1,1 @@
-"""Tumour position from observations of the brain's surface: causes, their ensemble, prior and posterior."""
+"""Location of the tumour from observations of the brain's surface: causes, ensemble, prior and posterior."""

@@ -1,4 +1,4 @@
-"""Calibration of covariances on ensemble members whose tissue and skull group are not in the prior."""
+"""Calibration of covariances by trials on ensemble members whose group is not in the trial's prior."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from .prior import MotionPrior, build_prior, compute_centroid_motion
 LEVEL = 0.95
 """Nominal coverage of ellipsoids."""
 RADIUS_SQUARED = float(2.0 * gammaincinv(1.5, LEVEL))
-"""Squared radius of the 95 % ellipsoid of a Gaussian [standard deviations^2]: chi-squared, 3 degrees of freedom."""
+"""Squared radius of the 95 % ellipsoid of a 3D Gaussian [standard deviations^2]: chi-squared quantile."""
 TRIAL_COUNT = 960  # Number of trials.
 NEAREST_TRIALS = (
     120  # Number of trials, nearest by `compute_similarity_features`, that calibrate an observation's covariance.
@@ -36,7 +36,7 @@ MIN_MOTION_RATIO = 1e-3  # Lower bound of motion over error, so that its logarit
 
 @dataclass(frozen=True)
 class TrialSettings:
-    """Settings of `run_trials`."""
+    """Settings of the trials in `run_trials`."""
 
     point_counts: tuple[int, int] = (20, 400)  # Range of a trial's number of points.
     covered_shares: tuple[float, float] = (0.1, 1.0)  # Range of a trial's observed share of the open cortex.
@@ -52,17 +52,17 @@ def run_trials(
     ensemble: Ensemble, presses: PressResponses, progress: Callable[[int, int], object] = lambda done, total: None,
     count: int = TRIAL_COUNT, settings: TrialSettings = TrialSettings(),
 ) -> np.ndarray:  # fmt: skip
-    """Run `count` trials: features (`compute_similarity_features`) and squared Mahalanobis error of each (k, 5).
+    """Run `count` trials; return their features (`compute_similarity_features`) and squared Mahalanobis errors (k, 5).
 
-    Groups are held out one at a time, so that a trial's tissue, tumour and directions are not in its prior. One motion
-    in three combines two causes. Rigid errors have exactly the reported size, from 0 to 3 mm. Half of the trials use
-    point clouds (no correspondences). Rejected observations are skipped. No trial has a tip: with one, errors are
-    smaller.
+    One group per skull is held out at a time, so that a trial's tissue, tumour and directions are not in its prior. One
+    motion in three combines two causes. Rigid errors have exactly the reported size, from 0 to 3 mm. Half of the trials
+    use point clouds (no correspondences). Rejected observations are skipped. No trial has a tool tip, which would make
+    errors smaller.
 
     Raises
     ------
     InputError
-        No skull has two groups, of which one could be held out.
+        No skull has two groups, of which one can be held out.
     """
     fold, found = assign_folds(ensemble), []
     if fold.max() < 0:
@@ -84,7 +84,7 @@ def run_trials(
 
 
 def assign_folds(ensemble: Ensemble) -> np.ndarray:
-    """Compute the fold (N,), from 0, in which members are held out: one group per skull; -1: only group of a skull."""
+    """Return the fold (N,) in which a member is held out, one group per skull; -1 for the only group of a skull."""
     turn = np.full(len(ensemble.group), -1)
     for skull in np.unique(ensemble.skull):
         own = ensemble.skull == skull
@@ -95,7 +95,7 @@ def assign_folds(ensemble: Ensemble) -> np.ndarray:
 
 
 def compute_coverage_factor(trials: np.ndarray, evidence: Evidence) -> float:
-    """Compute the factor on covariances for tumour-centroid ellipsoids to cover 95 % of similar trials."""
+    """Compute the factor on covariances with which tumour-centroid ellipsoids cover 95 % of similar trials."""
     away = ((trials[:, :-1] - compute_similarity_features(evidence)) ** 2).sum(axis=1)
     square = np.sort(trials[np.argsort(away, kind="stable")[:NEAREST_TRIALS], -1])
     rank = min(int(np.ceil(LEVEL * (len(square) + 1))), len(square))
@@ -103,7 +103,7 @@ def compute_coverage_factor(trials: np.ndarray, evidence: Evidence) -> float:
 
 
 def is_within_trials(trials: np.ndarray, evidence: Evidence) -> bool:
-    """Return True if the features are in the range of the trials, which include the largest extent."""
+    """Return True if the features of the evidence are in the range of the trials; the extent has no upper limit."""
     own = compute_similarity_features(evidence)
     alike = trials[trials[:, -2] == own[-1], :-1]
     within = len(alike) and (own >= alike.min(axis=0)).all()
@@ -111,11 +111,11 @@ def is_within_trials(trials: np.ndarray, evidence: Evidence) -> bool:
 
 
 def compute_similarity_features(evidence: Evidence) -> np.ndarray:
-    """Compute the features (4,) by which trials are compared: three logarithms, then 0, or `CLOUD_OFFSET` for a cloud.
+    """Compute the features (4,) that measure similarity of trials: three logarithms, and `CLOUD_OFFSET` for clouds.
 
-    Logarithms of the observed motion over its error (rigid error included), of the number of points, and of the extent
-    of the observed patch: root mean square distance [m] from its centroid, weighted by `EXTENT_WEIGHT`. A point
-    with a correspondence gives three numbers, a point of a cloud one.
+    The logarithms are those of the observed motion / its error (rigid error included), of the number of points, and of
+    the observed patch's extent: root mean square distance [m] from its centroid, times `EXTENT_WEIGHT`. The fourth is 0
+    for points with correspondences.
     """
     first = np.unique(evidence.point, return_index=True)[1]
     count, at = len(first), evidence.positions[first]
@@ -129,7 +129,7 @@ def compute_similarity_features(evidence: Evidence) -> np.ndarray:
 def _simulate_trial(
     ensemble: Ensemble, members: np.ndarray, number: int, random: np.random.Generator, settings: TrialSettings
 ) -> tuple[Observation, np.ndarray]:
-    """Simulate the observation of one or two motions, and the true motion (3,) [m] of the tumour centroid."""
+    """Simulate an observation of one or two motions; return it and the tumour centroid's true motion (3,) [m]."""
     anatomy = ensemble.anatomy
     here = members[ensemble.skull[members] == random.choice(np.unique(ensemble.skull[members]))]
     several = np.intersect1d(SINGLE_CAUSES, ensemble.kind[here])
@@ -156,7 +156,7 @@ def _simulate_trial(
 def sample_observed_patch(
     anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator, count: int, area_share: float
 ) -> Evidence:
-    """Sample `count` error-free points of a motion (V, 3) [m] on a round share `area_share` of the open cortex."""
+    """Sample `count` points, without errors, of a motion (V, 3) [m] on a round `area_share` of the open cortex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     corners = nodes[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -173,6 +173,6 @@ def sample_observed_patch(
 
 
 def _square(prior: MotionPrior, found: Posterior, middle: np.ndarray) -> float:
-    """Squared Mahalanobis distance of an estimate's error (3,) [m] by its own covariance."""
+    """Return the squared Mahalanobis distance between the estimated and the true centroid motion `middle` (3,) [m]."""
     off = found.shape_weights @ prior.centroid_motion - middle
     return float(off @ np.linalg.solve(found.compute_covariance(prior.centroid_motion[:, None])[0], off))

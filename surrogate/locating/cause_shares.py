@@ -1,7 +1,7 @@
-"""Causes of the cortex motion, as far as the observation separates them.
+"""Shares of causes in the motion of the cortex, as far as the observation separates the causes.
 
-Shares are computed from posterior samples. Causes whose own shares scatter widely are not separable. The finest
-grouping is chosen in which the joint share of each group is determined.
+Shares are computed from posterior samples. Causes with widely scattered shares are not separable. The finest grouping
+is chosen in which the joint share of every group is determined.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,14 +23,14 @@ MIN_REPORTED_SHARE = 0.005  # Smallest share that is reported.
 
 @dataclass(frozen=True)
 class CauseShare:
-    """Joint share of causes that are not separable from each other.
+    """Joint share of causes that cannot be separated from each other.
 
     Parameters
     ----------
     causes
-        Names from `KINDS`; a single one if separable from all others.
+        Names from `KINDS`; a single name if the cause is separable from all others.
     share, low, high
-        Joint share of the mean square motion of the open cortex: mean, bounds of a 90 % interval.
+        Joint share of the mean square motion of the open cortex: mean, and limits of a 90 % interval.
     """
 
     causes: tuple[str, ...]
@@ -45,9 +45,9 @@ class CauseShare:
 
 
 def group_cause_shares(samples: np.ndarray) -> tuple[CauseShare, ...]:
-    """Group `KINDS` as finely as sampled shares (n, kinds) determine; largest share first, negligible ones dropped.
+    """Group `KINDS` as finely as shares (n, kinds) of n samples determine; largest share first, small ones dropped.
 
-    Among several finest groupings, the one with the smallest sum of interval widths is chosen.
+    Among several finest groupings, the one with the smallest sum of interval widths is returned.
     """
     ways = []
     for groups in _generate_partitions(range(samples.shape[1])):
@@ -64,7 +64,7 @@ def group_cause_shares(samples: np.ndarray) -> tuple[CauseShare, ...]:
 
 
 def _generate_partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
-    """Generate all partitions of items."""
+    """Generate all partitions of some items into groups."""
     if not items:
         yield []
         return
@@ -76,7 +76,7 @@ def _generate_partitions(items: Sequence[int]) -> Iterator[list[list[int]]]:
 
 
 def compute_cause_shares(prior: MotionPrior, posterior: Posterior) -> np.ndarray:
-    """Sample shares (n, kinds) of causes in the mean square motion of the open cortex from the posterior."""
+    """Compute shares (n, kinds) of causes in the mean square motion of the open cortex, for n posterior samples."""
     ends = np.round(SAMPLE_COUNT * np.cumsum([result.probability for result in posterior.results])).astype(int)
     normal = np.random.default_rng(0).standard_normal((SAMPLE_COUNT, len(prior.kind)))
     squares, begin = np.zeros((SAMPLE_COUNT, len(KINDS))), 0

@@ -1,4 +1,4 @@
-"""Causes of brain motion to be located from an observation: tools, CSF drainage and swelling, in unmeasured tissue."""
+"""Causes of brain motion that a locator considers: tools, drained CSF and swelling, in tissue of unknown stiffness."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -18,9 +18,9 @@ from ..data.tool_loads import draw
 from .regions import Region, build_tissue
 
 KINDS = ("tool", "drainage", "swelling", "tumour swelling", "oedema")
-"""Names of the causes of an ensemble."""
+"""Names of the causes in an ensemble."""
 TOOL, DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA = range(len(KINDS))  # Numbers of the causes in `KINDS`.
-SWELLING_WAVE = Wave(0.25, 0.0)  # Swelling is one rising wave; the second wave is zero.
+SWELLING_WAVE = Wave(0.25, 0.0)  # Wave that gives each volume change at some time; the second wave is zero.
 TOOL_POINTS = 70  # Number of points on the open cortex where a tool acts.
 # Candidate tissues: Poisson's ratio of the brain, ratio of tumour to brain stiffness.
 TISSUES = ((0.45, 2.0), (0.49, 0.7))
@@ -29,34 +29,34 @@ ACCURACY = Accuracy(tolerance=1e-3)  # Accuracy of the FEM results for tools.
 
 @dataclass(frozen=True)
 class Causes:
-    """Sampling configuration of an ensemble. Ranges are those of the brain-shift literature.
+    """Sampling configuration of an ensemble; its ranges are those of the brain-shift literature.
 
     Parameters
     ----------
     poisson
-        Poisson's ratios; drained tissue gives 0.45, brain within seconds 0.49 (`sim.MATERIALS`).
+        Candidate Poisson's ratios; drained tissue has 0.45, brain within seconds 0.49 (`sim.MATERIALS`).
     poisson_let_go
-        Largest Poisson's ratio for a skull that separates: above it, swelling takes minutes and explains no more.
+        Largest Poisson's ratio for a separating skull: larger values take minutes with swelling, and explain no more.
     stiffness
-        Smallest and largest ratio of tumour to brain stiffness, log-uniform.
+        Smallest and largest ratio of tumour to brain stiffness, sampled log-uniformly.
     exponent
-        Smallest and largest -m of Ogden's law, log-uniform: -4.7 of Miller, Chinzei 2002, -19 of `sim.MATERIALS`.
+        Smallest and largest -m of Ogden's law, log-uniform: 4.7 of Miller, Chinzei 2002; 19 of `sim.MATERIALS`.
     tools
-        Tool members in one group; second value for a skull that separates, whose loads are solved one by one.
+        Number of tool loads in a group; the second number is for a separating skull, which is solved load by load.
     drainages
-        Directions of gravity in one group.
+        Number of gravity directions in a group.
     levels
-        Shares of the fluid that remain, one after the other, in each drainage.
+        Shares of the fluid that remain in each drainage, in order.
     cone
-        Largest angle [rad] between gravity and the open cortex's inward axis: surgeons turn the opening up.
+        Largest angle [rad] between gravity and the open cortex's inward axis; surgeons turn the craniotomy upwards.
     swellings, tumour_swellings, oedema
-        Volume changes in each group: of the brain, of the tumour alone, and of the brain round the tumour.
+        Relative volume changes in each group: of the brain, of the tumour alone, and of the brain round the tumour.
     reach
-        Smallest and largest extent of oedema from the tumour [m], log-uniform.
+        Smallest and largest distance [m] up to which oedema surrounds the tumour, log-uniform.
     reaches
-        Number of such extents in one group; second value for a skull that separates, as in `tools`.
+        Number of such distances in a group; the second number is for a separating skull, as in `tools`.
     regions
-        Regions of known stiffness: it is not sampled.
+        Regions of known stiffness, which is not sampled.
     """
 
     poisson: tuple[float, ...] = (0.45, 0.47, 0.49)
@@ -83,26 +83,26 @@ SUPINE = np.array(Gravity().direction)  # Direction of gravity in the scan, as i
 
 
 def build_linear_tissue(stiffness_ratio: float, poisson: float) -> Material:
-    """Build linear tissue `stiffness_ratio` as stiff as the brain at small strain."""
+    """Build linear tissue with `stiffness_ratio` times the brain's stiffness at small strain."""
     return Material("linear", YOUNG * stiffness_ratio, poisson)
 
 
 @dataclass(frozen=True)
 class Group:
-    """Ensemble members that share tissue and skull.
+    """Group of ensemble members with the same tissue and skull.
 
     Parameters
     ----------
     number
-        Number from 0; samples depend on it and the seed alone.
+        Number from 0; samples depend only on this number and the seed.
     skull
         Skull model, one of `sim.effects.SKULLS`.
     poisson, ratio, exponent
-        Poisson's ratio of the brain; tumour stiffness over the brain's; -m of Ogden's law, by which both stiffen.
+        Poisson's ratio of the brain, ratio of tumour to brain stiffness, and -m of Ogden's law for both tissues.
     regions
         Other regions of known stiffness.
     reach
-        Extents [m] of oedema from the tumour, one load set each.
+        Distances [m] up to which oedema surrounds the tumour, each solved separately.
     """
 
     number: int
@@ -116,21 +116,21 @@ class Group:
     def build_effects(
         self, volume_changes: tuple[float, ...], regions: tuple[int, ...] | None = None
     ) -> tuple[Effect, ...]:
-        """Build the effects of the FEM, with up to these volume changes in these regions (None: all)."""
+        """Build the FEM effects, with volume changes up to `volume_changes` in the labelled `regions` (None: all)."""
         swells = Pulsation(Wave(SWELLING_WAVE.frequency, max(map(abs, volume_changes))), SWELLING_WAVE, regions)
         tissue = build_tissue(self._build_tissue, self.poisson, self.ratio, self.regions)
         return (tissue, Held(), SKULLS[self.skull], ToolForce(), Gravity(), swells)
 
     def _build_tissue(self, times: float, poisson: float) -> Ogden:
-        """Build Ogden tissue `times` as stiff as the brain at small strain."""
+        """Build Ogden tissue with `times` the brain's stiffness at small strain."""
         mu, lam = Material("neo-hookean", YOUNG * times, poisson).lame
         return Ogden(((2.0 * mu, -self.exponent),), lam + 2.0 * mu / 3.0)
 
 
 def build_groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL_CAUSES) -> tuple[Group, ...]:
-    """Build groups with each skull and each Poisson's ratio; none if the anatomy has no skull.
+    """Build groups with each skull and each Poisson's ratio; () if the anatomy has no skull.
 
-    In each skull, tumour stiffness, exponent and oedema extent are stratified: one group in every part of each range.
+    For each skull, tumour stiffness, exponent and oedema distance are stratified: one group in every part of a range.
     """
     made: list[Group] = []
     for number, skull in enumerate(SKULLS if anatomy.slide_normal.any() else ()):
@@ -147,14 +147,14 @@ def build_groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL_CAUSES)
 
 
 def _sample_stratified(random: np.random.Generator, count: int, limits: tuple[float, float]) -> list[float]:
-    """Sample one number in each of `count` log-equal parts of a range, in random order."""
+    """Sample one number in each of `count` log-equal parts of a range; return the numbers in random order."""
     low, high = np.log(limits)
     share = (random.permutation(count) + random.uniform(size=count)) / max(count, 1)
     return np.exp(low + share * (high - low)).tolist()
 
 
 def build_pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL_CAUSES) -> Loads:
-    """Sample the tool loads of a group."""
+    """Sample the tool loads of a group, with gravity as in the scan."""
     count = causes.tools[group.skull == SEPARATING_SKULL]
     pushed = draw("mixed", anatomy, count, seed * 1000 + group.number).get(Pushed)
     assert pushed is not None
@@ -162,14 +162,14 @@ def build_pushes(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes =
 
 
 def build_swellings(anatomy: Anatomy, volume_changes: tuple[float, ...]) -> Loads:
-    """Build loads of these volume changes; pass the same changes to `Group.build_effects`."""
+    """Build loads with these relative volume changes; pass the same changes to `Group.build_effects`."""
     # The wave gives the time at which each volume change is reached.
     time = np.arcsin(np.array(volume_changes) / max(map(abs, volume_changes))) / (2.0 * np.pi * SWELLING_WAVE.frequency)
     return Loads((_build_idle(anatomy, len(time)), _build_posture(anatomy, np.tile(SUPINE, (len(time), 1)), 1.0)), time)
 
 
 def build_drainages(group: Group, anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL_CAUSES) -> tuple[Loads, ...]:
-    """Build loads of drained fluid, level by level, for sampled head directions."""
+    """Build loads of drained fluid for sampled gravity directions: one `Loads` for each level, in order."""
     random = np.random.default_rng([seed, group.number, 1])
     down = sample_gravity_directions(random, open_cortex(anatomy).axis, causes)
     idle = _build_idle(anatomy, len(down))
@@ -182,13 +182,13 @@ def _build_idle(anatomy: Anatomy, count: int) -> Pushed:
 
 
 def _build_posture(anatomy: Anatomy, down: np.ndarray, left: float) -> Posture:
-    """Build postures with gravity along `down` (n, 3) and a share of the fluid left."""
+    """Build postures with gravity along `down` (n, 3) and a share `left` of the fluid."""
     level = np.array([compute_fluid_level(anatomy.mesh.nodes, one, left) for one in down])
     return Posture(down, level, np.ones(len(down)))
 
 
 def sample_gravity_directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
-    """Sample directions of gravity (n, 3), uniform by solid angle in a cone round the inward axis."""
+    """Sample gravity directions (n, 3), uniform by solid angle in a cone round the inward `axis` (3,)."""
     cosine = random.uniform(np.cos(causes.cone), 1.0, causes.drainages)
     angle = random.uniform(0.0, 2.0 * np.pi, causes.drainages)
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
@@ -199,14 +199,14 @@ def sample_gravity_directions(random: np.random.Generator, axis: np.ndarray, cau
 
 @dataclass(frozen=True, eq=False)
 class PressResponses:
-    """Motions by forces of equal magnitude on the open cortex.
+    """Responses of linear tissue to forces of equal magnitude on the open cortex.
 
     Parameters
     ----------
     points
         Positions (p, 3) [m] on the open cortex.
     motion
-        Displacements (tissues, p, 3, V, 3) float32 [m] by name of the skull, for a force along each axis.
+        Displacements (tissues, p, 3, V, 3) float32 [m] by skull name, for a force along each axis at each point.
     """
 
     points: np.ndarray
@@ -216,7 +216,7 @@ class PressResponses:
 def solve_presses(
     anatomy: Anatomy, skulls: tuple[str, ...], device: str = "auto", regions: tuple[Region, ...] = ()
 ) -> PressResponses:
-    """Solve linear tissue under forces of 0.01 N on discs of 7 mm radius, for each of some skulls, with `regions`."""
+    """Solve linear tissue under forces of 0.01 N on discs of 7 mm radius, for each skull; return the responses."""
     nodes = anatomy.mesh.nodes[np.unique(anatomy.open_surface)]
     points = nodes[select_spaced_points(nodes, TOOL_POINTS)]
     force = np.tile(0.01 * np.eye(3), (len(points), 1))
@@ -230,7 +230,7 @@ def solve_presses(
 
 
 def select_spaced_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Select `count` of the points (n, 3) by farthest-point sampling, starting next to the centroid; return indices."""
+    """Select `count` of the points (n, 3) by farthest-point sampling, the most central first; return their indices."""
     found = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmin())]
     away = np.full(len(points), np.inf)
     while len(found) < min(count, len(points)):

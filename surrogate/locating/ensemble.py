@@ -1,4 +1,4 @@
-"""Ensemble of brain motions by every cause, in many tissues and skulls, from which the prior is built."""
+"""Ensemble of brain motions by all causes, with many tissues and skulls, from which the prior is built."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -36,10 +36,10 @@ MIN_MOTION = 2e-5  # Smallest RMS motion of the open cortex [m]: below it, a mem
 
 
 def mark_tumour_surroundings(anatomy: Anatomy, distance: float) -> tuple[Anatomy, tuple[int, ...]]:
-    """Mark brain within `distance` [m] of the tumour as a separate region; return the body and the labels that swell.
+    """Mark brain within `distance` [m] of the tumour as a new region; return the anatomy and the labels that swell.
 
-    These labels are the new region's, and the oedema's if the anatomy has one. Tissue is unchanged if the material
-    laws name only regions of the anatomy.
+    These are the labels of the new region and, if the anatomy has it, of its oedema. The tissue of the new region is
+    the brain's, provided that no material law names its label.
     """
     mesh = anatomy.mesh
     tumour = KDTree(mesh.nodes[anatomy.tumour_nodes])
@@ -52,16 +52,16 @@ def mark_tumour_surroundings(anatomy: Anatomy, distance: float) -> tuple[Anatomy
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Motions of all vertices of one anatomy.
+    """Ensemble of N motions of all vertices of one anatomy.
 
     Parameters
     ----------
     anatomy
-        The body.
+        Anatomy of the ensemble.
     motion
         Displacements (N, V, 3) float32 [m].
     kind, skull, group
-        Indices (N,) into `KINDS` and into the names of `sim.effects.SKULLS`; number of the group.
+        Indices (N,) into `KINDS` and into the names of `sim.effects.SKULLS`, and numbers of the groups.
     """
 
     anatomy: Anatomy
@@ -75,14 +75,14 @@ def solve_groups(
     anatomy: Anatomy, seed: int = 0, device: str = "auto", causes: Causes = USUAL_CAUSES, folder: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> Ensemble:  # fmt: skip
-    """Solve an ensemble, group by group. Finished groups of an interrupted run are read from `folder`.
+    """Solve an ensemble group by group; finished groups of an interrupted run are read from `folder`.
 
     `progress` receives the number of groups done and their total.
 
     Raises
     ------
     InputError
-        An anatomy without open cortex, tumour or skull; a group without a converged member.
+        The anatomy has no open cortex, tumour or skull, or no member of a group has converged.
     """
     if not len(anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour to locate: make one that has.")
@@ -104,7 +104,7 @@ def solve_groups(
 def _get_motions(
     anatomy: Anatomy, group: Group, seed: int, device: str, causes: Causes, folder: Path | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Read the motions and kinds of a group from the folder, or compute and keep them; the key holds all inputs."""
+    """Read a group's motions and causes from the folder, or compute and store them; the key has all inputs."""
     stated = anatomy.digest, recommend_element(anatomy.mesh), group, seed, causes, ACCURACY
     path = get_cache_path(folder, f"{group.number:03d}-", device, *stated)
     names = "motion", "kind"
@@ -120,7 +120,7 @@ def _get_motions(
 def solve_members(
     anatomy: Anatomy, group: Group, seed: int = 0, device: str = "auto", causes: Causes = USUAL_CAUSES
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute motions (n, V, 3) float32 [m] and kinds (n,) of one group: converged ones that move the open cortex."""
+    """Compute a group's motions (n, V, 3) float32 [m] and causes (n,); unconverged and tiny motions are dropped."""
     fem = Fem(anatomy, group.build_effects(causes.swellings), ACCURACY, device)
     tumour = tuple(np.unique(anatomy.mesh.region[anatomy.in_tumour]).tolist())
     answers = [
@@ -150,12 +150,12 @@ def solve_members(
 def _solve_swelling(
     anatomy: Anatomy, group: Group, shares: tuple[float, ...], regions: tuple[int, ...], device: str, fem: Fem
 ) -> Deformation:
-    """Solve for given volume changes of some regions; the stiffness, and so its factor, is that of `fem`."""
+    """Solve relative volume changes `shares` of some regions; the factorised stiffness of `fem` is used again."""
     swells = Fem(anatomy, group.build_effects(shares, regions), ACCURACY, device, stiff_as=fem)
     return swells.deform(build_swellings(anatomy, shares))
 
 
 def compute_surface_motion(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
-    """Compute root mean square motions (n,) [m] of the open cortex's vertices for motions (n, V, 3) [m]."""
+    """Compute the root mean square over open-cortex vertices (n,) [m] of each of n motions (n, V, 3) [m]."""
     nodes = np.unique(anatomy.open_surface)
     return np.sqrt((motion[:, nodes] ** 2).sum(axis=2).mean(axis=1))

@@ -1,4 +1,4 @@
-"""Observations as linear data: displacement of material points along given axes, with error covariance."""
+"""Observations as linear data: displacements of material points along given axes, with their error covariance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim.geometry.locate import LocatedPoints
 from ..array_functions import compute_squared_distances
 
 SHIFT_ERROR = 0.8e-3
-"""Default standard deviation of the rigid error (registration shift) along each axis [m]."""
+"""Default standard deviation of the rigid error's translation (registration shift) along each axis [m]."""
 # Rotation error about each axis per metre of registration shift [rad/m].
 TURN_PER_SHIFT = float(np.radians(0.3)) / SHIFT_ERROR
 SLIPPED_ERROR = 10e-3  # Rigid error of a failed registration along each axis [m].
@@ -23,7 +23,7 @@ BLOCK_SIZE = 48  # Block size: triangular matrices with fewer than twice this ma
 
 @dataclass(frozen=True)
 class NoiseSettings:
-    """Settings of the error covariance of points and shapes."""
+    """Settings of the error covariances of observed points and of the prior's shapes."""
 
     independent_error: float = 0.3e-3  # Independent part of a point's non-rigid error [m].
     correlated_error: float = 0.5e-3  # Spatially correlated part of a point's non-rigid error [m].
@@ -35,7 +35,7 @@ class NoiseSettings:
 
 NOISE = NoiseSettings()
 SIGMA = float(np.hypot(NOISE.independent_error, NOISE.correlated_error))
-"""Standard deviation of a point's non-rigid error along each axis [m]: independent and correlated noise together."""
+"""Standard deviation of a point's non-rigid error along each axis [m]: independent and correlated part together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,19 +45,19 @@ class Evidence:
     Parameters
     ----------
     location
-        Material points of the rows, in the mesh.
+        Position of each row's material point in the mesh.
     positions
-        Undeformed positions (m, 3) [m].
+        Undeformed positions (m, 3) [m] of the material points.
     axis
-        Unit vectors (m, 3).
+        Unit vectors (m, 3), along which displacements are observed.
     motion
-        (m,) [m].
+        Observed displacements (m,) [m].
     sigma
-        (m,) [m]: standard deviation of the non-rigid error.
+        Standard deviations (m,) [m] of the non-rigid errors.
     point
-        Number (m,) of the observed point of each row.
+        Number (m,) of the observed point that each row belongs to.
     shift_sigma
-        [m]: standard deviation of the rigid error's translation along each axis.
+        Standard deviation [m] of the rigid error's translation along each axis.
     """
 
     location: LocatedPoints
@@ -72,43 +72,43 @@ class Evidence:
         return len(self.motion)
 
     def select(self, rows: np.ndarray) -> Evidence:
-        """Select rows by a mask (m,) or by numbers."""
+        """Select rows by a mask (m,) or by indices."""
         place = LocatedPoints(self.location.vertices[rows], self.location.weights[rows])
         arrays = {name: getattr(self, name)[rows] for name in ("positions", "axis", "motion", "sigma", "point")}
         return replace(self, location=place, **arrays)
 
     @property
     def centroid(self) -> np.ndarray:
-        """(3,) [m]: centroid of the undeformed positions; centre of rotations."""
+        """Centroid (3,) [m] of the undeformed positions, about which rigid errors rotate."""
         return self.positions.mean(axis=0)
 
     @property
     def rigid_jacobian(self) -> np.ndarray:
-        """Matrix (m, 6) from a rigid error, translation [m] and rotation [rad] about the centroid, to rows."""
+        """Matrix (m, 6) from a rigid error to rows: translation [m], then rotation [rad] about the centroid."""
         return np.concatenate([self.axis, np.cross(self.positions - self.centroid, self.axis)], axis=1)
 
     @property
     def rigid_fit(self) -> np.ndarray:
-        """Rigid error (6,) [m, rad] that explains most of the observation by least squares, if nothing deformed."""
+        """Rigid error (6,) [m, rad] that fits the observation best by least squares, with the brain undeformed."""
         return np.linalg.lstsq(self.rigid_jacobian, self.motion, rcond=None)[0]
 
     @property
     def rigid_scale(self) -> np.ndarray:
-        """Standard deviations (6,) of the prior of a rigid error: translation [m], rotation [rad]."""
+        """Prior standard deviations (6,) of the rigid error: translation [m], then rotation [rad]."""
         return max(self.shift_sigma, MIN_SHIFT) * np.repeat([1.0, TURN_PER_SHIFT], 3)
 
     @property
     def rigid_ratio(self) -> float:
-        """Ratio of `rigid_alone` to the reported rigid error: the larger of translation and rotation."""
+        """Size of `rigid_fit` relative to the reported rigid error: the larger ratio of translation and rotation."""
         return float((np.linalg.norm(self.rigid_fit.reshape(2, 3), axis=1) / self.rigid_scale[[0, 3]]).max())
 
     @property
     def slip_ratio(self) -> float:
-        """Standard deviation of the rigid error of a slipped registration, relative to the reported one."""
+        """Standard deviation of the rigid error of a slipped registration, relative to the reported one; at least 1."""
         return max(SLIPPED_ERROR / max(self.shift_sigma, MIN_SHIFT), 1.0)
 
     def compute_covariance(self, scale: float = 0.0) -> np.ndarray:
-        """Covariance (m, m) [m^2] of non-rigid errors, and of the shapes' model error for motions of `scale` [m]."""
+        """Compute the covariance (m, m) [m^2] of non-rigid errors and of model errors for motions of `scale` [m]."""
         share, square = (
             (NOISE.independent_error / SIGMA) ** 2,
             compute_squared_distances(self.positions, self.positions),
@@ -121,20 +121,20 @@ class Evidence:
 
     @property
     def is_paired(self) -> bool:
-        """True if points have correspondences: three rows each (a cloud's points, and tips, give one)."""
+        """True if points have correspondences, with three rows per point; points of clouds, and tips, have one row."""
         return len(self) >= 2 * len(np.unique(self.point))
 
     @property
     def axis_count(self) -> int:
-        """3 if rows are of motions along three axes, point after point; else 1."""
+        """Number of axes per point: 3 if every point has a row for each of the axes, in order; else 1."""
         threefold = len(self) % 3 == 0 and np.array_equal(self.axis, np.tile(np.eye(3), (len(self) // 3, 1)))
         return 3 if threefold else 1
 
     @property
     def weights(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (v,) that rows depend on, and the matrix from their motions to rows.
+        """Vertices (v,) that the rows depend on, and the matrix from the vertices' displacements to the rows.
 
-        (m / 3, v) if rows are of three axes, one after the other, else (m, 3 v): of all axes of a vertex.
+        The matrix is (m / 3, v), for each axis, if `axis_count` is 3; else (m, 3 v), for all axes of the vertices.
         """
         copies = self.axis_count
         place = LocatedPoints(self.location.vertices[::copies], self.location.weights[::copies])
@@ -147,7 +147,7 @@ class Evidence:
         return vertices, weights
 
     def build_whitening(self, scale: float) -> Whitening:
-        """Build the transform to independent errors of variance 1, for observed motions of `scale` [m]."""
+        """Build the transform to independent errors of variance 1, for motions of root mean square `scale` [m]."""
         copies = self.axis_count
         lower = cholesky(self.select(np.arange(0, len(self), copies)).compute_covariance(scale), lower=True)
         return Whitening(invert_triangular(lower), copies)
@@ -155,25 +155,25 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """Inverse R of the Cholesky factor of an error covariance, which is R^-1 R^-T.
+    """Whitening transform: inverse R of the Cholesky factor of an error covariance R^-1 R^-T.
 
     Parameters
     ----------
     root
-        (m / copies, m / copies).
+        Matrix R (m / axis_count, m / axis_count).
     axis_count
-        3 if the errors along three axes are equally distributed and independent, row after row; else 1.
+        3 if the errors along three axes are independent and have the same covariance; else 1.
     """
 
     root: np.ndarray
     axis_count: int
 
     def whiten(self, rows: np.ndarray) -> np.ndarray:
-        """Compute R rows, (m, k) or (m,)."""
+        """Compute the product of R with rows (m, k) or (m,)."""
         return (self.root @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
     def transform_back(self, rows: np.ndarray) -> np.ndarray:
-        """Compute R^T rows, (m, k) or (m,)."""
+        """Compute the product of R^T with rows (m, k) or (m,)."""
         return (self.root.T @ rows.reshape(len(self.root), -1)).reshape(rows.shape)
 
     @property
@@ -182,14 +182,14 @@ class Whitening:
         return self.axis_count * float(np.log(np.diag(self.root)).sum())
 
     def compute_precision(self, rows: np.ndarray) -> np.ndarray:
-        """Compute blocks (n, c, c) of the inverse covariance for rows (n, c); all axes of points if `copies` is 3."""
+        """Compute blocks (n, c, c) of the inverse covariance for rows (n, c); each has all axes of its points."""
         columns = self.root.T[rows[:, :: self.axis_count] // self.axis_count]
         alike = columns @ columns.transpose(0, 2, 1)
         return np.kron(alike, np.eye(self.axis_count))
 
 
 def invert_triangular(lower: np.ndarray) -> np.ndarray:
-    """Invert a lower triangular matrix (n, n) by recursive halving: matrix products are fastest."""
+    """Invert a lower triangular matrix (n, n) by recursive halving, which uses fast matrix products."""
     half = len(lower) // 2
     if half < BLOCK_SIZE:
         return trtri(lower.T, lower=0)[0].T
@@ -201,12 +201,12 @@ def invert_triangular(lower: np.ndarray) -> np.ndarray:
 
 
 def compute_correlation(squared_distance: np.ndarray, length: float) -> np.ndarray:
-    """Compute correlations (n, n) of smooth noise: Gaussian of squared distances (n, n) [m^2] and a length [m]."""
+    """Compute correlations (n, n) of smooth noise: Gaussian of squared distances (n, n) [m^2], with a length [m]."""
     return np.exp(squared_distance * (-0.5 / length**2))
 
 
 def compute_correlation_root(points: np.ndarray, length: float = NOISE.correlation_length) -> np.ndarray:
-    """Compute the factor (n, n) from independent noise at points (n, 3) [m] to smooth noise of variance 1."""
+    """Compute the factor (n, n) from independent noise at points (n, 3) [m] to correlated noise of variance 1."""
     value, vector = np.linalg.eigh(compute_correlation(compute_squared_distances(points, points), length))
     return vector * np.sqrt(np.maximum(value, 0.0))
 
@@ -218,7 +218,7 @@ def build_motion_evidence(
     sigma: np.ndarray,
     shift_sigma: float = SHIFT_ERROR,
 ) -> Evidence:
-    """Build evidence from undeformed points (n, 3) [m] and their motions (n, 3) [m]; three rows a point."""
+    """Build evidence from undeformed points (n, 3) [m] and their motions (n, 3) [m], with three rows per point."""
     count = len(positions)
     point = np.repeat(np.arange(count), 3)
     location, axis = LocatedPoints(location.vertices[point], location.weights[point]), np.tile(np.eye(3), (count, 1))

@@ -1,4 +1,4 @@
-"""Iterated conditioning of clouds and tips: points without an undeformed position are matched to the estimated surface.
+"""Iterated conditioning: points without an undeformed position are matched to the estimated surface.
 
 The closest points are recomputed in each iteration, as in Besl, McKay 1992, "A method for registration of 3-D shapes",
 IEEE Trans. Pattern Anal. Mach. Intell. 14:239-256.
@@ -17,14 +17,14 @@ CENTROID_TOLERANCE = 0.2e-3  # Motion of the tumour's centroid below which the i
 def match_and_update(
     prior: MotionPrior, observation: Observation, allow_slip: bool = False
 ) -> tuple[Posterior, np.ndarray]:
-    """Compute the posterior of an observation, and the numbers (k,) of its points near the cortex.
+    """Compute the posterior of an observation; return it and the indices (k,) of the used points, near the cortex.
 
-    The rigid error may be `allow_slip`, see `condition_prior`.
+    If `allow_slip`, the rigid error may be that of a slipped registration, see `condition_prior`.
 
     Raises
     ------
     InputError
-        See `to_evidence`.
+        See `to_evidence` and `condition_prior`.
     """
     anatomy, tips, count = prior.anatomy, observation.tips, len(observation.now)
     evidence = to_evidence(anatomy, observation)

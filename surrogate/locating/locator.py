@@ -1,4 +1,4 @@
-"""Posterior of the tumour's position, from observations of the brain's surface."""
+"""Estimation of the tumour's position from observations of the brain's surface, as a posterior distribution."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ SAMPLE_COUNT = 4000  # Number of normal samples from which the 95 % radius is es
 
 @dataclass(frozen=True)
 class LocationLimits:
-    """Limits beyond which a location is rejected, or has a warning."""
+    """Limits beyond which a location is rejected or has a warning."""
 
     max_outlier_share: float = 0.35  # Largest share of outliers.
-    max_surprise: float = 2.5  # Largest `surprise` that a cause of the ensemble can explain.
+    max_surprise: float = 2.5  # Largest `Posterior.surprise` of an accepted observation.
     # Smallest log-odds of a registration slip against a motion for which a slip is assumed possible: in synthetic tests
     # one of 432 motions, and all slips of 8 to 20 mm along the cortex (docs/notes/locate_experiments.md).
     min_slip_log_odds: float = -2.0
@@ -51,14 +51,14 @@ LIMITS = LocationLimits()
 
 @dataclass(frozen=True)
 class RigidExplanation:
-    """Rigid error that explains most of the observation by least squares, with the brain undeformed.
+    """Rigid error that fits the observation best by least squares, with the brain undeformed.
 
     Parameters
     ----------
     share
-        Share of the observation, in mean square, that it explains.
+        Share of the observation's mean square that the rigid error explains.
     shift, turn
-        Size of the rigid error [m], [rad].
+        Magnitude of its translation [m] and rotation [rad].
     """
 
     share: float
@@ -68,7 +68,7 @@ class RigidExplanation:
 
 @dataclass(frozen=True, eq=False)
 class Location:
-    """Posterior of the tumour's position: Gaussian, in RAS.
+    """Posterior of the tumour's position: a Gaussian, in RAS.
 
     Parameters
     ----------
@@ -77,18 +77,18 @@ class Location:
     posterior
         Posterior of the shapes' weights and of the rigid error, with calibrated covariances.
     p95
-        [m]: with probability 0.95 the centroid of the tumour is within this distance of `centroid`.
+        Radius [m] round `centroid` that contains the tumour's centroid with probability 0.95.
     outliers, outlier_tips
-        Numbers of points, and of tips, from 0. They are away from the open cortex, or no other point supports them.
+        Indices of the rejected points and tips, which are far from the open cortex or not supported by other points.
     slipped
-        True if the registration may have slipped, by far more than reported. Then the posterior includes a slip.
+        True if the registration error may be far larger than reported; the posterior then includes such an error.
     checked
-        True if the user checked the registration, so that no slip is suspected.
+        True if the user has checked the registration, so that no slip is assumed.
     calibrated
-        True if covariances were calibrated on similar observations: named points or a cloud, number of points, motion
-        over error; and the registration did not slip.
+        True if covariances were calibrated on similar observations (correspondences, number of points, motion over
+        error) and the registration did not slip.
     seconds
-        Time taken, without set-up and tables that all observations share.
+        Computing time [s], without the tables that all observations share.
     """
 
     prior: MotionPrior
@@ -102,36 +102,36 @@ class Location:
     seconds: float
 
     def compute_motion(self, nodes: np.ndarray) -> np.ndarray:
-        """Compute the mean motion (n, 3) [m] of vertices (n,)."""
+        """Compute the mean motion (n, 3) [m] of the vertices `nodes` (n,)."""
         return np.tensordot(self.posterior.shape_weights, self.prior.restrict_shapes(nodes), 1)
 
     def compute_covariance(self, nodes: np.ndarray) -> np.ndarray:
-        """Compute covariances (n, 3, 3) [m^2] of the motion of vertices (n,)."""
+        """Compute covariances (n, 3, 3) [m^2] of the motions of the vertices `nodes` (n,)."""
         return self.posterior.compute_covariance(self.prior.restrict_shapes(nodes))
 
     @property
     def centroid(self) -> np.ndarray:
-        """(3,) [m]: mean motion of the centroid of the tumour's volume."""
+        """Mean motion (3,) [m] of the tumour's centroid (by volume)."""
         return self.posterior.shape_weights @ self.prior.centroid_motion
 
     @property
     def centroid_covariance(self) -> np.ndarray:
-        """(3, 3) [m^2]: covariance of the motion `centroid`."""
+        """Covariance (3, 3) [m^2] of the motion of the tumour's centroid."""
         return self.posterior.compute_covariance(self.prior.centroid_motion[:, None])[0]
 
     @property
     def bias(self) -> np.ndarray:
-        """(3,) [m]: mean registration shift of the observation, at the centroid of its points."""
+        """Mean registration shift (3,) [m] of the observation, at the centroid of its points."""
         return self.posterior.rigid_error[:3]
 
     @property
     def rotation(self) -> np.ndarray:
-        """(3,) [rad]: mean registration rotation about the centroid of the points."""
+        """Mean registration rotation (3,) [rad] of the observation, about the centroid of its points."""
         return self.posterior.rigid_error[3:]
 
     @property
     def explained(self) -> float:
-        """Share of the observed motion, in mean square, that the mean motion and the rigid error explain."""
+        """Share of the observed mean square motion that the mean motion and the rigid error explain together."""
         evidence, found = self.posterior.evidence, self.posterior
         left = evidence.motion - self.prior.project_shapes(*evidence.weights) @ found.shape_weights
         left -= evidence.rigid_jacobian @ found.rigid_error
@@ -140,7 +140,7 @@ class Location:
 
     @property
     def rigid_alone(self) -> RigidExplanation:
-        """Part of the observation that another rigid error would explain, with the brain undeformed."""
+        """Rigid error that would explain most of the observation, with the brain undeformed."""
         evidence = self.posterior.evidence
         found = evidence.rigid_fit
         left, whole = (evidence.motion - evidence.rigid_jacobian @ found, float(evidence.motion @ evidence.motion))
@@ -149,22 +149,22 @@ class Location:
 
     @cached_property
     def within_errors(self) -> bool:
-        """True if the observation is within its reported errors, so that no motion is significant."""
+        """True if the observation is within its reported errors: then no motion is significant."""
         return is_within_errors(self.posterior)
 
     @cached_property
     def cause_shares(self) -> tuple[CauseShare, ...]:
-        """Causes of the open cortex's motion, as far as separable, largest share first.
+        """Shares of causes in the open cortex's motion, as far as separable, largest share first.
 
-        Empty if the observation is within its errors, or the registration may have slipped.
+        Empty if the observation is within its errors, or if the registration may have slipped.
         """
         return () if self.slipped or self.within_errors else group_cause_shares(self._drawn_shares)
 
     @property
     def causes(self) -> dict[str, float]:
-        """Mean share of each of `KINDS` in the mean square motion of the open cortex; they sum to 1.
+        """Mean share of each of `KINDS` in the mean square motion of the open cortex; the shares sum to 1.
 
-        All are 0 if no cause is named. Single shares are rough estimates if causes are not separable.
+        All shares are 0 if `cause_shares` is empty. Shares of inseparable causes are rough estimates.
         """
         share = self._drawn_shares.mean(axis=0) if self.cause_shares else np.zeros(len(KINDS))
         return dict(zip(KINDS, share.tolist(), strict=True))
@@ -175,7 +175,7 @@ class Location:
 
     @property
     def doubt(self) -> str:
-        """Reasons why ellipsoids may be unreliable, in sentences; empty if calibrated."""
+        """Reason why the ellipsoids may be unreliable, in sentences; empty if they are calibrated."""
         if self.slipped:
             return (
                 f"It is a guess, as the registration may have slipped. {self._rigid_words} explains what was seen "
@@ -190,7 +190,7 @@ class Location:
 
     @property
     def is_registration_suspect(self) -> bool:
-        """Return True if a wrong registration explains the observation nearly as well as a motion does."""
+        """True if a wrong registration explains the observation nearly as well as a motion does."""
         found, checked = self.posterior, self.checked
         return self.slipped or (
             not checked
@@ -200,7 +200,7 @@ class Location:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about this result, in sentences: alternative explanations, and `doubt`."""
+        """Warnings about this result, in sentences: other explanations of the observation, and `doubt`."""
         named = self.is_registration_suspect and not self.slipped
         rigid = (
             f"{self._rigid_words} would explain {self.rigid_alone.share:.0%}, with a brain at rest. The two cannot be "
@@ -211,7 +211,7 @@ class Location:
 
     @property
     def _rigid_words(self) -> str:
-        """Description of the best rigid error with the brain undeformed, and of the reported one."""
+        """Text that compares the best-fitting rigid error, with the brain undeformed, with the reported one."""
         alone = self.rigid_alone
         stated = self.posterior.evidence.rigid_scale
         return (
@@ -221,7 +221,7 @@ class Location:
 
     @property
     def named_causes(self) -> str:
-        """Description of `group_cause_shares`, or the reason why no cause is named."""
+        """Description of `cause_shares`, or the reason why it is empty."""
         if self.slipped:
             return "not said, as the registration may have slipped"
         if self.within_errors:
@@ -234,16 +234,16 @@ class Location:
 
 @dataclass(frozen=True, eq=False)
 class Locator:
-    """Estimator of tumour motion for one anatomy, built once (`make_locator`) for any number of observations.
+    """Estimator of the tumour's motion in one anatomy, built once (`make_locator`) for all its observations.
 
     Parameters
     ----------
     prior
         Prior of motions.
     tried
-        (k, 5): results of trials (`calibration.run_trials`).
+        Results (k, 5) of the trials (`calibration.run_trials`).
     regions
-        Regions whose stiffness was known.
+        Regions of known stiffness.
     """
 
     prior: MotionPrior
@@ -256,19 +256,19 @@ class Locator:
         return self.prior.anatomy
 
     def restrict(self) -> Locator:
-        """Return this locator restricted to vertices at the open cortex and of the tumour: a tenth of the size.
+        """Return this locator restricted to vertices at the open cortex and in the tumour, with a tenth of the size.
 
-        The restricted locator accepts observations on the open cortex alone, and gives no motion of other tissue.
+        The restricted locator accepts only observations on the open cortex, and has no motion of other tissue.
         """
         return replace(self, prior=self.prior.restrict(find_observed_nodes(self.anatomy)))
 
     def locate(self, observation: Observation) -> Location:
-        """Locate the tumour by one observation.
+        """Estimate the tumour's position from one observation.
 
         Raises
         ------
         InputError
-            An observation that is too small, is elsewhere, or that no cause of the ensemble explains.
+            The observation has too few points or is far from the cortex, or no cause in the ensemble explains it.
         """
         with limit_to_one_thread():  # matrix products are small
             return self._locate_tumour(observation)
@@ -301,29 +301,29 @@ class Locator:
 
 
 def find_observed_nodes(anatomy: Anatomy) -> np.ndarray:
-    """Select the sorted vertices (n,) of the tumour and of all tetrahedra at the open cortex."""
+    """Return the sorted vertices (n,) of the tumour and of all tetrahedra with a vertex on the open cortex."""
     mesh = anatomy.mesh
     at_cortex = np.isin(mesh.tets, anatomy.open_surface).any(axis=1)
     return np.union1d(mesh.tets[at_cortex], anatomy.tumour_nodes)
 
 
 def compute_confidence_radius(covariance: np.ndarray) -> float:
-    """Compute the radius [m] round the mean of a Gaussian, covariance (3, 3) [m^2], that holds 95 % of samples."""
+    """Compute the radius [m] that contains 95 % of a Gaussian with `covariance` (3, 3) [m^2], round its mean."""
     drawn = _sample_normal() @ np.linalg.cholesky(covariance).T
     return float(np.quantile(np.sqrt((drawn**2).sum(axis=1)), 0.95))
 
 
 @cache
 def _sample_normal() -> np.ndarray:
-    """Sample standard normal numbers (SAMPLE_COUNT, 3) with a fixed seed."""
+    """Sample standard normal numbers (SAMPLE_COUNT, 3), with a fixed seed."""
     return np.random.default_rng(0).standard_normal((SAMPLE_COUNT, 3))
 
 
 def _is_slip_likely(anatomy: Anatomy, found: Posterior) -> bool:
-    """Return True if an excessive slip explains the observation nearly as well as a motion does, and is no sinking.
+    """Return True if a slip explains the observation nearly as well as a motion does, and is not like a sinking brain.
 
-    A brain that sinks by a centimetre resembles a registration shift, but moves uniformly and mostly along the
-    craniotomy's axis. A slip shifts the brain across this axis, or rotates it.
+    A brain that sinks by a centimetre resembles a registration shift, but it moves uniformly and mostly along the
+    craniotomy's axis. A slip moves the brain across this axis, or rotates it.
     """
     if found.slip_log_odds < LIMITS.min_slip_log_odds or found.evidence.rigid_ratio <= LIMITS.max_rigid_ratio:
         return False
@@ -340,7 +340,7 @@ def _check_explained(found: Posterior, outliers: int, points: int) -> None:
     Raises
     ------
     InputError
-        Too many outliers, or residuals larger than noise.
+        There are too many outliers, or the residuals are larger than the reported errors.
     """
     if outliers > LIMITS.max_outlier_share * points:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Locators of patients: built once before surgery, stored in files, and read within a second."""
+"""Locators of patients, computed once before surgery, and stored in files that are read within a second."""
 
 import json
 from collections.abc import Callable
@@ -31,17 +31,17 @@ ARRAYS = ("shape", *NUMBER_ARRAYS, "centre")  # Arrays of a file with the whole 
 
 
 def to_locator_path(anatomy: str | Path) -> Path:
-    """Return the path of an anatomy's locator: MESH.locator.npz next to MESH.vtu."""
+    """Return the path of an anatomy's locator: MESH.locator.npz, next to MESH.vtu."""
     return Path(anatomy).with_suffix(".locator.npz")
 
 
 def save_locator(path: str | Path, locator: Locator) -> None:
-    """Write a locator atomically.
+    """Write a locator to an .npz file, atomically.
 
     Raises
     ------
     InputError
-        A name that does not end in .npz, or a folder that cannot be written to.
+        The name does not end in .npz, or the folder is not writable.
     """
     prior = locator.prior
     header = {
@@ -55,12 +55,12 @@ def save_locator(path: str | Path, locator: Locator) -> None:
 
 
 def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
-    """Read the locator of an anatomy.
+    """Read the locator of an anatomy from a file.
 
     Raises
     ------
     InputError
-        A file that is missing, not a locator of this version, damaged, or of another anatomy.
+        The file is missing, of another version, damaged, or for another anatomy.
     """
     with wrap_errors(path, "a locator", REMEDY), Path(path).open("rb") as raw:
         archive = Archive(raw, REMEDY)
@@ -78,12 +78,12 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
 
 
 def _list_array_names(header: dict[str, Any]) -> tuple[str, ...]:
-    """Return the array names of a prior that is complete, or restricted to some vertices."""
+    """Return the names of a prior's arrays, for a file with all vertices or with some of them."""
     return ARRAYS if header.get("whole", True) else (*ARRAYS, "nodes")
 
 
 def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) -> None:
-    """Raise InputError if arrays do not fit the anatomy or each other."""
+    """Raise InputError if the arrays of a file do not fit the anatomy or each other."""
     shape, tried, every = arrays["shape"], arrays["tried"], np.arange(len(anatomy.mesh.nodes))
     nodes = arrays.get("nodes", every)
     fits = nodes.dtype.kind == "i" and np.array_equal(nodes, np.intersect1d(nodes, every))
@@ -101,16 +101,16 @@ def make_locator(
     anatomy: Anatomy, seed: int = 0, device: str = "auto", causes: Causes = USUAL_CAUSES, folder: Path | None = None,
     progress: Callable[[str, int, int], object] = lambda stage, done, total: None, count: int = TRIAL_COUNT,
 ) -> Locator:  # fmt: skip
-    """Build a locator of one anatomy. Finished groups of an interrupted run are read from `folder`.
+    """Build the locator of an anatomy; finished groups of an interrupted run are read from `folder`.
 
-    Regions of the `causes` belong to the locator. `progress` receives a stage, the number of its parts done, and their
-    total. `count` trials calibrate it.
+    The locator keeps the known regions in `causes`. `progress` receives a stage, the number of its parts done, and
+    their total. `count` is the number of trials that calibrate the locator.
 
     Raises
     ------
     InputError
-        An anatomy without open cortex, tumour or skull, or without a region of the causes; causes without a converged
-        member.
+        The anatomy has no open cortex, tumour or skull, or lacks a region in `causes`; no member of a group has
+        converged.
     """
     check_regions(causes.regions, anatomy)
     ensemble = solve_groups(anatomy, seed, device, causes, folder, lambda done, total: progress("causes", done, total))

@@ -1,4 +1,4 @@
-"""Observations of a brain, validated against the anatomy: moved points, a point cloud of the surface, tool tips."""
+"""Observations of a brain, checked against its anatomy: moved points, a point cloud of the surface, tool tips."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,8 +16,7 @@ from sim.geometry.surface import compute_vertex_normals, normalise_vectors
 from ..array_functions import compute_squared_distances
 from .evidence import SHIFT_ERROR, SIGMA, Evidence, build_motion_evidence
 
-# Likely unit errors: factor that brings the points to the cortex, hint to the user.
-UNIT_ERRORS = (  # Likely unit and axis errors: factor that brings the points to the cortex, hint to the user.
+UNIT_ERRORS = (  # Likely unit errors: factor that brings the points to the cortex, hint to the user.
     (1.0, ""),
     (1e-3, "if they were a thousandth of that: files are in mm, arrays in metres"),
     (1e3, "if they were a thousand times of that: files are in mm, arrays in metres"),
@@ -28,14 +27,14 @@ UNIT_ERRORS = (  # Likely unit and axis errors: factor that brings the points to
 # Likely axis errors: signs of x, y and z that bring the points to the cortex, hint to the user.
 FRAME_ERRORS = (((1.0, 1.0, 1.0), ""), ((-1.0, -1.0, 1.0), "if x and y were turned: they are LPS"))
 MAX_POINTS = 400
-"""Maximum number of points used, spread over those given: more add nothing, as neighbours share errors."""
+"""Maximum number of points used, evenly chosen; more points add little, as errors of neighbours are correlated."""
 
 
 @dataclass(frozen=True)
 class ObservationLimits:
-    """Limits of a plausible observation."""
+    """Limits of a plausible observation; values outside are rejected."""
 
-    min_points: int = 6  # Minimum number of points, and of different places.
+    min_points: int = 6  # Minimum number of points, and of distinct positions.
     min_spread_ratio: float = 0.05  # Smallest ratio of the spread of points across a line to that along it.
     near_distance: float = 6e-3  # Largest distance of at least half of the points from the open cortex [m].
     far_distance: float = 12e-3  # Largest distance of a point from the open cortex [m]; points beyond are outliers.
@@ -46,11 +45,11 @@ class ObservationLimits:
     max_coordinate: float = 1e6  # Largest coordinate [m].
     max_motion: float = 0.025  # Largest median motion of a brain [m].
     max_rigid_error: float = 0.02  # Largest rigid error of a tracker [m].
-    min_sigma: float = 0.01e-3  # Smallest error of a point [m]: below, a file of millimetres has metres.
+    min_sigma: float = 0.01e-3  # Smallest error of a point [m]; a smaller one is probably in metres instead of mm.
     min_motion: float = 1e-9  # Smallest motion that is not zero [m].
     # Largest median error [m]: with more, points give no information about motions of a few millimetres.
     max_sigma: float = 0.01
-    # Largest ratio of the span of points to that of the open cortex, and its inverse: beyond, units are wrong.
+    # Largest ratio of the points' span to that of the open cortex, or its inverse; beyond it units are wrong.
     max_span_ratio: float = 6.0
 
 
@@ -59,23 +58,23 @@ LIMITS = ObservationLimits()
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Observed points, in RAS and metres.
+    """Observed points and tool tips, in metres and RAS.
 
     Parameters
     ----------
     now
-        (n, 3): observed positions, rigid error included.
+        Observed positions (n, 3), which include the rigid error.
     rest
-        (n, 3): positions of the same points in the scan; None: a cloud of the surface, without correspondences.
+        Positions (n, 3) of the same points in the scan; None: a surface cloud without correspondences.
     sigma
-        (n,): standard deviation of each point's non-rigid error.
+        Standard deviation (n,) of each point's non-rigid error along each axis; None: `SIGMA`.
     tips
-        (k, 3): positions of tool tips that touch the surface.
+        Positions (k, 3) of tool tips that touch the surface.
     rigid
-        Standard deviation of the rigid error along each axis, common to all points.
+        Standard deviation of the rigid error's translation along each axis, common to all points.
     checked
-        True if the registration was checked on structures that do not move, as landmarks of the skull: then no slip
-        beyond `rigid` is suspected.
+        True if the registration was checked on structures that do not move, such as skull landmarks. Then no slip
+        beyond `rigid` is assumed.
 
     Examples
     --------
@@ -98,20 +97,20 @@ class Observation:
 
     @property
     def sigmas(self) -> np.ndarray:
-        """(n,) [m]: standard deviations of the points, `SIGMA` by default."""
+        """Standard deviations (n,) [m] of the points' non-rigid errors, `SIGMA` by default."""
         return np.full(len(self.now), SIGMA) if self.sigma is None else self.sigma
 
 
 def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
-    """Convert an observation to evidence, with the body undeformed.
+    """Check an observation and convert it to evidence, with the brain undeformed.
 
     Raises
     ------
     InputError
-        Values that are not finite or out of range, too few points, points on a line, a sigma below any tracker's, or
-        sigmas too large to be informative. A rigid error beyond any tracker's, motions beyond any brain's or too small
-        to be observed. Points away from the brain's surface, with the likely reason: units, LPS for RAS, another
-        anatomy.
+        Values are not finite or out of range, there are too few points, points are on a line, or a sigma is smaller
+        than any tracker's or too large to be informative. The rigid error is larger than any tracker's; motions are
+        larger than any brain's or too small to be observed. Points are far from the brain's surface; the message gives
+        the likely reason: units, LPS instead of RAS, another anatomy.
     """
     _check(observation)
     some = choose_point_numbers(len(observation.now))
@@ -136,7 +135,7 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
 
 
 def choose_point_numbers(point_count: int) -> np.ndarray:
-    """Select the numbers (k,) of at most `MAX_POINTS` points, evenly spread over `point_count`."""
+    """Select the indices (k,) of at most `MAX_POINTS` points, evenly spread over `point_count`."""
     return np.unique(np.linspace(0, point_count - 1, min(point_count, MAX_POINTS)).round().astype(int))
 
 
@@ -144,11 +143,11 @@ def to_deformed_evidence(
     anatomy: Anatomy, observation: Observation, point_numbers: np.ndarray, motion: np.ndarray,
     bias: Callable[[np.ndarray], np.ndarray],
 ) -> Evidence:  # fmt: skip
-    """Convert an observation to evidence, with the body deformed by `motion` (V, 3) [m].
+    """Convert an observation to evidence, with the brain deformed by `motion` (V, 3) [m].
 
-    Only the points `point_numbers` (k,) are used. Points without an undeformed position, and tips, are matched to the
-    closest point of the surface and give its motion along its normal. `bias` gives the estimated rigid error
-    (n, 3) [m] at positions (n, 3). Tips are numbered after the points.
+    Only the points with indices `point_numbers` (k,) are used. Points without an undeformed position, and tips, are
+    matched to the closest surface point, and give the surface's motion along the normal. `bias` maps positions (n, 3)
+    to the estimated rigid error (n, 3) [m]. Tips are numbered after the points.
     """
     parts, count = [], len(observation.now)
     cloud, number = observation.tips, count + np.arange(len(observation.tips))
@@ -176,7 +175,7 @@ def _build_normal_rows(
     anatomy: Anatomy, cloud: np.ndarray, sigma: np.ndarray, number: np.ndarray, motion: np.ndarray,
     bias: Callable[[np.ndarray], np.ndarray],
 ) -> Evidence:  # fmt: skip
-    """Build one row a point, with its `number` (n,): displacement of the surface along its deformed normal."""
+    """Build one row per point, with its `number` (n,): surface displacement along the deformed normal."""
     triangles, nodes = anatomy.open_surface, anatomy.mesh.nodes
     corners = (nodes + motion)[triangles]
     _, triangle, weights = find_closest_points(cloud - bias(cloud), corners)
@@ -243,9 +242,9 @@ def _check(observation: Observation) -> None:
 
 
 def _check_motions(length: np.ndarray) -> None:
-    """Raise InputError for lengths (n,) [m] of motions beyond any brain's, or given in metres.
+    """Raise InputError for motion lengths (n,) [m] that are larger than any brain's, or probably in metres.
 
-    Lengths of 0 are accepted: nothing moved.
+    Lengths of 0 are accepted, as for a brain that has not moved.
     """
     if np.median(length) > LIMITS.max_motion:
         raise InputError(
@@ -260,7 +259,7 @@ def _check_motions(length: np.ndarray) -> None:
 
 
 def _check_spread(where: np.ndarray, near: np.ndarray) -> None:
-    """Raise InputError if points (n, 3) [m] have too few distinct positions, or those `near` (n,) are on a line."""
+    """Raise InputError if points (n, 3) [m] have too few distinct positions, or if those `near` (n,) are on a line."""
     places = len(np.unique(np.round(where / LIMITS.place_tolerance), axis=0))
     if places < LIMITS.min_points:
         raise InputError(
@@ -274,7 +273,7 @@ def _check_spread(where: np.ndarray, near: np.ndarray) -> None:
 
 
 def _compute_surface_distances(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
-    """Compute distances (n,) [m] from the open cortex; up to `LIMITS.near_distance`, from the nearest vertex."""
+    """Compute distances (n,) [m] from the open cortex; below `LIMITS.near_distance`, from the nearest vertex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     away = np.sqrt(compute_squared_distances(points, nodes[np.unique(triangles)]).min(axis=1))
     far = np.flatnonzero(away > LIMITS.near_distance)
@@ -284,12 +283,12 @@ def _compute_surface_distances(anatomy: Anatomy, points: np.ndarray) -> np.ndarr
 
 
 def _is_mostly_far(off: np.ndarray, near: float) -> bool:
-    """Return True if more than half of distances (n,) [m] exceed `near` [m]."""
+    """Return True if more than half of the distances `off` (n,) exceed `near` [m]."""
     return bool(np.count_nonzero(off > near) > 0.5 * len(off))
 
 
 def _describe_mismatch(anatomy: Anatomy, points: np.ndarray, off: float, near: float) -> str:
-    """Describe why half of the points (n, 3) [m] may be at `off` from the open cortex, farther than `near` [m]."""
+    """Describe the likely reason why half of the points (n, 3) are `off` [m] from the open cortex, above `near` [m]."""
     start = f"half of the points lie more than {1e3 * off:.3g} mm from the open cortex"
     for (scale, unit_meant), (turned, frame_meant) in product(UNIT_ERRORS, FRAME_ERRORS):
         if not _is_mostly_far(_compute_surface_distances(anatomy, scale * points * turned), near):

@@ -1,4 +1,4 @@
-"""Observations in CSV files: millimetres, RAS, a header that names the columns."""
+"""Observations in CSV files, in millimetres and RAS, with a header that names the columns."""
 
 import csv
 from collections.abc import Callable, Mapping
@@ -14,22 +14,22 @@ from .observation import Observation
 # Column names: position, motion, standard deviation.
 PLACE, MOTION, SIGMA = ("x", "y", "z"), ("dx", "dy", "dz"), "sigma"
 NAME_COLUMNS = ("label", "name", "id")
-"""Columns that name a point; they are ignored."""
+"""Columns with the name of a point, which are ignored."""
 MAX_ROWS = 1_000_000  # Maximum number of rows of a list of points.
 MAX_LINE_LENGTH = 1000  # Maximum number of characters of a line.
 MAX_VALUE = 1e9  # Largest absolute value of a number.
 
 
 def read_observation(path: str | Path, tips: str | Path | None = None) -> Observation:
-    """Read `x,y,z,dx,dy,dz[,sigma]`, points in the scan and how they moved, or `x,y,z[,sigma]`, a cloud of the surface.
+    """Read `x,y,z,dx,dy,dz[,sigma]`, points in the scan and their motions, or `x,y,z[,sigma]`, a cloud of the surface.
 
-    `tips` is a file of `x,y,z`: contact positions of tool tips. All in millimetres, RAS.
+    `tips` is a file with `x,y,z`: positions of tool tips that touch the cortex. Files are in millimetres, RAS.
 
     Raises
     ------
     InputError
-        A file that is missing or not such a table, columns that are missing, unknown or duplicated, no rows, cells that
-        are not finite numbers or too large.
+        A file is missing or not such a table; columns are missing, unknown or duplicated; there are no rows; cells are
+        not finite numbers or too large.
     """
     columns = read_columns(path, {(*PLACE, *MOTION), (*PLACE, *MOTION, SIGMA), PLACE, (*PLACE, SIGMA)})
     touched = np.zeros((0, 3)) if tips is None else _to_points(read_columns(tips, {PLACE}), PLACE)
@@ -41,7 +41,7 @@ def read_observation(path: str | Path, tips: str | Path | None = None) -> Observ
 
 
 def _to_points(columns: dict[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
-    """Convert columns [mm] to points (n, 3) [m]."""
+    """Convert three columns in mm to points (n, 3) in m."""
     return 1e-3 * np.column_stack([columns[name] for name in names])
 
 
@@ -51,10 +51,10 @@ def read_columns(
     optional_columns: tuple[str, ...] = (),
     is_blank: Callable[[Mapping[str, str]], bool] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Read columns of a table by name, with an allowed header; in `optional_columns` columns cells may be empty (NaN).
+    """Read the columns of a table by name; the header must be allowed. Cells of `optional_columns` may be empty (NaN).
 
-    With `is_blank`, further columns are allowed. It is called with all cells of a row by column; where it returns True,
-    the `optional_columns` columns of that row are NaN.
+    If `is_blank` is given, further columns are allowed. It receives the cells of a row by column name; if it returns
+    True, the row's `optional_columns` are NaN.
 
     Raises
     ------

@@ -1,10 +1,10 @@
-"""Posterior of motions: a mixture of Gaussians.
+"""Posterior of motions as a mixture of Gaussians.
 
 A prior motion is a sum of shapes with independent weights (Rasmussen, Williams 2006, "Gaussian Processes for Machine
-Learning", section 2.1). A hypothesis is a set of causes; hypotheses are weighed by their evidence (equation 5.8).
-Shapes only resemble tissue, so that evidence counts less than its formula says: Miller, Dunson 2019, "Robust Bayesian
-inference via coarsening", J. Am. Stat. Assoc. 114:1113-1125. Leave-one-out residuals: Sundararajan, Keerthi 2001,
-"Predictive approaches for choosing hyperparameters in Gaussian processes", Neural Comput. 13:1103-1118.
+Learning", section 2.1). A hypothesis is a set of causes, and is weighted by its evidence (equation 5.8). As shapes only
+approximate tissue, the evidence is raised to a power below 1: Miller, Dunson 2019, "Robust Bayesian inference via
+coarsening", J. Am. Stat. Assoc. 114:1113-1125. Leave-one-out residuals: Sundararajan, Keerthi 2001, "Predictive
+approaches for choosing hyperparameters in Gaussian processes", Neural Comput. 13:1103-1118.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class PosteriorSettings:
 
     motion_significance: float = 0.005  # Significance level of a motion, for each of three tests.
     outlier_significance: float = 1e-4  # Significance level of an outlier.
-    min_inliers: int = 4  # Number of points up to which none is tested as an outlier.
-    evidence_divisor: float = 2.0  # Divisor of the log evidence, as model errors make hypotheses look too improbable.
+    min_inliers: int = 4  # Minimum number of remaining points; if reached, no outlier is tested.
+    evidence_divisor: float = 2.0  # Divisor of the log evidence, for model errors of the shapes.
     max_hypotheses: int = 24  # Maximum number of hypotheses in the mixture: the most probable ones.
 
 
@@ -43,12 +43,12 @@ POSTERIOR = PosteriorSettings()
 
 
 def is_within_errors(posterior: Posterior) -> bool:
-    """Return True if the observation is within its errors, the reported rigid error included: no motion is significant.
+    """Return True if the observation is within its errors, rigid error included, so that no motion is significant.
 
-    Two tests compare its size: the square Mahalanobis distance has a rigid part, by generalised least squares, and a
-    remainder. Both are chi-squared. The third compares its form: the ratio of the mean evidence of prior motions to
-    that of errors alone. By Markov's inequality errors alone exceed 1 / p with a probability of p at most. This
-    test detects a dent whose total size is within the errors.
+    Two tests are on the observation's size: its squared Mahalanobis distance is the sum of a rigid part, by generalised
+    least squares, and a remainder, which are both chi-squared. The third test is on its form: the ratio of the mean
+    evidence of prior motions to that of errors alone. By Markov's inequality, errors alone exceed a ratio of 1 / p with
+    a probability of p at most. This test detects a dent whose total size is within the errors.
     """
     evidence = posterior.evidence
     whitening, scale = evidence.build_whitening(0.0), evidence.rigid_scale
@@ -73,11 +73,11 @@ class HypothesisResult:
     probability
         Probability of the hypothesis.
     rows, mean
-        (k,): row numbers of the unknowns, and their posterior means.
+        Row numbers (k,) of the unknowns, and their posterior means.
     prior_deviations
-        (k,): their prior standard deviations.
+        Prior standard deviations (k,) of the unknowns.
     cholesky
-        (k, k): Cholesky factor of the precision of the unknowns, each over `prior_deviations`.
+        Cholesky factor (k, k) of the precision of the unknowns, each divided by its prior standard deviation.
     """
 
     probability: float
@@ -88,32 +88,32 @@ class HypothesisResult:
 
     @cached_property
     def root(self) -> np.ndarray:
-        """Factor R (k, k) of the covariance R^T R."""
+        """Factor R (k, k) of the unknowns' posterior covariance R^T R."""
         return self.prior_deviations * invert_triangular(self.cholesky)
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Posterior of motions: mixture over hypotheses.
+    """Posterior of motions: mixture over the most probable hypotheses.
 
     Parameters
     ----------
     evidence
         Evidence without outliers.
     results
-        Posteriors of hypotheses; their shares sum to 1.
+        Posteriors of the hypotheses; their probabilities sum to 1.
     unknowns
-        Mean (r + 6,) of the shapes' weights, and of the rigid error in its prior's standard deviations.
+        Mean (r + 6,) of the shapes' weights, and of the rigid error divided by its prior standard deviations.
     surprise
-        Mean over rows of the leave-one-out square Mahalanobis distance: 1 if the observation fits.
+        Mean over rows of the squared Mahalanobis distance from leave-one-out predictions; about 1 if the model fits.
     outliers
-        Numbers of the points that were removed.
+        Numbers of the points that were removed as outliers.
     slip_log_odds
-        Log-odds of a slipped registration against one that did not slip: of the best hypothesis of each.
+        Log-odds of a slipped registration: best hypothesis with a slip against the best hypothesis without one.
     motion_evidence
-        `motion_evidence` of the `ObservedPrior`.
+        Log evidence of motions, see `ObservedPrior.motion_evidence`.
     covariance_factor
-        Calibration factor on the mixture's covariances.
+        Calibrated factor on the mixture's covariances.
     """
 
     evidence: Evidence
@@ -127,20 +127,20 @@ class Posterior:
 
     @property
     def shape_weights(self) -> np.ndarray:
-        """Posterior mean (r,) of the weights of the shapes."""
+        """Posterior mean (r,) of the shapes' weights."""
         return self.unknowns[:-6]
 
     @property
     def rigid_error(self) -> np.ndarray:
-        """Mean (6,) of the rigid error: translation [m], rotation [rad]."""
+        """Posterior mean (6,) of the rigid error: translation [m], then rotation [rad]."""
         return self.unknowns[-6:] * self.evidence.rigid_scale
 
     def compute_bias(self, positions: np.ndarray) -> np.ndarray:
-        """Compute the mean rigid error (n, 3) [m] at positions (n, 3) [m]."""
+        """Compute the posterior mean of the rigid error's displacement (n, 3) [m] at positions (n, 3) [m]."""
         return self.rigid_error[:3] + np.cross(self.rigid_error[3:], positions - self.evidence.centroid)
 
     def compute_covariance(self, shapes: np.ndarray) -> np.ndarray:
-        """Compute covariances (q, 3, 3) [m^2] of motions from shapes (r, q, 3) [m]."""
+        """Compute the covariances (q, 3, 3) [m^2] of the motions of q points, given their shapes (r, q, 3) [m]."""
         flat = np.pad(shapes.reshape(len(shapes), -1), ((0, 6), (0, 0)))  # a rigid error moves no tissue
         mean, found = self.unknowns @ flat, np.zeros((shapes.shape[1], 3, 3))
         for result in self.results:
@@ -153,22 +153,22 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class ObservedPrior:
-    """Prior at the observed points, whitened by their errors.
+    """Prior at the observed points, whitened by their error covariance.
 
     Parameters
     ----------
     prior
         Prior of motions.
     motion_size
-        Prior size of motions [mm], root mean square.
+        Prior root mean square size of motions [mm].
     system
-        Whitened effect of unit weights, and of a rigid error of one standard deviation, on the observation.
+        Whitened effect on the observation of unit shape weights and of a rigid error of one standard deviation.
     log_odds
-        See `MotionPrior.compute_log_odds`.
+        Log-odds of places, see `MotionPrior.compute_log_odds`.
     slip_ratio
-        See `Evidence.slip`.
+        Size of a slip relative to the reported rigid error, see `Evidence.slip_ratio`.
     is_paired
-        True if points have correspondences. Oedema is excluded for point clouds: their errors resemble it.
+        True if points have correspondences. For point clouds oedema is excluded, as their errors resemble oedema.
     """
 
     prior: MotionPrior
@@ -180,7 +180,7 @@ class ObservedPrior:
 
     @property
     def slip_log_odds(self) -> float:
-        """Log-odds of a slip, as in `Posterior`."""
+        """Log-odds of a slipped registration, as in `Posterior`."""
         best = self.log_evidence.max(axis=1)
         return POSTERIOR.evidence_divisor * float(best[self._slips].max() - best[~self._slips].max())
 
@@ -188,7 +188,7 @@ class ObservedPrior:
     def motion_evidence(self) -> float:
         """Logarithm of the mean evidence of motions, for a registration within its reported error.
 
-        Odds do not count: a tip gives no information on motion.
+        The log-odds of places are left out, as a tool tip gives no information on motion.
         """
         logs = POSTERIOR.evidence_divisor * (self.log_evidence - self.log_odds)[~self._slips]
         logs, rows = logs[np.isfinite(logs)], self.system
@@ -196,13 +196,13 @@ class ObservedPrior:
 
     @property
     def _slips(self) -> np.ndarray:
-        """Mask of the hypotheses (h,) with a slipped registration."""
+        """Mask (h,) of the hypotheses with a slipped registration."""
         return np.isinf([hypothesis.rigid_ratio for hypothesis in self.prior.hypotheses])
 
     def compute_posteriors(self, allow_slip: bool = False) -> list[HypothesisResult]:
-        """Compute the posteriors of the most probable hypotheses, the best first; their shares sum to 1.
+        """Compute the posteriors of the most probable hypotheses, best first; their probabilities sum to 1.
 
-        Hypotheses of a slipped registration are included if it is `allow_slip`.
+        Hypotheses with a slipped registration are included if `allow_slip`.
         """
         logs = self.log_evidence if allow_slip else np.where(self._slips[:, None], -np.inf, self.log_evidence)
         best = np.argsort(-logs, axis=None, kind="stable")[: min(POSTERIOR.max_hypotheses, np.isfinite(logs).sum())]
@@ -217,9 +217,9 @@ class ObservedPrior:
 
     @cached_property
     def log_evidence(self) -> np.ndarray:
-        """Logarithms (h, 1 + p) of odds and coarsened evidence of hypotheses, up to a common constant.
+        """Log of prior odds and coarsened evidence (h, 1 + p) of the hypotheses, up to a common constant.
 
-        First without a tool, then with one at each place; -inf where none may press.
+        Column 0 is without a pressing tool, the others are for a tool on each place; -inf where excluded.
         """
         # All hypotheses include tools all over the cortex and the rigid error, and each set extends an earlier one.
         rigid = (
@@ -244,7 +244,7 @@ class ObservedPrior:
         return self.log_odds + evidence.swapaxes(1, 2).reshape(-1, len(self.log_odds)) / POSTERIOR.evidence_divisor
 
     def _build_equations(self) -> NormalEquations:
-        """Build the normal equations of all unknowns in each skull, each over its prior standard deviation."""
+        """Build the normal equations of all unknowns for each skull, each divided by its prior standard deviation."""
         shared, products = self.prior.tables, self.system.products
         skulls, places = len(shared.rows), shared.place_rows
         rows = np.concatenate([shared.rows, np.tile(self._rigid, (skulls, 1))], axis=1)
@@ -262,11 +262,11 @@ class ObservedPrior:
 
     @property
     def _rigid(self) -> np.ndarray:
-        """Row numbers (6,) of the rigid error."""
+        """Row numbers (6,) of the rigid error's components."""
         return np.arange(-7, -1) + len(self.system.products)
 
     def compute_posterior(self, hypothesis: Hypothesis, place_rows: np.ndarray, probability: float) -> HypothesisResult:
-        """Compute the posterior of a hypothesis with the additional rows (q,) of one place."""
+        """Compute the posterior of a hypothesis, including the shapes `place_rows` (q,) of a tool on one place."""
         own = np.concatenate([hypothesis.rows, self._rigid, place_rows])
         size = np.full(len(own), self.motion_size)
         size[: len(hypothesis.rows)] *= hypothesis.deviations
@@ -279,7 +279,7 @@ class ObservedPrior:
 
 
 def build_observed_prior(prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS) -> ObservedPrior:
-    """Whiten a prior at the points of some evidence; tips of tools (k, 3) [m] touch the cortex."""
+    """Whiten a prior at the points of evidence; `tips` (k, 3) [m] are tool tips that touch the cortex."""
     seen = float(np.sqrt((evidence.motion**2).sum() / len(np.unique(evidence.point))))
     # A motion and a rigid error may cancel, so that the observation is small; and noise hides smaller motions.
     scale = 1e3 * max(float(np.hypot(seen, np.sqrt(3.0) * evidence.shift_sigma)), float(np.median(evidence.sigma)))
@@ -296,14 +296,14 @@ def build_observed_prior(prior: MotionPrior, evidence: Evidence, tips: np.ndarra
 def condition_prior(
     prior: MotionPrior, evidence: Evidence, tips: np.ndarray = NO_TIPS, allow_slip: bool = False
 ) -> Posterior:
-    """Condition a prior on evidence, without points that no others support. Tips (k, 3) [m] touch the cortex.
+    """Condition a prior on evidence without outliers; `tips` (k, 3) [m] are tool tips that touch the cortex.
 
-    The rigid error is of the reported size, or `allow_slip`: then it may be that of a slipped registration.
+    The rigid error has the reported size; if `allow_slip`, it may also be that of a slipped registration.
 
     Raises
     ------
     InputError
-        Fewer points that agree than needed.
+        Fewer points than `PosteriorSettings.min_inliers` agree on a motion.
     """
     kept, point = np.ones(len(evidence), bool), evidence.point
     while True:
@@ -330,7 +330,7 @@ def condition_prior(
 
 
 def _compute_distances(rows: WhitenedSystem, result: HypothesisResult, point: np.ndarray) -> np.ndarray:
-    """Compute square Mahalanobis distances (n,) of points from their leave-one-out predictions by one hypothesis."""
+    """Compute squared Mahalanobis distances (n,) of points from leave-one-out predictions under one hypothesis."""
     data = len(rows.products) - 1
     precise = rows.apply_precision(np.append(result.rows, data))
     known = precise[:, :-1] @ result.root.T

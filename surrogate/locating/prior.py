@@ -1,8 +1,8 @@
-"""Prior of brain motions: shapes of every cause in every skull, and sets of causes that may act together.
+"""Prior of brain motions: shapes of every cause for every skull, and sets of causes that may act together.
 
-A motion is a sum of shapes with independent weights. Shapes of drainage and swelling are the principal components of an
-ensemble. Those of tools are responses of linear tissue to smooth forces on the open cortex, all over it or round one
-place.
+A motion is a sum of shapes with independent weights. The shapes of drainage, swelling and oedema are principal
+components of an ensemble. The shapes of tools are responses of linear tissue to smooth forces on the open cortex,
+either on all of it or round one place: a position that a tool may press.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from .ensemble import Ensemble, compute_surface_motion
 
 # Maximum number of shapes of each cause in each skull model.
 MAX_SHAPES = {DRAINAGE: 12, SWELLING: 12, TUMOUR_SWELLING: 4, OEDEMA: 8, TOOL: 40}
-MIN_SHAPE_SHARE = 1e-6  # Smallest share of the variance of one shape.
-# Prior size of motions by cause, as a share of the observed motion. That of `TUMOUR_SWELLING` is with a swelling brain;
-# that of `TOOL` is of forces all over the cortex, which compensate for missing shapes.
+MIN_SHAPE_SHARE = 1e-6  # Smallest share of the variance that a used shape explains.
+# Prior size of motions by cause, as a share of the observed motion. `TUMOUR_SWELLING` acts with a swelling brain;
+# `TOOL` is for forces on the whole cortex, which compensate for missing shapes.
 CAUSE_SIZES = {DRAINAGE: 1.0, SWELLING: 1.0, TUMOUR_SWELLING: 0.3, OEDEMA: 1.0, TOOL: 0.15}
-# Candidate rigid errors relative to the reported one (a sinking brain resembles one); inf: a slipped registration.
+# Candidate rigid errors relative to the reported one (a sinking brain resembles a rigid error); inf: a slip.
 RIGID_RATIOS = (0.1, 1.0, np.inf)
-# Skull whose tool shapes are used: one that separates keeps contact under a tool, so sliding contact applies.
+# Skull whose tool shapes are used: a separating skull keeps contact under a tool, as sliding contact does.
 TOOL_SKULLS = {"bonded": "bonded", "slide": "slide", "contact": "slide"}
 OTHER_CAUSES = (DRAINAGE, SWELLING, TUMOUR_SWELLING, OEDEMA)  # Causes other than tools.
 # Sets of causes other than tools that may act together.
@@ -42,7 +42,7 @@ NO_PLACE = -1  # Place number of shapes that belong to no place.
 
 @dataclass(frozen=True)
 class PressSettings:
-    """Settings of the prior of a tool that presses on one place."""
+    """Settings of the prior of a tool that presses on one place of the cortex."""
 
     place_count: int = 30  # Number of places that one tool may press on.
     max_place_shapes: int = 6  # Maximum number of shapes of each place.
@@ -57,18 +57,18 @@ PRESS = PressSettings()
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Set of causes that act together, with prior sizes.
+    """Hypothesis: a set of causes that act together, with prior sizes.
 
     Parameters
     ----------
     rows
-        Rows (k,) of the prior's shapes.
+        Row numbers (k,) of the hypothesis's shapes in the prior.
     deviations
-        Standard deviations (k,) of their weights, as shares of the observed motion.
+        Prior standard deviations (k,) of the shapes' weights, relative to the observed motion.
     rigid_ratio
         Size of the rigid error relative to the reported one; inf for a slipped registration.
     place_rows
-        (p, q) rows of shapes; those of one line may be added: a tool that presses on one place.
+        Row numbers (p, q) of shapes of a tool that presses on one of p places; the shapes of one place may be added.
     """
 
     rows: np.ndarray
@@ -79,18 +79,18 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class PriorTables:
-    """Shapes that may act in each of s skulls, as tables with one kind per column.
+    """Tables of the shapes that may act in each of s skulls; all shapes in a column have the same cause.
 
     Parameters
     ----------
     rows
-        Rows (s, k) of the prior's shapes. A skull with fewer of a kind is padded with row 0, of size 0.
+        Row numbers (s, k) of shapes in the prior; a skull with fewer shapes of a cause is padded with row 0, of size 0.
     deviations
-        Sizes (s, k), see `Hypothesis`.
+        Prior standard deviations (s, k), see `Hypothesis`.
     kind
-        (k,) of the columns; tools all over the cortex.
+        Cause (k,) of each column; tools act on the whole cortex.
     place_rows
-        Rows (s, p, q), see `Hypothesis`.
+        Row numbers (s, p, q), see `Hypothesis`.
     """
 
     rows: np.ndarray
@@ -101,23 +101,23 @@ class PriorTables:
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """Prior of motions of one anatomy: its shapes.
+    """Prior of motions of one anatomy, by its shapes.
 
     Parameters
     ----------
     anatomy
-        The body.
+        Anatomy of the shapes.
     shape
-        (r, n, 3) float32 [m] at `nodes`. Those of one kind, skull and place together, with weights of variance 1, move
-        the open cortex or the tumour by 1 mm in root mean square.
+        Shapes (r, n, 3) float32 [m] at `nodes`. Together, with weights of variance 1, the shapes of one cause, skull
+        and place move the open cortex or the tumour by 1 mm in root mean square.
     kind, skull
         Indices (r,) into `KINDS` and into the names of `sim.effects.SKULLS`.
     place
-        Number (r,) of the position under the tool, or `NO_PLACE`.
+        Number (r,) of the place under the tool, or `NO_PLACE`.
     centre
-        Undeformed coordinates (p, 3) [m] of these positions.
+        Undeformed positions (p, 3) [m] of the places.
     nodes
-        Sorted mesh vertices (n,) of the shapes; None: all.
+        Sorted mesh vertices (n,) of the shapes; None: all vertices.
     """
 
     anatomy: Anatomy
@@ -129,41 +129,41 @@ class MotionPrior:
     nodes: np.ndarray | None = None
 
     def restrict_shapes(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the shapes (r, k, 3) [m] at some vertices (k,).
+        """Return the shapes (r, k, 3) [m] at the vertices `nodes` (k,).
 
         Raises
         ------
         InputError
-            A vertex that is not among `nodes`.
+            The prior does not have one of the vertices.
         """
         return self.shape[:, self._find_columns(nodes)]
 
     def restrict(self, nodes: np.ndarray) -> MotionPrior:
-        """Return this prior restricted to some vertices (k,); raises InputError as `restrict_shapes`.
+        """Return this prior restricted to the vertices `nodes` (k,); raises InputError as `restrict_shapes`.
 
-        Results are unchanged where available. An observation that touches other vertices is rejected.
+        Results at these vertices are unchanged. An observation that depends on other vertices is rejected.
         """
         some = np.unique(nodes)
         return replace(self, shape=self.restrict_shapes(some), nodes=some)
 
     def prepare(self) -> None:
-        """Compute the tables that all observations share, once."""
+        """Compute the cached tables that all observations share."""
         _ = self.centroid_motion, self.hypotheses, self.tables, self._by_vertex
 
     @cached_property
     def centroid_motion(self) -> np.ndarray:
-        """(r, 3) [m]: motion of the centroid of the tumour's volume by each shape."""
+        """Motion (r, 3) [m] of the tumour's centroid (by volume) for each shape."""
         tumour = self.anatomy.tumour_nodes
         return np.einsum("v,rvi->ri", compute_tumour_weights(self.anatomy)[tumour], self.restrict_shapes(tumour))
 
     @cached_property
     def cortex_products(self) -> np.ndarray:
-        """(r, r) [m^2]: inner products of the shapes, summed over the open cortex's vertices."""
+        """Inner products (r, r) [m^2] of the shapes over the open cortex's vertices."""
         flat = self.restrict_shapes(np.unique(self.anatomy.open_surface)).reshape(len(self.shape), -1).astype(float)
         return flat @ flat.T
 
     def _find_columns(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the column numbers of vertices (k,) among the available ones."""
+        """Return the indices of the vertices `nodes` (k,) among those of the prior."""
         if self.nodes is None:
             return nodes
         column = np.searchsorted(self.nodes, nodes).clip(max=len(self.nodes) - 1)
@@ -176,27 +176,27 @@ class MotionPrior:
 
     @cached_property
     def _by_vertex(self) -> np.ndarray:
-        """(n, 3, r) float32 [m]: the shapes, with those of one vertex contiguous in memory."""
+        """Shapes (n, 3, r) float32 [m], with the shapes of a vertex contiguous in memory."""
         return np.ascontiguousarray(self.shape.transpose(1, 2, 0))
 
     def restrict_to_vertices(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the shapes (k, 3, r) float32 [m] at some vertices (k,); raises InputError as `restrict_shapes`."""
+        """Return the shapes (k, 3, r) float32 [m] at the vertices (k,); raises InputError as `restrict_shapes`."""
         return self._by_vertex[self._find_columns(nodes)]
 
     def project_shapes(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Compute displacements (m, r) [m] of each shape, by vertices and weights as in `Evidence.weights`."""
+        """Compute observed displacements (m, r) [m] of each shape, by vertices and weights of `Evidence.weights`."""
         shape = self.restrict_to_vertices(vertices)
         return (weights @ shape.reshape(weights.shape[1], -1)).reshape(-1, shape.shape[2])
 
     def compute_log_odds(self, tips: np.ndarray) -> np.ndarray:
-        """Compute log-odds (1 + p,) of no tool, or one pressing on each place, where tips (k, 3) [m] touch."""
+        """Compute log-odds (1 + p,) of no tool and of a tool on each of p places, given touching `tips` (k, 3) [m]."""
         if not len(tips):
             return np.zeros(1 + len(self.centre))
         away = ((self.centre[:, None] - tips) ** 2).sum(axis=2).min(axis=1)
         return np.append(np.log(PRESS.no_place_probability), -away / (2.0 * PRESS.touch_deviation**2))
 
     def _select_skull_rows(self, number: int) -> tuple[dict[int, np.ndarray], np.ndarray]:
-        """Return rows by kind in a skull (tools: all over the cortex), and (p, q), those of a tool on each place."""
+        """Return a skull's row numbers by cause (tools: whole cortex), and those (p, q) of a tool on each place."""
         rows = {kind: np.flatnonzero((self.kind == kind) & (self.skull == number)) for kind in OTHER_CAUSES}
         pressed = (self.kind == TOOL) & (self.skull == list(SKULLS).index(TOOL_SKULLS[list(SKULLS)[number]]))
         places = [np.flatnonzero(pressed & (self.place == place)) for place in range(self.place.max() + 1)]
@@ -204,7 +204,7 @@ class MotionPrior:
 
     @cached_property
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """Every set of causes in every skull, with a small, a reported and a slipped rigid error."""
+        """Every set of causes for every skull, each with a small, a reported and a slipped rigid error."""
         made = []
         for number in range(len(SKULLS)):
             rows, places = self._select_skull_rows(number)
@@ -217,7 +217,7 @@ class MotionPrior:
 
     @cached_property
     def tables(self) -> PriorTables:
-        """Tables of the shapes that may act in each skull."""
+        """Tables of the shapes that may act, by skull."""
         found, places = zip(*map(self._select_skull_rows, range(len(SKULLS))), strict=True)
         rows, size, kinds = [], [], []
         for kind in (TOOL, *OTHER_CAUSES):
@@ -231,7 +231,7 @@ class MotionPrior:
 
 
 def build_prior(ensemble: Ensemble, presses: PressResponses, members: np.ndarray | None = None) -> MotionPrior:
-    """Build the prior of an ensemble, or of some of its members (N,) bool, and of forces on the open cortex."""
+    """Build the prior from ensemble members (mask (N,); None: all) and from responses to forces on the cortex."""
     anatomy, parts = ensemble.anatomy, []
     chosen = np.ones(len(ensemble.kind), bool) if members is None else members
     for kind, skull in product(OTHER_CAUSES, range(len(SKULLS))):
@@ -260,9 +260,9 @@ def build_prior(ensemble: Ensemble, presses: PressResponses, members: np.ndarray
 
 
 def normalise_motions(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
-    """Scale motions (n, V, 3) [m] to 1 mm root mean square, on the open cortex or in the tumour (the larger).
+    """Scale each of n motions (n, V, 3) to a root mean square of 1 mm on the open cortex or in the tumour (the larger).
 
-    Scaling by the cortex alone would magnify motions that leave it nearly undeformed.
+    Scaling by the cortex alone would magnify motions that hardly deform the cortex.
     """
     tumour = np.sqrt((motion[:, anatomy.tumour_nodes] ** 2).sum(axis=2).mean(axis=1))
     size = np.maximum(compute_surface_motion(anatomy, motion), tumour)
@@ -270,12 +270,12 @@ def normalise_motions(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
 
 
 def normalise_shapes(anatomy: Anatomy, shapes: np.ndarray) -> np.ndarray:
-    """Scale shapes (k, V, 3) [m] so that together they move the open cortex by 1 mm."""
+    """Scale shapes (k, V, 3) [m] by one factor, so that together they move the open cortex by 1 mm (RMS)."""
     return shapes * np.float32(1e-3 / np.sqrt((compute_surface_motion(anatomy, shapes) ** 2).sum()))
 
 
 def compute_principal_components(motion: np.ndarray, max_components: int) -> np.ndarray:
-    """Compute up to `max_components` principal components (k, V, 3) of motions (n, V, 3), with the same Gram matrix."""
+    """Compute up to `max_components` uncentred principal components (k, V, 3) of motions, times singular values."""
     flat = motion.reshape(len(motion), -1)
     value, vector = np.linalg.eigh((flat @ flat.T).astype(float))
     chosen = np.argsort(-value)[:max_components]
@@ -284,12 +284,12 @@ def compute_principal_components(motion: np.ndarray, max_components: int) -> np.
 
 
 def compute_centroid_motion(anatomy: Anatomy, motion: np.ndarray) -> np.ndarray:
-    """Compute the motion (n, 3) [m] of the centroid of the tumour's volume for motions (n, V, 3) [m]."""
+    """Compute the motion (n, 3) [m] of the tumour's centroid (by volume) for motions (n, V, 3) [m]."""
     return np.einsum("v,nvi->ni", compute_tumour_weights(anatomy), motion)
 
 
 def compute_tumour_weights(anatomy: Anatomy) -> np.ndarray:
-    """Compute the weight (V,) of each vertex in the centroid of the tumour's volume."""
+    """Compute the weight (V,) of each vertex in the position of the tumour's centroid (by volume)."""
     mesh = anatomy.mesh
     inside = anatomy.in_tumour
     share = np.zeros(len(mesh.nodes))

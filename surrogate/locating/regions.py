@@ -1,4 +1,4 @@
-"""Regions of known stiffness, in a brain of unknown stiffness."""
+"""Regions of known stiffness in a brain whose stiffness is not known."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ RATIO_TOLERANCE = 1e-6  # Relative tolerance for equal stiffness ratios.
 
 @dataclass(frozen=True)
 class Region:
-    """Known tissue of a region.
+    """Region with its known tissue parameters.
 
     Parameters
     ----------
     label
-        Label in the mesh.
+        Label of the region in the mesh.
     ratio
-        Young's modulus relative to the brain's.
+        Young's modulus of the region / that of the brain.
     poisson
-        Poisson's ratio; None: the brain's.
+        Poisson's ratio; None: that of the brain.
 
     Raises
     ------
     InputError
-        A label that is not a whole number, or parameters outside the range of tissue.
+        The label is not an integer, or a parameter is outside the range of tissue.
     """
 
     label: int
@@ -45,22 +45,22 @@ class Region:
 def build_tissue(
     make_tissue: Callable[[float, float], Tissue], poisson: float, tumour_ratio: float, regions: tuple[Region, ...]
 ) -> Elasticity:
-    """Build the elasticity of brain, tumour and known regions from `make_tissue(ratio, poisson)`.
+    """Build the elasticity of brain, tumour and known regions from the function `make_tissue(ratio, poisson)`.
 
-    A `ratio` is a stiffness over the brain's. `poisson` is the brain's, `tumour_ratio` is the tumour's, unless the
-    tumour is a known region.
+    A ratio is the stiffness relative to the brain's. `poisson` is the brain's Poisson's ratio. `tumour_ratio` is the
+    tumour's stiffness ratio, unless the tumour is a known region.
     """
     known = {one.label: make_tissue(one.ratio, poisson if one.poisson is None else one.poisson) for one in regions}
     return Elasticity(make_tissue(1.0, poisson), {TUMOUR_LABEL: make_tissue(tumour_ratio, poisson), **known})
 
 
 def list_known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
-    """Return the regions that have a tissue of their own.
+    """Return the regions whose tissue is given separately from the brain's.
 
     Raises
     ------
     InputError
-        Tissue without a Young's modulus.
+        A tissue has no Young's modulus.
     """
     brain = elasticity.default
     if not elasticity.regions:
@@ -76,17 +76,17 @@ def list_known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
 
 
 def check_regions(regions: tuple[Region, ...], anatomy: Anatomy) -> None:
-    """Raise InputError for a region that an anatomy does not have."""
+    """Raise InputError for a region that is missing in the anatomy."""
     for one in regions:
         if missing := describe_missing_region(anatomy.mesh, one.label):
             raise InputError(missing)
 
 
 def find_differing_regions(elasticity: Elasticity, known_regions: tuple[Region, ...]) -> tuple[int, ...]:
-    """Return the labels of regions whose tissue differs from the known one.
+    """Return the labels of the regions whose tissue differs from that of `known_regions`.
 
-    Regions without an entry count as brain. The tumour is excluded: its stiffness may be unknown. Empty if a tissue has
-    no Young's modulus.
+    Regions without an entry count as brain. The tumour is excluded, as its stiffness may be unknown. If a tissue has no
+    Young's modulus, the result is empty.
     """
     if not all(isinstance(tissue, Material) for tissue in (elasticity.default, *elasticity.regions.values())):
         return ()
@@ -102,7 +102,7 @@ def find_differing_regions(elasticity: Elasticity, known_regions: tuple[Region, 
 
 
 def describe_regions(regions: tuple[Region, ...]) -> str:
-    """Describe the known regions; empty if there are none."""
+    """Describe the known regions with their stiffness; empty if there are none."""
     return "; ".join(
         f"{describe_region(one.label)} {one.ratio:.3g} times as stiff as the brain"
         + ("" if one.poisson is None else f", Poisson's ratio {one.poisson:g}")

@@ -1,10 +1,10 @@
-"""Whitened effect of the unknowns on observed points: rows with independent errors of variance 1.
+"""Whitened effect of the unknowns on the observed points: rows with independent errors of variance 1.
 
-Unknowns are scaled to a prior variance of 1, and data d are whitened. The normal equations have the matrix M = 1 + A^T
-A and the right side b = A^T d. Up to a constant that all sets share, the logarithm of a set's evidence is b^T M^-1 b /
-2 - log(det M) / 2. Source: Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equation 5.8. Both
-terms are sums over blocks that are eliminated one after another, each from the Schur complement that is left. Source:
-Golub, Van Loan 2013, "Matrix Computations", section 4.2.
+Unknowns are scaled to a prior variance of 1, and the data d are whitened. The normal equations have the matrix M = 1 +
+A^T A and the right side b = A^T d. The log evidence of a set of unknowns is b^T M^-1 b / 2 - log(det M) / 2, up to a
+constant common to all sets. Source: Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equation 5.8.
+Both terms are sums over blocks of unknowns, eliminated one after the other by Schur complements. Source: Golub, Van
+Loan 2013, "Matrix Computations", section 4.2.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from .prior import MotionPrior
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Stacks (...) of partly eliminated normal equations, to which the unknowns of one of p places may be added.
+    """Stack (...) of partly eliminated normal equations; the unknowns of one of p places may be added to each.
 
     Parameters
     ----------
     kind
-        (k,) of the remaining unknowns; those of one kind are adjacent.
+        Kind (k,) of each remaining unknown; unknowns of one kind are adjacent.
     products
-        (..., k, k + p (q + 1)): their products with each other, and with the columns of `place_products`.
+        Products (..., k, k + p (q + 1)) of the remaining unknowns with each other and with the columns of all places.
     place_products
-        (..., p, q, q + 1): products of the q unknowns of each place with each other and with the data, which come last.
+        Products (..., p, q, q + 1) of the q unknowns of each place with each other and, in the last column, the data.
     log_evidence
-        (...): log evidence of the eliminated unknowns.
+        Log evidence (...) of the eliminated unknowns.
     """
 
     kind: np.ndarray
@@ -41,7 +41,7 @@ class NormalEquations:
     log_evidence: np.ndarray
 
     def eliminate_unknowns(self, kind: int, is_last: bool = False) -> NormalEquations:
-        """Eliminate the unknowns of one kind; the `is_last` elimination leaves no `table`."""
+        """Eliminate the unknowns of one kind; if `is_last`, products of other remaining unknowns are dropped."""
         first = int(np.argmax(self.kind == kind))
         end = first + np.count_nonzero(self.kind == kind)
         own, left = slice(first, end), np.delete(self.kind, slice(first, end))
@@ -62,7 +62,7 @@ class NormalEquations:
         return NormalEquations(left, table, place, evidence)
 
     def scale_unknowns(self, kind: int, deviations: np.ndarray) -> NormalEquations:
-        """Return equations (..., b) in which unknowns of one kind have b prior standard deviations, instead of 1."""
+        """Return equations (..., b) with b prior standard deviations for the unknowns of one kind, instead of 1."""
         own = np.flatnonzero(self.kind == kind)
         size = np.ones((len(deviations), self.products.shape[-1]))
         size[:, own] = deviations[:, None]
@@ -73,7 +73,7 @@ class NormalEquations:
 
 
 def add_place_unknowns(equations: Sequence[NormalEquations]) -> np.ndarray:
-    """Compute logarithms (n, ..., p) of the evidence of n equations with one place each, of the eliminated unknowns."""
+    """Compute the log evidence (n, ..., p) of n equations with the unknowns of each of p places added."""
     # Blocks are small and many: Gaussian elimination of all at once takes a tenth of the time of library calls.
     table = np.ascontiguousarray(np.moveaxis(np.stack([each.place_products for each in equations]), (-2, -1), (0, 1)))
     found = np.stack([each.log_evidence for each in equations])[..., None]
@@ -87,21 +87,21 @@ def add_place_unknowns(equations: Sequence[NormalEquations]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class WhitenedSystem:
-    """Whitened rows (m,) of unknowns (weights of r shapes, rigid error) and of the data.
+    """Whitened rows (m,) of the unknowns (weights of r shapes, rigid error) and of the data.
 
-    A shape's rows are `weights` times its motions at the vertices: many points depend on few vertices, so that products
-    of rows need fewer numbers.
+    The rows of a shape are `weights` times the shape's motions at the vertices. As many points depend on few vertices,
+    this form needs fewer numbers.
 
     Parameters
     ----------
     whitening
-        Transform to independent errors.
+        Transform of the data to independent errors.
     weights
-        (m / c, v c'), as those of `Evidence.weights` and whitened. Rows of c = 3 axes use c' = 1 axis at once.
+        Whitened `Evidence.weights` (m / c, v c'): c = 3 and c' = 1 if rows have three axes, else c = 1 and c' = 3.
     shape
-        (v c', c r) [m]: motions of the vertices.
+        Motions (v c', c r) [m] of the vertices for each shape.
     rigid_rows
-        (m, 7): rows of a rigid error of one standard deviation, and the data.
+        Rows (m, 7) of the rigid error, for one standard deviation of each component, and of the data.
     """
 
     whitening: Whitening
@@ -110,7 +110,7 @@ class WhitenedSystem:
     rigid_rows: np.ndarray
 
     def apply_precision(self, columns: np.ndarray) -> np.ndarray:
-        """Compute the errors' inverse covariance times rows (m, k) of some of the unknowns and of the data (k,)."""
+        """Compute the errors' inverse covariance times the rows (m, k) of some `columns` (k,): unknowns or data."""
         shapes = columns < self._shapes
         found, back = np.empty((len(self.rigid_rows), len(columns))), self.whitening.transform_back
         some = self.shape.reshape(-1, self._shapes)[:, columns[shapes]].reshape(len(self.shape), -1)
@@ -125,7 +125,7 @@ class WhitenedSystem:
 
     @cached_property
     def products(self) -> np.ndarray:
-        """(r + 7, r + 7): inner products of the rows of unknowns and of the data, which come last."""
+        """Inner products (r + 7, r + 7) of the rows of all unknowns and of the data, which are last."""
         count, tall = self._shapes, len(self.weights) > 2 * len(self.shape)
         few = np.linalg.qr(self.weights, mode="r") if tall else self.weights
         rows = (few @ self.shape).reshape(-1, count)
@@ -139,7 +139,7 @@ class WhitenedSystem:
 
 
 def whiten_system(prior: MotionPrior, evidence: Evidence, motion_size: float) -> WhitenedSystem:
-    """Build whitened rows of a prior's shapes and of evidence, with the model error of motions of a size [m]."""
+    """Build whitened rows of a prior's shapes and of evidence, with the model error for motions of a size [m]."""
     whitening = evidence.build_whitening(motion_size)
     vertices, weights = evidence.weights
     shape = prior.restrict_to_vertices(vertices).reshape(weights.shape[1], -1).astype(float)

@@ -1,1 +1,1 @@
-"""Trained models: a deformer, its bounds, its training range, and its file."""
+"""Trained models: the deformer, its error bounds, its training range, and its file format."""

@@ -1,4 +1,4 @@
-"""Applicability check: scenes that a trained model supports, by the effects that it was trained under."""
+"""Applicability check: a trained model supports only scenes with the effects, tissue and element of its training."""
 
 import ast
 from collections.abc import Iterable, Mapping
@@ -30,13 +30,13 @@ from .learned import Learned
 
 # Effects that do nothing without a load of their kind: training may include them although a scene does not.
 LOAD_EFFECTS = {kind.__name__ for kind in (ToolForce, ToolDisplacement, NodalForce, Gravity)}
-SIZE_TOLERANCE = 1e-9  # Relative tolerance for equal tool sizes: 26 mm are 0.026 m or 1e-3 * 26.
+SIZE_TOLERANCE = 1e-9  # Relative tolerance for equal tool sizes, as 26 mm may be written as 0.026 m or 1e-3 * 26.
 # Training effects of models whose file does not give them.
 DEFAULT_EFFECTS = frozenset(kind.__name__ for kind in (Elasticity, Held, Slide, ToolForce))
 
 
 def read_trained_effects(provenance: Mapping[str, str]) -> frozenset[str]:
-    """Return the names of the effects that a model was trained under, or a data set was made under, by its file."""
+    """Return the effect names of the training, from the provenance of a model or data set; empty if it is invalid."""
     if "effects" not in provenance:
         return DEFAULT_EFFECTS
     with suppress(SyntaxError):
@@ -47,17 +47,17 @@ def read_trained_effects(provenance: Mapping[str, str]) -> frozenset[str]:
 
 
 def read_trained_skull(provenance: Mapping[str, str]) -> str:
-    """Return the skull model of a data set: one of `sim.effects.SKULLS`."""
+    """Return a data set's skull model, a key of `sim.effects.SKULLS`; "bonded" if its provenance gives none."""
     names = read_trained_effects(provenance)
     return next((name for name, effect in SKULLS.items() if type(effect).__name__ in names), "bonded")
 
 
 def find_rejection(model: Learned, effects: Iterable[Effect], element: str | None = None) -> str | None:
-    """Return the reason why a model does not support these effects or this element, or None if it does.
+    """Return the reason why a model does not support these effects or this element; None if it supports both.
 
-    A model of poses needs contact with its tool, one of pushes a tool's force. If its anatomy has no skull, `Bonded`
-    and `Slide` are equivalent. Tissue and element must be those of the training; an `element` of None is not compared,
-    nor is anything missing in the model's file.
+    A model of poses needs contact with its tool; a model of pushes needs `ToolForce`. If the anatomy has no skull,
+    `Bonded` and `Slide` are equivalent. Tissue and element must equal those of the training. An `element` of None is
+    not compared, nor is a property that the model's file lacks.
     """
     effects = tuple(effects)
     trained, asked = read_trained_effects(model.training), frozenset(type(effect).__name__ for effect in effects)
@@ -80,21 +80,21 @@ def find_rejection(model: Learned, effects: Iterable[Effect], element: str | Non
 
 
 def _is_same_tool(one: Tool, other: BuiltIn) -> bool:
-    """Return True if tools are of one kind and size, within round-off."""
+    """Return True if two built-in tools have the same class and equal sizes, within round-off."""
     if not isinstance(one, BuiltIn) or type(one) is not type(other):
         return False
     return bool(np.allclose(astuple(one), astuple(other), rtol=SIZE_TOLERANCE, atol=0.0))
 
 
 def _get_moved_tools(effect: Effect) -> tuple[Tool, ...]:
-    """Return the tools that an effect moves by pose."""
+    """Return the tools that an effect moves by pose; () for other effects."""
     if isinstance(effect, Retraction):
         return (effect.blade,)
     return effect.tools if isinstance(effect, ToolContact) else ()
 
 
 def _describe_series_change(trained: Elasticity, here: Elasticity) -> str | None:
-    """Return the difference between the relaxation of tissues that are otherwise equal; None without one."""
+    """Describe the difference in relaxation of two tissues that are otherwise equal; None if there is none."""
     learned, asked = get_relaxation_series([trained]), get_relaxation_series([here])
     if learned == asked or here.default is None or replace(cast(Any, here.default), prony=learned) != trained.default:
         return None
@@ -102,13 +102,13 @@ def _describe_series_change(trained: Elasticity, here: Elasticity) -> str | None
 
 
 def _format_series(series: Pairs) -> str:
-    """Describe a Prony series."""
+    """Describe a Prony series as text that follows "it", such as "relaxes by 50 % in 2 s"."""
     each = " and ".join(f"{100.0 * g:g} % in {tau:g} s" for g, tau in series)
     return f"relaxes by {each}" if each else "does not relax"
 
 
 def _describe_body_change(model: Learned, effects: tuple[Effect, ...], element: str | None) -> str | None:
-    """Return the difference in tissue or element between a model's FEM and this one; None without one."""
+    """Describe the difference in tissue or element between a model's training and a scene; None if there is none."""
     stated, here = model.training, next((effect for effect in effects if isinstance(effect, Elasticity)), None)
     if "tissue" in stated and here is not None:
         trained = read_tissue_text(stated)

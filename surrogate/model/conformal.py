@@ -1,9 +1,9 @@
-"""Bounds on the error of a prediction relative to FEM: split conformal prediction with a scale for each load.
+"""Bounds on the error of a prediction relative to FEM: split conformal prediction with a load-dependent scale.
 
 Lei, G'Sell, Rinaldo, Tibshirani, Wasserman 2018, "Distribution-free predictive inference for regression", J. Am. Stat.
-Assoc. 113:1094-1111, section 5.2. The quantiles are by classes as in Vovk, Lindsay, Nouretdinov, Gammerman 2003,
-"Mondrian confidence machine". Every class of force has its own quantiles, so that errors of weak loads do not determine
-the bounds of strong ones.
+Assoc. 113:1094-1111, section 5.2. Loads are divided into classes of force, each with its own quantiles, as in Vovk,
+Lindsay, Nouretdinov, Gammerman 2003, "Mondrian confidence machine". The errors of weak loads thus do not determine the
+bounds of strong loads.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from ..regressors.protocol import compute_standardisation
 from .training_range import Excess, LoadMeasures
 
 LEVELS = (0.95, 0.99)  # Nominal coverage of the bounds.
-LOAD_FEATURES = 4  # Number of features of the load itself: force, radius, angle, overhang. The others are its position.
+LOAD_FEATURES = 4  # Number of features before the load's position: force, radius, angle, overhang.
 FEATURE_LIMIT = 4.0  # Limit of standardised features [standard deviations].
-GROWTH = 4.0  # Relative growth of a bound beyond the training range, per unit of `Outside.beyond`.
+GROWTH = 4.0  # Relative growth of a bound beyond the training range, per unit of `Excess.bound_excess`.
 # Default growth with the distance from the nearest training load, where no loads determine it [1/m].
 USUAL_GROWTH = 1e3
 MAX_GROWTH = 2e4  # Maximum growth with the distance from the nearest training load [1/m].
@@ -30,35 +30,35 @@ MAX_GROWTH = 2e4  # Maximum growth with the distance from the nearest training l
 class BoundSettings:
     """Settings of `fit_bound`."""
 
-    # Minimum number of calibration loads in a class of force: fewer than 99 give no guarantee at 0.99.
+    # Minimum number of calibration loads in a force class; fewer than 99 give no guarantee at 0.99.
     loads_per_class: int = 200
-    # True if the scale's logarithm is quadratic in the load's features, given `min_quadratic_errors`; else linear.
+    # If True, the scale's logarithm is quadratic in the load's features, given `min_quadratic_errors`; else linear.
     allow_quadratic: bool = True
     max_classes: int = 10  # Maximum number of classes of force.
     # Weight of the squared coefficients relative to the squared misfit of logarithms, per load.
     ridge_weight: float = 1e-2
-    min_quadratic_errors: int = 150  # Minimum number of seen loads for a quadratic scale: ten per term.
-    min_error_share: float = 1e-3  # Smallest error as a share of the mean error.
+    min_quadratic_errors: int = 150  # Minimum number of scale examples for a quadratic scale: ten per term.
+    min_error_share: float = 1e-3  # Lower limit of an error when its logarithm is fitted, as a share of the mean error.
 
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """Bound on the largest error over the tumour's vertices: quantile x scale(load), with probability 0.95 (0.99).
+    """Bound on the maximum error over the tumour's vertices, with probability 0.95 and 0.99: quantile x scale(load).
 
-    Guaranteed for loads distributed as the calibration loads; elsewhere it grows, without a guarantee.
+    It is guaranteed for loads with the distribution of the calibration loads. Elsewhere it grows, without a guarantee.
 
     Parameters
     ----------
     mean, deviation
         Mean and standard deviation (f,) of the scale's features.
     weights
-        Weights (t,) of monomials up to degree two of standardised features; their sum is the logarithm of the scale.
+        Weights (t,) of the monomials (degree <= 2) of standardised features; the weighted sum is the scale's logarithm.
     edges
-        Limits (k - 1,) [N] between the k force classes.
+        Limits (k - 1,) [N] between the k classes of force.
     quantile
-        (2, k): of error over scale, for `LEVELS` and each class.
+        Quantiles (2, k) of error / scale, for each of `LEVELS` and each class of force.
     growth, near
-        Growth () [1/m] with the distance from the nearest training load, and distance () [m] from which it grows.
+        Growth () [1/m] with the distance from the nearest training load, and distance () [m] beyond which it applies.
     """
 
     mean: np.ndarray
@@ -70,7 +70,7 @@ class Bound:
     near: np.ndarray
 
     def evaluate(self, features: np.ndarray, force: np.ndarray, range_excess: Excess) -> np.ndarray:
-        """Compute bounds (2, B) [m] for `LEVELS`, by features (B, f), forces (B,) [N] and `range_excess`."""
+        """Compute bounds (2, B) [m] for `LEVELS`, from features (B, f), forces (B,) [N] and `range_excess`."""
         scale = np.exp(_compute_monomials(_normalise_features(features, self.mean, self.deviation)) @ self.weights)
         away = np.maximum(range_excess.distance - self.near, 0.0)
         scale = scale * (1.0 + self.growth * away) * (1.0 + GROWTH * range_excess.bound_excess)
@@ -81,16 +81,16 @@ def fit_bound(
     scale_examples: tuple[np.ndarray, np.ndarray], features: np.ndarray, force: np.ndarray, error: np.ndarray,
     settings: BoundSettings = BoundSettings(), *, distance: np.ndarray | float = 0.0, growth: float = 0.0,
 ) -> Bound:  # fmt: skip
-    """Fit a bound whose scale follows the errors of `scale_examples`, and calibrate it on other loads.
+    """Fit the scale of a bound to the errors of `scale_examples`, and calibrate its quantiles on other loads.
 
-    The scale depends on the load, not on its position. If `scale_examples` cover little of the cortex, a scale that
-    follows the position diverges between them. One such scale gave a bound of 4.2 mm for a distance with an error of
-    0.05 mm.
+    The fitted scale does not depend on the load's position. If `scale_examples` cover little of the cortex, a scale
+    that depends on position diverges between them. One such scale gave a bound of 4.2 mm for a distance with an error
+    of 0.05 mm.
 
     Parameters
     ----------
     scale_examples
-        Features (m, f) and largest errors (m,) [m] of loads that are not in the model's training.
+        Features (m, f) and maximum errors (m,) [m] of loads that the model was not trained on.
     features, force, error
         Features (n, f), forces (n,) [N] and maximum errors (n,) [m] of the calibration loads.
     distance, growth
@@ -120,13 +120,13 @@ def fit_bound(
 
 
 def fit_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.ndarray]) -> float:
-    """Compute the growth [1/m] with which the first of `LEVELS` is covered equally far from and near training loads.
+    """Compute the growth [1/m] with which a bound has the same coverage far from the training loads as near them.
 
     Parameters
     ----------
     near, far
-        Errors over a bound without growth (n,), and distances (n,) [m] from the nearest training load: of loads drawn
-        as the training loads, and of others. Fewer than 19 others do not determine it: `USUAL_GROWTH`.
+        Ratios (n,) of error to a bound without growth, and distances (n,) [m] from the nearest training load. `near`:
+        loads sampled as the training loads. `far`: other loads; with fewer than 19, `USUAL_GROWTH` is returned.
     """
 
     def larger(growth: float) -> bool:
@@ -145,9 +145,9 @@ def fit_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.nd
 
 
 def compute_scale_features(pushes: Pushed, measures: LoadMeasures) -> np.ndarray:
-    """Compute features (B, 7) of an error's size: logarithms of force and radius, angle, overhang and point [mm].
+    """Compute the features (B, 7) of a bound's scale: logarithms of force and radius, angle, overhang, point [mm].
 
-    For relaxing tissue, where all loads have one tool, the relaxed share replaces the radius.
+    For relaxing tissue, where all loads have the same tool, the relaxed share replaces the radius.
     """
     force, relaxed = np.log(np.maximum(measures.magnitude, np.finfo(float).tiny)), get_relaxation(pushes)
     second = np.log(pushes.footprint) if relaxed is None else relaxed
@@ -155,7 +155,7 @@ def compute_scale_features(pushes: Pushed, measures: LoadMeasures) -> np.ndarray
 
 
 def compute_conformal_quantile(ratio: np.ndarray, level: float) -> float:
-    """Return the ceil(level (n + 1))-th smallest of `ratio` (n,): infinite if n is too small for the level."""
+    """Return the ceil(level (n + 1))-th smallest of `ratio` (n,); infinity if n is too small for `level`."""
     rank = int(np.ceil(level * (len(ratio) + 1)))
     return float(np.sort(ratio)[rank - 1]) if rank <= len(ratio) else np.inf
 
@@ -165,11 +165,11 @@ def _normalise_features(features: np.ndarray, mean: np.ndarray, deviation: np.nd
 
 
 def _compute_monomials(x: np.ndarray) -> np.ndarray:
-    """Compute monomials 1, x_i and x_i x_j of (B, f): (B, t)."""
+    """Compute the monomials 1, x_i and x_i x_j (B, t) of `x` (B, f)."""
     first, second = np.triu_indices(x.shape[1])
     return np.concatenate([np.ones_like(x[:, :1]), x, x[:, first] * x[:, second]], axis=1)
 
 
 def _mask_monomials(count: int, curved: int) -> np.ndarray:
-    """Return the mask (t,) of fitted monomials: 1, x_i of the load, and x_i x_j of the first `curved` features."""
+    """Return the mask (t,) of the monomials to fit: 1, x_i of the load, and x_i x_j of the first `curved` features."""
     return np.concatenate([[True], np.arange(count) < LOAD_FEATURES, np.triu_indices(count)[1] < curved])

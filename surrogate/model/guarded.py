@@ -1,4 +1,4 @@
-"""Trained model with FEM fallback: loads with too large an error bound are solved by FEM."""
+"""Trained model with FEM fallback: FEM solves the loads for which the model's error bound is too large."""
 
 from dataclasses import dataclass, replace
 
@@ -25,17 +25,17 @@ class Guarded:
     Parameters
     ----------
     model
-        Model that is evaluated first.
+        Trained model, which is evaluated first for all loads.
     fem
-        FEM of the model's body, effects and element. It solves loads that the model marks as extrapolated, loads
+        FEM with the model's anatomy, effects and element. It solves loads that the model marks as extrapolated, loads
         without a bound, and loads whose bound is above the limit.
     limit
-        Limit of the largest error over the tumour's vertices, at 95 % [m].
+        Limit [m] of the bound on the maximum error over the tumour's vertices, with probability 0.95.
 
     Raises
     ------
     InputError
-        A model that follows relaxing tissue: FEM would need the frames that it did not solve.
+        The model's tissue relaxes: FEM would need all earlier frames, also those that it did not solve.
     """
 
     model: Learned
@@ -55,16 +55,16 @@ class Guarded:
         return self.model.anatomy
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Solve `loads` at mesh vertices `at` (n,): by default at those of the model.
+        """Solve `loads`, and return the deformation at the mesh vertices `at` (n,) (default: the model's vertices).
 
-        If FEM solves every load, and `at` is not given, the result has every vertex. FEM starts from a `start` with
-        every vertex, else from the undeformed configuration. If it finds no equilibrium, the model's result and bound
-        are kept.
+        If FEM solves every load and `at` is not given, the result has every mesh vertex. FEM starts from `start` if
+        that has every vertex, else from the undeformed configuration. If FEM finds no equilibrium, the model's result
+        and bound are kept.
 
         Raises
         ------
         InputError
-            Loads, or a start, that the model rejects.
+            The model rejects the loads or the start.
         """
         predicted = self.model.deform(loads, start, at)
         unsure = np.flatnonzero(self.find_unreliable(predicted))
@@ -79,7 +79,7 @@ class Guarded:
         return _replace_rows(predicted, unsure[good], solved.select(np.flatnonzero(good)), pushed)
 
     def find_unreliable(self, predicted: Deformation) -> np.ndarray:
-        """Return the mask (B,) of predictions that need FEM."""
+        """Return the mask (B,) of the predictions that FEM must replace."""
         bound = np.where(np.isnan(predicted.bound[0]), self.model.bound, predicted.bound[0])
         return find_fem_fallback(bound, np.array([not outcome.good for outcome in predicted.outcome]), self.limit)
 
@@ -87,33 +87,33 @@ class Guarded:
 
 
 def get_reported_errors(model: Learned) -> ReportedErrors:
-    """Return a model's reported errors on held-out cortex."""
+    """Return the errors on held-out cortex that a model reports."""
     return ReportedErrors(model.bound, model.held_out)
 
 
 def describe_error(model: Learned) -> str:
-    """Describe a model's reported errors, and the deformer used in scenes: see `Guarded`."""
+    """Describe a model's errors on held-out cortex, and state if scenes use the model with FEM fallback."""
     stated = get_reported_errors(model)
     guarded = "scenes play it without FEM, as its tissue relaxes" if model.series else "scenes play it guarded"
     return f"{model.held_out or stated}: {guarded if stated.is_weak else 'scenes play it without FEM'}"
 
 
 def find_model(deformer: Deformer) -> Learned | None:
-    """Return the model that a deformer is, or evaluates first; None for FEM."""
+    """Return the trained model that a deformer consists of or evaluates first; None for FEM."""
     if isinstance(deformer, Guarded):
         return deformer.model
     return deformer if isinstance(deformer, Learned) else None
 
 
 def find_first_model(deformer: Deformer, result: Deformation) -> Learned | None:
-    """Return the model that computed the first result of a deformer; None if FEM did."""
+    """Return the trained model that computed load case 0 of a deformer's result; None if FEM computed it."""
     return find_model(deformer) if result.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
 
 
 def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation, pushed: bool) -> Deformation:
-    """Replace some `rows` (k,) of predictions by FEM solutions; the reaction of a push always comes from the load.
+    """Replace `rows` (k,) of predictions by the k FEM solutions; if `pushed`, the reactions are not replaced.
 
-    The reaction of a pose is unknown in all rows if the model does not predict it.
+    If the model does not predict the reaction of a pose, the reaction is not available in any row.
     """
     pick = np.arange(len(predicted))
     pick[rows] = len(predicted) + np.arange(len(rows))
@@ -129,20 +129,20 @@ def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation,
 
 
 def compute_tool_pressure(model: Learned, loads: Loads, result: Deformation) -> np.ndarray:
-    """Compute the tool's mean pressure (B, k) [Pa] at each vertex of the bare surface: force by area.
+    """Compute the tool's mean pressure (B, k) [Pa] at the k vertices of the bare surface: nodal force / nodal area.
 
-    Contact forces are those on linear tissue, scaled so that their sum is the model's predicted force. Areas are thirds
-    of the deformed surface's triangles at a vertex, as in `sim.contact_pressure.compute_pressure`.
+    Contact forces are computed on linear tissue and scaled so that their sum is the model's tool force. A nodal area is
+    a third of the area of the adjacent deformed triangles, as in `sim.contact_pressure.compute_pressure`.
 
     Parameters
     ----------
     result
-        Result of `model` for the loads, at all its vertices.
+        Result of `model` for the loads, at all vertices of the model.
 
     Raises
     ------
     InputError
-        A model without a contact part, or without its tool's force; a result of another size.
+        The model has no contact part or no force model, or the result has another size.
     """
     part = _find_contact(model)
     if part is None:
@@ -169,7 +169,7 @@ def compute_tool_pressure(model: Learned, loads: Loads, result: Deformation) -> 
 
 
 def has_tool_pressure(model: Learned) -> bool:
-    """Return True if `compute_tool_pressure` is available for a model."""
+    """Return True if a model has the contact part and force model that `compute_tool_pressure` needs."""
     return _find_contact(model) is not None
 
 

@@ -1,20 +1,20 @@
-"""Errors of a model on held-out cortex, and the test whether it needs FEM fallback."""
+"""Errors of a model on held-out cortex regions, and the decision that a model needs FEM fallback."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 MAX_VERTEX_ERROR = 0.2e-3
-"""Limit of the maximum vertex error of the tumour, at 95 %, beyond which FEM is used instead of a model [m]."""
+"""Limit [m] of the maximum vertex error of the tumour (95th percentile); above it FEM replaces the model."""
 VERTEX_ERROR_LIMITS = (MAX_VERTEX_ERROR, 0.1e-3, 0.05e-3, 0.02e-3, 0.01e-3, 0.0)
-"""Candidate limits: a model gets the largest one that satisfies `MAX_MEAN_ERROR` and `MAX_P999_ERROR`.
+"""Candidate limits [m]; a model gets the largest one that satisfies `MAX_MEAN_ERROR` and `MAX_P999_ERROR`.
 
-With 0, FEM solves all loads.
+With the limit 0, FEM solves all loads.
 """
 MAX_MEAN_ERROR = 0.01  # Largest mean error of a model without FEM fallback, as a share of the motion.
 MAX_P999_ERROR = 0.2e-3  # Largest 99.9th percentile of the vertex errors of a model without FEM fallback [m].
 MIN_LOADS_FOR_P999 = 1000
-"""Minimum number of loads for a 99.9th percentile."""
+"""Minimum number of loads to compute a 99.9th percentile."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +24,15 @@ class HeldOutErrors:
     Parameters
     ----------
     mean, guarded
-        Error over the motion of its load, mean over loads and tumour vertices: of the model alone, and as `Guarded`.
+        Mean over loads and tumour vertices of (error / mean motion of the load), of the model alone and of `Guarded`.
         Loads solved by FEM count as exact.
     p999
-        99.9th percentile of the model alone, over loads and vertices [m]; None for fewer than `MIN_LOADS_FOR_P999`
+        99.9th percentile [m] over loads and vertices of the model's errors; None for fewer than `MIN_LOADS_FOR_P999`
         loads.
     solved
-        Share of these loads that FEM solves.
+        Share of the held-out loads that `Guarded` solves by FEM.
     limit
-        Limit of `VERTEX_ERROR_LIMITS` [m] in use; older files have the first.
+        Limit [m] chosen from `VERTEX_ERROR_LIMITS`; older files use the first.
     """
 
     mean: float
@@ -43,11 +43,11 @@ class HeldOutErrors:
 
     @property
     def is_sufficient(self) -> bool:
-        """True if the model does not need FEM fallback."""
+        """True if the model alone is accurate enough to be used without FEM fallback."""
         return _is_enough(self.mean, self.p999)
 
     def __str__(self) -> str:
-        """Return a description of the errors."""
+        """Return a description of the errors, for reports."""
         behind = (
             f"with FEM for {100 * self.solved:.0f} % of the loads (bound above "
             f"{1e3 * self.limit:g} mm) {100 * self.guarded:.2f} %"
@@ -57,14 +57,14 @@ class HeldOutErrors:
 
 @dataclass(frozen=True)
 class ReportedErrors:
-    """Reported errors of a model on held-out cortex: `bound` and `held_out` as in `Learned`."""
+    """Reported errors of a model on held-out cortex, with `bound` [m] and `held_out` as in `Learned`."""
 
     bound: float
     held_out: HeldOutErrors | None
 
     @property
     def is_weak(self) -> bool:
-        """True if the model needs FEM fallback: by mean error, or by maximum vertex error if that is missing."""
+        """True if the model needs FEM fallback, by `held_out` or, if that is None, by `bound` alone."""
         return not (self.bound <= MAX_VERTEX_ERROR if self.held_out is None else self.held_out.is_sufficient)
 
     def __str__(self) -> str:
@@ -80,17 +80,17 @@ class ReportedErrors:
 
 
 def find_fem_fallback(bound: np.ndarray, is_outside: np.ndarray, limit: float) -> np.ndarray:
-    """Return the mask (B,) of loads that need FEM: no bound within the limit, or `is_outside`.
+    """Return the mask (B,) of loads that FEM must solve: no bound or a bound above the limit, or `is_outside`.
 
-    `bound` (B,) and `limit` are in metres, `is_outside` (B,) bool.
+    `bound` (B,) and `limit` are in metres. `is_outside` (B,) is True for loads outside the training range.
     """
     return ~(bound <= limit) | is_outside
 
 
 def measure_held_out(error: np.ndarray, motion: np.ndarray, bound: np.ndarray, is_outside: np.ndarray) -> HeldOutErrors:
-    """Compute errors on B loads, and the largest of `VERTEX_ERROR_LIMITS` with a guarded model of small error.
+    """Compute the errors on B held-out loads, and choose the largest sufficient limit of `VERTEX_ERROR_LIMITS`.
 
-    The guarded model's mean error is at most `MAX_MEAN_ERROR`, its 99.9th percentile `MAX_P999_ERROR`.
+    A limit is sufficient if the model with FEM fallback satisfies `MAX_MEAN_ERROR` and `MAX_P999_ERROR`.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def measure_held_out(error: np.ndarray, motion: np.ndarray, bound: np.ndarray, i
     motion
         Mean displacement (B,) [m] of the tumour's vertices.
     bound
-        Bound of the maximum vertex error, at 95 % (B,) [m].
+        Bound (B,) [m] of the maximum vertex error, with probability 0.95.
     is_outside
         Mask (B,) of loads outside the training range.
     """

@@ -1,4 +1,4 @@
-"""Cache of computed arrays in a folder, so that an interrupted run continues."""
+"""Cache of computed arrays in a folder, from which an interrupted run resumes."""
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -14,13 +14,13 @@ from sim.runtime.versions import get_version
 from .npz_archive import Archive
 
 REMEDY = "Delete it: it is computed again."
-"""Remedy for a damaged cache file."""
+"""Remedy in the error message for a damaged cache file."""
 
 
 def get_cache_path(folder: Path | None, stem: str, device: str, *inputs: object) -> Path | None:
-    """Return the cache path of arrays that this version computes on a kind of device; None without a folder.
+    """Return the cache path of arrays that this version computes on a device type (CPU or CUDA); None without a folder.
 
-    `inputs` lists all other inputs that determine their bytes, the element included: each with a distinctive `repr`.
+    `inputs` lists all other inputs that determine the arrays, including the element. Each has a distinctive `repr`.
     """
     if folder is None:
         return None
@@ -33,14 +33,14 @@ def load_cached_arrays(
     path: Path | None, description: str, names: Iterable[str], compute: Callable[[], Mapping[str, np.ndarray]],
     check: Callable[[Mapping[str, np.ndarray]], object] = lambda arrays: None,
 ) -> Mapping[str, np.ndarray]:  # fmt: skip
-    """Read arrays by name from a file if it exists; else compute and store them. Without a path: compute only.
+    """Read arrays by name from a file if it exists, else compute and store them. Without a path, only compute them.
 
-    `description` describes the file's content, with its article; `check` rejects invalid arrays.
+    `description` names the file's content, with an article, for error messages. `check` raises for invalid arrays.
 
     Raises
     ------
     InputError
-        A file that cannot be read, or that the check rejects.
+        The file cannot be read, or `check` rejects its arrays.
     """
     if path is not None and path.exists():
         with wrap_errors(path, description, REMEDY), path.open("rb") as raw:

@@ -1,4 +1,4 @@
-"""Trained deformer, for the tumour and the open cortex."""
+"""Trained deformer: it predicts the displacements of the tumour and of the open cortex."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -33,7 +33,7 @@ from .tip_distance import TipModel, TumourDistance
 from .tool_contact import ForceModel, build_warm_encoders, collect_contact_state, compute_wrench
 from .training_range import Excess, LoadMeasures, TrainingRange, measure_loads
 
-# Largest force or footprint relative to the training's. On the template FEM finds no equilibrium for three loads of
+# Largest force or footprint, relative to the training's largest. On the template FEM has no equilibrium for 3 loads of
 # this size, and at twice the force the error of a prediction is up to 31 %.
 MAX_TRAINING_RATIO = 3.0
 STORED_TOLERANCE = 1e-6  # Rounding error of training points, stored in single precision [m].
@@ -41,14 +41,14 @@ STORED_TOLERANCE = 1e-6  # Rounding error of training points, stored in single p
 
 @dataclass(frozen=True, eq=False)
 class ModelPart:
-    """Encoder, regressor and basis: one summand of the response, on the basis's vertices.
+    """One summand of the predicted response, at the basis's vertices: encoder, regressor and basis.
 
     Parameters
     ----------
     encoder
         Name in `ENCODERS`.
     regressor
-        Map from features to coefficients, fitted to responses to one newton.
+        Map from features to basis coefficients, fitted to responses to a force of one newton.
     basis
         Map from coefficients to responses.
     """
@@ -58,38 +58,38 @@ class ModelPart:
     basis: Basis
 
     def compute_response(self, features: np.ndarray) -> np.ndarray:
-        """Compute responses (B, n, 3) [m/N] of `basis.nodes` to the encoder's features (B, f)."""
+        """Compute the responses (B, n, 3) [m/N] of `basis.nodes`, from the encoder's features (B, f)."""
         return self.basis.decode(self.regressor.predict(features))
 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """Sum of parts, as a `Deformer`.
+    """Trained `Deformer`: a sum of parts.
 
-    Every part predicts the response to one newton, which is multiplied by the force: zero force gives zero motion.
+    Every part predicts the response per newton, which is multiplied by the force, so zero force gives zero motion.
 
     Parameters
     ----------
     anatomy
-        Anatomy that it was trained on.
+        Anatomy of the training.
     parts
-        Parts, which are summed where they overlap.
+        Parts; their predictions are summed at vertices that they share.
     envelope
         Range of the training loads.
     bound
         95th percentile of the maximum vertex error of the tumour on held-out loads, relative to FEM [m].
     bounds
-        Conformal bounds of each load, if calibration loads were set aside.
+        Conformal bound of each load's error; None if no calibration loads were set aside.
     training
-        Training settings, as text.
+        Training settings and provenance of the training data, as text.
     tool
-        Tool of the poses that it supports; None: it supports pushes. Depth [m] then replaces force.
+        Tool whose poses the model supports, with depth [m] instead of force; None if the model supports pushes.
     tip
-        Model of the distance from tip to tumour, if trained.
+        Correction and bound of the distance from tip to tumour; None if not trained.
     held_out
         Errors on held-out cortex; None if none was held out, or for older files.
     force
-        Model of the tool's force, if trained.
+        Model of the tool's force; None if not trained.
 
     Examples
     --------
@@ -115,7 +115,7 @@ class Learned:
 
     @cached_property
     def source(self) -> str:
-        """Description of its model type and training, for `source` of results."""
+        """Description of the model type and its training, for `Deformation.source`."""
         stated = self.training
         tissue = str(read_tissue_text(stated)) if "tissue" in stated else "tissue not given"
         element = stated.get("element", "not given")
@@ -123,12 +123,12 @@ class Learned:
 
     @cached_property
     def series(self) -> Pairs:
-        """Prony series of its tissue, if it follows relaxation in time; else ()."""
+        """Prony series of the tissue if the model includes relaxation over time; else ()."""
         return () if self.tool is None else read_prony_series(self.training)
 
     @cached_property
     def nodes(self) -> np.ndarray:
-        """Sorted mesh vertices (n,) that it predicts."""
+        """Sorted mesh vertices (n,) that the model predicts."""
         return np.unique(np.concatenate([part.basis.nodes for part in self.parts]))
 
     @cached_property
@@ -141,7 +141,7 @@ class Learned:
 
     @cached_property
     def _modes_at(self) -> Callable[[bytes], tuple[tuple[list[ModelPart], np.ndarray], ...]]:
-        """Function from vertices to parts by basis, with its modes (r, 3 n) there, zero outside the basis."""
+        """Function from vertices (int64 bytes) to the parts of each basis, with its modes (r, 3 n) at the vertices."""
         groups: dict[int, list[ModelPart]] = {}
         for part in self.parts:
             groups.setdefault(id(part.basis.modes), []).append(part)
@@ -161,16 +161,16 @@ class Learned:
 
     @cached_property
     def _is_predicted(self) -> np.ndarray:
-        """(V,) bool: mask of the predicted vertices."""
+        """Mask (V,) of the mesh vertices that the model predicts."""
         known = np.zeros(len(self.anatomy.mesh.nodes), bool)
         known[self.nodes] = True
         return known
 
     def _check_in_range(self, pushed: Pushed, doubtful: np.ndarray) -> None:
-        """Raise InputError for loads off the open cortex, or far beyond the training range.
+        """Raise InputError for loads outside the open cortex, or far beyond the training range.
 
-        Checks only the `doubtful` (k,) rows: a load inside the training range is accepted, unless its radius is too
-        small.
+        Only the rows `doubtful` (k,) can fail the contact test: a load inside the training range touches the cortex,
+        unless its radius is too small.
         """
         if not len(doubtful):
             return
@@ -200,18 +200,17 @@ class Learned:
             )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Predict the static deformation by `Pushed` loads, or by poses of its tool.
+        """Predict the static deformation under `Pushed` loads, or under poses of the model's tool.
 
-        With a start, a rod's or blade's contact search continues from it, which is faster; without, it approaches
-        straight. For relaxing tissue the time between counts; without a start the tool was held until the loads' time,
-        see `data.load_histories`.
+        The contact search of a rod or a blade starts from the contact in `start`, which is faster; without `start` the
+        tool approaches straight. Relaxing tissue continues from `start`; without it, see `data.load_histories`.
 
         Raises
         ------
         InputError
-            Loads of another kind, or that do not touch the open cortex, or are more than `MAX_TRAINING_RATIO` times as
-            strong or as wide as any of the training. A start with other rows, see `update_relaxation`; a vertex in
-            `at` that the model does not predict.
+            Loads are of another kind, do not touch the open cortex, or have more than `MAX_TRAINING_RATIO` times the
+            training's largest force or footprint; `start` has another number of load cases or another state, see
+            `update_relaxation`; a vertex in `at` is not predicted.
         """
         check_loads(loads)
         if start is not None and not isinstance(start, Deformation):
@@ -232,7 +231,7 @@ class Learned:
         self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: RelaxationState | None,
         encoders: Mapping[str, Encoder],
     ) -> Deformation:  # fmt: skip
-        """Sum the parts; the computation began at `begun` [s]."""
+        """Sum the predictions of the parts and build the result; the computation began at `begun` [s]."""
         known = measure_loads(self._patch, pushed)
         outside = self.envelope.compute_excess(pushed, known)
         far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED_TOLERANCE
@@ -263,7 +262,7 @@ class Learned:
     ) -> np.ndarray:
         """Predict displacements (B, n, 3) [m] of mesh vertices `nodes` (n,), without range checks and bound.
 
-        Beyond the training's forces the response per newton is that at the nearest training force.
+        Outside the range of training forces, the response per newton of the nearest training force is used.
         """
         magnitude, asked = self.clip_to_range(pushed)
         if not len(nodes):
@@ -278,17 +277,17 @@ class Learned:
         return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
 
     def clip_to_range(self, pushed: Pushed) -> tuple[np.ndarray, Pushed]:
-        """Return sizes (B,) of forces [N] or depths [m], and the loads with sizes clipped to the training range."""
+        """Return forces [N] or depths [m] (B,), and the loads with these clipped to the training range."""
         magnitude, direction = split_forces(pushed)
         return magnitude, replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
 
     def predict_force(self, pushed: Pushed, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
-        """Predict forces (B, 3) [N] of the tool at indentations; proportional to depth beyond the training.
+        """Predict the tool's forces (B, 3) [N] at indentations, proportional to depth beyond the training's depths.
 
         Raises
         ------
         InputError
-            A model without a trained force.
+            The model was trained without the tool's force.
         """
         if self.force is None:
             raise InputError("this model does not know its tool's force: train it again, on newly simulated poses.")
@@ -300,7 +299,7 @@ class Learned:
         return magnitude[:, None] * found
 
     def compute_bounds(self, bound: Bound | None, pushed: Pushed, known: LoadMeasures, outside: Excess) -> np.ndarray:
-        """Compute the bounds (2, B) of loads, [m], or [N] for a force; NaN without one."""
+        """Compute error bounds (2, B) of loads, in [m], or in [N] for a force; NaN if `bound` is None."""
         if bound is None:
             return np.stack([np.nan * outside.excess] * len(LEVELS))
         # The error, like the motion, is in proportion to a force below the training's smallest.
@@ -311,21 +310,21 @@ class Learned:
     def predict_distance(
         self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None
     ) -> TumourDistance:
-        """Predict the distance from the tool's tip to the tumour, both in the deformed brain: see `TipGauge`.
+        """Predict the distance from the tool's tip to the tumour in the deformed brain, as measured by `TipGauge`.
 
         Parameters
         ----------
         answer
-            This model's result for the loads, if available: at least at the open cortex and the tumour.
+            This model's result for the loads, at least at the open cortex and the tumour; None: it is computed.
         apart
-            (B,) [m]: the distance in that result, if already measured, as for a tool that is lifted off again.
+            Distances (B,) [m] in `answer`, if already measured; None: they are measured.
 
         Raises
         ------
         InputError
-            Loads of another kind, or a result without the open cortex and the tumour.
+            The loads are of another kind, or `answer` lacks vertices of the open cortex or the tumour.
         """
-        # With the result of these very loads as start, no time passes.
+        # With the result of the same loads as start, no time passes.
         pushed = self._convert_loads(loads, answer)[0]
         if apart is None:
             if answer is None:
@@ -340,17 +339,17 @@ class Learned:
         )
 
     def to_input(self, loads: Loads) -> Pushed:
-        """Convert loads to the model's input: pushes, or indentations of its tool's poses (`to_indentation`).
+        """Convert loads to the model's input: pushes, or indentations by its tool (`to_indentation`).
 
         Raises
         ------
         InputError
-            Loads of another kind.
+            The loads are of another kind.
         """
         return self._convert_loads(loads)[0]
 
     def _convert_loads(self, loads: Loads, start: Deformation | None = None) -> tuple[Pushed, RelaxationState | None]:
-        """Convert loads as `asked`, from a start, and return the state of relaxation, if tissue relaxes."""
+        """Convert loads as `to_input`; return them and the relaxation state after `start`, None without relaxation."""
         if self.tool is None:
             return get_only_pushes(loads), None
         pushed = to_indentation(loads, self.tool, self._patch)
@@ -368,9 +367,9 @@ def build_prediction(
     displacement: np.ndarray, nodes: np.ndarray, loads: Loads, outside_range: Iterable[bool], start_time: float,
     bound: np.ndarray, source: str,
 ) -> Deformation:  # fmt: skip
-    """Build the result of a trained model called at `start_time` [s]; `outside_range` (B,): loads outside its training.
+    """Build a model's result, computed since `start_time` [s]; loads of `outside_range` (B,) are marked extrapolated.
 
-    displacement (B, n, 3) [m] of `nodes` (n,); bound and source as in `Deformation`.
+    `displacement` (B, n, 3) [m] belongs to the vertices `nodes` (n,); `bound` and `source` are as in `Deformation`.
     """
     count = len(loads)
     pushed, unknown = loads.get(Pushed), np.full(count, np.nan)

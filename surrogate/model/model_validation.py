@@ -1,4 +1,4 @@
-"""Validation of models from files: models that no training can produce are rejected before use."""
+"""Validation of models read from files: states that no training can produce are rejected before use."""
 
 from collections.abc import Mapping
 
@@ -19,16 +19,16 @@ from .held_out import HeldOutErrors
 from .learned import Learned, ModelPart
 from .training_range import TrainingRange
 
-FEATURE_COUNT = 7  # Number of tool features, and so of the features of bounds.
+FEATURE_COUNT = 7  # Number of features of `compute_scale_features`, on which bounds depend.
 
 
 def check_model_state(name: str, model: Learned) -> None:
-    """Check that a model is valid.
+    """Check that a model is valid: parts, training range, bounds, errors and force model.
 
     Raises
     ------
     InputError
-        Parts, an envelope or bounds that no training can produce; the message names them.
+        A component cannot be the result of a training; the message names it.
     """
     try:
         _require_good(len(model.parts) > 0, "it has no parts")
@@ -51,12 +51,12 @@ def check_model_state(name: str, model: Learned) -> None:
 
 
 def check_finite_state(state: Mapping[str, np.ndarray]) -> None:
-    """Check that a regressor's state is valid.
+    """Check that all arrays of a regressor's state are finite numbers.
 
     Raises
     ------
     InputError
-        Arrays that are not finite numbers.
+        An array contains other types, infinity or NaN.
     """
     for name, array in state.items():
         _require_good(
@@ -80,7 +80,7 @@ def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
     nodes, modes = basis.nodes, basis.modes
     _require_good(nodes.ndim == 1 and nodes.dtype.kind in "iu" and len(nodes) > 0, "its nodes are no vertex numbers")
     _require_good(nodes.min() >= 0 and nodes.max() < len(anatomy.mesh.nodes), "its nodes lie outside the mesh")
-    # They increase; if one basis has the tumour and the cortex, once more from the start.
+    # Numbers increase; a basis of tumour and cortex has two increasing parts.
     rises = np.diff(nodes.astype(np.int64)) > 0
     _require_good(
         bool(np.sum(~rises) <= 1) and len(np.unique(nodes)) == len(nodes), "its nodes are not sorted, or come twice"
@@ -92,7 +92,7 @@ def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
 
 
 def _compute_probe(encoder: str, model: Learned) -> np.ndarray:
-    """Compute features of a training load, without a tool's footprint integral."""
+    """Compute the encoder's features of one load inside the training range, without integrating a footprint."""
     if encoder in ("nodal", "rooted"):
         return np.ones((1, 3 * len(open_patch(model.anatomy).nodes)))
     envelope = model.envelope
@@ -170,7 +170,7 @@ def _check_bounds(bounds: Bound) -> None:
 
 
 def _is_valid_error(stated: HeldOutErrors) -> bool:
-    """Return True if errors on held-out cortex have valid values."""
+    """Return True if errors on held-out cortex have possible values."""
     sizes = (stated.mean, stated.guarded, stated.solved, *([] if stated.p999 is None else [stated.p999]))
     return all(type(size) is float and 0.0 <= size < np.inf for size in sizes) and stated.solved <= 1.0
 

@@ -1,4 +1,4 @@
-"""Arrays of an untrusted `.npz` file: only requested ones are read, up to a size limit."""
+"""Arrays of an untrusted `.npz` file: only requested arrays are read, up to a size limit."""
 
 import json
 import math
@@ -18,14 +18,14 @@ MAX_NPY_HEADER = 10_000  # Maximum size of an array's header [bytes].
 
 
 def compute_seal(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
-    """Compute the digest of a file's header, without its own `seal`, and of all its arrays."""
+    """Compute the digest of all arrays and of a file's header, without the header's entry `seal`."""
     names = sorted(arrays)
     stated = json.dumps([names, {name: value for name, value in header.items() if name != "seal"}], sort_keys=True)
     return compute_digest(np.frombuffer(stated.encode(), np.uint8), *(arrays[name] for name in names))
 
 
 def write_archive(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays as `np.savez_compressed` does, with bzip2: faster and a quarter smaller than Deflate."""
+    """Write arrays as an `.npz` file compressed by bzip2, which is faster and a quarter smaller than Deflate."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy")  # without a time stamp: equal arrays give equal bytes
@@ -35,21 +35,21 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 class Archive:
-    """Arrays of an open `.npz` file, of at most `largest` bytes in total.
+    """Reader of an open `.npz` file; each call reads at most `max_bytes` bytes of arrays.
 
-    Every message ends with a `remedy`. Files of the wrong kind raise the exceptions of `zipfile` and NumPy.
+    Every error message ends with `remedy`. Files of the wrong kind raise the exceptions of `zipfile` and NumPy.
     """
 
     def __init__(self, file: BinaryIO, remedy: str = "", max_bytes: int = MAX_MODEL_BYTES) -> None:
         self._zip, self._remedy, self._largest = zipfile.ZipFile(file), remedy, max_bytes
 
     def read_text(self, name: str) -> str:
-        """Read an array with a single text.
+        """Read the text that an array stores.
 
         Raises
         ------
         InputError
-            A text that is longer than allowed.
+            The array is missing, or larger than `MAX_HEADER_BYTES`.
         """
         self._check_names([name], MAX_HEADER_BYTES)
         return str(self._read_array(name))
@@ -60,19 +60,19 @@ class Archive:
         Raises
         ------
         InputError
-            Arrays that are missing, or larger in total than allowed.
+            An array is missing, or the total size exceeds `max_bytes`.
         """
         wanted = sorted(set(names))
         self._check_names(wanted, self._largest)
         return {name: self._read_array(name) for name in wanted}
 
     def read_by_digest(self, digests: Iterable[str]) -> dict[str, np.ndarray]:
-        """Read arrays that are stored under the digest of their content.
+        """Read arrays whose names are the digests of their content, and verify the digests.
 
         Raises
         ------
         InputError
-            See `read_arrays`; an array whose content has another digest.
+            See `read_arrays`, or an array does not match its digest.
         """
         found = self.read_arrays(digests)
         for name, array in found.items():
@@ -81,12 +81,12 @@ class Archive:
         return found
 
     def read_sealed(self, header: Mapping[str, Any], names: Iterable[str]) -> dict[str, np.ndarray]:
-        """Read arrays by name, and verify the header's `seal` of header and arrays.
+        """Read arrays by name, and verify the digest `seal` of header and arrays.
 
         Raises
         ------
         InputError
-            See `read_arrays`; header or arrays that do not match the seal.
+            See `read_arrays`, or the header and arrays do not match the seal.
         """
         found = self.read_arrays(names)
         if compute_seal(header, found) != header["seal"]:

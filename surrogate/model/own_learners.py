@@ -1,4 +1,4 @@
-"""User-defined learners: registered from a file or package; trained, stored and read like the built-in ones."""
+"""User-defined learners, registered from a file or a package, and used like the built-in learners."""
 
 import sys
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from ..data.encode import ENCODERS, Encoder
 from ..regressors.protocol import Regressor
 
 ENTRY_POINT_GROUP = "sulcus.learners"
-"""Entry-point group of packages that provide learners, by the learner's name."""
+"""Entry-point group of packages that provide learners; each entry point has its learner's name."""
 RESERVED_NAMES = frozenset(
     [
         "ann",
@@ -31,12 +31,12 @@ RESERVED_NAMES = frozenset(
 )
 """Names of built-in learners."""
 PLAYER_NAMES = frozenset(["auto", "fem", "guarded"])
-"""Names of deformers that are not learners."""
+"""Names of deformers that are not learners, and so cannot be learner names."""
 
 
 @dataclass(frozen=True)
 class OwnLearner:
-    """Registered user-defined learner: a name in `ENCODERS`, and the class of its regressor."""
+    """User-defined learner that is registered: its encoder, a name in `ENCODERS`, and the class of its regressor."""
 
     encoder: str
     regressor: type[Regressor]
@@ -47,14 +47,14 @@ K = TypeVar("K", bound=type[Regressor])  # Type of a registered class.
 
 
 def register_learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K], K]:
-    """Register a class of `Regressor` under a name; it is instantiated without arguments.
+    """Return a class decorator that registers a `Regressor` under a name; the class is instantiated without arguments.
 
-    `encoder`: features of a load to train on, a name in `encode.ENCODERS` or a function (Patch, Pushed) -> (B, f).
+    `encoder` computes the features to train on: a name in `encode.ENCODERS`, or a function (Patch, Pushed) -> (B, f).
 
     Raises
     ------
     InputError
-        A name that is taken, an unknown encoder, a class without the methods of a `Regressor`.
+        The name is taken, the encoder is unknown, or the class lacks a method of `Regressor`.
     """
     if callable(encoder):
         ENCODERS[name], encoder = encoder, name
@@ -76,12 +76,12 @@ def register_learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K]
 
 
 def find_own_learner(name: str) -> OwnLearner | None:
-    """Find a registered learner, loading the package with an entry point of its name if necessary; None without one.
+    """Return a registered learner, or import the package whose entry point has that name; None if there is neither.
 
     Raises
     ------
     InputError
-        A package that cannot be imported, or that registers no learner of its entry point's name.
+        The package cannot be imported, or does not register a learner under its entry point's name.
     """
     if name in OWN_LEARNERS:
         return OWN_LEARNERS[name]
@@ -97,10 +97,10 @@ def find_own_learner(name: str) -> OwnLearner | None:
 
 
 def find_learner_name(regressor_class: type) -> str | None:
-    """Return the name under which a class was registered."""
+    """Return the name under which a class was registered; None if it was not."""
     return next((name for name, own in OWN_LEARNERS.items() if own.regressor is regressor_class), None)
 
 
 def _get_file(kind: type) -> str | None:
-    """Return the file of a class: an edited file may register its learner again."""
+    """Return the path of the file that defines a class, since an edited file may register its learner again."""
     return getattr(sys.modules.get(kind.__module__), "__file__", None)

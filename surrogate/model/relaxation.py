@@ -1,10 +1,10 @@
-"""Relaxation of tissue under a tool that a model follows, and the test whether its training covers that history.
+"""Stress relaxation of tissue under a moving tool, and the test that the training covers the tool's history.
 
-FEM stores the decaying part of the stress, for each pair (g, tau) of a Prony series (`sim/terms/viscoelastic.py`). A
-model stores the same for one number, the tool's depth d:
+FEM stores the decaying part of the stress for each pair (g, tau) of a Prony series (`sim/terms/viscoelastic.py`). A
+trained model stores the decaying part h of one number, the tool's depth d:
     h <- exp(-dt / tau) h + g exp(-dt / (2 tau)) (d - its last value).
 
-The resistance to a change of shape has then lost the share r = sum_i (g_i - h_i / d), which all predictions depend on.
+The shear resistance has then lost the share r = sum_i (g_i - h_i / d), which is an input of all predictions.
 """
 
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ from ..data.encode import split_forces
 from ..data.load_histories import compute_decayed_coefficients
 
 MEMORY_KEY = "relaxation"
-"""Key in `Deformation.memory`: depth [m], position of first contact [m], then each h [m]; (B, 4 + pairs)."""
+"""Key in `Deformation.memory` of an array (B, 4 + pairs): depth [m], point of first contact [m], then each h [m]."""
 MAX_BACK_SHARE = 0.02  # Limit of the training: a tool moving back makes h negative by at most this share of g d.
 MAX_SLIDE_SHARE = 0.5  # Limit of the training: a tool slides by at most this share of its footprint's radius.
 
 
 @dataclass(frozen=True, eq=False)
 class RelaxationState:
-    """State of relaxation under B tools.
+    """State of relaxation under B tools, one tool per load case.
 
     Parameters
     ----------
     relaxed_share
-        (B,): r, lost share of the resistance to a change of shape.
+        Lost share r of the shear resistance (B,).
     outside_training
-        (B,) bool: True if the history is outside the training.
+        Mask (B,) of load cases with a tool history that the training does not cover.
     memory
         State for the next time step, in the layout of `MEMORY_KEY`.
     """
@@ -47,7 +47,7 @@ class RelaxationState:
 def update_relaxation(
     series: Pairs, pushes: Pushed, times: np.ndarray, start: Deformation | None, min_depth: float
 ) -> RelaxationState:
-    """Advance relaxation at indentations from the previous result; without one, assume `load_histories`.
+    """Compute the relaxation at indentations, from the result `start` or else from a history as in `load_histories.py`.
 
     Parameters
     ----------
@@ -56,14 +56,14 @@ def update_relaxation(
     times
         Times (B,) [s].
     start
-        Result of a model of the same series, at earlier or the same times.
+        Previous result of a model with the same `series`, at the same or earlier times; None: no earlier result.
     min_depth
-        Depth [m] below which tissue counts as free.
+        Smallest depth [m] in the test for a tool that moves back.
 
     Raises
     ------
     InputError
-        A start without such a memory, or of later times.
+        `start` has no relaxation state of this size, or is at a later time than the loads.
     """
     depth, (g, tau) = split_forces(pushes)[0], np.array(series).T
     if start is None:
@@ -86,7 +86,7 @@ def update_relaxation(
 def _compute_relaxed(
     g: np.ndarray, pushed: Pushed, depth: np.ndarray, first: np.ndarray, left: np.ndarray, shallowest: float
 ) -> RelaxationState:
-    """Compute the state from h (B, n) [m] of each pair, and the tools' positions of first contact (B, 3) [m]."""
+    """Compute the state from h (B, n) [m] of each Prony pair, and the points of first contact (B, 3) [m]."""
     touching = depth > 0.0
     share = (g - left / np.where(touching, depth, 1.0)[:, None]).sum(axis=1)
     back = (left < -MAX_BACK_SHARE * g * np.maximum(depth, shallowest)[:, None]).any(axis=1)

@@ -1,4 +1,4 @@
-"""Model files: one `.npz` of plain arrays with a JSON header, no pickle."""
+"""Model files: one `.npz` file with plain arrays and a JSON header, without pickle."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
@@ -50,13 +50,13 @@ FITTED: dict[str, type[FittedRegressor]] = {
 
 
 def save(path: str | Path, models: Mapping[str, Learned]) -> None:
-    """Write models of one anatomy under their names, atomically.
+    """Write models of one anatomy to a file under their names, atomically.
 
     Raises
     ------
     InputError
-        No model, models of different anatomies, a name that does not end in .npz, or a folder that cannot be written. A
-        state that is more than arrays of numbers or text, or a regressor that is not registered.
+        There are no models or models of different anatomies, the name does not end in .npz, or the folder is not
+        writable; a state has other content than arrays of numbers or text, or a regressor is not registered.
     """
     digests = {model.anatomy.digest for model in models.values()}
     if len(digests) != 1:
@@ -83,13 +83,12 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
 
 
 def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
-    """Read the models of an anatomy, by name.
+    """Read the models of an anatomy from a file; return them by name.
 
     Raises
     ------
     InputError
-        A file that is missing or not a model file of this project, that was trained on another anatomy, or that holds
-        an invalid model.
+        The file is missing, not a model file of this project, or for another anatomy, or it contains an invalid model.
 
     Examples
     --------
@@ -122,26 +121,26 @@ def load(path: str | Path, anatomy: Anatomy) -> dict[str, Learned]:
 
 
 def read_reported_errors(path: str | Path) -> dict[str, ReportedErrors]:
-    """Read the reported errors of a file's models, by name; their arrays are not read.
+    """Read the reported errors of a file's models without their arrays; return them by model name.
 
     Raises
     ------
     InputError
-        A file that is missing, or not a model file of this project.
+        The file is missing, or not a model file of this project.
     """
     with _open_header(path) as header:
         return {name: ReportedErrors(about["bound"], _read_held_out(about)) for name, about in header["models"].items()}
 
 
 def read_learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None:
-    """Read the tissue that a file's models were trained on, regions included; their arrays are not read.
+    """Read the tissue, with its regions, that a file's models were trained on; the arrays are not read.
 
-    None if the file does not give it, or for models of another anatomy.
+    Return None if the file does not give the tissue, or if the models are of another anatomy.
 
     Raises
     ------
     InputError
-        See `read_reported_errors`; an invalid tissue.
+        See `read_reported_errors`, or the tissue is invalid.
     """
     with _open_header(path) as header:
         if header["anatomy"] != anatomy.digest:
@@ -151,14 +150,14 @@ def read_learned_tissue(path: str | Path, anatomy: Anatomy) -> Elasticity | None
 
 @contextmanager
 def _open_header(path: str | Path) -> Iterator[dict[str, Any]]:
-    """Open the header of a model file; errors within the block are reported with the file's name."""
+    """Read the header of a model file, as a context manager that adds the file's name to errors inside it."""
     path = to_path(path)
     with wrap_errors(path, "a model", REMEDY), path.open("rb") as raw:
         yield _read_header(Archive(raw, REMEDY))
 
 
 def _read_header(archive: Archive) -> dict[str, Any]:
-    """Read the header of a model file; older files have no seal."""
+    """Read the header of a model file, and verify its seal; older files have no seal."""
     header = json.loads(archive.read_text("header"))
     if "seal" in header:
         archive.read_sealed(header, ())
@@ -166,13 +165,13 @@ def _read_header(archive: Archive) -> dict[str, Any]:
 
 
 def _read_held_out(description: dict[str, Any]) -> HeldOutErrors | None:
-    """Read the errors on held-out cortex; None for older files."""
+    """Read the errors on held-out cortex from a model's description; None for older files."""
     stated = description.get("left_out")
     return None if stated is None else HeldOutErrors(**stated)
 
 
 def _list_array_keys(descriptions: Iterable[dict[str, Any]]) -> Iterator[str]:
-    """Yield the names of all arrays that models refer to."""
+    """Yield the names of all arrays that the models' descriptions refer to."""
     for description in descriptions:
         for part in description["parts"]:
             yield from (part["nodes"], part["modes"], *part["state"].values())
@@ -191,7 +190,7 @@ def _get_own_name(regressor: FittedRegressor) -> str:
 
 
 def _find_type(name: str) -> type[FittedRegressor]:
-    """Return the class named in a model file: a built-in one, or one that the user has registered or installed."""
+    """Return the class of a regressor named in a model file: a built-in or a user-defined class."""
     if name in FITTED:
         return FITTED[name]
     own = find_own_learner(name)
@@ -278,7 +277,7 @@ def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
 
 
 def _rebuild_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray], reach: float) -> Bound | None:
-    """Rebuild a bound; those of older files grow only beyond the training loads' reach; their profile is ignored."""
+    """Rebuild a bound; a bound in an older file grows only beyond `reach` [m] of the training loads."""
     if names is None:
         return None
     older = {"growth": np.array(1e3 * GROWTH), "near": np.array(reach)}

@@ -1,4 +1,4 @@
-"""Tool contact of a pose model: model of the tool's force, and warm starts of the contact search."""
+"""Tool contact of a pose model: prediction of the tool's force, and warm starts of the contact search."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ class ForceModel:
     Parameters
     ----------
     encoder
-        Name in `ENCODERS`: features for the regressor.
+        Name in `ENCODERS` of the function that computes the regressor's features.
     regressor
-        Map from features of an indentation to the force (B, 3) [N/m] per metre of depth. With a contact part it
-        predicts the remainder; None: nothing is added.
+        Map from features of an indentation to the force (B, 3) [N/m] per metre of depth; in a model with a contact
+        part, to the difference from that part's force. None: nothing is added to the contact part.
     bound
-        Bound of the force's error [N], if calibration loads were set aside.
+        Bound of the force's error [N]; None if no calibration loads were set aside.
     """
 
     encoder: str = "tool"
@@ -36,14 +36,14 @@ class ForceModel:
     bound: Bound | None = None
 
     def predict_remainder(self, patch: Patch, pushes: Pushed) -> np.ndarray | float:
-        """Predict the regressor's contribution (B, 3) [N/m] at indentations."""
+        """Predict the force (B, 3) [N/m] per metre of depth that the regressor adds; 0 without a regressor."""
         return 0.0 if self.regressor is None else self.regressor.predict(ENCODERS[self.encoder](patch, pushes))
 
 
 def compute_wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.ndarray:
-    """Compute force [N] and moment about the tool's origin [N m] at poses (B, 4, 4): (B, 1, 6), from forces (B, 3).
+    """Compute wrenches (B, 1, 6) from forces (B, 3) [N] at poses (B, 4, 4): force, then moment about the tool's origin.
 
-    Frictionless pressure on a ball acts through its centre. The moment of other tools is not available: NaN.
+    The pressure on a ball acts through its centre, as contact has no friction. For other tools the moment [N m] is NaN.
     """
     known = isinstance(tool, Ball)
     moment = np.cross(tool.radius * pose[:, :3, 2], force) if known else np.full(force.shape, np.nan)
@@ -51,11 +51,11 @@ def compute_wrench(force: np.ndarray, pose: np.ndarray, tool: BuiltIn) -> np.nda
 
 
 CONTACT_KEY = "where a blade touches"
-"""Key of the contact in the warm data of a result: rows of `RigidContact.compute_warm_start`."""
+"""Key of the contact state in `Deformation.warm`: rows of `RigidContact.compute_warm_start`."""
 
 
 def build_warm_encoders(regressors: Sequence[FittedRegressor], start: Deformation | None) -> Mapping[str, Encoder]:
-    """Return encoders that start rods and blades from the contact stored in `start`, if there is one."""
+    """Return encoders that start the contact search from the contact state in `start`; `ENCODERS` if there is none."""
     contact, held = _find_contact(regressors), None if start is None else start.warm.get(CONTACT_KEY)
     if contact is None or held is None or held.shape[1:] != (contact.warm_start_width,) or not np.isfinite(held).all():
         return ENCODERS
@@ -70,11 +70,11 @@ def build_warm_encoders(regressors: Sequence[FittedRegressor], start: Deformatio
 def collect_contact_state(
     regressors: Sequence[FittedRegressor], patch: Patch, pushes: Pushed, encoders: Mapping[str, Encoder]
 ) -> dict[str, np.ndarray]:
-    """Return the contact to store with a result for the next warm start: rows (B, h), or nothing."""
+    """Return the contact state (B, h) for the next warm start, under `CONTACT_KEY`; empty without a rod or a blade."""
     contact = _find_contact(regressors)
     return {} if contact is None else {CONTACT_KEY: contact.compute_warm_start(encoders["core"](patch, pushes))}
 
 
 def _find_contact(regressors: Sequence[FittedRegressor]) -> RigidContact | None:
-    """Return the contact regressor of a rod or a blade; a ball's search is short."""
+    """Return the contact regressor of a rod or a blade, else None; a ball's contact search needs no warm start."""
     return next((each for each in regressors if isinstance(each, RigidContact) and len(each.core)), None)

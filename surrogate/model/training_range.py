@@ -1,4 +1,4 @@
-"""Range of a model's training loads: outside it, a prediction is marked as extrapolated."""
+"""Training range of a model: predictions for loads outside this range are marked as extrapolated."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ..data.cortex_patch import Patch
 from ..data.encode import split_forces
 from ..data.indentation import Indented
 
-# Tolerance of lengths [m], angles [rad] and relative forces, so that round-off puts no training load outside.
+# Tolerance of lengths [m], angles [rad] and relative forces, so that no training load is outside by round-off.
 RANGE_TOLERANCE = 1e-6
 
 
 class LoadMeasures(NamedTuple):
-    """Force [N], angle to the inward normal [rad], footprint beyond the edge of the craniotomy [m]: (B,) each."""
+    """Force [N], angle to the inward normal [rad], and footprint overhang at the craniotomy's edge [m], (B,) each."""
 
     magnitude: np.ndarray
     angle: np.ndarray
@@ -28,11 +28,11 @@ class LoadMeasures(NamedTuple):
 
 
 class Excess(NamedTuple):
-    """Position of loads relative to the training range, (B,) each.
+    """Distances (B,) of loads from the training range; all are arrays with one entry per load.
 
-    `distance` is that from the nearest training load [m]. `bound_excess` measures how far a load leaves the range
-    otherwise: the largest of millimetres over the edge, radians beyond the angle, and three relative excesses, of
-    force, radius and force over radius. `excess` includes millimetres beyond the reach, and is zero inside.
+    `distance` [m] is measured from the nearest training point. `bound_excess` is the largest excess over the other
+    limits: overhang in mm, angle in rad, and the relative excesses of force, radius and force over radius. `excess`
+    also includes the distance beyond `TrainingRange.reach` in mm, and is zero inside the range.
     """
 
     distance: np.ndarray
@@ -41,7 +41,7 @@ class Excess(NamedTuple):
 
     @property
     def zero(self) -> Excess:
-        """Position with all distances zero, as of training loads."""
+        """Excess of the same length with all values zero, as for training loads."""
         return Excess(*(0.0 * each for each in self))
 
 
@@ -54,17 +54,17 @@ class TrainingRange:
     points
         Points (n, 3) of the training loads [m].
     reach
-        Largest distance of a training point from its nearest neighbour [m]: how densely they cover the cortex.
+        Largest distance [m] from a training point to its nearest neighbour; it measures the sampling density.
     overhang
-        Largest footprint radius minus distance to the edge [m].
+        Largest difference [m] between the footprint's radius and its distance to the craniotomy's edge.
     angle
         Largest angle [rad] between force and inward normal.
     force
-        Smallest and largest [N]. Below the smallest the response is in proportion, so weaker loads are inside.
+        Smallest and largest force [N]. Weaker loads are inside, as the response below is proportional to force.
     footprint
         Smallest and largest radius [m].
     line_force
-        Largest force over radius [N/m], to which the indentation of a round tool is in proportion.
+        Largest ratio of force to radius [N/m], to which the indentation by a round tool is proportional.
     """
 
     points: np.ndarray
@@ -76,23 +76,23 @@ class TrainingRange:
     line_force: float
 
     def is_inside(self, patch: Patch, pushes: Pushed) -> np.ndarray:
-        """Return the mask (B,) of loads inside the range."""
+        """Return the mask (B,) of loads inside the training range."""
         return self.compute_excess(pushes, measure_loads(patch, pushes)).excess == 0.0
 
     def is_training_point(self, point: np.ndarray, corners: np.ndarray) -> bool:
-        """Return True if any of the points (B, 3) [m] is exactly a training point.
+        """Return True if at least one of the points (B, 3) [m] equals a training point in single precision.
 
-        The surface's corners (n, 3) [m] do not count: many different poses have the same nearest corner.
+        The surface's corners (n, 3) [m] do not count, since many different poses have the same nearest corner.
         """
         asked, known, free = (set(map(tuple, place.astype(np.float32))) for place in (point, self.points, corners))
         return bool((asked & known) - free)
 
     def clip_to_range(self, measures: LoadMeasures) -> LoadMeasures:
-        """Return loads with forces clipped to the training range."""
+        """Return the measures with forces clipped to the training range's smallest and largest force."""
         return measures._replace(magnitude=np.clip(measures.magnitude, *self.force))
 
     def compute_excess(self, pushes: Pushed, measures: LoadMeasures) -> Excess:
-        """Compute the position of loads relative to the range."""
+        """Compute the excess of loads over the training range, from their measures."""
         magnitude, angle, overhang = measures
         away = np.sqrt(compute_squared_distances(pushes.point, self.points).min(axis=1))
         beyond = np.stack(
@@ -110,7 +110,7 @@ class TrainingRange:
 
 
 def compute_training_range(patch: Patch, pushes: Pushed) -> TrainingRange:
-    """Compute the envelope of the training loads, from these loads alone."""
+    """Compute the training range from the training loads."""
     magnitude, angle, overhang = measure_loads(patch, pushes)
     return TrainingRange(
         pushes.point.astype(np.float32),
@@ -124,14 +124,14 @@ def compute_training_range(patch: Patch, pushes: Pushed) -> TrainingRange:
 
 
 def _compute_reach(point: np.ndarray) -> float:
-    """Compute the largest distance [m] of a point (n, 3) from its nearest neighbour: zero for a single point."""
+    """Compute the largest distance [m] from a point (n, 3) to its nearest neighbour; zero for a single point."""
     if len(point) < 2:
         return 0.0
     return float(KDTree(point).query(point, 2)[0][:, 1].max())
 
 
 def measure_loads(patch: Patch, pushes: Pushed) -> LoadMeasures:
-    """Measure loads for the envelope; for a rod or a blade the shaft's angle counts if it is larger."""
+    """Compute the measures of loads; the angle of a rod or a blade is the larger of its force's and its shaft's."""
     (magnitude, direction), inward = split_forces(pushes), patch.find_normals(pushes.point)
     cosine = np.einsum("bi,bi->b", direction, inward)
     if isinstance(pushes, Indented):

@@ -1,1 +1,1 @@
-"""Export of models as ONNX graphs."""
+"""Export of trained models as ONNX graphs."""

@@ -1,6 +1,6 @@
-"""Export of trained models to ONNX: one graph from loads to displacements and bounds, for use in other programs.
+"""Export of trained models to ONNX, for use in other programs: one graph from loads to displacements and bounds.
 
-The graph is traced: the model's own formulas run with wires instead of arrays, so that no formula is written twice.
+The graph is traced: the model's own formulas run on `Tensor` instead of arrays, so that each is implemented only once.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from .graph import GraphBuilder, Port
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-# Regressors whose formulas use only operations that a wire supports.
+# Regressors whose formulas use only operations that `Tensor` supports.
 TRACEABLE = (Linear, Pcr, Ann, Svr, Gp, RemainderGp, Series, ForcePairs)
 FORMAT = "sulcus onnx 1"  # Version of the names, shapes and meanings of inputs, outputs and metadata.
 DESCRIPTION = (  # Description in the ONNX file.
@@ -40,12 +40,12 @@ DESCRIPTION = (  # Description in the ONNX file.
 
 
 def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelProto:
-    """Build the ONNX graph of `build_graph`.
+    """Build the ONNX model of the graph that `build_graph` traces.
 
     Raises
     ------
     InputError
-        See `build_graph`; the package `onnx` not installed.
+        See `build_graph`, or the package `onnx` is not installed.
     """
     return build_graph(name, model, cortex).build_model(
         name, DESCRIPTION, get_version("sulcus"), _build_metadata(name, model)
@@ -53,22 +53,22 @@ def build_onnx_model(name: str, model: Learned, cortex: bool = False) -> ModelPr
 
 
 def build_graph(name: str, model: Learned, cortex: bool = False) -> GraphBuilder:
-    """Trace the graph of a model: of the tumour, or of all its vertices.
+    """Trace the graph of a model, for the tumour's vertices or (`cortex`) for all vertices of the model.
 
-    Inputs, B loads at a time: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as `sim.Pushed` has them.
-    If the result depends on a compliance matrix, which that of the cortex always does, also `weight` (B, m). It is the
-    share of the force on each of the nodes `pressed` (m,) of the open cortex. `compute_footprint_weights` of
-    `sim.discretisation.footprint` integrates it over `Patch`, which no operator of ONNX can do.
+    The inputs have B loads: `point` (B, 3) [m], `force` (B, 3) [N], `footprint` (B,) [m], as in `sim.Pushed`. If the
+    result depends on a compliance matrix, as the cortex always does, there is also `weight` (B, m). It is the share of
+    the force on each node `pressed` (m,) of the open cortex: the footprint's integral over `Patch`, by
+    `compute_footprint_weights` of `sim.discretisation.footprint`, for which ONNX has no operator.
 
-    Outputs, as in `Learned.deform`: `displacement` (B, n, 3) [m] of the mesh vertices `nodes` (n,), whose undeformed
-    positions are `rest` (n, 3) [m]. `bound` (B, 2) [m] of the tumour, at the metadata's levels, is NaN if nothing was
-    calibrated. Then come `excess` (B,), that of `Outside`; and `extrapolated` (B,), True if it is above zero. All in
+    The outputs are as in `Learned.deform`: `displacement` (B, n, 3) [m] of the mesh vertices `nodes` (n,), with
+    undeformed positions `rest` (n, 3) [m]; `bound` (B, 2) [m] for the tumour at the levels in the metadata, NaN without
+    calibration; `excess` (B,), as in `Excess`; and `extrapolated` (B,), True if `excess` is above zero. Numbers are in
     single precision; intermediate values have the precision of the model.
 
     Raises
     ------
     InputError
-        A regressor that has no graph; a model that follows its tissue in time.
+        A regressor has no graph, or the model includes relaxation over time.
     """
     if model.series:
         raise InputError(f"{name} follows tissue that relaxes in time, which no graph does: export another model.")
@@ -78,7 +78,7 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> GraphBuilder
         if np.isin(part.basis.nodes, nodes).any() and type(part.regressor) not in TRACEABLE:
             kind = type(part.regressor).__name__
             raise InputError(f"{name} has a part of the kind {kind}, which has no ONNX graph: export another learner.")
-    # Any two loads of the training range give the formulas the types and shapes of their arrays.
+    # Two arbitrary loads in the training range determine the types and shapes of all arrays.
     down = np.array([0.0, 0.0, -envelope.force[1]])
     pushed = Pushed(
         sheet.add_input(
@@ -90,7 +90,7 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> GraphBuilder
 
     @cache
     def weight() -> Any:
-        """Create the input of the footprint integral, once for all uses."""
+        """Add the input `weight` once, for all parts that use it."""
         sample = np.full((2, len(patch.nodes)), 1.0 / len(patch.nodes))
         sheet.add_output(sheet.add_constant(patch.nodes), Port("pressed", np.int64, patch.nodes.shape, "of the mesh"))
         return sheet.add_input("weight", sample, "share of the force on each of the nodes `pressed`")
@@ -120,12 +120,12 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> GraphBuilder
 
 
 def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False) -> None:
-    """Write `build_onnx_model` atomically.
+    """Write the ONNX model of `build_onnx_model` to a file, atomically.
 
     Raises
     ------
     InputError
-        See `build_onnx_model`; a path that does not end in .onnx, or a folder that cannot be written.
+        See `build_onnx_model`; the path does not end in .onnx, or the folder cannot be written.
     """
     graph = build_onnx_model(name, model, cortex)
     with write_atomically(path, ".onnx") as partial:
@@ -133,7 +133,7 @@ def write_onnx(path: str | Path, name: str, model: Learned, cortex: bool = False
 
 
 def _build_metadata(name: str, model: Learned) -> dict[str, str]:
-    """Return the metadata: units, levels, and all provenance of the training."""
+    """Return the metadata of the graph: format, units, levels, and the provenance of the training."""
     return {
         **model.training,
         "format": FORMAT,

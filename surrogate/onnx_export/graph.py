@@ -1,4 +1,4 @@
-"""Tracing of ONNX graphs: NumPy's own functions, called with a wire, write the corresponding operator."""
+"""Tracing of ONNX graphs: NumPy functions that are called with a `Tensor` add the corresponding ONNX operator."""
 
 from __future__ import annotations
 
@@ -38,21 +38,21 @@ OPERATORS = {
     np.log: "Log",
     np.tanh: "Tanh",
 }
-"""Operators of NumPy's universal functions."""
+"""ONNX operators that correspond to NumPy's universal functions."""
 
 
 class Tensor(NDArrayOperatorsMixin):
-    """Named array of a graph, whose first axis is the batch. Operators and functions of NumPy write to its sheet.
+    """Symbolic array of a graph, with the batch as first axis. NumPy operators and functions add nodes to the graph.
 
     Parameters
     ----------
     sheet
-        Graph that it belongs to.
+        Graph that the tensor belongs to.
     name
-        Name in the graph.
+        Name of the tensor in the graph.
     sample
-        Value for a batch of sample loads: type and shape are NumPy's. No formula may depend on the length
-        of the batch, which differs in use.
+        Value for a batch of sample loads, which gives type and shape. No formula may depend on the length of the batch,
+        as it differs in use.
     """
 
     def __init__(self, graph: GraphBuilder, name: str, sample: np.ndarray):
@@ -62,7 +62,7 @@ class Tensor(NDArrayOperatorsMixin):
         return len(self.sample)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *operands: Operand, **_: object) -> Tensor:
-        """Write a universal function; in-place assignment gives another wire."""
+        """Add a universal function to the graph; an in-place operation gives a new tensor."""
         if method == "__call__" and ufunc is np.arccos:
             return _compute_arccos(self)
         if method != "__call__" or ufunc not in OPERATORS:
@@ -72,11 +72,11 @@ class Tensor(NDArrayOperatorsMixin):
         )
 
     def __array_function__(self, function: Callable, _: object, args: Sequence, kwargs: Mapping[str, Any]) -> Tensor:
-        """Write another function of NumPy."""
+        """Add a function of `FUNCTIONS` to the graph."""
         return FUNCTIONS[function](self.sheet, *args, **kwargs) if function in FUNCTIONS else NotImplemented
 
     def __getitem__(self, key: Any) -> Tensor:
-        """Select along axes, or add axes of length one; the batch axis must be taken whole."""
+        """Select along axes, or insert axes of length one; the batch axis must be selected as a whole."""
         out, axis = self, 0
         for each in key if isinstance(key, tuple) else (key,):
             if each is None:
@@ -90,39 +90,39 @@ class Tensor(NDArrayOperatorsMixin):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the sample."""
+        """Shape of the tensor for the sample loads."""
         return self.sample.shape
 
     @property
     def T(self) -> Tensor:
-        """Wire with its axes reversed."""
+        """Tensor with its axes in reverse order."""
         return self.sheet.add_node("Transpose", self.sample.T, self)
 
     def astype(self, dtype: type) -> Tensor:
-        """Convert to another type."""
+        """Return the tensor converted to another data type."""
         if self.sample.dtype == dtype:
             return self
         return self.sheet.add_node("Cast", self.sample.astype(dtype), self, to=KINDS[np.dtype(dtype)])
 
     def reshape(self, *shape: int) -> Tensor:
-        """Change the shape; the batch axis is -1."""
+        """Return the tensor in another shape; -1 stands for the batch axis."""
         return self.sheet.add_node("Reshape", self.sample.reshape(shape), self, np.array(shape))
 
     def argmin(self, axis: int) -> Tensor:
-        """Return the position of the minimum along an axis (whole numbers)."""
+        """Return the index of the minimum along an axis."""
         return self.sheet.add_node("ArgMin", self.sample.argmin(axis), self, axis=axis, keepdims=0)
 
     def sum(self, axis: int, keepdims: bool = False) -> Tensor:
-        """Sum over an axis."""
+        """Return the sum along an axis."""
         sample = self.sample.sum(axis, keepdims=keepdims)
         return self.sheet.add_node("ReduceSum", sample, self, np.array([axis]), keepdims=int(keepdims))
 
     def min(self, axis: int) -> Tensor:
-        """Return the minimum over an axis."""
+        """Return the minimum along an axis."""
         return self.sheet.add_node("ReduceMin", self.sample.min(axis), self, axes=(axis,), keepdims=0)
 
     def max(self, axis: int) -> Tensor:
-        """Return the maximum over an axis."""
+        """Return the maximum along an axis."""
         return self.sheet.add_node("ReduceMax", self.sample.max(axis), self, axes=(axis,), keepdims=0)
 
 
@@ -130,7 +130,7 @@ Operand = Tensor | np.ndarray | float
 
 
 class Port(NamedTuple):
-    """Input or output: its name, type and shape, and a description."""
+    """Input or output of a graph: name, data type, shape, and description."""
 
     name: str
     dtype: type
@@ -139,7 +139,7 @@ class Port(NamedTuple):
 
 
 class GraphNode(NamedTuple):
-    """Operator, its inputs, its output, and its attributes."""
+    """Node of a graph: ONNX operator, names of its inputs and output, and its attributes."""
 
     operator: str
     inputs: tuple[str, ...]
@@ -148,7 +148,7 @@ class GraphNode(NamedTuple):
 
 
 class GraphBuilder:
-    """Graph under construction. The same operator on the same wires is one node, equal arrays are one constant."""
+    """Graph under construction; equal operators on equal tensors become one node, and equal arrays one constant."""
 
     def __init__(self) -> None:
         self._inputs: list[Port] = []
@@ -158,7 +158,7 @@ class GraphBuilder:
         self._made: dict[object, Tensor] = {}
 
     def add_node(self, operator: str, sample: np.ndarray, *inputs: Tensor | np.ndarray, **attributes: Any) -> Tensor:
-        """Write an ONNX operator on wires and constants; `sample` is its result for the sample loads."""
+        """Add an ONNX operator on tensors and constants; `sample` is its value for the sample loads."""
         names = tuple((each if isinstance(each, Tensor) else self.add_constant(each)).name for each in inputs)
         key = operator, names, tuple(attributes.items())
         if key not in self._made:
@@ -167,13 +167,13 @@ class GraphBuilder:
         return self._made[key]
 
     def to_common_type(self, operands: Sequence[Operand]) -> list[Tensor]:
-        """Convert operands to their common NumPy type: NumPy's operators mix types, those of graphs do not."""
+        """Convert operands to tensors of their common NumPy type, because ONNX operators do not mix types."""
         kind = np.result_type(*map(_sample, operands))
         wires = (each if isinstance(each, Tensor) else self.add_constant(np.asarray(each, kind)) for each in operands)
         return [wire.astype(kind.type) for wire in wires]
 
     def add_constant(self, array: np.ndarray) -> Tensor:
-        """Add a constant of the array's own type; whole numbers in 64 bits."""
+        """Add a constant of the array's type (integers as int64), and return its tensor."""
         array = np.asarray(array, np.int64) if array.dtype.kind in "iu" else array
         key = array.dtype.str, array.shape, array.tobytes()
         if key not in self._made:
@@ -182,22 +182,22 @@ class GraphBuilder:
         return self._made[key]
 
     def add_input(self, name: str, sample: np.ndarray, description: str) -> Any:
-        """Add an input (B, ...) of single precision; formulas compute in double precision."""
+        """Add an input (B, ...) in single precision; return it as a tensor in double precision, for the formulas."""
         self._inputs.append(Port(name, np.float32, ("B", *sample.shape[1:]), description))
         return Tensor(self, name, sample.astype(np.float32)).astype(np.float64)
 
     def add_output(self, wire: Tensor, port: Port) -> None:
-        """Add an output, of the port's type."""
+        """Add a tensor as an output, converted to the port's type."""
         self._nodes.append(GraphNode("Identity", (wire.astype(port.dtype).name,), port.name, {}))
         self._outputs.append(port)
 
     @property
     def constants(self) -> Mapping[str, np.ndarray]:
-        """Constants by name."""
+        """Constant arrays of the graph, by name."""
         return self._constants
 
     def to_json(self) -> dict[str, list]:
-        """Return inputs and outputs by name, and the operators in the order of evaluation, for JSON."""
+        """Return names of inputs and outputs, and all nodes in order of evaluation, as plain types for JSON."""
         nodes = [[node.operator, node.inputs, node.output, _to_plain(node.attributes)] for node in self._nodes]
         return {
             "inputs": [port.name for port in self._inputs],
@@ -206,7 +206,7 @@ class GraphBuilder:
         }
 
     def build_model(self, name: str, description: str, version: str, metadata: Mapping[str, str]) -> ModelProto:
-        """Build the ONNX model; `metadata` are its metadata.
+        """Build the ONNX model of the graph, with `metadata` as its properties.
 
         Raises
         ------
@@ -243,7 +243,7 @@ class GraphBuilder:
 
 
 def _to_plain(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert attributes to those that JSON has."""
+    """Convert node attributes to types that JSON supports."""
     return {name: value if isinstance(value, str | tuple) else int(value) for name, value in attributes.items()}
 
 
@@ -292,11 +292,11 @@ FUNCTIONS: dict[Callable, Callable[..., Tensor]] = {
     np.clip: lambda _, x, least, most: np.minimum(np.maximum(x, least), most),
     np.ones_like: lambda _, x: 0.0 * x + 1.0,
 }
-"""Other functions of NumPy, called with the sheet and their arguments."""
+"""Further NumPy functions that graphs support; each is called with the graph and its arguments."""
 
 
 def _compute_arccos(cosine: Tensor) -> Tensor:
-    """Compute the arc cosine by the half-chord: runtimes have arc functions in single precision only."""
+    """Compute the arc cosine from the half chord, because runtimes have arc functions in single precision only."""
     half = np.sqrt(0.5 * np.maximum(1.0 - np.absolute(cosine), 0.0)).astype(np.float32)
     arc = 2.0 * cosine.sheet.add_node("Asin", np.arcsin(half.sample), half).astype(np.float64)
     return np.where(cosine < 0.0, np.pi - arc, arc)
@@ -304,7 +304,7 @@ def _compute_arccos(cosine: Tensor) -> Tensor:
 
 @compute_squared_distances.register
 def _(points: Tensor, sites: np.ndarray) -> Any:
-    """Compute |x|^2 - 2 x y + |y|^2, in double precision: differences would take the memory of B n f numbers."""
+    """Compute |x|^2 - 2 x y + |y|^2 in double precision, as differences x - y would need memory for B n f numbers."""
     x, y = points.astype(np.float64), sites.astype(np.float64)
     return np.maximum((x * x).sum(axis=1, keepdims=True) - x @ (2.0 * y.T) + (y * y).sum(axis=1), 0.0)
 
@@ -324,5 +324,5 @@ def _(rows: Tensor, table: QuantisedTable, index: np.ndarray) -> Any:
 
 @find_nonzero_columns.register
 def _(rows: Tensor) -> np.ndarray:
-    """Return all columns: zeros are unknown before the graph runs."""
+    """Return all columns, because the zeros are not known before the graph runs."""
     return np.arange(rows.shape[1])

@@ -1,1 +1,1 @@
-"""Regressors, one per file: features in, coefficients out."""
+"""Regressors from features to coefficients, one type per file."""

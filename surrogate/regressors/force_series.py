@@ -1,4 +1,4 @@
-"""Power series in the force: single forces, pairs of forces, and a Gaussian process for the remainder."""
+"""Power series in the force: table of low orders, pairs of nodal forces, and a Gaussian process for the remainder."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,17 +20,17 @@ FACTORS = [np.array(list(combinations_with_replacement(range(3), order))).T for 
 ORDER_COLUMNS = (slice(0, 3), slice(3, 9), slice(9, 19))  # Columns of the products of each order.
 TERM_COUNT = ORDER_COLUMNS[-1].stop  # Number of products of all orders.
 STENCIL_SIZE = 3  # Number of radii of an interpolating parabola.
-HEIGHT_EQUIVALENT = 1e-2  # Height equivalent to a barycentric coordinate of -1 [m].
+HEIGHT_EQUIVALENT = 1e-2  # Height above a triangle that counts like a barycentric coordinate of -1 [m].
 SMALL_FORCE_SHARE = (
     0.4  # Share of the largest training force, below which the remainder is smaller than the table's own errors.
 )
 # Rounding step of the Gaussian process's dual coefficients at the largest force [m]: a third of the file size.
 DUAL_STEP = 2e-6
-FLAT_TOLERANCE = 1e-6  # Smallest spread of places along an axis relative to the largest: a flat cortex has two axes.
+FLAT_TOLERANCE = 1e-6  # Smallest relative spread of positions along a used axis; a flat cortex has two axes.
 
 
 def compute_direction_monomials(direction: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Compute products (B, 19) of the components of directions (B, 3), times force^(order - 1) of forces (B,) [N]."""
+    """Compute monomials (B, 19) of direction components (B, 3), times force^(order - 1) of forces (B,) [N]."""
     columns = [direction[:, FACTORS[0][0]]]
     for order, factors in enumerate(FACTORS[1:], start=1):
         products = direction[:, factors[0]]
@@ -42,21 +42,21 @@ def compute_direction_monomials(direction: np.ndarray, force: np.ndarray) -> np.
 
 @dataclass(eq=False)
 class Series:
-    """Regressor of the response to one newton: first orders of the power series in the force, from a table.
+    """Regressor of the response per newton: the first three orders of the power series in the force, from a table.
 
-    Between tabulated places and radii it interpolates: parabolas on each triangle, and through three radii. In
-    the direction, each order is a homogeneous polynomial, which the table represents exactly.
+    Between tabulated positions and radii it interpolates: quadratically on each triangle, and by parabolas through
+    three radii. In the direction, each order is a homogeneous polynomial, which the table represents exactly.
 
     Parameters
     ----------
     corners
         Vertices (V, 3) [m] of the open cortex.
     triangles
-        (S, 6): three corners, then the midpoints of the opposite edges, as numbers of places.
+        Triangles (S, 6) as indices of positions: three corners, then the midpoints of the opposite edges.
     radii
         Footprint radii (R,) [m], increasing.
     table
-        (places R, 19 r): coefficients of the basis's modes.
+        Coefficients (positions x R, 19 r) of the basis's modes.
     """
 
     corners: np.ndarray
@@ -68,12 +68,12 @@ class Series:
     def quantise_table(
         cls, corners: np.ndarray, triangles: np.ndarray, radii: np.ndarray, table: np.ndarray, step: np.ndarray
     ) -> Self:
-        """Round a table (places, R, 19, r) to the steps of its terms (19,)."""
+        """Build the regressor from a table (positions, R, 19, r), rounded to the steps `step` (19,) of its terms."""
         steps = np.repeat(step, table.shape[-1])
         return cls(corners, triangles, radii, QuantisedTable.quantise(table.reshape(-1, len(steps)), steps))
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict coefficients (B, r) float32 of `compute_tool_features` (B, 8)."""
+        """Predict coefficients (B, r) float32 from features (B, 8) of `compute_tool_features`."""
         return predict_in_chunks(self._compute_prediction, X)
 
     def _compute_prediction(self, X: np.ndarray) -> np.ndarray:
@@ -86,20 +86,20 @@ class Series:
         return (compute_direction_monomials(X[:, 3:6], X[:, 6]).astype(np.float32)[:, None] @ mixed)[:, 0]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return places, radii, and the table: whole numbers of steps, `share`, and the step of each column, `unit`."""
+        """Return corners, triangles, radii, and the table: integers as `share`, step sizes as `unit`."""
         known = {name: getattr(self, name) for name in ("corners", "triangles", "radii")}
         return {**known, "unit": self.table.step, "share": self.table.integers}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """Rebuild from `state`; files of earlier versions have float16 instead of whole numbers, and more axes."""
+        """Rebuild from `state`; older files have float16 instead of integers, and more axes."""
         step = state["unit"].ravel()
         table = QuantisedTable(state["share"].reshape(-1, len(step)), step)
         return cls(state["corners"], state["triangles"], state["radii"], table)
 
     @cached_property
     def _frames(self) -> np.ndarray:
-        """(S, 4, 4): maps (point, 1) to the barycentric coordinates in a triangle and the height over it [m]."""
+        """Maps (S, 4, 4) from (point, 1) to barycentric coordinates in each triangle and height above it [m]."""
         a, b, c = (self.corners[self.triangles[:, corner]] for corner in range(3))
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -110,11 +110,11 @@ class Series:
 
     @cached_property
     def _columns(self) -> np.ndarray:
-        """Frames as one matrix (4, 4 S)."""
+        """The maps `_frames` as one matrix (4, 4 S)."""
         return np.ascontiguousarray(self._frames.transpose(2, 1, 0).reshape(4, -1))
 
     def _locate_places(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find six places (B, 6) of the triangle nearest to each point (B, 3) [m], and their weights (B, 6)."""
+        """Find the positions (B, 6) of the triangle nearest to each point (B, 3) [m], and their weights (B, 6)."""
         local = (point @ self._columns[:3] + self._columns[3]).reshape(-1, 4, len(self.triangles))
         miss = np.absolute(local[:, 3]) - HEIGHT_EQUIVALENT * np.minimum(local[:, :3].min(axis=1), 0.0)
         best = miss.argmin(axis=1)
@@ -125,7 +125,7 @@ class Series:
         return take_rows(best, self.triangles), np.concatenate(share, axis=1)
 
     def _interpolate_radii(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return radii (B, k) and weights (B, k): the parabola through the three radii about each radius (B,) [m]."""
+        """Return indices (B, k) of tabulated radii and parabola weights (B, k) to interpolate at `radius` (B,) [m]."""
         width = min(STENCIL_SIZE, len(self.radii))
         inside = np.clip(radius, self.radii[0], self.radii[-1])
         first = np.clip(np.searchsorted(self.radii, inside) - 2, 0, len(self.radii) - width)
@@ -139,17 +139,17 @@ class Series:
 
 
 class RemainderGp:
-    """Gaussian process of the response's remainder in units of force^3 + faint^3.
+    """Gaussian process of the response that the series does not represent, in units of force^3 + faint^3.
 
-    The first neglected order is in proportion to force^3, so that the rows of strong and weak loads have equal weight.
-    Its features are `compute_tool_features` and force over radius, to which indentation is in proportion.
+    The first neglected order is proportional to force^3, so in these units strong and weak loads have equal weight. The
+    features are `compute_tool_features` and force over radius, to which indentation is proportional.
     """
 
     gp_: Gp
     faint_: np.ndarray
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Fit to `compute_tool_features` X (n, 8) and remainders Y (n, r)."""
+        """Fit to features X (n, 8) of `compute_tool_features` and remainders Y (n, r); return the regressor itself."""
         self.faint_ = np.array(SMALL_FORCE_SHARE * X[:, 6].max())
         self.gp_ = Gp().fit(append_force_ratio(X), Y / self._compute_unit(X))
         strongest = X[[X[:, 6].argmax()]]
@@ -158,48 +158,48 @@ class RemainderGp:
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict coefficients (B, r) float32 of `compute_tool_features` (B, 8)."""
+        """Predict coefficients (B, r) float32 from features (B, 8) of `compute_tool_features`."""
         return (self.gp_.predict(append_force_ratio(X)) * self._compute_unit(X)).astype(np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the Gaussian process's state, and `faint` [N]."""
+        """Return the Gaussian process's state, and the force `faint` [N]."""
         return {**self.gp_.state(), "faint": self.faint_}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """Rebuild the regressor from `state`."""
+        """Rebuild the regressor from the arrays of `state`."""
         model = cls()
         model.faint_ = state["faint"]
         model.gp_ = Gp.restored({name: array for name, array in state.items() if name != "faint"})
         return model
 
     def _compute_unit(self, X: np.ndarray) -> np.ndarray:
-        """Return the units (n, 1) [N^3] of rows."""
+        """Return the unit (n, 1) [N^3] of each row."""
         return X[:, 6:7] ** MAX_ORDER + self.faint_**MAX_ORDER
 
 
 def append_force_ratio(X: np.ndarray) -> np.ndarray:
-    """Append force / radius to the features (n, 8) of `compute_tool_features`: (n, 9)."""
+    """Append force over radius to the features (n, 8) of `compute_tool_features`; return (n, 9)."""
     return np.column_stack([X, X[:, 6] / X[:, 7]])
 
 
 @dataclass(frozen=True, eq=False)
 class ForcePairs:
-    """Regressor of the second-order contribution to the response, from `compute_root_scaled_forces`.
+    """Regressor of the second order of the response, from the features `compute_root_scaled_forces`.
 
     Parameters
     ----------
     pairs
-        (P, 2): two force components, of the nodes of the open cortex.
+        Pairs (P, 2) of indices of force components at the open cortex's nodes.
     table
-        (P, r): coefficients of the basis's modes for each pair's product [1/N^2].
+        Coefficients (P, r) [1/N^2] of the basis's modes for the product of each pair.
     """
 
     pairs: np.ndarray
     table: QuantisedTable
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict coefficients (B, r) float32 of `compute_root_scaled_forces` (B, 3 m)."""
+        """Predict coefficients (B, r) float32 from features (B, 3 m) of `compute_root_scaled_forces`."""
         return predict_in_chunks(self._compute_prediction, X)
 
     def _compute_prediction(self, X: np.ndarray) -> np.ndarray:
@@ -211,26 +211,26 @@ class ForcePairs:
 
     @cached_property
     def _rows(self) -> np.ndarray:
-        """Row (n, n) int32 of each pair of components, or -1."""
+        """Row (n, n) int32 of `table` for each pair of components; -1 if the pair has no row."""
         out = np.full((self.pairs.max(initial=-1) + 1,) * 2, -1, np.int32)
         out[self.pairs[:, 0], self.pairs[:, 1]] = np.arange(len(self.pairs))
         return out
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return pairs, and the table: whole numbers of steps, `share`, and the step of each mode, `unit`."""
+        """Return pairs, and the table: integers as `share`, step sizes as `unit`."""
         return {"pairs": self.pairs.astype(np.int32), "unit": self.table.step, "share": self.table.integers}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """Rebuild from `state`; files of earlier versions have float16 instead of whole numbers."""
+        """Rebuild from `state`; older files have float16 instead of integers."""
         return cls(state["pairs"], QuantisedTable(state["share"], state["unit"]))
 
 
 def interpolate_table(points: np.ndarray, table: np.ndarray, held_out: np.ndarray) -> np.ndarray:
-    """Replace the rows of the `held_out` places of a table by interpolation of the others.
+    """Replace a table's rows at `held_out` positions by interpolation from the other positions; return the table.
 
-    By cubic radial basis functions with a linear polynomial (Duchon 1977, "Splines minimizing rotation-invariant
-    semi-norms"), which reproduce fields that are linear in the place.
+    Cubic radial basis functions with a linear polynomial are used (Duchon 1977, "Splines minimizing rotation-invariant
+    semi-norms"), which reproduce fields that are linear in position.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def interpolate_table(points: np.ndarray, table: np.ndarray, held_out: np.ndarra
     Raises
     ------
     InputError
-        Every place is left out.
+        All positions are held out.
     """
     if not held_out.any():
         return table

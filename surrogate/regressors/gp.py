@@ -1,4 +1,4 @@
-"""Gaussian process from a load to the coefficients of a reduced basis, with its own standard deviation."""
+"""Gaussian process regression from a load's features to the coefficients of a reduced basis."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,39 +15,39 @@ from sim.runtime.threads import limit_to_one_thread
 from ..array_functions import compute_squared_distances
 from .protocol import StoredRegressor, compute_standardisation
 
-LENGTH_BOUNDS = (0.05, 1e3)  # Bounds of the lengths [standard deviations of a feature].
+LENGTH_BOUNDS = (0.05, 1e3)  # Bounds of the length scales [standard deviations of a feature].
 NOISE_BOUNDS = (1e-8, 1.0)  # Bounds of the noise relative to the variance of an output.
-START_LENGTH = 3.0  # Initial length [standard deviations of a feature].
+START_LENGTH = 3.0  # Initial length scale [standard deviations of a feature].
 START_NOISE = 1e-4  # Initial noise relative to the variance of an output.
 
 
 @dataclass(eq=False)
 class Gp(StoredRegressor):
-    """Gaussian process with a Matern 5/2 kernel and a length for each feature; all outputs share lengths and noise.
+    """Gaussian process with a Matern 5/2 kernel and a length scale per feature; outputs share length scales and noise.
 
     Rasmussen, Williams 2006, "Gaussian Processes for Machine Learning", equations 2.25, 2.26, 4.17, 5.9. The
-    hyperparameters maximise the likelihood of at most `likelihood_rows`, of the strongest `likelihood_outputs`. It is
-    conditioned on every row, up to `max_rows`, beyond which a random subset is used.
+    hyperparameters maximise the likelihood of at most `likelihood_rows` rows and the `likelihood_outputs` strongest
+    outputs. The process is conditioned on all rows, or on a random subset of `max_rows` rows.
 
     Parameters
     ----------
     likelihood_rows, max_rows
-        Maximum numbers of rows of the likelihood and of the conditioning; the cost is cubic in them.
+        Maximum numbers of rows in the likelihood and in the conditioning; the cost is cubic in both.
     likelihood_outputs
-        Number of outputs of largest variance in the likelihood, each in units of its own variance.
+        Number of outputs in the likelihood: those of largest variance, each scaled to variance 1.
     seed
-        Seed of the subsets.
+        Seed of the random subset of rows.
     """
 
     kept = ("mean", "deviation", "offset", "length", "noise", "scaled", "dual")
-    """Standardisation, lengths (f,), noise, standardised training rows (n, f), their dual coefficients (n, r)."""
+    """Standardisation, length scales (f,), noise, standardised training rows (n, f), dual coefficients (n, r)."""
     likelihood_rows: int = 600
     max_rows: int = 4000
     likelihood_outputs: int = 20
     seed: int = 0
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Fit to rows X (n, f), Y (n, r)."""
+        """Fit to features X (n, f) and coefficients Y (n, r); return the regressor itself."""
         vars(self).pop("seen_", None)
         order = np.random.default_rng(self.seed).permutation(len(X))[: self.max_rows]
         self.mean_, self.deviation_ = compute_standardisation(X)
@@ -78,7 +78,7 @@ class Gp(StoredRegressor):
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """Rebuild from `state`; files of earlier versions have the rows in lengths, `seen`."""
+        """Rebuild from `state`; older files have rows divided by the length scales, `seen`."""
         known = dict(state)
         if "seen" in known:
             known["scaled"] = known.pop("seen") * known["length"]
@@ -86,26 +86,26 @@ class Gp(StoredRegressor):
 
     @cached_property
     def seen_(self) -> np.ndarray:
-        """Training rows (n, f) in lengths."""
+        """Standardised training rows (n, f), divided by the length scales."""
         return self.scaled_ / self.length_
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict coefficients (B, r) float32 of features (B, f): the mean of the posterior."""
+        """Predict coefficients (B, r) float32 from features (B, f): the posterior mean."""
         x = (X - self.mean_) / (self.deviation_ * self.length_)
         near = compute_matern(np.sqrt(compute_squared_distances(x, self.seen_)))
         return (near @ self.dual_ + self.offset_).astype(np.float32)
 
 
 def compute_matern(distance: np.ndarray) -> np.ndarray:
-    """Compute (1 + s + s^2/3) exp(-s), s = sqrt(5) distance: equation 4.17."""
+    """Compute the kernel (1 + s + s^2/3) exp(-s) with s = sqrt(5) distance (equation 4.17)."""
     s = np.sqrt(5.0) * distance
     return (1.0 + s + s * s / 3.0) * np.exp(-s)
 
 
 def compute_negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
-    """Compute minus the log marginal likelihood of x (n, f), y (n, r), up to a constant, and its gradient (f + 1,).
+    """Compute the negative log marginal likelihood of x (n, f), y (n, r), up to a constant, and its gradient (f + 1,).
 
-    `log` (f + 1,) holds the logarithms of the lengths and of the noise. Each output's variance is the most likely one,
+    `log` (f + 1,) has the logarithms of the length scales and of the noise. Each output has its most likely variance,
     y^T K^-1 y / n, so that all outputs share one K.
     """
     count, outputs = y.shape
@@ -118,7 +118,7 @@ def compute_negative_likelihood(log: np.ndarray, x: np.ndarray, y: np.ndarray) -
     dual = cho_solve(factor, y, check_finite=False)
     misfit = np.einsum("nr,nr->r", y, dual)
     value = 0.5 * count * np.log(misfit / count).sum() + outputs * np.log(np.diagonal(factor[0])).sum()
-    # Derivative by K; derivatives by hyperparameters are traces of its product with dK (equation 5.9).
+    # Derivative by K. Derivatives by hyperparameters are traces of its products with dK (equation 5.9).
     (inverted,) = get_lapack_funcs(("potri",), factor[:1])
     lower, _ = inverted(factor[0], lower=True)
     slope = outputs * (np.tril(lower) + np.tril(lower, -1).T)

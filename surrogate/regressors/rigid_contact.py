@@ -1,13 +1,13 @@
 """Contact of a rigid tool with linear tissue: a model for known tool poses that needs almost no training.
 
-The body is condensed to the nodes that a tool may touch: u = C f, C their compliance, undeformed. Of all frictionless
-forces that keep the tool out of every facet, the solution has the least energy f.Cf / 2 (Signorini's problem). A tool
-is all points within a radius of a point, a line or a rectangle, and enters a flat facet first at the facet's nearest
-point. So each entered facet adds a constraint, until no facet is entered (the exchange method: Hettich, Kortanek 1993,
-"Semi-infinite programming", SIAM Rev. 35:380-429). They are linearised at the points' present positions: a distance
-from a convex set is convex, so that a solution of the linear constraints satisfies all. The multipliers are a
-nonnegative least-squares problem (Lawson, Hanson 1974, "Solving Least Squares Problems", chapter 23). Stiffness
-cancels: the tissue's stiffness need not be known.
+The body is condensed to the nodes that a tool may touch: u = C f, with the compliance C of the undeformed body. Of all
+frictionless forces that keep the tool out of every facet, the solution has the least energy f.Cf / 2 (Signorini's
+problem). A tool consists of all points within a radius of a point, a line or a rectangle. It penetrates a flat facet
+first at the facet's nearest point, so each penetrated facet adds a constraint, until none is penetrated (the exchange
+method: Hettich, Kortanek 1993, "Semi-infinite programming", SIAM Rev. 35:380-429). Constraints are linearised at the
+points' present positions. The distance from a convex set is convex, so a solution of the linear constraints satisfies
+all. The multipliers solve a nonnegative least-squares problem (Lawson, Hanson 1974, "Solving Least Squares Problems",
+chapter 23). The tissue's stiffness cancels out and need not be known.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ ROD_FEATURES = 17  # Number of features of a rod or a blade.
 class ContactSearchSettings:
     """Settings of the search for contact points in `RigidContact`."""
 
-    candidate_distance: float = 1.5  # Distance from a tool's core within which facets are contact candidates [radii].
+    candidate_distance: float = 1.5  # Distance from the tool's core up to which facets are contact candidates [radii].
     ball_tolerance: float = 1e-6  # Penetration tolerance of a ball [m].
     rod_tolerance: float = 1e-5  # Penetration tolerance of a rod or a blade [m].
-    min_search_motion: float = 3.0  # Smallest motion that continues the contact search [tolerances].
+    min_search_motion: float = 3.0  # Smallest nodal motion that continues the contact search [tolerances].
     max_iterations: int = 60  # Maximum number of iterations of the contact search.
-    path_step: float = 0.5  # Step of a rod or a blade on its path [radii], so that tissue stays before it.
+    path_step: float = 0.5  # Step of a rod or a blade on its path [radii], so that tissue stays in front of it.
     # Number of iterations at intermediate steps: more change the result by less than its error, in twice the time.
     path_iterations: int = 3
-    # Number of iterations after which constraints without force stay, so that there are no cycles. Until then they are
+    # Number of iterations after which constraints without force are kept, to prevent cycles. Until then they are
     # dropped, which is faster.
     dropping_iterations: int = 15
-    # Compliance of a point relative to the nodes' mean, below which it counts as bone, which the tool enters: no force,
-    # or an unbounded one, would keep it out.
+    # Compliance of a point, relative to the nodes' mean, below which it is bone. A tool may enter bone, as no force,
+    # or an unbounded one, would prevent that.
     min_compliance: float = 0.02
     max_exchanges: int = 10  # Maximum number of exchanges of the active set.
     inactive_tolerance: float = 1e-8  # Penetration of an inactive point that is tolerated [m].
@@ -67,31 +67,31 @@ SEARCH = ContactSearchSettings()
 
 @dataclass(eq=False)
 class RigidContact:
-    """Regressor of the response to one metre of indentation.
+    """Regressor of the response to an indentation, per metre of depth.
 
-    Its input is `compute_tool_features` of a ball, or `compute_core_features` of a rod or a blade, optionally followed
-    by `held` of the previous pose of the rod or blade: the search then starts there, which takes a fraction of the
-    time.
+    Its input is `compute_tool_features` of a ball, or `compute_core_features` of a rod or a blade. The latter may be
+    followed by `compute_warm_start` of the previous pose: the search then starts from that contact, which takes a
+    fraction of the time.
 
-    The nonlinear contribution far from the tool is nearly a factor on the force that is linear in depth over radius:
-    only this line is fitted. For relaxing tissue there is another line, in proportion to the relaxed share.
+    Far from the tool, nonlinearity acts nearly as a factor on the force. This factor is a line in depth over radius,
+    which is fitted. For relaxing tissue a second line is added, in proportion to the relaxed share.
 
     Parameters
     ----------
     points
         Positions (k, 3) [m] of the nodes that a tool may touch.
     triangles
-        Triangles (S, 3) of positions in `points`.
+        Triangles (S, 3) as indices into `points`.
     compliance
         Compliance matrix (3 k, 3 k) [m/N] float32.
     answers
-        (3 k, r) [1/N] float32: coefficients of the basis's modes by unit forces.
+        Coefficients (3 k, r) [1/N] float32 of the basis's modes for unit forces on the nodes.
     line
-        (2, r): value at depth 0, and slope per radius of depth. (4, r): then the change of both at full relaxation.
+        Factor (2, r): value at depth 0, and slope per depth / radius; (4, r): then the change of both on relaxation.
     grip
-        (2,) or (4,): the same factor of the force that the tool exerts; (0,) if not fitted.
+        Factor (2,) or (4,) on the tool's force, as `line`; (0,) if not fitted.
     core
-        (4,) [m]: half sizes of a rod's or blade's core, and its radius. (0,): a ball, its radius a feature.
+        Half sizes of a rod's or blade's core, and its radius (4,) [m]; (0,) for a ball, whose radius is a feature.
     """
 
     points: np.ndarray
@@ -101,43 +101,43 @@ class RigidContact:
     line: np.ndarray
     grip: np.ndarray = field(default_factory=lambda: np.zeros(0))
     core: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    # Last features and their result: motion and reaction of one load share one search.
+    # Last features and their contact, so that motion and reaction of a load need only one search.
     _last: tuple[bytes, np.ndarray] = field(default=(b"", np.zeros(0)), init=False, repr=False)
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict coefficients (B, r) float32 of features (B, f), whose force is depth [m]."""
+        """Predict coefficients (B, r) float32 from features (B, f), which contain a depth [m] instead of a force."""
         found = self.compute_linear(X)
         return (found * (self._compute_terms(X)[:, : len(self.line)] @ self.line)).astype(np.float32)
 
     def compute_linear(self, X: np.ndarray) -> np.ndarray:
-        """Compute the coefficients (B, r) for linear tissue."""
+        """Compute the coefficients (B, r) for linear tissue, per metre of depth."""
         force = self.compute_nodal_forces(X).astype(np.float32)
         return force @ self.answers / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
 
     def predict_force(self, X: np.ndarray) -> np.ndarray:
-        """Predict the force (B, 3) [N/m] that the tool exerts, per metre of depth; `grip` must have been fitted."""
+        """Predict the tool's force (B, 3) [N/m] on the tissue per metre of depth; requires a fitted `grip`."""
         return self._compute_resultant(X) * (self._compute_terms(X) @ self.grip)[:, None]
 
     @property
     def warm_start_width(self) -> int:
-        """Number of columns of `held`."""
+        """Number of columns of `compute_warm_start`."""
         return self._width + len(self.compliance) + 4 * MAX_STORED_POINTS
 
     def compute_warm_start(self, X: np.ndarray) -> np.ndarray:
-        """Return poses of rods or blades, forces and contact points (B, h): a warm start for the next pose."""
+        """Return a warm start (B, h) for the next pose: features, nodal forces and contact points."""
         return np.hstack([X[:, : self._width], self._find_contact(X)])
 
     def get_warm_start_force(self, warm_start: np.ndarray) -> np.ndarray:
-        """Extract the forces (B, 3 k) [N] from rows of `warm_start`."""
+        """Return the nodal forces (B, 3 k) [N] in the rows of `warm_start`."""
         return warm_start[:, self._width : self._width + len(self.compliance)]
 
     def _compute_terms(self, X: np.ndarray) -> np.ndarray:
-        """Compute the terms of lines (B, 2), or for relaxing tissue (B, 4)."""
+        """Compute the terms (B, 2) of the factor's line: 1 and depth / radius; (B, 4) for relaxing tissue."""
         depth, relaxed = np.column_stack([np.ones(len(X)), X[:, 6] / X[:, 7]]), self._split_features(X)[1]
         return np.hstack([depth, relaxed * depth]) if relaxed.shape[1] else depth
 
     def _split_features(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Split features: pose of the tool, relaxed share, and `held`; the last two may be empty."""
+        """Split features into tool pose, relaxed share and warm start; the last two may have no columns."""
         more = X[:, self._width :]
         relaxed, held = np.split(more, [more.shape[1] % self.warm_start_width], axis=1)
         return X[:, : self._width], relaxed, held
@@ -153,11 +153,11 @@ class RigidContact:
         return whole / np.maximum(X[:, 6:7], np.finfo(np.float32).tiny)
 
     def compute_nodal_forces(self, X: np.ndarray) -> np.ndarray:
-        """Compute the tool's forces (B, 3 k) [N] on linear tissue at the nodes that it may touch."""
+        """Compute the tool's nodal forces (B, 3 k) [N] on linear tissue."""
         return self._find_contact(X)[:, : len(self.compliance)]
 
     def _find_contact(self, X: np.ndarray) -> np.ndarray:
-        """Compute forces (B, 3 k) [N], then triangles and barycentric coordinates (4,) of the contact points, or -1."""
+        """Compute nodal forces (B, 3 k) [N], then contact points: triangle, barycentric coordinates; -1 if none."""
         stands, _, held = self._split_features(X)
         X = np.ascontiguousarray(np.hstack([stands, held]))
         asked, (known, found) = X.tobytes(), self._last
@@ -174,9 +174,9 @@ class RigidContact:
     def fit_lines(
         self, X: np.ndarray, Y: np.ndarray, column_groups: np.ndarray, tool_force: np.ndarray | None = None
     ) -> Self:
-        """Fit the lines to coefficients Y (B, r); `column_groups` (r,) numbers the columns that share one.
+        """Fit the lines to coefficients Y (B, r); columns with the same number in `column_groups` (r,) share a line.
 
-        `tool_force` (B, 3) [N/m] is the tool's force per metre of depth, if available.
+        `tool_force` (B, 3) [N/m] is the tool's force per metre of depth; None: `grip` is not changed.
         """
         found, terms = self.compute_linear(X), self._compute_terms(X)
         line = np.zeros((terms.shape[1], found.shape[1]))
@@ -187,24 +187,24 @@ class RigidContact:
         return replace(self, line=line, grip=grip)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return all fields."""
+        """Return all fields as arrays by name."""
         return {item.name: getattr(self, item.name) for item in fields(self) if item.init}
 
     @classmethod
     def restored(cls, state: Mapping[str, np.ndarray]) -> Self:
-        """Rebuild the regressor from `state`."""
+        """Rebuild the regressor from the arrays of `state`."""
         return cls(**state)
 
     @cached_property
     def _rounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres (S, 3) and radii (S,) [m] of the triangles' bounding balls."""
+        """Centres (S, 3) [m] and radii (S,) [m] of the triangles' bounding balls."""
         return compute_bounding_balls(self.points[self.triangles])
 
     def _compute_path(self, x: np.ndarray) -> tuple[list[PlacedBox], float, np.ndarray | None]:
-        """Compute the tool's path for a row of features, its radius [m], and a row of `_find_contact`, or None.
+        """Compute a tool's path for a row of features; return the path, the contact radius [m] and the start's contact.
 
-        The path starts at the previous pose, if that is nearer than the first contact; then the row is the result
-        there. Else it starts at the first step of the approach.
+        If the previous pose is nearer than the first contact, the path starts there, and the start's contact is its row
+        of `_find_contact`. Else the path starts at the first step of the approach, and the start's contact is None.
         """
         # Warp is imported only for pressing tools, not for reading a model.
         from sim.discretisation.nearest_points import PlacedBox
@@ -231,9 +231,9 @@ class RigidContact:
         return PlacedBox(x[8:11], axes, self.core[:3])
 
     def _solve_contact(self, stations: list[PlacedBox], radius: float, begun: np.ndarray | None) -> np.ndarray:
-        """Solve the contact of a tool of a radius [m] at the last station of its path: a row of `_find_contact`.
+        """Solve the contact of a tool of `radius` [m] at the last station of its path; return a row of `_find_contact`.
 
-        begun is the result at the first station; None: no contact before.
+        `begun` is the contact at the first station; None: the path starts without contact.
         """
         from sim.discretisation.nearest_points import NearestSearch
 
@@ -282,7 +282,7 @@ class RigidContact:
     def _select_facets(
         self, stations: list[PlacedBox], radius: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Select facets (S,) within reach of a tool; return their nodes (n,), positions (S, 3), compliance rows."""
+        """Select facets (S,) within a tool's reach; return facets, nodes (n,), node indices (S, 3), compliance rows."""
         around, wide = self._rounds
         reach = SEARCH.candidate_distance * radius
         far = wide + reach + np.linalg.norm(stations[0].half_sizes)
@@ -295,18 +295,18 @@ class RigidContact:
 
 
 def _fit_line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Fit the factor (k,), a sum of terms (B, k), of rows `found` (B, r) to `wanted` (B, r) by least squares."""
+    """Fit coefficients (k,) of terms (B, k) whose sum is the factor that scales `found` (B, r) to `wanted` (B, r)."""
     factor = np.einsum("br,br->b", found, wanted) / np.square(found).sum(axis=1)
     return np.linalg.lstsq(terms, factor, rcond=None)[0]
 
 
 def _compute_bearing_forces(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Compute least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m], gain semi-definite.
+    """Compute the least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m]; gain is semi-definite.
 
-    Block pivoting: most points stay active. Those with tension are released, and released ones that are penetrated
-    become active again, until neither remains. If this does not end soon, a nonnegative least-squares problem is
-    solved. (Portugal, Judice, Vicente 1994, "A comparison of block pivoting and interior-point algorithms for linear
-    least squares problems with nonnegative variables", Math. Comput. 63:625-643.)
+    Block pivoting: most points remain active. Points with tension are released, and released points that are penetrated
+    become active again, until there are neither. If this takes too long, a nonnegative least-squares problem is solved.
+    (Portugal, Judice, Vicente 1994, "A comparison of block pivoting and interior-point algorithms for linear least
+    squares problems with nonnegative variables", Math. Comput. 63:625-643.)
     """
     count = len(gain)
     if not count:

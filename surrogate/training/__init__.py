@@ -1,1 +1,1 @@
-"""Training of models from a data set."""
+"""Training of models from a data set, with their scores and bounds."""

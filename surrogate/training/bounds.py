@@ -1,4 +1,4 @@
-"""Errors of a model against the finite elements, and bounds that are calibrated by loads that no fit has seen."""
+"""Errors of a model relative to FEM, and bounds calibrated on loads that were not used to fit the model."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ from ..model.training_range import Excess, LoadMeasures, measure_loads
 from .examples import Examples
 from .expansion import Expansion
 
-SCALE_STRIDE = 3  # One in this many calibration loads fits the scale of a bound; the others fit its quantiles.
-MIN_SCALE_LOADS = BoundSettings.loads_per_class  # Number of calibration loads below which all fit the quantiles.
+SCALE_STRIDE = 3  # One in this many calibration loads fits a bound's scale; the others give its quantiles.
+MIN_SCALE_LOADS = BoundSettings.loads_per_class  # Number of calibration loads below which all give the quantiles.
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceDistances:
-    """Loads, and the FEM distances (B,) [m] from tip to tumour under them."""
+    """Loads, and the distances (B,) [m] from tip to tumour under these loads, computed by FEM."""
 
     loads: Loads
     distance: np.ndarray
 
     def select(self, index: np.ndarray | slice) -> ReferenceDistances:
-        """Select loads by numbers, a slice, or (B,) bool."""
+        """Select load cases by indices, a slice, or a mask (B,)."""
         return ReferenceDistances(self.loads.select(index), self.distance[index])
 
 
 def compute_distance_errors(model: Learned, reference: ReferenceDistances) -> np.ndarray:
-    """Compute absolute errors (B,) [m] of a model's distances relative to FEM."""
+    """Compute the absolute errors (B,) [m] of a model's tip-tumour distances relative to FEM."""
     return np.abs(model.predict_distance(reference.loads).distance - reference.distance)
 
 
 def add_distance_correction(model: Learned, patch: Patch, reference: ReferenceDistances) -> Learned:
-    """Add a correction of distances to a model, trained on its training loads or some of them."""
+    """Return the model with a distance correction, fitted to at most `MAX_CONDITIONING_LOADS` of its training loads."""
     plain, stride = replace(model, tip=TipModel()), -(-len(reference.loads) // MAX_CONDITIONING_LOADS)
     some = reference.select(slice(None, None, stride))
     off = some.distance - plain.predict_distance(some.loads).distance
@@ -57,7 +57,7 @@ def add_distance_correction(model: Learned, patch: Patch, reference: ReferenceDi
 def improve_distances(
     model: Learned, patch: Patch, training: ReferenceDistances, held_out: ReferenceDistances
 ) -> tuple[Learned, np.ndarray]:
-    """Add a correction if it reduces the mean error of held-out distances; return the model and errors (B,) [m]."""
+    """Add a distance correction if it reduces the mean held-out error; return the model and those errors (B,) [m]."""
     candidates = [replace(model, tip=TipModel()), add_distance_correction(model, patch, training)]
     error = [compute_distance_errors(each, held_out) for each in candidates]
     best = int(error[1].mean() < error[0].mean())
@@ -65,8 +65,8 @@ def improve_distances(
 
 
 TUMOUR_FIT = BoundSettings()  # Settings of the bound of the tumour.
-# Settings of the bound of the tip distance. The tip sometimes snaps through with the cortex, so that the tail of its
-# errors grows with the force: classes are as small as a 99 % bound allows, and the scale's logarithm is linear.
+# Settings of the bound of the tip distance. The cortex under the tip sometimes snaps through, so that the tail of the
+# errors grows with force: classes are as small as a 99 % bound allows, and the scale's logarithm is linear.
 TIP_FIT = BoundSettings(loads_per_class=100, allow_quadratic=False)
 FORCE_FIT = BoundSettings()  # Settings of the bound of the force of a tool moved by pose.
 BOUND_FITS = {"tumour": TUMOUR_FIT, "tip": TIP_FIT, "force": FORCE_FIT}  # Settings of all bounds, by name.
@@ -74,16 +74,16 @@ BOUND_FITS = {"tumour": TUMOUR_FIT, "tip": TIP_FIT, "force": FORCE_FIT}  # Setti
 
 @dataclass(frozen=True, eq=False)
 class BoundExamples:
-    """Errors of a model on loads that none of its fits has used.
+    """Errors of a model on loads that were not used to fit the model.
 
     Parameters
     ----------
     pushes, measures, excess
-        B loads, and their position relative to the model's training range.
+        B loads, their measures, and their excess over the model's training range.
     features
-        Features (B, f) of the scale of its bounds.
+        Features (B, f) on which the scale of bounds depends.
     error
-        (B,) [m]: maximum over the tumour's vertices, or of the distance; [N]: of the tool's force.
+        Errors (B,): of the distance or the maximum over the tumour's vertices [m], or of the tool's force [N].
     """
 
     pushes: Pushed
@@ -93,7 +93,7 @@ class BoundExamples:
     error: np.ndarray
 
     def select(self, index: np.ndarray) -> BoundExamples:
-        """Select loads by number or (B,) bool."""
+        """Select loads by indices or by a mask (B,)."""
         known, outside = (
             LoadMeasures(*(each[index] for each in self.measures)),
             Excess(*(each[index] for each in self.excess)),
@@ -107,12 +107,12 @@ class BoundExamples:
 
     @property
     def force(self) -> np.ndarray:
-        """(B,) [N]: force magnitudes."""
+        """Force magnitudes (B,) [N], or depths [m] for poses."""
         return self.measures.magnitude
 
 
 def collect_bound_examples(model: Learned, patch: Patch, pushes: Pushed, error: np.ndarray) -> BoundExamples:
-    """Combine errors (B,) [m] of a model with its input loads."""
+    """Combine a model's errors (B,) on loads with the measures and features that bounds depend on."""
     known, envelope = measure_loads(patch, pushes), model.envelope
     features = compute_scale_features(pushes, envelope.clip_to_range(known))
     return BoundExamples(pushes, known, envelope.compute_excess(pushes, known), features, error)
@@ -121,11 +121,11 @@ def collect_bound_examples(model: Learned, patch: Patch, pushes: Pushed, error: 
 def calibrate_bound(
     near: BoundExamples, settings: BoundSettings, growth: float, examples: BoundExamples | None = None
 ) -> Bound:
-    """Calibrate a bound on loads `near` the training loads, with a `growth` [1/m] by distance from these.
+    """Calibrate a bound on loads `near` the training loads; it grows by `growth` [1/m] with the distance from them.
 
-    One in `SCALE_STRIDE` of these loads fits its scale, and the others its quantiles: they have the distribution of the
-    guarantee. With fewer than `MIN_SCALE_LOADS` loads all calibrate, and its scale follows the errors of `examples`, if
-    given.
+    One in `SCALE_STRIDE` of these loads fits the bound's scale. The others, to whose distribution the guarantee
+    applies, give its quantiles. With fewer than `MIN_SCALE_LOADS` loads and given `examples`, all loads give the
+    quantiles, and `examples` fit the scale.
     """
     if examples is None or len(near.error) >= MIN_SCALE_LOADS:
         fits = _select_scale_loads(near)
@@ -137,14 +137,14 @@ def calibrate_bound(
 
 
 def compute_growth(near: BoundExamples, far: BoundExamples, settings: BoundSettings) -> float:
-    """Compute the growth [1/m] with which a bound has equal coverage `far` from training loads and near them."""
+    """Compute the growth [1/m] with which a bound has equal coverage on loads `far` from and `near` training loads."""
     return fit_growth(*_compute_relative_errors(near, far, settings))
 
 
 def compute_held_out_bounds(
     model: Learned, near: BoundExamples, far: BoundExamples, split: DiscSplit, settings: BoundSettings
 ) -> np.ndarray:
-    """Compute bounds (2, B) [m] of loads on held-out discs, each with the growth estimated from the other discs."""
+    """Compute bounds (2, B) [m] of loads on held-out discs; the other discs determine the growth for each disc."""
     known, (ratio, away) = _compute_relative_errors(near, far, settings)
     disc, bound = split.disc_index[split.test_mask], np.empty((2, len(far.error)))
     for each in np.unique(disc):
@@ -156,14 +156,14 @@ def compute_held_out_bounds(
 
 
 def measure_bound_coverage(bound: np.ndarray, examples: BoundExamples) -> Coverage:
-    """Compute the empirical coverage of bounds (2, B) [m]."""
+    """Compute the empirical coverage of the examples' errors by bounds (2, B) of the same unit."""
     return measure_coverage(examples.force, examples.error, bound, int(examples.extrapolated.sum()))
 
 
 def _compute_relative_errors(
     near: BoundExamples, far: BoundExamples, way: BoundSettings
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Compute errors over a bound without growth, and distances [m] from training loads: calibration loads, `far`."""
+    """Return errors over a bound without growth, and distances [m] from training loads, for `near` and `far`."""
     plain = calibrate_bound(near, way, 0.0)
     return [
         (each.error / plain.evaluate(each.features, each.force, each.excess.zero)[0], each.excess.distance)
@@ -172,15 +172,15 @@ def _compute_relative_errors(
 
 
 def _select_scale_loads(near: BoundExamples) -> np.ndarray:
-    """Select the loads that fit the scale: (B,) bool."""
+    """Return the mask (B,) of the loads that fit a bound's scale."""
     return np.arange(len(near.error)) % SCALE_STRIDE == 0
 
 
 @dataclass(frozen=True, eq=False)
 class ModelErrors:
-    """Errors of a model on B loads: maximum vertex error of the tumour, of the tip-tumour distance, of the force.
+    """Errors of a model on B loads: maximum over the tumour's vertices, tip-tumour distance, and tool force.
 
-    The force is that of a tool moved by pose; None if not available.
+    `force` is the error of the force of a tool moved by pose; None if not available.
     """
 
     tumour: BoundExamples
@@ -188,23 +188,23 @@ class ModelErrors:
     force: BoundExamples | None = None
 
     def list_available(self) -> dict[str, BoundExamples]:
-        """Return the available errors, by the names of `BOUND_FITS`."""
+        """Return the available errors by name, with the keys of `BOUND_FITS`."""
         found = {"tumour": self.tumour, "tip": self.tip}
         return found if self.force is None else {**found, "force": self.force}
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingSolutions:
-    """FEM results for the B converged loads of a data set.
+    """FEM results for the B converged load cases of a data set.
 
     Parameters
     ----------
     loads, pushes
-        Loads as in the data set, and as input of a model.
+        Loads as in the data set, and converted to a model's input.
     patch, nodes
-        Open cortex, and the tumour's vertices (n,).
+        Open cortex, and mesh vertices (n,) of the tumour.
     tumour, cortex
-        Displacements (B, n, 3) and (B, c, 3) [m].
+        Displacements of the tumour (B, n, 3) and of the remaining open cortex (B, c, 3) [m].
     distances
         Distances from tip to tumour.
     force
@@ -221,18 +221,18 @@ class TrainingSolutions:
     force: np.ndarray | None
 
     def select_examples(self, rows: np.ndarray) -> Examples:
-        """Select rows (B,) bool as examples, to fit models on."""
+        """Select rows by a mask (B,), as examples to fit models to."""
         force = None if self.force is None else self.force[rows]
         return Examples(select_cases(self.pushes, rows), self.tumour[rows], self.cortex[rows], force)
 
     def compute_vertex_errors(self, model: Learned, rows: np.ndarray) -> np.ndarray:
-        """Compute errors (k, n) [m] of a model at the tumour's vertices, on selected rows (B,) bool."""
+        """Compute a model's errors (k, n) [m] at the tumour's vertices, for the rows of a mask (B,)."""
         return compute_point_errors(model, self.loads.select(np.flatnonzero(rows)), self.tumour[rows], self.nodes)
 
     def compute_errors(
         self, model: Learned, rows: np.ndarray, tumour: np.ndarray | None = None, tip: np.ndarray | None = None
     ) -> ModelErrors:
-        """Compute a model's errors on rows (B,) bool; those at the tumour or of the tip (k,) [m] may be given."""
+        """Compute a model's errors on the rows of a mask (B,); `tumour` and `tip` (k,) [m] are used if given."""
         asked = select_cases(self.pushes, rows)
 
         def of(error: np.ndarray) -> BoundExamples:
@@ -251,7 +251,7 @@ def read_solutions(data: Dataset, expansion: Expansion) -> TrainingSolutions:
     Raises
     ------
     InputError
-        Unit responses that did not converge; an anatomy without tumour; loads other than `Pushed`, or the `Touching` of
+        Unit responses did not converge, the anatomy has no tumour, or the loads are neither `Pushed` nor `Touching` of
         one tool.
     """
     if not data.unit_good.all():
@@ -273,7 +273,7 @@ def read_solutions(data: Dataset, expansion: Expansion) -> TrainingSolutions:
 
 
 def _convert_loads(data: Dataset, loads: Loads, patch: Patch) -> Pushed:
-    """Convert loads of a data set to a model's input, like `Learned.to_input`."""
+    """Convert a data set's loads to a model's input, as `Learned.to_input` does."""
     if data.tool is not None:
         pushed, series = to_indentation(loads, data.tool, patch), read_prony_series(data.provenance)
         if not series:

@@ -1,4 +1,4 @@
-"""Inputs computed from the FEM of a data set without training: compliance, power series, contact."""
+"""Quantities computed by the FEM of a data set, without training: compliance, power series and contact."""
 
 from __future__ import annotations
 
@@ -40,54 +40,54 @@ from .examples import Examples, compute_residual_responses
 from .fem_tables import add_edge_midpoints, choose_radii, condense_contact, find_disc_nodes, join_bases, tabulate_series
 
 COARSE_BASIS = (1e-3, 60)  # Truncation tolerance and maximum number of modes of a model's basis.
-# Truncation tolerance and maximum number of modes of the series beyond the exact orders, 2 % of the motion.
+# Truncation tolerance and maximum number of modes of the series beyond the exact orders, which are 2 % of the motion.
 ADDED_BASIS = (5e-3, 160)
-# Models that use the contact on linear tissue; the second is trained on its residual.
+# Models with the contact on linear tissue; the second also has a part trained on the residual.
 CONTACT_MODELS = ("contact", "contact-gp")
-SERIES_MODELS = ("series", "series-gp")  # Models that use the power series; the second is trained on its residual.
+SERIES_MODELS = ("series", "series-gp")  # Models with the power series; the second also fits its residual.
 
 
 @dataclass(frozen=True)
 class ExpansionSettings:
-    """Settings of an `Expansion`."""
+    """Accuracy settings of an `Expansion`."""
 
     table_tolerance: float = 1e-4  # Truncation tolerance of the compliance matrix.
-    second_order_tolerance: float = 3e-3  # Truncation tolerance of the second order's modes: 0.1 % of the motion.
+    second_order_tolerance: float = 3e-3  # Truncation tolerance of the second order's modes, 0.1 % of the motion.
     # Truncation tolerance and maximum number of modes of the series' table.
     wide_basis: tuple[float, int] = (1e-5, 192)
-    table_places: int = 40  # Number of places, far apart, that span the series' table.
+    table_places: int = 40  # Number of distant positions whose series span the bases of the table.
     # Rounding of the second order's table relative to its largest entry. On the template this and `series_step` move
     # the tumour's worst vertex by at most 0.01 mm in 95 % of loads, a ninth of the model's error.
     pair_step: float = 1e-3
-    series_step: float = 2e-3  # Rounding of the series' tables relative to their largest motion at the largest force.
-    strip_size: int = 1536  # Number of motion components that are read at once: limits memory.
+    series_step: float = 2e-3  # Rounding of the series' tables, relative to the largest motion at the largest force.
+    strip_size: int = 1536  # Number of motion components computed at once, to limit memory.
 
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """Compliance, power series and contact from the FEM of a data set; computed on first use.
+    """Compliance, power series and contact from the FEM of a data set; each is computed on first use.
 
-    It does not depend on the data's results. The series is tabulated in wide bases, spanned by its own values at a few
-    places, so that the table's size does not depend on the size of tumour and cortex.
+    An expansion does not depend on the data's results. The series is tabulated in wide bases, spanned by the series at
+    a few positions, so that the table's size does not depend on the size of tumour and cortex.
 
     Parameters
     ----------
     data
-        Data set with anatomy, tissue and element; its loads give the widths of tools.
+        Data set with anatomy, tissue and element; its loads give the range of tool radii.
     device
         Device of the FEM.
     progress
-        Receives the number of places done and their total.
+        Receives the number of tabulated positions and their total.
     table_path
-        File of the series' table, read if it exists, else written; the caller ensures that it belongs to these data.
+        File of the series' table, read if it exists, else written; the caller ensures that it belongs to this data set.
     max_pairs
-        Maximum number of pairs of force components for the second order: this many take minutes, and 60 MB of a model.
+        Maximum number of pairs of force components in the second order; 150,000 take minutes, and 60 MB in a file.
     batch
-        Maximum number of load cases solved together; None: as many as fit now, on a GPU that no other process uses.
+        Maximum number of load cases solved together; None: as many as fit on a GPU that no other process uses.
     journal_path
-        Journal of the table's rows while it is computed, so that an interrupted run resumes; the caller removes it.
+        Journal of finished table rows, so that an interrupted run resumes; the caller deletes this file.
     settings
-        Accuracy of tables and bases; a file that is `table_path` must have been written with the same.
+        Accuracy of tables and bases; an existing file `table_path` must have been written with the same settings.
     """
 
     data: Dataset
@@ -101,27 +101,27 @@ class Expansion:
 
     @cached_property
     def patch(self) -> Patch:
-        """Open cortex."""
+        """Open cortex of the anatomy."""
         return open_patch(self.data.anatomy)
 
     @cached_property
     def tumour(self) -> np.ndarray:
-        """Vertices of the tumour."""
+        """Mesh vertices of the tumour."""
         return self.data.anatomy.tumour_nodes
 
     @cached_property
     def cortex(self) -> np.ndarray:
-        """Vertices of the open cortex that are not the tumour's."""
+        """Mesh vertices of the open cortex without those of the tumour."""
         return np.setdiff1d(self.patch.nodes, self.tumour)
 
     @cached_property
     def positions(self) -> np.ndarray:
-        """Places (P, 3) [m] of the series' table: nodes of the open cortex, and midpoints of its edges."""
+        """Positions (P, 3) [m] of the series' table: nodes of the open cortex and midpoints of its edges."""
         return add_edge_midpoints(self.patch)[1]
 
     @cached_property
     def compliance_parts(self) -> tuple[ModelPart, ...]:
-        """Compliance of the tumour, and of the cortex if there is more: exact at every node of the open cortex.
+        """Compliance of the tumour and of the cortex (if it has vertices), exact for forces at open-cortex nodes.
 
         The number of modes follows from `ExpansionSettings.table_tolerance`.
         """
@@ -129,12 +129,12 @@ class Expansion:
 
     @cached_property
     def second_order_part(self) -> ModelPart:
-        """Second order of the tumour: exact for forces at any nodes of the open cortex.
+        """Second order of the tumour's response, exact for forces at all nodes of the open cortex.
 
         Raises
         ------
         InputError
-            Data without a tissue.
+            The data set does not give its tissue.
         """
         known = self.table
         table = QuantisedTable.quantise(known.second_order, self.settings.pair_step * np.abs(known.second_order).max())
@@ -142,18 +142,18 @@ class Expansion:
 
     @cached_property
     def exact_parts(self) -> list[tuple[ModelPart, ...]]:
-        """Parts without training or interpolation: two orders of the tumour, and the first of the cortex.
+        """Exact parts, without training or interpolation: two orders for the tumour, the first for the cortex.
 
-        With too many pairs of nodes, the tumour's second order is in the table.
+        If there are more than `max_pairs` pairs, the tumour's second order is in the table instead.
         """
         paired = (self.second_order_part,) if len(self.table.pairs) else ()
         return [(table, *paired) if k == 0 else (table,) for k, table in enumerate(self.compliance_parts)]
 
     def build_bases(self, examples: Examples, tumour: tuple[float, int], cortex: tuple[float, int]) -> list[Basis]:
-        """Compute bases of the examples' motion beyond the exact parts, at the tumour and the cortex if there is more.
+        """Compute a basis of the residual motion after the exact parts, for the tumour and for the cortex, if any.
 
-        A dent as small as its tool is not a sum of a few modes, but its nonlinear part is. `tumour` and `cortex` are
-        the truncation tolerance and the maximum number of modes.
+        The linear dent under a tool needs many modes, but its nonlinear part needs few. `tumour` and `cortex` give the
+        truncation tolerance and the maximum number of modes of each basis.
         """
         both = zip(self.exact_parts, (examples.tumour, examples.cortex), (tumour, cortex), strict=False)
         return [
@@ -164,12 +164,12 @@ class Expansion:
         ]
 
     def build_series(self, bases: list[Basis], held_out: np.ndarray) -> list[Series]:
-        """Return the series beyond the exact parts, as coefficients of the examples' `bases`, without some places (P,).
+        """Return the series beyond the exact parts, in `bases`; rows of `held_out` (P,) positions are interpolated.
 
         Raises
         ------
         InputError
-            Data without a tissue.
+            The data set does not give its tissue.
         """
         triangles = add_edge_midpoints(self.patch)[0]
         inside = self.patch.compute_edge_distance(self.positions)[:, None] > self.radii
@@ -188,7 +188,7 @@ class Expansion:
 
     @cached_property
     def _beyond(self) -> list[np.ndarray]:
-        """Tables (P, R, 19, r) minus the exact parts."""
+        """Tables (P, R, 19, r) of the series minus the exact parts, for the tumour and the cortex."""
         known, found = self.table, []
         for table, parts, wide in zip(known.basis_columns, self.exact_parts, known.bases, strict=True):
             added = table.copy()
@@ -200,7 +200,7 @@ class Expansion:
 
     @cached_property
     def _unit_shares(self) -> np.ndarray:
-        """Forces (P R, 3, 3 m) at the patch's nodes by one newton along each axis, at each place and radius."""
+        """Nodal forces (P R, 3, 3 m) for one newton along each axis, at each position and radius."""
         point = np.repeat(self.positions, 3 * len(self.radii), axis=0)
         radius = np.tile(np.repeat(self.radii, 3), len(self.positions))
         shares = compute_unit_nodal_forces(self.patch, Pushed(point, np.tile(np.eye(3), (len(point) // 3, 1)), radius))
@@ -208,12 +208,12 @@ class Expansion:
 
     @cached_property
     def contact(self) -> tuple[RigidContact, list[Basis], float]:
-        """Contact of the tool on linear tissue, the bases of tumour and cortex of its results, and its time [s].
+        """Contact of the tool on linear tissue, bases of its result for tumour and cortex, and computing time [s].
 
         Raises
         ------
         InputError
-            Data without a tissue.
+            The data set does not give its tissue.
         """
         begun = time.perf_counter()
         contact, bases = condense_contact(self.build_fem(), self._known, self.data.tool)
@@ -226,12 +226,12 @@ class Expansion:
 
     @cached_property
     def table(self) -> SeriesTable:
-        """Series at every place.
+        """Power series at all positions and radii.
 
         Raises
         ------
         InputError
-            Data without a tissue.
+            The data set does not give its tissue.
         """
         if self.table_path is not None and self.table_path.exists():
             with wrap_errors(self.table_path, "a table of the series", REMEDY), self.table_path.open("rb") as raw:
@@ -256,7 +256,7 @@ class Expansion:
         return found
 
     def _compute_pairs(self, fem: Fem, basis: Basis) -> tuple[np.ndarray, np.ndarray, Basis]:
-        """Compute pairs within one footprint, the tumour's second order of each, and a basis of modes for it."""
+        """Compute node pairs within one footprint, the tumour's second order for each pair, and a basis for it."""
         near = find_disc_nodes(self.patch, float(self.radii[-1]))
         if 4.5 * near.sum() > self.max_pairs:
             return np.zeros((0, 2), int), np.zeros((0, 0), np.float32), Basis(basis.nodes, basis.modes[:0])
@@ -268,9 +268,9 @@ class Expansion:
         return pairs, table @ turn.T, Basis(basis.nodes, round_to_half(turn @ basis.modes))
 
     def _tabulate(self, fem: Fem) -> tuple[list[Basis], np.ndarray, bool]:
-        """Compute motions at a few places, the bases that they span, and the table of all places as their coefficients.
+        """Compute the bases from the series at a few positions, and the table of all positions in these bases.
 
-        The last value is True if the whole table was computed now.
+        Return the bases, the table, and True if the whole table was computed in this run.
         """
         count = len(self.positions)
         few = np.sort(select_spread(self.positions, self.settings.table_places))
@@ -305,22 +305,22 @@ class Expansion:
 
     @cached_property
     def _known(self) -> list[np.ndarray]:
-        """Vertices of the tumour, and of the cortex, if there is more."""
+        """Vertex sets of the tumour and, if it has further vertices, of the cortex."""
         return [nodes for nodes in (self.tumour, self.cortex) if len(nodes)]
 
     @cached_property
     def radii(self) -> np.ndarray:
-        """Radii (R,) [m] of the series' table: from the narrowest tool of the data to the widest."""
+        """Radii (R,) [m] of the series' table, from the smallest to the largest footprint of the data."""
         footprint = get_only_pushes(self.data.loads).footprint
         return choose_radii(float(footprint.min()), float(footprint.max()))
 
     def build_fem(self) -> Fem:
-        """Build the data's FEM, in double precision.
+        """Build the FEM of the data set, in double precision.
 
         Raises
         ------
         InputError
-            Data without a tissue.
+            The data set does not give its tissue.
         """
         stated = self.data.provenance
         if "tissue" not in stated:
@@ -334,18 +334,18 @@ class Expansion:
 
 @dataclass(frozen=True, eq=False)
 class SeriesTable:
-    """Table of the series: bases of tumour and cortex, coefficients at all places, and computing time.
+    """Power series at all tabulated positions, in bases of tumour and cortex, with its computing time.
 
     Parameters
     ----------
     bases
-        One basis, or two.
+        Basis of the tumour, and of the cortex if it has further vertices.
     table
-        (P, R, 19, r) float32: coefficients of the bases' modes, one after the other.
+        Coefficients (P, R, 19, r) float32 of the modes of all bases, one basis after the other.
     pairs, second_order, pair_basis
-        Pairs of nodal forces (P, 2), and the tumour's second order of each (P, r) float32 in a basis.
+        Pairs of force components (P, 2), the tumour's second order for each (P, r) float32, and its basis.
     seconds
-        [s]; NaN if an interrupted run was resumed.
+        Computing time [s]; NaN if an interrupted run was resumed.
     """
 
     bases: list[Basis]
@@ -357,17 +357,17 @@ class SeriesTable:
 
     @property
     def basis_columns(self) -> list[np.ndarray]:
-        """Table columns of each basis."""
+        """Columns of the table that belong to each basis."""
         return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
 
 
 def _compute_linear_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
-    """Compute coefficients (n, 3, r) of unit forces with shares (n, 3, 3 m)."""
+    """Compute basis coefficients (n, 3, r) for nodal forces `shares` (n, 3, 3 m) along each axis."""
     return part.regressor.predict(shares.reshape(-1, shares.shape[2])).reshape(*shares.shape[:2], -1)
 
 
 def _square_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
-    """Compute coefficients (n, 6, r) of the products of direction components in `FACTORS`, for shares (n, 3, 3 m)."""
+    """Compute coefficients (n, 6, r) of the direction products in `FACTORS`, for nodal forces `shares` (n, 3, 3 m)."""
     own = [part.regressor.predict(shares[:, axis]) for axis in range(3)]
     both = [
         own[a] if a == b else part.regressor.predict(shares[:, a] + shares[:, b]) - own[a] - own[b]
@@ -379,7 +379,7 @@ def _square_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
 def _build_wide_basis(
     nodes: np.ndarray, motions: np.ndarray, orders: Sequence[slice], wide: tuple[float, int]
 ) -> Basis:
-    """Compute the wide basis of motions (F, R, 19, 3 n) of vertices (n,), with equal weight for each of some orders."""
+    """Compute a basis of motions (F, R, 19, 3 n) of vertices (n,), in which the given orders have equal weight."""
     rows = [motions[:, :, order].reshape(-1, len(nodes), 3) for order in orders]
     tiny = np.finfo(np.float32).tiny
     return fit_basis(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *wide)

@@ -1,4 +1,4 @@
-"""Tables of finite elements: a body condensed to the touchable nodes, and the series at places of the cortex."""
+"""Tables computed by FEM: contact compliance of the nodes that a tool may touch, and power series on the cortex."""
 
 from collections.abc import Callable
 
@@ -25,10 +25,10 @@ BASIS_TOLERANCE = 1e-4  # Truncation tolerance of a basis, as a share of the uni
 def condense_contact(
     fem: Fem, parts: list[np.ndarray], tool: BuiltIn | None = None
 ) -> tuple[RigidContact, list[Basis]]:
-    """Condense the contact of a tool with an undeformed body; return it with a basis for each of `parts`, vertex sets.
+    """Condense an undeformed body to the nodes that a tool may touch; return the contact and a basis for each part.
 
-    Without a `tool` it is a ball of the radius in the features. The contact returns coefficients of the bases, one
-    after the other.
+    `parts` are vertex sets (n,). Without `tool`, the tool is a ball with the radius in the features. The contact
+    returns the coefficients of all bases, one basis after the other.
     """
     surface = fem.anatomy.mesh.surface[fem.anatomy.bare]
     nodes, triangles = np.unique(surface, return_inverse=True)
@@ -49,19 +49,19 @@ def condense_contact(
 
 
 def _get_sizes(tool: BuiltIn) -> np.ndarray:
-    """Return the half sizes of a tool's core, and its radius (4,) [m]."""
+    """Return the half sizes of a tool's core and its radius (4,) [m]."""
     core = get_core(tool)
     return np.append(core.half, core.radius)
 
 
 def join_bases(bases: list[Basis]) -> Basis:
-    """Combine bases of different vertices into one."""
+    """Combine bases of disjoint vertex sets into one basis, with the modes of each."""
     modes = np.asarray(block_diag(*(basis.modes for basis in bases)))
     return Basis(np.concatenate([basis.nodes for basis in bases]), modes)
 
 
 def compute_unit_responses(fem: Fem, nodes: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Compute displacements (3 n, k, 3) float32 [m/N] of `vertices` (k,) by small unit forces on `nodes` (n,)."""
+    """Compute displacements (3 n, k, 3) float32 [m/N] of `vertices` (k,) under unit forces on `nodes` (n,)."""
     found = []
     for first in range(0, len(nodes), STRIP_NODES):
         some = nodes[first : first + STRIP_NODES]
@@ -70,11 +70,11 @@ def compute_unit_responses(fem: Fem, nodes: np.ndarray, vertices: np.ndarray) ->
     return np.concatenate(found)
 
 
-MAX_RADIUS_RATIO = 1.5  # Maximum ratio of neighbouring radii.
+MAX_RADIUS_RATIO = 1.5  # Maximum ratio of neighbouring tabulated radii.
 
 
 def choose_radii(min_radius: float, max_radius: float) -> np.ndarray:
-    """Compute radii [m] at which to tabulate footprints from `min_radius` to `max_radius`: one, or at least three."""
+    """Compute footprint radii [m] to tabulate, geometric from `min_radius` to `max_radius`: one, or at least three."""
     if max_radius <= min_radius * (1.0 + 1e-9):
         return np.array([min_radius])
     steps = int(np.ceil(np.log(max_radius / min_radius) / np.log(MAX_RADIUS_RATIO)))
@@ -85,10 +85,10 @@ def tabulate_series(
     fem: Fem, positions: np.ndarray, radii: np.ndarray, projection: OutputFunctionals,
     progress: Callable[[int, int], object] = lambda done, total: None, journal: Journal | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Compute the coefficients of `forms` at each of the places (P, 3) [m] and each radius: (P, R, 19, r) float32.
+    """Compute power series coefficients (P, R, 19, r) float32 at `positions` (P, 3) [m] for footprint `radii` (R,) [m].
 
-    `projection` projects each response on r modes; `progress` receives places done and their total. Places in the
-    `journal` are not solved again.
+    `projection` projects each response on r modes. `progress` receives the number of positions done and their total.
+    Positions in the `journal` are not solved again.
     """
     table = np.empty((len(positions), len(radii), TERM_COUNT, projection.count), np.float32)
     some = max(1, fem.batch // (len(radii) * FACTORS[-1].shape[1]))
@@ -113,9 +113,9 @@ def tabulate_series(
 
 
 def find_disc_nodes(patch: Patch, radius: float) -> np.ndarray:
-    """Return the mask (m, m) of node pairs that a disc of a radius [m], or adjacent triangles, may load at once.
+    """Return the mask (m, m) of node pairs that one disc of `radius` [m], or adjacent triangles, may load at once.
 
-    Triangles extend into a disc from nodes that are farther apart, but these contribute 1 in 100,000 of the tumour's
+    More distant nodes, whose triangles extend into a disc, are excluded: they contribute 1 in 100,000 of the tumour's
     motion.
     """
     longest = compute_edge_lengths(patch.points[patch.triangles]).max()
@@ -123,7 +123,7 @@ def find_disc_nodes(patch: Patch, radius: float) -> np.ndarray:
 
 
 def add_edge_midpoints(patch: Patch) -> tuple[np.ndarray, np.ndarray]:
-    """Build triangles (S, 6) with the midpoint of the edge opposite each corner, and their places (P, 3) [m]."""
+    """Build triangles (S, 6): corners, then midpoints of the opposite edges; return them and positions (P, 3) [m]."""
     edges = np.sort(patch.triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
     ends, middle = np.unique(edges, axis=0, return_inverse=True)
     triangles = np.column_stack([patch.triangles, len(patch.points) + middle.reshape(-1, 3)])

@@ -1,4 +1,4 @@
-"""Learners: inputs of each model type, and fits of the summands of its response to displacements."""
+"""Learners: the inputs of each model type, and the fit of the parts of its model to displacements."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,11 +29,11 @@ from .fem_tables import join_bases
 
 @dataclass(frozen=True, eq=False)
 class SharedInputs:
-    """Common inputs of all model types on a data set, computed on first use.
+    """Inputs shared by all model types on a data set; each is computed on first use.
 
-    Results and series within held-out discs are excluded. The response of linear tissue is included at every node: a
-    dent is not a sum of dents elsewhere, and the motion below it follows the dent. The tumour's second order follows
-    from that response and the material law, so that it is included too.
+    Results and series within held-out discs are excluded. The response of linear tissue is included at every node, also
+    within the discs: a dent is not a combination of dents elsewhere, and the motion below follows the dent. The
+    tumour's second order is also included, as it follows from that response and the material law.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class SharedInputs:
     expansion
         Expansion of the same data.
     split
-        Held-out loads, if any.
+        Split with the held-out loads; None: no load is held out.
     """
 
     basis_examples: Examples
@@ -51,13 +51,13 @@ class SharedInputs:
 
     @cached_property
     def series(self) -> tuple[ModelPart, ...]:
-        """Contribution of the FEM series beyond compliance, at the tumour and at the cortex, if there is more."""
+        """Parts of the power series beyond the exact parts, for the tumour and for the cortex, if any."""
         bases = self.expansion.build_bases(self.basis_examples, ADDED_BASIS, COARSE_BASIS)
         found = self.expansion.build_series(bases, self._mask_left_out(self.expansion.positions))
         return tuple(ModelPart("tool", part, basis) for part, basis in zip(found, bases, strict=True))
 
     def count_solves(self, name: str, examples: Examples) -> SolveCounts:
-        """Count the FEM solves that a model of `LEARNERS` or `POSE_LEARNERS`, or a user-defined one, depends on."""
+        """Count the FEM solves that a model of type `name` depends on, with their wall time."""
         known, data, loads = self.expansion, self.expansion.data, len(examples.loads.point)
         units = series = inside = 0
         seconds = [data.estimate_seconds("load", loads)]
@@ -84,25 +84,25 @@ class SharedInputs:
 
 @dataclass(frozen=True)
 class SelectionSettings:
-    """Settings of the selection by `TunedRegressor`."""
+    """Settings of the selection of regressor settings by `TunedRegressor`."""
 
-    inner_discs: int = 6  # Number of discs, far apart, that inner fits hold out.
+    inner_discs: int = 6  # Number of distant discs that inner fits hold out.
     inner_share: float = 0.2  # Share of the loads in the held-out discs of inner fits.
     min_selection_loads: int = 40  # Minimum number of loads for a selection of settings.
     max_selection_loads: int = 600  # Maximum number of loads used for a selection of settings.
-    selection_outputs: int = 8  # Number of outputs, the strongest, used for a selection of settings.
+    selection_outputs: int = 8  # Number of outputs, those of largest variance, used for a selection of settings.
 
 
 @dataclass(frozen=True)
 class TunedRegressor:
     """Regressor that selects its settings by the error on discs held out of the training rows.
 
-    One fit for each of the settings, to the strongest outputs of four fifths of the first rows, then one to all rows.
+    Each candidate is fitted to the strongest outputs of 4/5 of the first rows; the best one is then fitted to all rows.
 
     Parameters
     ----------
     settings
-        Regressors to select from; the first is used with few rows.
+        Candidate regressors; the first is used if there are too few rows for a selection.
     selection
         Settings of the selection.
     """
@@ -111,11 +111,11 @@ class TunedRegressor:
     selection: SelectionSettings = SelectionSettings()
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> FittedRegressor:
-        """Fit the best of the regressors to rows X (n, f) of `compute_tool_features`, Y (n, r)."""
+        """Fit the best candidate to features X (n, f) of `compute_tool_features` and coefficients Y (n, r)."""
         return self.settings[self.find_best(X, Y)]().fit(X, Y)
 
     def find_best(self, X: np.ndarray, Y: np.ndarray) -> int:
-        """Return the index of the settings with the smallest squared error on the discs; deterministic."""
+        """Return the index of the candidate with the smallest squared error on the held-out discs."""
         if len(X) < self.selection.min_selection_loads or len(self.settings) == 1:
             return 0
         X, Y = X[: self.selection.max_selection_loads], Y[: self.selection.max_selection_loads]
@@ -130,7 +130,7 @@ class TunedRegressor:
 
 
 def find_inner_discs(points: np.ndarray, selection: SelectionSettings = SelectionSettings()) -> np.ndarray:
-    """Return the mask (n,) of points in discs round `inner_discs` of the points (n, 3), far from each other."""
+    """Return the mask (n,) of points (n, 3) in discs round `inner_discs` distant points, with `inner_share` of all."""
     distance = find_nearest(points, points[select_spread(points, selection.inner_discs)])[1]
     return distance <= np.quantile(distance, selection.inner_share)
 
@@ -154,7 +154,7 @@ POSE_MODELS = ("gp", "ann", "svr")  # Model types for poses: the tool's position
 
 
 def fit_parts(name: str, inputs: SharedInputs, examples: Examples) -> tuple[ModelPart, ...]:
-    """Fit the summands of one model type to examples: for the tumour, and for the remaining open cortex."""
+    """Fit the parts of one model type to examples: parts for the tumour, and for the remaining open cortex."""
     known = inputs.expansion
     trained = partial(_fit_part, known.patch, examples.loads)
     if name in SERIES_MODELS:
@@ -182,7 +182,7 @@ def fit_parts(name: str, inputs: SharedInputs, examples: Examples) -> tuple[Mode
 
 
 def fit_force_model(name: str, parts: Sequence[ModelPart], patch: Patch, examples: Examples) -> ForceModel | None:
-    """Fit one pose model's tool force, given its trained motion `parts`; None if the examples have no force."""
+    """Fit the force model of a pose model, given its fitted `parts`; None if the examples have no force."""
     if examples.force is None:
         return None
     if name == "contact":
@@ -200,7 +200,7 @@ def fit_force_model(name: str, parts: Sequence[ModelPart], patch: Patch, example
 
 
 def _find_model_type(name: str) -> tuple[str, Callable[[], RegressorFactory]]:
-    """Return encoder and regressor of a model type, user-defined ones included."""
+    """Return the encoder name and the regressor factory of a built-in or user-defined model type."""
     if name in LEARNED_MODELS:
         return LEARNED_MODELS[name]
     own = find_own_learner(name)
@@ -209,7 +209,7 @@ def _find_model_type(name: str) -> tuple[str, Callable[[], RegressorFactory]]:
 
 
 def _fit_contact(known: Expansion, examples: Examples) -> tuple[ModelPart, list[tuple[np.ndarray, np.ndarray]]]:
-    """Fit the contact on stiffening tissue to examples; return its part, and its residuals: vertices, (B, n, 3) [m]."""
+    """Fit the contact part to examples; return it, and the vertices and residuals (B, n, 3) [m] of each basis."""
     contact, bases, _ = known.contact
     encoder = "core" if len(contact.core) else "tool"
     features, size = ENCODERS[encoder](known.patch, examples.loads), split_forces(examples.loads)[0][:, None, None]
@@ -226,7 +226,7 @@ def _fit_part(
     patch: Patch, loads: Pushed, kind: tuple[str, Callable[[], RegressorFactory]], before: Sequence[ModelPart],
     on: Basis | np.ndarray, truth: np.ndarray,
 ) -> ModelPart:  # fmt: skip
-    """Fit a part to the residual of `truth` (B, n, 3) [m] after parts `before`: `on` a basis, or on vertices (n,)."""
+    """Fit a part to the residual of `truth` (B, n, 3) [m] after the parts `before`; `on` is a basis or vertices."""
     response = compute_residual_responses(before, patch, loads, truth)
     basis = on if isinstance(on, Basis) else fit_basis(on, response, *COARSE_BASIS)
     encoder, make = kind
@@ -238,7 +238,7 @@ def _fit_part(
 
 
 def _check_own(regressor: FittedRegressor, X: np.ndarray, Y: np.ndarray) -> None:
-    """Check that a user-defined regressor returns finite coefficients of the right shape on its training loads."""
+    """Check that a user-defined regressor predicts finite coefficients of the right shape for its training loads."""
     found = np.asarray(regressor.predict(X))
     if found.shape != Y.shape or not np.isfinite(found).all():
         raise InputError(

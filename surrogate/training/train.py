@@ -1,4 +1,4 @@
-"""Training: from a data set to models, their scores and bounds."""
+"""Training of models from a data set, with their scores on held-out discs and their bounds."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -44,14 +44,14 @@ MIN_CALIBRATION_LOADS = 19  # Minimum number of calibration loads for a 95 % bou
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """Models by type, their scores on held-out discs, and the split.
+    """Trained models by model type, their scores on held-out discs, and the split.
 
-    `motion` is the mean displacement [m] of the tumour over the held-out loads. `calibrated` is the number of loads
-    that calibrated the models' bounds, and `training_loads` the number of training loads. `held_out_coverage` gives by
-    model type the empirical coverage of bounds on held-out discs. These are bounds of the scored model, calibrated on
-    loads outside the discs; their growth with the distance from training loads is estimated from the other discs.
-    `held_out_distance_coverage` gives the same for the distance from tip to tumour, and `force` the errors of the
-    tool's force there, for poses whose data has it.
+    `motion` is the mean displacement [m] of the tumour over the held-out loads. `calibrated` is the number of
+    calibration loads, `training_loads` that of training loads. `held_out_coverage` gives, by model type, the empirical
+    coverage of bounds on the held-out discs. These bounds belong to the scored model and are calibrated on loads
+    outside the discs; their growth with distance is estimated from the other discs. `held_out_distance_coverage` gives
+    the same for the tip-tumour distance. `force` gives the errors of the tool's force on the discs, for poses with
+    known reactions.
     """
 
     models: dict[str, Learned]
@@ -70,19 +70,19 @@ class Trained:
 
 
 def list_learners(data: Dataset) -> tuple[str, ...]:
-    """Return the model types that a data set can train: series and contact need FEM of a known tissue."""
+    """Return the model types that a data set can train; series and contact types need data that give their tissue."""
     stated = "tissue" in data.provenance
     kinds = LEARNERS if data.tool is None else POSE_LEARNERS
     return tuple(name for name in kinds if stated or name not in (*SERIES_MODELS, *CONTACT_MODELS))
 
 
 def check_learners(names: Sequence[str], has_poses: bool, source: str) -> None:
-    """Check that data of pushes, or of poses, can train the model types. `source` names the data in the message.
+    """Check that data of poses, or of pushes, can train the model types; `source` names the data in the message.
 
     Raises
     ------
     InputError
-        No name, an unknown name, or a model type for the other kind of data.
+        No name is given, a name is unknown, or a model type is for the other kind of data.
     """
     kinds, others, held = (POSE_LEARNERS, LEARNERS, "poses") if has_poses else (LEARNERS, POSE_LEARNERS, "pushes")
     unknown = [name for name in names if name not in (*kinds, *others) and find_own_learner(name) is None]
@@ -103,31 +103,30 @@ def train(
     data: Dataset, learners: Sequence[str] | None = None, progress: Callable[[str], object] = lambda learner: None,
     split: DiscSplit | None = None, most: int | None = None, expansion: Expansion | None = None,
 ) -> Trained:  # fmt: skip
-    """Fit `learners`, by default all that the data can train: first for the scores, then for use.
+    """Fit models of the types `learners` (None: all that the data can train): first to score, then to use.
 
-    Scored models are trained outside discs of the cortex, and scored inside. Returned models are trained on all those
-    loads; their bounds are calibrated on further ones, held out of all fits. Another `split`, with a row for each
-    converged load, calibrates nothing and returns the models trained on it.
+    Scored models are trained on loads outside discs of the cortex and scored on loads inside. Returned models are
+    trained on both; their bounds are calibrated on further loads, which no fit uses. With a given `split`, which has a
+    row for each converged load, nothing is calibrated, and the models trained on that split are returned.
 
-    Every model predicts the tumour and the open cortex; the cortex is not scored, and comes from the compliance matrix
-    if the model type is not in `SERIES_MODELS`. Cases that did not converge are ignored.
+    Every model predicts the tumour and the open cortex. The cortex is not scored; for pushes its response is that of
+    the compliance matrix if the model type is not in `SERIES_MODELS`. Load cases that did not converge are ignored.
 
     Parameters
     ----------
     progress
-        Receives the name of each model type that is done.
+        Receives the name of each model type that is finished.
     most
-        Maximum number of training loads, without those for calibration or test.
+        Maximum number of training loads, without those for calibration or test; None: no limit.
     expansion
-        Expansion of these data, by default a new one on any available device: minutes on a CPU, so pass it on for
-        further trainings on these data.
+        Expansion of this data set; None: a new one on an available device. It takes minutes on a CPU, so pass it on to
+        further trainings on the same data.
 
     Raises
     ------
     InputError
-        Unknown model types, or types for another kind of loads; no training loads. Data with other causes
-        than `Pushed` or the `Touching` of one tool, an anatomy without tumour, too few loads, or unit responses that
-        did not converge.
+        A model type is unknown or for another kind of loads, or there are no training loads; the data have other causes
+        than `Pushed` or `Touching` of one tool, no tumour, too few loads, or unit responses that did not converge.
     """
     wanted = list_learners(data) if learners is None else tuple(dict.fromkeys(learners))
     check_learners(wanted, has_poses=data.tool is not None, source=str(data.path))
@@ -163,7 +162,7 @@ def train(
 
 @dataclass(frozen=True, eq=False)
 class ModelFit:
-    """Inputs of a fit: mask (B,) of the results to fit, these as examples, and the inputs common to all model types."""
+    """Inputs of a fit: mask (B,) of training rows, their examples, inputs shared by model types, and training range."""
 
     rows: np.ndarray
     examples: Examples
@@ -171,7 +170,7 @@ class ModelFit:
     envelope: TrainingRange
 
     def fit_parts(self, name: str, patch: Patch) -> tuple[tuple[ModelPart, ...], ForceModel | None]:
-        """Fit a model type: the parts of its model, and its model of a tool's force."""
+        """Fit a model type; return the parts of its model, and its model of the tool's force, if any."""
         with time_stage(f"learn {name}"):
             parts = fit_parts(name, self.inputs, self.examples)
             return parts, fit_force_model(name, parts, patch, self.examples)
@@ -179,7 +178,7 @@ class ModelFit:
 
 @dataclass(frozen=True, eq=False)
 class TrainingResult:
-    """Model of one type, its score on held-out discs, and the empirical coverage of its bounds there."""
+    """Model of one type, with its score on held-out discs and the empirical coverage of its bounds there."""
 
     model: Learned
     score: Score
@@ -198,7 +197,7 @@ def _fit_of(answers: TrainingSolutions, rows: np.ndarray, shared: Expansion, lef
 def _train_and_score(
     name: str, data: Dataset, answers: TrainingSolutions, split: DiscSplit, apart: np.ndarray, fits: Sequence[ModelFit]
 ) -> TrainingResult:
-    """Fit one model type outside the discs and score it inside, then fit it to all loads not used for calibration."""
+    """Fit a model type outside the discs and score it inside; then fit it to all loads that are not for calibration."""
     outside, patch = fits[0], answers.patch
     parts, force = outside.fit_parts(name, patch)
     training = {"learner": name, **data.provenance}
@@ -243,7 +242,7 @@ def _train_and_score(
 
 
 def _fit_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: ModelFit) -> Learned:
-    """Fit the model to further loads, with a correction of its distances if it had one."""
+    """Fit the model type to the rows of `fit`; add a distance correction if `model` has one."""
     parts, force = fit.fit_parts(name, answers.patch)
     fitted = replace(model, parts=parts, envelope=fit.envelope, force=force)
     if model.tip is None or model.tip.correction is None:
@@ -253,7 +252,7 @@ def _fit_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: Mode
 
 
 def _add_bounds(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:
-    """Add bounds, calibrated on errors `near` training loads, to a model; they grow by `growth` [1/m] towards `far`."""
+    """Return the model with bounds calibrated on errors `near` training loads; each grows by its `growth` [1/m]."""
     seen = far.list_available()
     bounds = {
         way: calibrate_bound(here, BOUND_FITS[way], growth[way], seen[way])
@@ -269,17 +268,17 @@ def _add_bounds(model: Learned, near: ModelErrors, growth: Mapping[str, float], 
 
 
 def _compute_motion(answers: TrainingSolutions, rows: np.ndarray) -> np.ndarray:
-    """Compute the tumour's mean displacement [m] under selected rows (B,) bool."""
+    """Compute the tumour's mean displacement [m] for each selected row of a mask (B,)."""
     return np.linalg.norm(answers.tumour[rows], axis=2).mean(axis=1)
 
 
 def _select_first(rows: np.ndarray, most: int | None) -> np.ndarray:
-    """Select the first `most` rows of a mask (B,)."""
+    """Keep the first `most` rows of a mask (B,); None: keep all."""
     return rows if most is None else rows & (np.cumsum(rows) <= most)
 
 
 def _extend_split(split: DiscSplit, apart: np.ndarray) -> DiscSplit:
-    """Extend a split of the rows that are not `apart` (B,) to all rows."""
+    """Extend a split of the rows that are not `apart` (B,) to all rows; the rows `apart` get the disc index -2."""
     disc = np.full(len(apart), -2)
     disc[~apart] = split.disc_index
     return replace(split, disc_index=disc)
