@@ -1,4 +1,4 @@
-"""Verification of a scene's images: metrics of every frame, and their limits."""
+"""Verification of a scene's images: metrics of every frame, and comparison of the worst values with limits."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -37,27 +37,27 @@ class SceneFigures:
     Parameters
     ----------
     overlap
-        Intersection over union of the drawn tumour's silhouette and that of the finite elements, seen by the scene's
-        own camera.
+        Smallest intersection over union of the silhouettes of the drawn tumour and of the FEM tumour, both projected
+        by the camera of the scene.
     error_mm, motion_mm
-        Mean distance over the tumour's nodes between prediction and finite elements, and the largest mean motion [mm].
+        Largest mean error and largest mean displacement (by FEM) of the tumour's nodes over the frames [mm].
     pixels
-        Distance between the drawn camera's projection of the tumour and OpenCV's for the scene's camera [pixel].
+    Distance between the tumour's projections by the drawing camera and by OpenCV with the scene's camera [pixel].
     drawn
-        95th percentile of the distance between the outline in the image, detected by its colour, and that of the FEM
-        tumour by another renderer [pixel].
+        95th percentile of the distance between the outline in the image, which is detected by its colour, and the
+        outline that another renderer computes [pixel].
     printed, labelled
-        True if the image shows the frame number and the distance from tip to tumour as they are computed here; true if
-        that distance is completely visible near the tip.
+        `printed`: the image shows the frame number and the distance from tip to tumour that is computed here.
+        `labelled`: the text of this distance is completely visible near the tip.
     visible
         Smallest share of the tumour's silhouette that drape and bone leave visible.
     honest
         True if occluded parts are drawn as a broken outline without shading, and the image names the occluder.
     finite, answered
-        True if every number and image is finite and the visible cortex moves as the FEM surface; true if every
-        solution, drawn or by FEM, has a good outcome.
+        `finite`: every number and image is finite, and the visible cortex moves with the FEM surface.
+        `answered`: every drawn solution and every FEM solution has a good outcome.
     doubt
-        First solution with a bad outcome: frame, source and outcome; number of others.
+        Frame, source and outcome of the first solution with a bad outcome, and the number of other bad solutions.
     in_step
         True if every image shows the solution at its own time.
     leaked
@@ -114,7 +114,7 @@ class SceneFigures:
         return [sentence for sentence, kept in rules.items() if not kept]
 
     def to_row(self) -> dict[str, float | bool | str | None]:
-        """Convert to a row of JSON; None: not measured (JSON has no infinity)."""
+        """Convert the metrics to a JSON object; values that are not finite become None, since JSON has no infinity."""
         figures = asdict(self)
         return {name: value if name == "doubt" or np.isfinite(value) else None for name, value in figures.items()}
 
@@ -122,9 +122,9 @@ class SceneFigures:
 def measure_frames(
     player: Player, get_camera: Callable[[float], Camera], frames: Sequence[Frame], reference: Deformation
 ) -> SceneFigures:
-    """Compare drawn frames with the FEM solutions of the same loads (one row per frame).
+    """Compare drawn frames with the FEM solutions of the same loads, and return the worst metrics over all frames.
 
-    `get_camera` gives the reference camera at a time [s].
+    `reference` contains one load case per frame. `get_camera` returns the scene's camera at a time [s].
     """
     doubts = _list_unreliable(frames, reference)
     moved = [
@@ -164,7 +164,7 @@ def measure_frames(
 
 
 def _compute_coverage(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
-    """Compute the share of frames whose displayed ellipsoid contains the tumour's centre by FEM."""
+    """Compute the share of frames whose ellipsoid contains the FEM tumour's centroid; NaN without estimates."""
     if not any(frame.estimate for frame in frames):
         return np.nan
     anatomy, held = player.site.anatomy, []
@@ -182,7 +182,7 @@ def is_within_surface(surface: Layer, point: np.ndarray) -> bool:
 
 
 def _compute_removed_share(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
-    """Compute the share of the tumour's motion, summed over its vertices and the frames, that estimates remove."""
+    """Compute 1 - (sum of errors) / (sum of motions) over tumour vertices and frames; NaN without estimates."""
     if not any(frame.estimate for frame in frames):
         return np.nan
     nodes, rest = player.site.anatomy.tumour_nodes, player.site.anatomy.mesh.nodes
@@ -193,7 +193,7 @@ def _compute_removed_share(player: Player, frames: Sequence[Frame], truth: Defor
 
 
 def _list_unreliable(frames: Sequence[Frame], truth: Deformation) -> list[str]:
-    """List frames whose displayed or FEM solution is unreliable, with the outcome."""
+    """List a sentence for each drawn or FEM solution with a bad outcome: frame, source and outcome."""
     found = []
     for frame, true in zip(frames, truth.outcome, strict=True):
         outcomes = {"as drawn": frame.deformation.outcome[0], "by the finite elements": true}
@@ -202,10 +202,10 @@ def _list_unreliable(frames: Sequence[Frame], truth: Deformation) -> list[str]:
 
 
 def list_warnings(frames: Sequence[Frame]) -> list[str]:
-    """List warnings about the estimates of a scene with an observation model, or about its frames.
+    """List warnings about the estimates of the tumour position in the frames of a scene with an observation model.
 
-    Frames that the locator rejects or doubts are counted, with the first reason. If the tumour is still in most frames,
-    the removed share is mostly rigid error. These warnings explain exceeded limits, and are not limits themselves.
+    Warnings count the frames that the locator rejects or doubts, and name the first reason. Another warning appears if
+    the tumour hardly moves in most frames: the removed share then shows mainly the rigid error. Warnings set no limits.
     """
     estimates = [frame.estimate for frame in frames if frame.estimate is not None]
     refused = [estimate.rejection for estimate in estimates if estimate.location is None]
@@ -230,7 +230,7 @@ def _is_finite(frame: Frame) -> bool:
 
 
 def _is_cortex_embedded(player: Player, frame: Frame) -> bool:
-    """Return True if the visible cortex moves as the FEM surface in which it is embedded."""
+    """Return True if the visible cortex moves with the FEM surface in which it is embedded."""
     stage = player.stage.select_stage(frame.loads)
     if not stage.scene.look.natural:
         return True
@@ -242,10 +242,10 @@ def _is_cortex_embedded(player: Player, frame: Frame) -> bool:
 
 
 def _measure_miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
-    """Compute overlap, mean distance [m], largest image distance [pixel] and outline distance of a frame to the truth.
+    """Compare one frame with row `row` of the FEM solution `truth`.
 
-    The last values are the share of the drawn silhouette that the drape does not cover, and true if parts that are not
-    seen through cortex are drawn as occluded.
+    Returns overlap, mean distance [m], projection and outline distances [pixel], the share of the drawn silhouette that
+    the drape does not cover, and True if parts of the tumour that are not under visible cortex are drawn as occluded.
     """
     stage = player.stage.select_stage(frame.loads)
     believed = player.estimate_positions(frame)

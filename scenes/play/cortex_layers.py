@@ -1,4 +1,4 @@
-"""Details drawn on the open cortex: vessels, squares of cotton that move with it, and a gloved finger."""
+"""Details drawn on the open cortex: vessels, squares of cotton that move with the cortex, and a gloved finger."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,10 +47,10 @@ VESSELS = VesselSettings()
 def add_vessels(
     intensity: Intensity | None, site: CraniotomyFrame, seed: int, absorption: tuple[float, float, float], relief: float
 ) -> Solid:
-    """Return the scan around an opening as a solid texture with random vessels, which the seed determines.
+    """Return a solid texture of the scan around the craniotomy, with random vessels that `seed` determines.
 
-    Vessels move with the tissue, and have no height. Without a scan, brightness is uniform. `absorption`, `relief`: see
-    `Solid`.
+    Vessels move with the tissue and have no height. Without a scan, the brightness is uniform. See `Solid` for
+    `absorption` and `relief`.
     """
     half = site.radius + VESSELS.border_width
     wide, tall = VESSELS.voxel_across, VESSELS.voxel_along
@@ -69,7 +69,7 @@ def add_vessels(
 def compute_vessel_absorption(
     coordinates: np.ndarray, random: np.random.Generator, settings: VesselSettings = VESSELS
 ) -> np.ndarray:
-    """Compute the share of light (n, n) that vessels absorb, on a grid of coordinates `coordinates` (n,) [m]."""
+    """Compute the share (n, n) of light that vessels absorb, on a square grid with ticks `coordinates` (n,) [m]."""
     points, widths = sample_vessel_paths(float(np.abs(coordinates).max()), random, settings)
     here = np.stack(np.meshgrid(coordinates, coordinates, indexing="ij"), axis=-1)
     away, nearest = KDTree(points).query(here, distance_upper_bound=2.0 * settings.max_width)
@@ -82,7 +82,7 @@ def compute_vessel_absorption(
 def sample_vessel_paths(
     half_width: float, random: np.random.Generator, settings: VesselSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample vessels that enter at the border of a square and branch: points (k, 2) [m] and widths (k,) [m]."""
+    """Sample branching vessels that enter a square at its border; return points (k, 2) [m] and widths (k,) [m]."""
     count = settings.trunk_count
     angles = 2.0 * np.pi * (np.arange(count) + random.uniform(0.0, 0.7, count)) / count
     rim = half_width * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -123,7 +123,7 @@ class FingerSettings:
 
 @dataclass(frozen=True, eq=False)
 class CottonoidSurface:
-    """Squares of cotton as points of the cortex: vertices and weights (n, 3), and triangles (m, 3) of the points."""
+    """Squares of cotton on the cortex: mesh vertices and weights (n, 3) of n points, and triangles (m, 3) of points."""
 
     vertices: np.ndarray
     weights: np.ndarray
@@ -131,13 +131,13 @@ class CottonoidSurface:
     offsets: np.ndarray
 
     def build_layer(self, positions: np.ndarray) -> Layer:
-        """Return the layer for mesh vertices at positions (V, 3) [m]."""
+        """Return the rendered layer of the squares for mesh vertices at `positions` (V, 3) [m]."""
         carried = np.einsum("nk,nkd->nd", self.weights, positions[self.vertices])
         return Layer("cotton", COTTON, carried + self.offsets, self.triangles, COTTON_COLOUR, gloss=0.1)
 
 
 def build_cottonoids(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> CottonoidSurface:
-    """Lay squares of cotton on an open cortex."""
+    """Build the surface of squares of cotton that lie on the open cortex."""
     steps = np.linspace(-0.5, 0.5, SQUARE_VERTICES)
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     i, j = (each.ravel() for each in np.meshgrid(*[np.arange(SQUARE_VERTICES - 1)] * 2, indexing="ij"))
@@ -156,7 +156,7 @@ def build_cottonoids(site: CraniotomyFrame, cottonoids: Sequence[Cottonoid]) -> 
 
 
 def build_finger(site: CraniotomyFrame, angle: float, settings: FingerSettings = FingerSettings()) -> Layer:
-    """Build a motionless gloved finger over the craniotomy edge, from a direction in the tangent plane [rad]."""
+    """Build the layer of a static gloved finger over the craniotomy edge, at an angle in the tangent plane [rad]."""
     out = np.cos(angle) * site.right + np.sin(angle) * site.up
     tip = site.origin + (site.clearance - settings.overhang) * out - settings.height * site.axis
     way = normalise_vectors((out - 0.35 * site.axis)[None])[0]

@@ -1,4 +1,4 @@
-"""Anatomy with its scan, and the deformers available for it, by name."""
+"""Anatomy with its scan and its files, and the deformers that are available for this anatomy, by name."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -50,17 +50,17 @@ from .stage import Stage
 from .stereo_observer import StereoObserver
 
 GUARDED = "guarded"
-"""Name of the best model with FEM fallback."""
+"""Name of the deformer that uses the best trained model, with FEM as fallback."""
 # Text: FEM's result is the reference of an estimate.
 TRUTH_TEXT = "what an estimate is held against is the truth, as finite elements have it"
 
 
 @dataclass(frozen=True, eq=False)
 class PatientSetup:
-    """Anatomy, its T1 scan if there is one, models by name, uncertainties and costs of effects by scene.
+    """Anatomy, T1 scan (None if not available), models by name, uncertainties and costs of effects by scene.
 
-    `locator_file` has the locator of the tumour, for scenes with an observation model. `limit` [m] is that of a guarded
-    model; None: the limit derived from its own errors on held-out cortex. `families`: available families.
+    `locator_file` contains the locator of the tumour, for scenes with an observation model. A guarded model uses FEM
+    above a predicted error of `limit` [m]; None: limit derived from held-out cortex. `families` caches built families.
     """
 
     anatomy: Anatomy
@@ -76,7 +76,7 @@ class PatientSetup:
 
     @cached_property
     def site(self) -> CraniotomyFrame:
-        """The open cortex."""
+        """Coordinate system of the craniotomy of this anatomy."""
         return build_craniotomy_frame(self.anatomy)
 
     @cached_property
@@ -99,12 +99,12 @@ class PatientSetup:
 
     @cached_property
     def learned_tissue(self) -> Elasticity | None:
-        """Tissue that the models were trained on, with that of regions; None if no model gives it.
+        """Tissue of brain and regions that the models were trained on; None if no model reports a tissue.
 
         Raises
         ------
         InputError
-            A model gives an invalid tissue.
+            A model file contains an invalid tissue.
         """
         return find_first_tissue(model.training for model in self.models.values())
 
@@ -113,12 +113,12 @@ class PatientSetup:
         return scene.observation_model is not None and (self.locator_file is None or not self.locator_file.is_file())
 
     def build_stage(self, scene: Scene) -> Stage:
-        """Build a scene's stage on this anatomy, rendered on the device of this setup.
+        """Build the rendered parts of a scene on this anatomy; rendering uses the device of this setup.
 
         Raises
         ------
         InputError
-            A scene with observations on an anatomy without a locator, or with a locator of other regions.
+            The scene has an observation model, and the locator is missing or has another stiffness of a region.
         """
         device = find_device(self.device, LIVE.precision).name
         if scene.observation_model is not None and (
@@ -139,10 +139,10 @@ class PatientSetup:
                 return replace(stage, observer=StereoObserver(stage, self.locator, scene.observation_model))
 
     def list_rejections(self, scene: Scene) -> dict[str, str | None]:
-        """Find the reason why each trained model does not support a scene, by name; None if it does.
+        """Return by model name the reason why a trained model does not support a scene; None for a model that does.
 
-        A model supports only the effects, the tissue and the element that it was trained on. No model is the
-        reference of an estimate.
+        A model supports only the effects, the tissue and the element type of its training. No model supports a scene
+        with an observation model, because FEM must compute the reference for its estimates.
         """
         if scene.observation_model is not None:
             return dict.fromkeys(self.models, TRUTH_TEXT)
@@ -154,17 +154,17 @@ class PatientSetup:
         return {name: self.models[name] for name, reason in self.list_rejections(scene).items() if reason is None}
 
     def list_deformers(self, scene: Scene) -> tuple[str, ...]:
-        """List all deformers available for a scene: trained models that support it, the best one guarded, FEM."""
+        """List names of the deformers for a scene: supporting models, "guarded" if FEM can be a fallback, and "fem"."""
         knowing = tuple(self.select_models(scene))
         return (*knowing, *([GUARDED] if self._can_guard(scene) else []), "fem")
 
     def select_best(self, scene: Scene) -> str:
-        """Select the trained model with the smallest error bound; FEM if none supports the scene."""
+        """Return the name of the trained model with the smallest error bound; "fem" if no model supports the scene."""
         knowing = self.select_models(scene)
         return min(knowing, key=lambda name: knowing[name].bound, default="fem")
 
     def select_default_scene(self) -> str:
-        """Select the first built-in scene that a trained model supports, or press."""
+        """Return the name of the first built-in scene that a trained model supports; "press" if there is none."""
         return next((name for name in SCENES if self.select_models(find_scene(name))), "press")
 
     def limit_of(self, scene: Scene) -> float:
@@ -175,9 +175,9 @@ class PatientSetup:
         return MAX_VERTEX_ERROR if stated is None else stated.limit
 
     def select_default(self, scene: Scene) -> str:
-        """Select the default deformer of a scene: its own, or the best model, guarded if its bound is weak.
+        """Return the name of a scene's default deformer: the scene's choice, else the best model, else "fem".
 
-        A model of tissue that relaxes is used without guard, with its bound: see `_can_guard`.
+        The best model is guarded if its error bound is weak and its tissue does not relax: see `_can_guard`.
         """
         name = self.select_best(scene)
         if scene.deformer in (*self.select_models(scene), *FAMILIES):
@@ -185,15 +185,15 @@ class PatientSetup:
         return GUARDED if self._can_guard(scene) and get_reported_errors(self.models[name]).is_weak else name
 
     def _can_guard(self, scene: Scene) -> bool:
-        """Return True if FEM can serve as fallback of the best model.
+        """Return True if FEM can be the fallback of the best model.
 
-        With relaxing tissue it cannot: an FEM frame depends on all previous frames, which the model computed.
+        With relaxing tissue FEM cannot: an FEM frame would need the FEM solutions of all previous frames.
         """
         name = self.select_best(scene)
         return name in self.models and not self.models[name].series
 
     def describe_deformer(self, name: str, scene: Scene) -> str:
-        """Describe a deformer by name: its FEM solver, or its training."""
+        """Describe the deformer `name` in a scene: its FEM solver, or the training of its model."""
         solver = describe_solver(self.choose_element(scene), scene.effects)
         if name == GUARDED:
             model, limit = self.models[self.select_best(scene)], 1e3 * self.limit_of(scene)
@@ -201,21 +201,21 @@ class PatientSetup:
         return solver if name == "fem" else FAMILIES[name] if name in FAMILIES else self.models[name].source
 
     def build_fem(self, scene: Scene, accuracy: Accuracy, batch: int = 64, live: bool = False) -> Fem | ResectedFem:
-        """Build FEM for a scene's effects, tissue and element; for `live` see `Fem`."""
+        """Build the FEM solver of a scene's effects, tissue and element type; see `Fem` for `live`."""
         effects, element = scene.get_effects_on(self.anatomy), self.choose_element(scene)
         return build_fem(self.anatomy, effects, accuracy, self.device, batch, element, live)
 
     def choose_element(self, scene: Scene) -> str:
-        """Return the element of a scene, or the recommended one for the mesh."""
+        """Return the element type of a scene, or else the recommended element type for the mesh."""
         return scene.element or recommend_element(self.anatomy.mesh)
 
     def build_deformer(self, name: str, scene: Scene) -> Deformer:
-        """Build a deformer by name; FEM has the scene's accuracy.
+        """Build the deformer `name` for a scene; FEM solves with the scene's accuracy.
 
         Raises
         ------
         InputError
-            An unknown name; a model that was trained with other effects, tissue or element; a family without an effect.
+            An unknown name, a model that was trained with other effects, tissue or element, or an unsupported effect.
         """
         if name == "fem":
             return self.build_fem(scene, scene.accuracy, live=True)
@@ -249,33 +249,33 @@ class PatientSetup:
         return self.models[name]
 
     def build_player(self, name: str, scene: Scene) -> Player:
-        """Return a scene on this anatomy's open cortex with a deformer by name.
+        """Build a player of a scene on this anatomy, with the deformer `name`.
 
         Raises
         ------
         InputError
-            See `build_deformer`; an anatomy without open cortex.
+            See `build_deformer`; also if the anatomy has no open cortex.
         """
         return self.build_player_of(self.build_stage(scene), self.build_deformer(name, scene), name)
 
     def build_player_of(self, stage: Stage, deformer: Deformer, name: str) -> Player:
-        """Return a player of a stage and the deformer `name`, with the deformer's errors on this anatomy."""
+        """Build a player of a stage with a built deformer of this `name`, and with recorded errors on this anatomy."""
         ensemble, motion_error = self.estimate_uncertainty(stage.scene), self.estimate_motion_error(stage.scene)
         recorded = self.select_recorded(stage.scene).get(name)
         return Player(stage, deformer, uncertainty=ensemble, motion_error=motion_error, recorded=recorded)
 
     def estimate_uncertainty(self, scene: Scene) -> Uncertainty | None:
-        """Return the expected error of the tumour position in a scene; None without an ensemble of this scene."""
+        """Return the expected error of the tumour position in a scene; None if no ensemble of this scene is stored."""
         found = self.uncertainties.get(scene.name)
         return found if found and found.mark == self.compute_mark(scene) else None
 
     def find_effect_record(self, scene: Scene) -> EffectRecord | None:
-        """Return the recorded costs of a scene's effects; None without a record of exactly this scene and anatomy."""
+        """Return the recorded costs of a scene's effects; None if no record has the mark of this scene and anatomy."""
         found = self.effect_records.get(scene.name)
         return found if found and found.mark == self.compute_mark(scene) else None
 
     def select_recorded(self, scene: Scene) -> dict[str, FamilyFigures]:
-        """Select the families with figures that apply to a scene: a tool's force on this tissue, fixed to bone."""
+        """Return recorded figures by family; empty unless the scene is a tool force on this tissue, fixed to bone."""
         kinds = {type(effect): str(effect) for effect in scene.get_effects_on(self.anatomy)}
         pushed = {*kinds, Bonded} == {Elasticity, Held, Bonded, ToolForce}
         return {name: one for name, one in self.family_figures.items() if pushed and one.tissue == kinds[Elasticity]}
@@ -285,9 +285,9 @@ class PatientSetup:
         return compute_scene_mark(scene, self.site, self.choose_element(scene))
 
     def estimate_motion_error(self, scene: Scene) -> MotionError | None:
-        """Return the error in proportion to the motion, from this anatomy's ensemble of the scene or the template's.
+        """Return the position error as a share of the motion, fitted to the ensemble of this anatomy or the template.
 
-        None without an ensemble of a scene of that name with the same kinds of effects.
+        Returns None if the scene is not built-in, has other effect types than the built-in scene, or has no ensemble.
         """
         found = self.uncertainties.get(scene.name) or read_template_uncertainties().get(scene.name)
         if found is None or scene.name not in SCENES:
@@ -303,12 +303,12 @@ class PatientSetup:
 
 @dataclass(frozen=True, eq=False)
 class RestDeformer:
-    """Deformer without motion: the body stays undeformed, as in the scan."""
+    """Deformer that returns no motion: the brain stays undeformed, as in the scan."""
 
     anatomy: Anatomy
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Return zero displacement under any loads, as `guess` marks it."""
+        """Return zero displacements for any loads, at all vertices or at the vertices `at`; see `build_start`."""
         rest = build_start(np.zeros((len(loads), *self.anatomy.mesh.nodes.shape)))
         return rest if at is None else rest.restrict(at)
 
@@ -320,7 +320,7 @@ def read_template_uncertainties() -> Mapping[str, Uncertainty]:
 
 
 def describe_solvers(deformer: Deformer) -> tuple[str, ...]:
-    """List the solvers that a deformer tries for a load, as sentences; empty for a model or a resected body."""
+    """List sentences on the solvers that an intact `Fem` tries for a load; empty for any other deformer."""
     return deformer.plan.explain() if isinstance(deformer, Fem) else ()
 
 
@@ -330,7 +330,7 @@ def to_model_path(anatomy: Path, scene_name: str = "model") -> Path:
 
 
 def load_models(path: Path, anatomy: Anatomy) -> dict[str, Learned]:
-    """Load the models next to an anatomy, by name; models for one scene are called NAME-SCENE.
+    """Load the models in the files next to an anatomy, by name; models of a single scene are called NAME-SCENE.
 
     Raises
     ------
@@ -350,12 +350,12 @@ def open_theatre(
 ) -> PatientSetup:
     """Read an anatomy (default: the shipped template) with the files next to it: scan, models, uncertainties.
 
-    `scenes`: names of the scenes that will be played.
+    `scenes`: names of the scenes to be played. `model`: another file with models.
 
     Raises
     ------
     InputError
-        See `check_scene_exists`, before anything is read. Missing, unreadable or inconsistent files; an
+        An unknown scene (see `check_scene_exists`; it is tested first); a missing, unreadable or inconsistent file; an
         unavailable device.
 
     Examples

@@ -25,10 +25,10 @@ FOLD_START = 9e-3  # Distance from the hole at which the folds have their height
 
 @lru_cache(maxsize=4)
 def build_drape(site: CraniotomyFrame, segment_id: int, folded: bool) -> Layer:
-    """Build the surface lifted off the brain, with a round hole over the open cortex, and a wall round the hole.
+    """Build the drape: the brain surface moved outwards, with a round hole over the open cortex and a wall round it.
 
-    If `folded`, it is cloth with soft folds, which begin at the edge of the hole. All scenes of a patient share the
-    result.
+    If `folded`, the drape is cloth with soft folds that begin at the edge of the hole. The result is cached for all
+    scenes of a patient.
     """
     points, triangles, rim = cut_hole(site)
     colour = np.broadcast_to(DRAPE_COLOUR, points.shape)
@@ -44,7 +44,7 @@ def build_drape(site: CraniotomyFrame, segment_id: int, folded: bool) -> Layer:
 
 
 def cut_hole(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the surface lifted off the brain, with a round hole over the open cortex; see `clip_surface`."""
+    """Return the brain surface moved outwards, with a hole over the open cortex; for the arrays see `clip_surface`."""
     mesh = site.anatomy.mesh
     lifted = mesh.nodes + DRAPE_HEIGHT * compute_vertex_normals(mesh.nodes, mesh.surface)
     # Distance of a node outside the hole: across the axis on the near side, everywhere on the far side.
@@ -56,7 +56,7 @@ def cut_hole(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def fold_cloth(
     site: CraniotomyFrame, points: np.ndarray, triangles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Refine and fold a drape: points (n, 3) [m], triangles (m, 3), edges (k, 2) of the hole, and colours (n, 3)."""
+    """Refine and fold a drape; return points (n, 3) [m], triangles (m, 3), hole edges (k, 2) and colours (n, 3)."""
     corners, triangles = np.unique(points[triangles].reshape(-1, 3).round(9), axis=0, return_inverse=True)
     hole = HOLE_RATIO * site.clearance
 
@@ -83,7 +83,7 @@ def list_border_edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def compute_fold_heights(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Compute the height (n,) of folds, 0 to 1, at distances beyond the hole [m] and angles about its axis [rad]."""
+    """Compute fold heights (n,) in 0..1 at distances (n,) from the hole's edge [m] and angles (n,) round it [rad]."""
     rise, away = np.clip(distance / FOLD_START, 0.0, 1.0), distance / 15e-3
     folds = []
     for count, start in zip(FOLD_COUNTS, (0.0, 2.0), strict=True):
@@ -96,9 +96,9 @@ def compute_fold_heights(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
 def clip_surface(
     points: np.ndarray, triangles: np.ndarray, field: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the part of a surface where a linear field is positive: points (n, 3), triangles (m, 3), cut edges (k, 2).
+    """Clip a surface with points (V, 3) and triangles (F, 3) to the part where a linear `field` (V,) is positive.
 
-    points (V, 3), triangles (F, 3), value (V,). Triangles that the zero line crosses are cut along it.
+    Returns points (n, 3), triangles (m, 3) and cut edges (k, 2). Triangles on the zero line are cut along this line.
     """
     positive = field[triangles] > 0.0
     whole = triangles[positive.all(axis=1)]

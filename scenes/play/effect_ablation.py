@@ -1,4 +1,4 @@
-"""Cost and influence of each effect of a scene: the scene is solved with and without it, frame by frame."""
+"""Cost and influence of each effect of a scene, from FEM solutions of the frames with and without the effect."""
 
 import gc
 import time as clock
@@ -29,8 +29,8 @@ ALL = "all"  # Name of the run with all effects.
 class AblationRun:
     """FEM solutions of a scene's frames: displacements (F, V, 3) [m], NaN for resected vertices, and their cost.
 
-    `milliseconds`: median per frame; `memory_bytes`: device arrays kept from frame to frame; `unphysical`:
-    number of frames with inverted or overstrained tetrahedra.
+    `milliseconds`: median time per frame. `memory_bytes`: total size of the Warp arrays that the run keeps.
+    `unphysical`: number of frames with inverted or overstrained tetrahedra.
     """
 
     displacement: np.ndarray
@@ -41,11 +41,11 @@ class AblationRun:
 
 @dataclass(frozen=True)
 class AblationRow:
-    """Row of one effect: differences of the full scene from the scene without it; `ALL`: values of the full scene.
+    """Differences between the full scene and the scene without one effect; for `ALL`, values of the full scene.
 
-    Values: time per frame [ms]; memory kept on the device [MB]; maximum over frames of the mean displacement of the
-    tumour's and the open cortex's vertices [mm]. `refused` is the reason why the effect cannot be removed: then
-    there are no values. `unphysical`: number of such frames of the run without the effect; `ALL`: of the full scene.
+    Values are time per frame [ms], kept device memory [MB], and the maximum over frames of the mean displacement of
+    the vertices of tumour and open cortex [mm]; None if the effect cannot be removed for the reason `refused`.
+    `unphysical`: number of frames with inverted or overstrained tetrahedra in the run without the effect.
     """
 
     effect: str
@@ -58,7 +58,7 @@ class AblationRow:
 
 
 def list_switchable_effects(scene: Scene, anatomy: Anatomy) -> list[str]:
-    """List effects that can be disabled: all except tissue and constraints."""
+    """List the class names of effects that can be disabled: all effects except tissue and constraints."""
     kinds = (type(effect) for effect in scene.get_effects_on(anatomy))
     return [kind.__name__ for kind in kinds if kind not in (Elasticity, Held, Bonded, Slide)]
 
@@ -73,14 +73,14 @@ def remove_effect(scene: Scene, effect: Effect) -> Scene:
 def measure_effects(
     patient: PatientSetup, scene: Scene, frame_step: int, effect_names: Collection[str] | None = None
 ) -> Iterator[AblationRow]:
-    """Yield the row of the scene, then of each effect, with the scene's own tissue; solve each `frame_step`-th frame.
+    """Yield the row of the full scene, then the row of each effect; every `frame_step`-th frame is solved.
 
-    `effect_names`: classes of the effects to measure; None: all.
+    `effect_names`: class names of the effects to measure; None: all effects.
 
     Raises
     ------
     InputError
-        A scene that cannot be solved to the end.
+        A frame of the full scene is not solved.
     """
     whole = solve_frames(patient, scene, frame_step)
     nowhere = replace(whole, displacement=np.zeros_like(whole.displacement), milliseconds=0.0, memory_bytes=0)
@@ -106,7 +106,7 @@ def measure_effects(
 def build_record(
     patient: PatientSetup, scene: Scene, rows: Sequence[AblationRow], frame_step: int, machine: str
 ) -> EffectRecord:
-    """Build the record of a scene's measured effects; each `frame_step`-th frame was solved on a `machine`."""
+    """Build the record of measured effects from `rows`; every `frame_step`-th frame was solved on `machine`."""
     figures = {row.effect: (row.milliseconds, row.tumour_mm) for row in rows}
     frames = len(scene.times[::frame_step])
     return EffectRecord(
@@ -116,12 +116,12 @@ def build_record(
 
 
 def solve_frames(patient: PatientSetup, scene: Scene, frame_step: int) -> AblationRun:
-    """Solve each `frame_step`-th frame of a scene in order, each starting from the previous one.
+    """Solve every `frame_step`-th frame of a scene in order; each solve starts from the previous solution.
 
     Raises
     ------
     InputError
-        A body without fixed nodes, or a frame that is not in equilibrium. Unphysical equilibria are counted.
+        A mesh without fixed nodes, or a frame without equilibrium. An unphysical equilibrium is counted, not rejected.
     """
     before = list_arrays()  # arrays that existed before do not belong to the scene
     fem = patient.build_fem(scene, scene.accuracy, live=True)
@@ -137,7 +137,7 @@ def solve_frames(patient: PatientSetup, scene: Scene, frame_step: int) -> Ablati
 def _solve_frames(
     fem: Deformer, scene: Scene, site: CraniotomyFrame, times: list[float]
 ) -> tuple[list[np.ndarray], list[float], int]:
-    """Solve the frames: displacements (V, 3) [m], NaN where resected, and seconds; number of unphysical frames."""
+    """Solve the frames; return displacements (V, 3) [m] (NaN where resected) and seconds by frame, unphysical count."""
     last, found, seconds, unphysical, stage = None, [], [], 0, Stage(scene, site)
     for time in times:
         loads = scene.build_loads(site, scene.path(time), time)

@@ -20,12 +20,12 @@ REMEDY = "Delete it, and measure again by `sulcus effects --out`."  # Remedy for
 
 @dataclass(frozen=True)
 class EffectRecord:
-    """Measured effects of one scene on one anatomy, of which a number of `frames` was solved.
+    """Measured effects of one scene on one anatomy, from `frames` solved frames.
 
-    `mark`: fingerprint of the scene, see `compute_scene_mark`; `day`: ISO 8601; `machine` in words.
-    `effects`, by class name: FEM time per frame that an effect adds [ms], and tumour motion that it causes [mm]; None:
-    not solvable without it, `refused` has the reason. `all`: time and motion of the whole scene. `unphysical`: number
-    of frames with inverted or overstrained tetrahedra, in the solutions with and without each effect.
+    `mark`: fingerprint of the scene, see `compute_scene_mark`; `day`: ISO 8601 date; `machine`: description.
+    `effects`, by class name: FEM time per frame [ms] and tumour motion [mm] that the effect adds. The key "all" has the
+    values of the full scene. Both are None if the scene cannot be solved without the effect; `refused` has the reason.
+    `unphysical`: number of frames with inverted or overstrained tetrahedra, summed over all runs.
     """
 
     scene: str
@@ -39,13 +39,13 @@ class EffectRecord:
 
 
 def format_unphysical(count: int) -> str:
-    """Describe a number of unphysical frames; empty for none."""
+    """Format the number of unphysical frames as a clause; return an empty string for 0."""
     frames = f"{count} frame has" if count == 1 else f"{count} frames have"
     return f"{frames} inverted or overstrained tetrahedra" if count else ""
 
 
 def read_effect_records(path: Path) -> dict[str, EffectRecord]:
-    """Read the records of a file, by scene; empty without a file.
+    """Read the records of a file, by scene name; return an empty dict if the file does not exist.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def read_effect_records(path: Path) -> dict[str, EffectRecord]:
 
 
 def write_effect_record(path: Path, record: EffectRecord) -> None:
-    """Add a scene to a file, or replace it."""
+    """Add the record of a scene to a file; a former record of the same scene is replaced."""
     rows = (read_effect_records(path) | {record.scene: record}).values()
     with write_atomically(path, ".json") as unfinished:
         stored = {"format": FORMAT, "units": ["ms", "mm"], "scenes": [asdict(row) for row in rows]}

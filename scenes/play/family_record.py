@@ -1,4 +1,4 @@
-"""Figures of families of models on an anatomy: a report of `sulcus report`, stored next to it."""
+"""Measured errors and times of model families on an anatomy, read from a `sulcus report` file next to its mesh."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,10 +15,10 @@ Figure = Annotated[float, msgspec.Meta(ge=0.0, lt=1e7)]  # Number in a report [m
 
 
 class FamilyFigures(msgspec.Struct, array_like=True, frozen=True):
-    """Figures of a family over a number of palpation loads on `tissue` that is fixed to bone, timed on `machine`.
+    """Error and times of a model family over `loads` palpation loads, on `tissue` fixed to bone, timed on `machine`.
 
-    `p95_mm`: 95th percentile of the maximum error at the tumour relative to quadratic FEM (p2). `preparation_s`: time
-    before the first load.
+    `p95_mm`: 95th percentile of the maximum error at the tumour relative to quadratic FEM (p2). `median_ms`: time per
+    load. `preparation_s`: time before the first load.
     """
 
     tissue: str
@@ -29,13 +29,13 @@ class FamilyFigures(msgspec.Struct, array_like=True, frozen=True):
     preparation_s: Figure
 
     def describe_error(self, brief: bool) -> str:
-        """Describe the error for an image."""
+        """Format the error bound for an image; `brief` selects the short form."""
         bound = format_bound(1e-3 * self.p95_mm, 2)
         return f"model <= {bound}" if brief else f"model error <= {bound} (95 % of {self.loads} pushes, relative to p2)"
 
 
 def read_family_figures(mesh_path: Path, anatomy_digest: str) -> dict[str, FamilyFigures]:
-    """Read the figures of families in MESH.report.json, of the anatomy with this digest; empty without a file.
+    """Read the figures by family in MESH.report.json for the anatomy with this digest; empty if there is no file.
 
     Raises
     ------

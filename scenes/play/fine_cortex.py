@@ -20,7 +20,7 @@ CUT_COLOUR = (0.80, 0.58, 0.46)  # Colour of the walls of a cavity (RGB, 0 to 1)
 
 @dataclass(frozen=True, eq=False)
 class FineCortex:
-    """Fine surface embedded in FEM surface vertices (n,) of a mesh, and its colours (m, 3)."""
+    """Fine surface embedded in the FEM surface with mesh vertices (n,), and the colours (m, 3) of its own vertices."""
 
     vertices: np.ndarray
     surface: EmbeddedSurface
@@ -30,7 +30,7 @@ class FineCortex:
 def build_fine_cortex(
     site: CraniotomyFrame, mesh: TetMesh, surface: np.ndarray, intensity: Intensity | None, edge: float = EDGE_LENGTH
 ) -> FineCortex:
-    """Build the fine cortex on surface triangles (S, 3) of a mesh, from which tissue may have been resected.
+    """Build the fine cortex on the surface triangles (S, 3) of an intact or a resected mesh.
 
     `edge`: largest edge of a triangle in the craniotomy [m].
     """

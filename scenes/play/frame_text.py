@@ -1,4 +1,4 @@
-"""Text of a frame: what acts, and both errors: of the model, and of the tumour in the patient."""
+"""Text lines of a frame: active loads, error of the deformation model, and error of the tumour position."""
 
 import re
 from collections.abc import Sequence
@@ -34,14 +34,14 @@ OUTCOME_WARNINGS = {  # Warnings written into an image whose solution is unrelia
 
 
 def describe_outcome(outcome: Outcome) -> str:
-    """Return the reason why a solution is unreliable, in a few words for the image; empty if it is reliable."""
+    """Return the warning for an image that shows an unreliable solution; empty if the outcome is good."""
     return "" if outcome.good else OUTCOME_WARNINGS.get(outcome, "not solved to the end: do not rely on it")
 
 
 def format_active_loads(loads: Loads, solution: Deformation, nodes: np.ndarray) -> str:
-    """Describe the active loads of the first load case, and the measured tool force, as one line; empty without loads.
+    """Format the active loads of the first load case, and the measured tool force, as one line; empty without loads.
 
-    `nodes` (V, 3) [m] are the undeformed vertices of the brain: the fluid level is given as a share of its height.
+    `nodes` (V, 3) [m] are the undeformed vertices of the brain: the CSF level is a percentage of the brain's height.
     """
     return ", ".join(words for words in (_describe_cause(cause, solution, nodes) for cause in loads.causes) if words)
 
@@ -65,7 +65,7 @@ def _describe_cause(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str
 
 
 def _name_direction(direction: np.ndarray) -> str:
-    """Name the RAS directions of a vector (3,): the main one, and the angles to the others, as "back, 30 deg left"."""
+    """Name the main RAS direction of a vector (3,), and its angles towards the others, as in "back, 30 deg left"."""
     down = direction / np.linalg.norm(direction)
     axes = [axis for axis in np.argsort(-np.abs(down), kind="stable") if abs(down[axis]) > MIN_NAMED_COMPONENT]
     names = [SIDES[axis][int(down[axis] < 0.0)] for axis in axes]
@@ -74,14 +74,14 @@ def _name_direction(direction: np.ndarray) -> str:
 
 
 def _describe_fluid(cause: Posture, nodes: np.ndarray) -> str:
-    """Describe the fluid level as a share of the brain's height."""
+    """Describe the CSF level as a percentage of the brain's height along gravity."""
     height = -nodes @ (cause.direction[0] / np.linalg.norm(cause.direction[0]))
     share = float(np.clip((cause.csf_level[0] - height.min()) / np.ptp(height), 0.0, 1.0))
     return f"CSF level {100.0 * share:.0f} %"
 
 
 def shorten_source(source: str) -> str:
-    """Shorten `Deformation.source`: regions with another tissue are given by name only."""
+    """Shorten `Deformation.source`: regions with their own tissue are listed by name only."""
     return OWN_TISSUES_PATTERN.sub(lambda found: f"; own tissue: {', '.join(REGION_PATTERN.findall(found[0]))}", source)
 
 
@@ -92,20 +92,20 @@ def format_errors(
     model_bound: float | None, tumour_error: TumourError, is_surrogate: bool, warning: str = "", brief: bool = False,
     figures: FamilyFigures | None = None,
 ) -> list[str]:  # fmt: skip
-    """Build the lines for an image: error of the model, and error of the tumour position.
+    """Build the lines for an image: error of the model (unless there is a warning or an observation), position error.
 
-    Only the latter for an unreliable solution, and for an estimate from observations.
+    An unreliable solution (`warning`) and an estimate from observations have only the tumour position error.
 
     Parameters
     ----------
     model_bound
-        Error bound guaranteed by the model [m]; None if there is none.
+        Error bound guaranteed by the model [m]; None if the model has no bound.
     is_surrogate
         True if another model than FEM computed the deformation.
     brief
         True for the short form, for a small image.
     figures
-        Recorded figures of another family than FEM, which replace the bound.
+        Recorded figures of a model family other than FEM; their error replaces `model_bound`.
     """
     modelled = tumour_error.observed is None and not warning
     model = figures.describe_error(brief) if figures else format_model_error(model_bound, is_surrogate, brief)
@@ -113,13 +113,13 @@ def format_errors(
 
 
 def is_by_other_family(deformation: Deformation) -> bool:
-    """Return True if neither finite elements nor a trained model, but another family of models computed a result."""
+    """Return True if a model family other than FEM and trained models computed the deformation."""
     method = deformation.source.partition(" (")[0]
     return method in FAMILIES or method in OTHER_METHODS.values()
 
 
 def format_model_error(bound: float | None, is_surrogate: bool, brief: bool = False) -> str:
-    """Describe the error of the model relative to its FEM."""
+    """Format the error bound [m] of a surrogate relative to FEM, or state that the result is the FEM reference."""
     if not is_surrogate:
         return "FEM reference" if brief else "FEM reference (no surrogate)"
     if bound is None:
@@ -129,7 +129,7 @@ def format_model_error(bound: float | None, is_surrogate: bool, brief: bool = Fa
 
 
 def format_tumour_error(error: TumourError, brief: bool = False) -> str:
-    """Describe the error of the drawn tumour position relative to the patient."""
+    """Format the error of the drawn tumour position relative to the position in the patient."""
     if error.bound is None:
         return "tumour: not known" if brief else NOT_KNOWN_WORDS
     within, guess = format_bound(error.bound, 1), ", rough estimate" if error.is_rough else ""
@@ -146,7 +146,7 @@ def format_tumour_error(error: TumourError, brief: bool = False) -> str:
 
 
 def find_largest(errors: Sequence[TumourError]) -> TumourError:
-    """Return the largest error of several frames; not available if it is not available for one frame."""
+    """Return the frame error with the largest bound; without bound if the bound of any frame is not available."""
     known = [error for error in errors if error.bound is not None]
     if len(known) < len(errors) or not known:
         return TumourError(None)
@@ -154,7 +154,7 @@ def find_largest(errors: Sequence[TumourError]) -> TumourError:
 
 
 def annotate_image(overlaid: Overlaid, frame_number: int, remark: str) -> None:
-    """Write a remark at the bottom of a composite image and a frame's number, in place."""
+    """Write a remark and the frame number at the bottom of a composite image (in place)."""
     height, width = overlaid.taken.shape
     place_text(overlaid.colour, overlaid.taken, wrap_line(remark, MAX_BOTTOM_WIDTH * width), (0, height))
     place_text(overlaid.colour, overlaid.taken, label_frame(frame_number), (width, height))

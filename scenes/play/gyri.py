@@ -1,8 +1,8 @@
 """Gyri, sulci, vessels and pia of the open cortex, as maps over the tangent plane of the undeformed craniotomy.
 
-The pattern is procedural: a Swift-Hohenberg field, whose stripes have one wavelength and branch as gyri do. Dark fluid
-below the surface in the scan attracts its troughs, so a scan that shows sulci places them; an average brain or a body
-without a scan leaves the pattern to chance. It works for every anatomy, and always gives gyri of natural width.
+The pattern is a Swift-Hohenberg field, whose stripes have one wavelength and branch like gyri. Dark fluid below the
+surface in the scan attracts the troughs of the field, so that a scan with visible sulci determines their positions.
+On an average brain or without a scan the pattern is random. Gyri have a natural width on every anatomy.
 """
 
 from dataclasses import dataclass, replace
@@ -56,13 +56,13 @@ GYRI = GyriSettings()
 
 @dataclass(frozen=True, eq=False)
 class CortexMaps:
-    """Maps (n, n, 4) over the tangent plane: depth [m] and colour (RGB, 0 to 1); `half_width` is half the side [m]."""
+    """Maps (n, n, 4) of depth [m] and colour (RGB, 0 to 1) on a square with half side `half_width` [m]."""
 
     values: np.ndarray
     half_width: float
 
     def sample(self, site: CraniotomyFrame, points: np.ndarray) -> np.ndarray:
-        """Return values (m, 4) at undeformed points (m, 3) [m]."""
+        """Interpolate values (m, 4) at undeformed points (m, 3) [m], projected onto the tangent plane."""
         across = np.stack([site.right, site.up]) @ (points - site.origin).T
         index = (across / self.half_width + 1.0) * 0.5 * (len(self.values) - 1)
         columns = [map_coordinates(each, index, order=1, mode="nearest") for each in np.moveaxis(self.values, 2, 0)]
@@ -71,24 +71,24 @@ class CortexMaps:
 
 @lru_cache(maxsize=2)
 def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> CortexMaps:
-    """Draw the maps of an open cortex; equal inputs give equal maps."""
+    """Build the depth and colour maps of an open cortex; equal inputs give equal maps."""
     random = np.random.default_rng(3)
     count = COARSE_STEP * int(np.ceil(2.0 * (site.radius + MAP_MARGIN) / MAP_SPACING / COARSE_STEP))
     half = 0.5 * (count - 1) * MAP_SPACING
     here = np.stack(np.meshgrid(*[np.arange(count)] * 2, indexing="ij"))
 
     def smooth(length: float) -> np.ndarray:
-        """Smooth noise (n, n) of unit standard deviation, with a length scale [m]."""
+        """Sample smooth noise (n, n) of unit standard deviation, with a length scale `length` [m]."""
         noise = gaussian_filter(random.standard_normal((count, count)), length / MAP_SPACING, mode="wrap")
         return noise / noise.std()
 
     def warp(image: np.ndarray, length: float, shift: float) -> np.ndarray:
-        """Shift an image (n, n) by smooth noise of a length scale and a standard deviation [m]."""
+        """Shift the pixels of an image (n, n) by smooth noise with length scale `length` and deviation `shift` [m]."""
         bend = np.stack([smooth(length), smooth(length)]) * shift / MAP_SPACING
         return map_coordinates(image, here + bend, order=1, mode="wrap")
 
     def sample_vessels(trunks: int, width: float, tortuosity: float) -> np.ndarray:
-        """Opacity (n, n) of vessels that branch."""
+        """Sample the opacity (n, n) of branching vessels."""
         thin = replace(
             VESSELS, trunk_count=trunks, max_width=width, min_trunk_ratio=0.25, min_width=0.16e-3, turn_deviation=0.08,
             branch_probability=0.03, width_factor=0.9955, branch_width_ratio=0.62, mottle_contrast=0.0,
@@ -131,16 +131,16 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
 
 
 def _find_short(lines: np.ndarray, length: float) -> np.ndarray:
-    """Find the connected parts of a mask (n, n) that are shorter than a length [m], by their area."""
+    """Return the connected parts of a mask (n, n) that are shorter than `length` [m], which is estimated from area."""
     parts = np.zeros(lines.shape, np.int32)
     label(lines, output=parts)
     return lines & (np.bincount(parts.ravel()) < LINE_WIDTH * length / MAP_SPACING**2)[parts]
 
 
 def _find_sulci(field: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find the troughs of stripes (n, n) of unit amplitude: distance from the nearest [grid spacings], and strength.
+    """Return distances (n, n) from the nearest trough of a striped field [grid spacings], and its strength (n, n).
 
-    Across a wave of this wavelength, the ratio of slope and curvature is the tangent of the phase.
+    Stripes have unit amplitude. Across a wave, slope and curvature give the phase: tan(phase) = k slope / curvature.
     """
     k, width = 2.0 * np.pi / wavelength, 0.06 * wavelength
     x, y, xx, xy, yy = (
@@ -154,7 +154,7 @@ def _find_sulci(field: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.nd
 
 
 def _read_fluid(site: CraniotomyFrame, intensity: Intensity | None, half: float, count: int) -> np.ndarray:
-    """Read the darkness (n, n) of the scan below the surface, in standard deviations; 0 without a scan."""
+    """Compute the darkness (n, n) of the scan below the surface [standard deviations]; zero without a scan."""
     if intensity is None:
         return np.zeros((count, count))
     mesh = site.anatomy.mesh
@@ -172,7 +172,7 @@ def _read_fluid(site: CraniotomyFrame, intensity: Intensity | None, half: float,
 
 
 def _solve_swift_hohenberg(random: np.random.Generator, fluid: np.ndarray, wavelength: float) -> np.ndarray:
-    """Grow stripes (n, n) of a wavelength [grid spacings] from noise; troughs are attracted by `fluid` (n, n)."""
+    """Compute a striped field (n, n) of a wavelength [grid spacings] from noise; `fluid` (n, n) attracts troughs."""
     k = np.hypot(*np.meshgrid(np.fft.fftfreq(len(fluid)), np.fft.rfftfreq(len(fluid)), indexing="ij")) * wavelength
     implicit = 1.0 / (1.0 - TIME_STEP * (GROWTH - (1.0 - k**2) ** 2))
     field = 0.3 * random.standard_normal(fluid.shape)

@@ -1,4 +1,4 @@
-"""Detection of a frame's overlay in its pixels: outline, numbers, and parts that are not seen through cortex."""
+"""Detection of a frame's overlay in its pixels: outline, numbers, and parts under drape or bone."""
 
 import numpy as np
 
@@ -41,14 +41,14 @@ MAX_NUMBER_DISTANCE = 0.35  # Largest distance of the number from the tip, as a 
 
 
 def render_silhouette(camera: Camera, layer: Layer) -> np.ndarray:
-    """Compute the pixels (H, W) bool that a surface covers, by the independent renderer."""
+    """Compute the mask (H, W) bool of pixels that a surface covers, with the independent ray caster."""
     return raycast(camera, layer.vertices, layer.triangles).mask
 
 
 def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
-    """Compute the distance between the outline in a frame's image and the outline of a silhouette (H, W) bool [pixel].
+    """Compute the distance [pixel] between the outline in a frame's image and that of a silhouette mask (H, W) bool.
 
-    Outlines drawn broken, because they are occluded or unreliable, may have gaps.
+    A broken outline, which marks an occluded tumour or an unreliable solution, may have gaps.
     """
     ink, shut = average_colour(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), mask_covered_pixels(frame)
     above = _mask_foreground(frame)
@@ -62,25 +62,25 @@ def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
 
 
 def measure_true_outline_error(frame: Frame, mask: np.ndarray) -> float:
-    """Compute the distance of the truth's outline [pixel]; the estimate's outline, drawn over it, is masked out."""
+    """Compute the distance [pixel] between the drawn FEM tumour's outline and a mask's outline; ignore the estimate's."""
     above = _mask_foreground(frame) | find_colour(frame.shown, average_colour(TUMOUR_COLOUR))
     return measure_outline_distance(frame.shown, average_colour(TRUTH_COLOUR), mask, above, 2 * sum(TRUE_STROKES))
 
 
 def _mask_foreground(frame: Frame) -> np.ndarray:
-    """Return the mask (H, W) bool of text and tools."""
+    """Return the mask (H, W) bool of pixels with text or a tool."""
     return find_colour(frame.shown, WHITE, 0) | (frame.picture.segmentation == TOOL)
 
 
 def mask_covered_pixels(frame: Frame) -> np.ndarray:
-    """Return the mask (H, W) bool of pixels that show neither a tool nor cortex through which the tumour is seen."""
+    """Return the mask (H, W) bool of pixels that show neither a tool nor the open cortex above the tumour."""
     return ~np.isin(frame.picture.segmentation, (*OPENING.ids, TOOL))
 
 
 def has_hidden_mark(frame: Frame, mask: np.ndarray) -> bool:
-    """Return True if the image marks the occluded part of a silhouette (H, W) bool, if there is one.
+    """Return True if the image marks the occluded part of a silhouette (H, W) bool, or if no part is occluded.
 
-    In this part the outline must be broken, without shading, and the image must name the occluder.
+    In the occluded part, the outline must be broken and not shaded, and the image must name the occluder.
     """
     ink, shut = average_colour(DOUBTFUL_COLOUR if frame.doubt else TUMOUR_COLOUR), mask_covered_pixels(frame)
     least, most = BROKEN_SHARES
@@ -113,7 +113,7 @@ def has_printed_numbers(player: Player, frame: Frame) -> bool:
 
 
 def has_distance_at_tip(player: Player, frame: Frame) -> bool:
-    """Return True if the distance is completely visible near the tip, or near the border if the tip is out of view."""
+    """Return True if the distance text is visible near the tip, or near the border if the tip is outside the image."""
     if frame.tip is None:
         return True
     (tip,), _ = frame.camera.project(frame.tip[None])
@@ -127,7 +127,7 @@ def has_distance_at_tip(player: Player, frame: Frame) -> bool:
 
 
 def _find_number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, int, int, int] | None:
-    """Find the box of the distance text in an image; None if it is not found."""
+    """Find the bounding box of the distance text in an image; None if the text is not found."""
     corners = _get_corners(player, frame)
     distance, inside = _compute_distance(player, frame, corners, tip), is_enclosing(corners, tip)
     error = None if frame.doubt else frame.tumour_error.bound
@@ -140,7 +140,7 @@ def _find_number(player: Player, frame: Frame, tip: np.ndarray) -> tuple[int, in
 
 
 def _has_printed_estimate(player: Player, frame: Frame) -> bool:
-    """Return True if the image shows the estimated tumour motion and its error as computed here."""
+    """Return True if the image shows the estimated tumour motion and its error, or if there is no estimate."""
     found = frame.estimate
     if found is None or found.location is None:
         return True
@@ -160,12 +160,12 @@ def _has_printed_estimate(player: Player, frame: Frame) -> bool:
 
 
 def _get_corners(player: Player, frame: Frame) -> np.ndarray:
-    """Return the corners (S, 3, 3) [m] of the tumour's triangles as they are drawn."""
+    """Return the corners (S, 3, 3) [m] of the drawn tumour's triangles."""
     return player.estimate_positions(frame)[player.stage.select_stage(frame.loads).anatomy.tumour_surface]
 
 
 def _compute_distance(player: Player, frame: Frame, corners: np.ndarray, tip: np.ndarray) -> float:
-    """Compute the distance from tip to tumour [m] by sampling the drawn surfaces, corrected by the model."""
+    """Compute the distance from tip to tumour [m] by sampling the drawn surface; a trained model corrects the value."""
     apart = float(np.linalg.norm(np.einsum("qc,scx->sqx", SAMPLES, corners) - tip, axis=2).min())
     model = find_first_model(player.deformer, frame.deformation)
     if model is None:

@@ -1,4 +1,4 @@
-"""Surgical instruments as visual shapes: their contact shape where they touch tissue, and a modelled upper part."""
+"""Rendered shapes of surgical instruments: the contact shape at the tissue, and a modelled upper part."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -63,14 +63,14 @@ SHAPES = {
 
 
 def build_sweep(profile: np.ndarray, stations: np.ndarray, wide_axis: Sequence[float]) -> trimesh.Trimesh:
-    """Sweep a profile along a smooth centre line: a closed surface [m], with edges that are shaded as sharp.
+    """Sweep a profile along a smooth centre line; return a closed surface [m] whose sharp edges are shaded as sharp.
 
     Parameters
     ----------
     profile
         Points (k, 2) of a closed convex curve, counter-clockwise, along the wide axis and the normal.
     stations
-        Rows (n, 5) [mm] along the centre line: point, and factors of the profile along both axes.
+        Rows (n, 5) along the centre line: a point [mm], and the scale factors [mm] of the profile along both axes.
     wide_axis
         Direction (3,) of the wide axis, not parallel to the centre line.
     """
@@ -81,7 +81,7 @@ def build_sweep(profile: np.ndarray, stations: np.ndarray, wide_axis: Sequence[f
 
 
 def build_loft(profiles: np.ndarray, centre_line: np.ndarray, wide_axis: Sequence[float]) -> trimesh.Trimesh:
-    """Join profiles (n, k, 2) [m] at the points (n, 3) [m] of a centre line; otherwise as `build_sweep`."""
+    """Join profiles (n, k, 2) [m] at the points (n, 3) [m] of a centre line to a closed surface; see `build_sweep`."""
     tangent = normalise_vectors(np.gradient(centre_line, axis=0))
     normal = normalise_vectors(np.cross(tangent, wide_axis))
     rings = centre_line[:, None] + profiles @ np.stack([np.cross(normal, tangent), normal], axis=1)
@@ -94,7 +94,7 @@ def build_loft(profiles: np.ndarray, centre_line: np.ndarray, wide_axis: Sequenc
 
 
 def has_instrument(tool: object) -> TypeGuard[Probe | Blade]:
-    """Return True if a tool is drawn as an instrument: a ball or blade of usual size, not a user's own shape."""
+    """Return True if a tool is drawn as an instrument: a ball or a blade of sufficient size, not another shape."""
     if type(tool) is Blade:
         return tool.length > 4.0 * tool.edge + 2.0 * SPATULA_BEND and tool.width > 4.0 * tool.edge
     return type(tool) is Probe and tool.radius >= MIN_BALL_RADIUS
@@ -102,7 +102,7 @@ def has_instrument(tool: object) -> TypeGuard[Probe | Blade]:
 
 @lru_cache(maxsize=8)
 def build_instrument(tool: Probe | Blade, instrument: BallInstrument, segment_id: int) -> tuple[Layer, ...]:
-    """Build the layers of a brain spatula, or of an instrument with a ball, in the tool's frame."""
+    """Build the rendered layers of a brain spatula, or of an instrument with a ball, in tool coordinates."""
     if isinstance(tool, Blade):
         return (build_metal_layer([build_spatula(tool)], [STEEL], segment_id, BLADE_LIGHT),)
     lift = np.array([0.0, 0.0, 1e3 * tool.radius, 0.0, 0.0])
@@ -121,7 +121,7 @@ def build_instrument(tool: Probe | Blade, instrument: BallInstrument, segment_id
 def build_metal_layer(
     meshes: Sequence[trimesh.Trimesh], colours: Sequence[Sequence[float]], segment_id: int, gloss: tuple[float, float]
 ) -> Layer:
-    """Join meshes of polished metal, each with its colour; light: gloss and shininess."""
+    """Join meshes, each with its colour, to one layer of polished metal; `gloss` contains gloss and shininess."""
     whole = cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
     along = np.asarray(whole.vertex_normals) @ REFLECTED
     bands = np.exp(-(((along[:, None] - BANDS) / 0.15) ** 2)).sum(axis=1, keepdims=True)
@@ -130,7 +130,7 @@ def build_metal_layer(
 
 
 def build_spatula(blade: Blade) -> trimesh.Trimesh:
-    """Build a brain spatula: the lower half of a blade, with a thinner strip that leads up and away from its end."""
+    """Build a brain spatula: the lower half of a blade, and a thinner strip that leads upwards from the blade's end."""
     edge, half = blade.edge, 0.5 * blade.length
     rounded = edge * np.sin(np.linspace(-0.48 * np.pi, 0.0, 9))
     y = np.append(rounded + edge - half, np.linspace(edge - half, half - SPATULA_BEND, 12)[1:])

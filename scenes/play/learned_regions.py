@@ -1,4 +1,4 @@
-"""Tissue of a scene's regions, given the tissue that the models of its anatomy were trained on."""
+"""Tissue of a scene's regions, derived from the tissue that the models of the anatomy were trained on."""
 
 from collections.abc import Collection
 from dataclasses import replace
@@ -10,10 +10,10 @@ from sim.material import Material, Ogden, Tissue
 def find_trained_regions(
     tissue: Elasticity, trained_tissue: Elasticity | None, excluded: Collection[int] = frozenset()
 ) -> dict[int, Tissue]:
-    """Return tissues by label of the regions that a scene with tissue `tissue` takes from the models.
+    """Return tissues, by region label, that a scene with tissue `tissue` takes from the models' training.
 
-    These are regions of the models' training without a tissue in the scene that are not among the `excluded`. Their
-    stiffness relative to the brain is kept.
+    The regions are those of `trained_tissue` that are neither in `tissue` nor in `excluded`. The ratio of a region's
+    stiffness to the brain's stiffness is kept.
     """
     brain = tissue.default
     if trained_tissue is None or brain is None or trained_tissue.default is None:
@@ -23,7 +23,7 @@ def find_trained_regions(
 
 
 def _scale_tissue(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
-    """Return a region's tissue in a scene of this brain, scaled from the trained one; other laws: the brain's."""
+    """Scale a trained region's tissue to the scene's `brain`; return `brain` if the material laws cannot be scaled."""
     if isinstance(region, Material | Ogden) and _remove_relaxation(brain) == _remove_relaxation(learned):
         return replace(region, prony=brain.prony)
     if not isinstance(brain, Material) or not isinstance(region, Material) or not isinstance(learned, Material):
@@ -33,5 +33,5 @@ def _scale_tissue(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
 
 
 def _remove_relaxation(tissue: Tissue) -> Tissue:
-    """Return a tissue without its relaxation."""
+    """Return a tissue without its relaxation (Prony terms)."""
     return replace(tissue, prony=()) if isinstance(tissue, Material | Ogden) else tissue

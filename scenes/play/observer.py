@@ -1,4 +1,4 @@
-"""Observers of the open cortex that estimate the tumour position, without force, stiffness or load."""
+"""Observers of the open cortex, which estimate the tumour position without measured force, stiffness or load."""
 
 from __future__ import annotations
 
@@ -41,20 +41,20 @@ NO_POINTS = Observation(np.zeros((0, 3)))
 
 @dataclass(frozen=True, eq=False)
 class TumourEstimate:
-    """Estimated tumour position, with the ground truth.
+    """Estimated tumour position in one frame, with the ground truth.
 
     Parameters
     ----------
     anatomy
-        The body at rest.
+        Undeformed anatomy.
     observation
         Observed points.
     location
-        Result of the locator; None if it rejects the observation.
+        Result of the locator; None if the locator rejects the observation.
     rejection
-        Reason of the rejection in the locator's words; else empty.
+        The locator's reason to reject the observation; empty if the observation is accepted.
     centroid, true_motion
-        (3,) [m]: centroid of the tumour in the scan, and its true displacement.
+        Centroid (3,) [m] of the tumour in the scan, and true displacement (3,) [m] of the centroid.
     seconds
         Time of observation and localisation [s].
     """
@@ -69,7 +69,7 @@ class TumourEstimate:
 
     @property
     def motion(self) -> np.ndarray:
-        """Mean displacement (3,) [m] of the tumour centroid; zero if the observation is rejected."""
+        """Estimated displacement (3,) [m] of the tumour centroid; zero if the observation is rejected."""
         return np.zeros(3) if self.location is None else self.location.centroid
 
     @property
@@ -79,7 +79,7 @@ class TumourEstimate:
 
     @property
     def error_bound(self) -> float | None:
-        """95 % bound on the error of the least certain tumour vertex [m]; None if the observation is rejected."""
+        """95 % bound on the error of the tumour vertex with the largest variance [m]; None after a rejection."""
         if self.location is None:
             return None
         largest = np.linalg.eigvalsh(self.location.compute_covariance(self.anatomy.tumour_nodes))[:, -1].max()
@@ -97,7 +97,7 @@ class TumourEstimate:
 
     @property
     def is_significant(self) -> bool:
-        """True if the estimated motion is larger than its error (95 %)."""
+        """True if the estimated motion is larger than the 95th percentile of its error."""
         return self.location is not None and self.motion_length > self.location.p95
 
     @property
@@ -110,7 +110,7 @@ class TumourEstimate:
 
     @property
     def remark(self) -> str:
-        """Remark in the image, in a few words."""
+        """Remark for the image: true motion and estimation error; empty if the observation is rejected."""
         if self.location is None:
             return ""
         still = "" if self.is_significant else "no significant motion detected; "
@@ -120,7 +120,7 @@ class TumourEstimate:
 
     @property
     def source(self) -> str:
-        """Description of the observation, or the reason of its rejection."""
+        """Description of the observation, or the reason why the locator rejected the observation."""
         if self.location is None:
             return f"rejected, {self.rejection}"
         tip = ", and where the tool touches" if len(self.observation.tips) else ""
@@ -144,7 +144,7 @@ class TumourEstimate:
 
 
 class TumourObserver(Protocol):
-    """Observer that estimates the tumour position from observations, for a stage."""
+    """Protocol of an observer, which estimates the tumour position in the frames of a scene from observations."""
 
     def estimate(self, frame_number: int, positions: np.ndarray, corners: np.ndarray | None = None) -> TumourEstimate:
         """Estimate the tumour position in frame `frame_number`, for a body at `positions` (V, 3) [m].
@@ -156,7 +156,7 @@ class TumourObserver(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PointObserver:
-    """Observer that samples the points and errors of a `PointObservation`, and calls a locator without loads."""
+    """Observer that samples the points and errors of a `PointObservation`, and locates the tumour without loads."""
 
     site: CraniotomyFrame
     locator: Locator
@@ -190,7 +190,7 @@ class PointObserver:
         return self.site.anatomy.mesh.nodes
 
     def _interpolate_points(self, positions: np.ndarray) -> np.ndarray:
-        """Interpolate the observed points (n, 3) [m]."""
+        """Interpolate the observed points (n, 3) [m] from mesh vertices at `positions` (V, 3) [m]."""
         vertices, weights = self._places
         return np.einsum("nc,nci->ni", weights, positions[vertices])
 
@@ -200,7 +200,7 @@ class PointObserver:
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Observed points: vertices (n, 3) of the mesh, and weights (n, 3)."""
+        """Mesh vertices (n, 3) and barycentric weights (n, 3) of the observed points."""
         site, random = self.site, np.random.default_rng([self.observation_model.seed, 0])
         triangles = site.anatomy.open_surface
         corners = self._rest[triangles]
@@ -241,9 +241,9 @@ def sample_rigid_error(model: PointObservation | StereoObservation, number: int)
 
 
 def find_touched_point(anatomy: Anatomy, positions: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Find the point of the cortex (1, 3) [m] that a tool with corners (t, 3) [m] touches.
+    """Find the point (1, 3) [m] of the cortex that a tool with surface corners (t, 3) [m] touches.
 
-    Empty, (0, 3), if the tool is in the air.
+    The result has the shape (0, 3) if the tool does not touch the cortex. `positions` (V, 3) [m] are the mesh vertices.
     """
     triangles = anatomy.open_surface
     near = corners[np.argsort(KDTree(positions[np.unique(triangles)]).query(corners)[0])[:SEARCHED_CORNERS]]
@@ -255,7 +255,7 @@ def find_touched_point(anatomy: Anatomy, positions: np.ndarray, corners: np.ndar
 def locate_tumour(
     anatomy: Anatomy, locator: Locator, observe: Callable[[], Observation], positions: np.ndarray, start_time: float
 ) -> TumourEstimate:
-    """Locate the tumour from an observation, and compare with the truth at `positions` (V, 3) [m]; rejections are kept.
+    """Locate the tumour from an observation, with the truth from `positions` (V, 3) [m]; a rejection raises no error.
 
     `start_time` is the start time of the measurement, by `time.perf_counter`.
     """

@@ -1,4 +1,4 @@
-"""Loop that plays a scene: tool input, deformation and rendering of each frame."""
+"""Player of a scene: tool input, deformation, rendering and overlay of each frame."""
 
 import time as clock
 from collections.abc import Iterator, Mapping
@@ -61,13 +61,13 @@ class Frame:
     Parameters
     ----------
     number, time
-        Frame number, from 0; time [s].
+        Frame number, which starts at 0, and time [s].
     touch, loads
         Requested tool input, and the resulting loads on the tissue.
     deformation
-        The deformer's solution.
+        Solution computed by the deformer.
     camera
-        The camera that the image was rendered with.
+        Camera with which the image was rendered.
     pose, tip
         T_world_tool (4, 4), and contact point of the tool (3,) [m]; None if the scene has no tool.
     picture
@@ -75,22 +75,22 @@ class Frame:
     shown
         The image (H, W, 3) uint8 with the predicted tumour, its position in the scan, and the frame number.
     taken, named
-        (H, W) uint8: above 0 on lines and text; and true if a legend names the lines.
+        `taken` (H, W) uint8 is above 0 on lines and text. `named` is True if a legend names the lines.
     distance
         Distance from the tool's tip to the tumour's predicted surface [m]; None without a tool.
     distance_error
-        Bound on its difference from FEM [m]; None if unknown.
+        Bound on the difference of `distance` from FEM [m]; None if not available.
     inside
-        True if the tip is inside the tumour: the distance is then to the surface around it.
+        True if the tip is inside the tumour; `distance` is then measured from inside to the tumour's surface.
     moved
-        Mean distance of the tumour's predicted surface from the scan [m]; by an estimate, that of the centroid.
+        Mean displacement of the tumour's predicted surface [m]; with an estimate, displacement of the centroid.
     moved_error
-        95 % bound on its difference from the motion in the patient [m]; None if unknown.
+        95 % bound on the difference of `moved` from the motion in the patient [m]; None if not available.
     model_error
         95th percentile over loads of the maximum tumour vertex error relative to the model's FEM [m]. None for FEM
-        itself, and if unknown.
+        and if not available.
     tumour_error
-        Expected error of the drawn tumour position, for any deformer.
+        Expected error of the drawn tumour position relative to the patient, for any deformer.
     doubt
         Reason why the solution is unreliable, as written in the image; empty if it is reliable.
     acts
@@ -98,11 +98,11 @@ class Frame:
     head
         The lines at the top of the image: errors of model and tumour.
     remark
-        Further text in the image, for example that the bone stops the tool; usually empty.
+        Further text in the image, for example that bone stops the tool; usually empty.
     seconds
-        Wall time by stage, see `STAGES`; "locate" is the time of an estimate.
+        Wall time [s] of each step in `STAGES`; with an estimate, "locate" is its time.
     estimate
-        Estimated tumour position, in a scene with an observation model: it is drawn, and `deformation` is the truth.
+        Estimated and drawn tumour position in a scene with an observation model; `deformation` is then the truth.
     """
 
     number: int
@@ -134,9 +134,9 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class PlacedTool:
-    """Drawn position of a tool: tip (3,) [m], and T_world_tool pose (4, 4).
+    """Drawn position of a tool: tip (3,) [m], and pose T_world_tool (4, 4).
 
-    beyond [m]: penetration of the bone that its load requires.
+    `bone_penetration` [m]: depth inside the bone that the tool would need for its load.
     """
 
     tip: np.ndarray
@@ -146,10 +146,10 @@ class PlacedTool:
 
 @dataclass(frozen=True, eq=False)
 class Player:
-    """Scene on a stage with one deformer. `draw` is a pure function of time, touch and the previous solution.
+    """Player of one scene with one deformer. `draw` is a pure function of number, time, touch and last solution.
 
-    If not `composed`, `Frame.shown` is the camera image without overlay and text. If `coarse`, as for images in motion,
-    the camera image has half the resolution, enlarged, under a sharp overlay.
+    If `composed` is False, `Frame.shown` is the camera image without overlay and text. If `coarse` is True, the camera
+    image is rendered with half the resolution and enlarged; the overlay keeps the full resolution.
 
     Examples
     --------
@@ -176,7 +176,7 @@ class Player:
 
     @property
     def site(self) -> CraniotomyFrame:
-        """Open cortex of the scene's anatomy."""
+        """Coordinate system of the craniotomy of the scene's anatomy."""
         return self.stage.site
 
     @property
@@ -185,43 +185,43 @@ class Player:
         return self.stage.camera
 
     def get_camera(self, time: float) -> Camera:
-        """Return the scene's camera at a time [s]; a static camera is one object, whose backdrop is cached."""
+        """Return the scene's camera at a time [s]; a static camera is always the same object (for caches)."""
         return self.camera if self.scene.viewpoint.path is None else self.scene.viewpoint.build_camera(self.site, time)
 
     @cached_property
     def remembers(self) -> bool:
-        """True if a solution depends on the previous one."""
+        """True if a solution depends on the previous solution."""
         solved = not isinstance(self.deformer, Learned)
         return self.follows or (solved and has_history(self.scene.get_effects_on(self.site.anatomy)))
 
     @cached_property
     def follows(self) -> bool:
-        """True if the deformer is a trained model that integrates its tissue in time."""
+        """True if the deformer is a trained model that integrates relaxing tissue in time."""
         return isinstance(self.deformer, Learned) and bool(self.deformer.series)
 
     def get_touch(self, number: int) -> Touch:
-        """Return the tool input of the script in a frame."""
+        """Return the scripted tool input of frame `number`."""
         return self.scene.path(float(self.scene.times[number]))
 
     def build_loads(self, number: int, touch: Touch | None = None) -> Loads:
-        """Return the loads of a frame; `touch` replaces the script's."""
+        """Return the loads of frame `number`; `touch` replaces the scripted tool input."""
         return self.scene.build_loads(self.site, touch or self.get_touch(number), float(self.scene.times[number]))
 
     def compute_deformation(self, loads: Loads, last: Deformation | None = None) -> Deformation:
-        """Compute the deformation, starting from the last; a trained model or a table returns drawn vertices only."""
+        """Compute the deformation, starting from `last`; `Learned` and `LinearModel` return drawn vertices only."""
         if isinstance(self.deformer, Learned | LinearModel):
             return self.deformer.deform(loads, start=last if self.follows else None, at=self.stage.drawn_vertices)
         return self.deformer.deform(loads, start=last)
 
     def draw(self, number: int, time: float, touch: Touch, last: Deformation | None = None) -> Frame:
-        """Draw the frame of a touch at a time [s]; the deformer starts from the last solution."""
+        """Compute and draw frame `number` for a tool input at a time [s]; the deformer starts from `last`."""
         begun = clock.perf_counter()
         loads = self.scene.build_loads(self.site, touch, time)
         deformation = self.compute_deformation(loads, last)
         return self.draw_frame(number, touch, loads, deformation, clock.perf_counter() - begun)
 
     def draw_frame(self, number: int, touch: Touch, loads: Loads, deformation: Deformation, seconds: float) -> Frame:
-        """Draw the frame of a solution of loads, which took `seconds`."""
+        """Draw frame `number` from the solution of its loads, which was computed in `seconds`."""
         begun = clock.perf_counter()
         positions = self.compute_positions(deformation)
         held = None if self.scene.tool is None else self.place_tool(self.scene.tool, touch, positions)
@@ -276,7 +276,7 @@ class Player:
         )  # fmt: skip
 
     def _measure_tip_gauge(self, held: PlacedTool, loads: Loads, answer: Deformation, tumour: Layer) -> DistanceGauge:
-        """Measure from the tip to the tumour, with the error bound of the deformer, if known."""
+        """Measure the distance from tip to tumour, with the deformer's error bound if it is available."""
         gauge = measure_tip_gauge(held.tip, tumour)
         if held.bone_penetration > CARRIED_DEPTH:
             return gauge
@@ -284,7 +284,7 @@ class Player:
         return gauge if read is None else replace(gauge, reading=read.distance, error=read.bound)
 
     def _get_model_error(self, answer: Deformation) -> float | None:
-        """Return a model's guaranteed error relative to FEM [m], of this load if available; None if unknown."""
+        """Return a trained model's error bound relative to FEM [m], of this load if available; None without bound."""
         model = find_first_model(self.deformer, answer)
         if model is None:
             return None
@@ -295,9 +295,9 @@ class Player:
     def _compute_tumour_error(
         self, touch: Touch, loads: Loads, motion: float, promised: float, estimate: TumourEstimate | None
     ) -> TumourError:
-        """Return the error of the tumour position: an ensemble's on the script's tool path, else by the motion [m].
+        """Return the tumour position error: from the ensemble if the tool follows its script, else from the motion [m].
 
-        An estimate from observations replaces its bound.
+        The bound of an estimate from observations is added as `observed`.
         """
         time = float(loads.times[0])
         scripted = self.uncertainty is not None and touch == self.scene.path(time)
@@ -313,10 +313,10 @@ class Player:
         return replace(error, observed=worst, registration=deviation)
 
     def play_frames(self, every: int = 1, together: int = 1) -> Iterator[Frame]:
-        """Yield every frame of the scene, or each `every`-th frame.
+        """Yield every `every`-th frame of the scene (default: all frames).
 
-        A model whose solutions are independent computes `together` frames together. This takes a quarter of the time,
-        and the first frame waits for the last solution.
+        A trained model with independent solutions computes `together` frames in one batch. This takes a quarter of the
+        time, but the first frame of a batch waits for all its solutions.
         """
         numbers = range(0, len(self.scene.times), every)
         if together == 1 or self.remembers or not isinstance(self.deformer, Learned):
@@ -335,19 +335,19 @@ class Player:
                 yield self.draw_frame(number, self.get_touch(number), loads, answers.select(np.array([row])), seconds)
 
     def compute_positions(self, deformation: Deformation, row: int = 0) -> np.ndarray:
-        """Return positions (V, 3) [m] of all mesh vertices in one load case; vertices without result are undeformed."""
+        """Return positions (V, 3) [m] of all mesh vertices in load case `row`; undeformed where there is no result."""
         positions = self.site.anatomy.mesh.nodes.copy()
         positions[deformation.nodes] += deformation.displacement[row]
         return positions
 
     def estimate_positions(self, frame: Frame) -> np.ndarray:
-        """Return the drawn positions (V, 3) [m] of all mesh vertices: the tumour's by the estimate, if there is one."""
+        """Return the drawn positions (V, 3) [m] of all mesh vertices; an estimate replaces the tumour's positions."""
         return _estimate_positions(self.compute_positions(frame.deformation), frame.estimate)
 
     def place_tool(self, tool: Instrument, touch: Touch, positions: np.ndarray) -> PlacedTool:
-        """Compute the tool position: a pushing tool rests on the deformed cortex from outside.
+        """Compute the drawn pose of a tool. A pushing tool rests on the outside of the deformed cortex.
 
-        An idle tool is lifted off. Displaced tissue may carry it to the craniotomy edge, which stops it.
+        An idle tool is lifted above the cortex. The craniotomy edge stops a tool that moves with displaced tissue.
         """
         if self.scene.posed:
             return PlacedTool(self.scene.compute_tip(self.site, touch), self.scene.compute_pose(self.site, touch), 0.0)
@@ -369,7 +369,7 @@ class Player:
 
 
 def is_undeformed(deformation: Deformation) -> bool:
-    """Return True if nothing moves by more than a micrometre: there is no motion whose error could be given."""
+    """Return True if no vertex moves by 1 micrometre or more; an error of the motion is then meaningless."""
     return bool(np.abs(deformation.displacement).max(initial=0.0) < MOTION_TOLERANCE)
 
 
@@ -378,7 +378,7 @@ def _estimate_positions(positions: np.ndarray, estimate: TumourEstimate | None) 
 
 
 def list_estimate_traces(estimate: TumourEstimate, tumour: Layer) -> tuple[MarkOutline, ...]:
-    """Build the traces of an estimate: its ellipsoid, and the true tumour surface with its centroid."""
+    """Build the outlines of an estimate: its ellipsoid if accepted, and the true tumour surface; each with a centre."""
     ellipsoid = estimate.build_ellipsoid()
     true = MarkOutline(tumour, TRUE_STROKES, estimate.centroid + estimate.true_motion)
     if ellipsoid is None:
@@ -387,13 +387,13 @@ def list_estimate_traces(estimate: TumourEstimate, tumour: Layer) -> tuple[MarkO
 
 
 def get_legend_names(estimate: TumourEstimate | None) -> LegendNames:
-    """Return the names of the lines of an image; a rejected estimate has no ellipsoid."""
+    """Return the legend's names of the lines in an image; a rejected estimate has no line of an ellipsoid."""
     if estimate is None:
         return PREDICTED_LINES
     return ESTIMATED_LINES if estimate.location is not None else replace(ESTIMATED_LINES, outlines=(SIMULATED,))
 
 
 def measure_tip_gauge(tip: np.ndarray, surface: Layer) -> DistanceGauge:
-    """Measure from a tip (3,) [m] to the nearest point of a hidden surface, and whether the tip is inside."""
+    """Return the gauge from a tip (3,) [m] to the nearest surface point, and if the surface encloses the tip."""
     corners = surface.vertices[surface.triangles]
     return DistanceGauge(tip, find_closest_points(tip[None], corners).point[0], is_inside=is_enclosing(corners, tip))

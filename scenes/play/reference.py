@@ -1,4 +1,4 @@
-"""FEM solution of every frame of a scene: the reference for drawn frames."""
+"""FEM solutions of the frames of a scene, used as the reference for drawn frames."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,9 +17,9 @@ BATCH_FRAMES = 16  # Number of frames that are solved together: small enough for
 
 
 def build_reference_fem(patient: PatientSetup, scene: Scene) -> Fem | ResectedFem:
-    """Build FEM for reference solutions of a scene: batches of frames on a GPU, frame after frame on the CPU.
+    """Build FEM for reference solutions of a scene: batches of frames on a GPU, single frames in order on the CPU.
 
-    A frame that starts from the last one takes a quarter of the time of a frame solved alone.
+    On the CPU, a frame that starts from the previous solution takes a quarter of the time of an independent solve.
     """
     if find_device(patient.device, TRAIN.precision).name != "cpu":
         return patient.build_fem(scene, TRAIN, BATCH_FRAMES)
@@ -29,7 +29,7 @@ def build_reference_fem(patient: PatientSetup, scene: Scene) -> Fem | ResectedFe
 def is_history_dependent(deformer: Deformer) -> bool:
     """Return True if FEM must solve a frame after the previous ones.
 
-    No history is needed if only forces act on an elastic intact body. A deformer that is not FEM needs no history.
+    FEM needs no history if only forces act on an intact elastic brain. Other deformers need no history.
     """
     return isinstance(deformer, ResectedFem) or (isinstance(deformer, Fem) and not deformer.problem.can_accelerate)
 
@@ -41,10 +41,10 @@ def solve_reference_frames(
     progress: Callable[[int], object] = lambda more: None,
     fem: Fem | ResectedFem | None = None,
 ) -> Deformation:
-    """Solve the loads of each frame for all vertices at training accuracy; in sequence if solutions depend on the past.
+    """Solve the loads of each frame for all mesh vertices at training accuracy, in order if solutions need a history.
 
-    `progress` receives the number of newly solved frames. `fem` is an existing solver, as
-    `build_reference_fem` builds it.
+    `progress` receives the number of newly solved frames. `fem` is an existing solver, for example from
+    `build_reference_fem`; None: a new solver for batches. Returns one load case per frame.
     """
     fem = fem or patient.build_fem(scene, TRAIN, BATCH_FRAMES)
     apart = not is_history_dependent(fem) and not (isinstance(fem, Fem) and fem.batch == 1)

@@ -1,4 +1,4 @@
-"""Frames of a run in any requested order, each computed from another frame near it."""
+"""Frames of a run in any requested order, each computed from a frame with a near number."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,16 +18,16 @@ MAX_TIME_STEP = 0.2
 
 @dataclass(frozen=True)
 class ReplayOrder:
-    """Order in which frames are computed from other frames.
+    """Rules by which frames are computed from other frames.
 
     Parameters
     ----------
     max_step
-        Maximum number of frames of one step. Longer distances are split at its multiples.
+        Maximum number of frames of one step. A longer distance is split at multiples of `max_step`.
     backward
-        True if a frame may be computed from a later one.
+        True if a frame may be computed from a later frame.
     max_stored
-        Number of solutions kept of a run, evenly spaced, to limit recomputation.
+        Number of evenly spaced solutions of a run that are stored, to limit recomputation.
     """
 
     max_step: int = 1
@@ -42,27 +42,27 @@ and ten times as much on quadratic elements.
 
 
 class FrameCache(Generic[T]):
-    """Frames of a run in any order. Frame n equals that of the sequential run 0 ... n, regardless of earlier requests.
+    """Cache that returns frames of a run in any order.
 
     Parameters
     ----------
-    frames
+    count
         Number of frames.
-    step
-        Function from a frame's number and the preceding frame (None: the state before the first) to the frame.
-    course
-        Order in which frames are computed.
+    compute_frame
+        Function that computes a frame from its number and its start frame (None: the state before frame 0).
+    order
+        Rules by which frames are computed from other frames. With `IN_ORDER`, frame n is that of the run 0 ... n.
     """
 
     def __init__(self, count: int, compute_frame: Callable[[int, T | None], T], order: ReplayOrder = IN_ORDER) -> None:
         self._step, self._course = compute_frame, order
         self._every = order.max_step * -(-count // (order.max_step * order.max_stored))
         self.kept: dict[int, T] = {}
-        """Frames that are not run again, by number."""
+        """Stored frames, by number."""
         self._last: dict[int, T] = {}
 
     def approach_frame(self, frame_number: int) -> tuple[int, T]:
-        """Take at most one step towards a frame; return the number and the frame that is reached."""
+        """Compute at most one step towards a frame; return the number of the reached frame, and this frame."""
         computed = self.kept | self._last
         starts = computed if self._course.backward else [other for other in computed if other <= frame_number]
         reached = min(starts, key=lambda other: abs(frame_number - other), default=-1)
@@ -75,7 +75,7 @@ class FrameCache(Generic[T]):
         return reached, computed[reached]
 
     def _find_step_end(self, start: int, number: int) -> int:
-        """Return the frame at which a step from `start` towards a frame ends."""
+        """Return the frame number at which a step from `start` towards frame `number` ends."""
         leap = self._course.max_step
         if start < number:
             return min(number, (start // leap + 1) * leap)
@@ -83,11 +83,11 @@ class FrameCache(Generic[T]):
 
 
 class ReplaySession:
-    """FEM solutions for users who scrub through a script or control its tool.
+    """Solutions for a user who jumps between the frames of a script or controls the tool manually.
 
-    With history-dependent solutions, a frame of the script is that of the sequential run. Manual control continues
-    from the last solution: each of its frames is one frame period later, regardless of its number. If the brain
-    separates from the skull, a jump passes through frames in between.
+    If solutions depend on the history, a scripted frame equals that of the sequential run. Manual control continues
+    from the last solution: each new frame is one frame period later, regardless of its number. If the brain can
+    separate from the skull, a jump computes frames in between.
     """
 
     def __init__(self, player: Player) -> None:
@@ -103,7 +103,7 @@ class ReplaySession:
         self._last: Deformation | None = None
 
     def approach_frame(self, frame_number: int, touch: Touch | None = None) -> tuple[int, Deformation]:
-        """Return number and solution of a frame, or of one on the way to it; `touch` under manual control."""
+        """Return number and solution of a frame, or of a frame in between; `touch` is the input of manual control."""
         player, last = self.player, self._last
         if self._reel is not None and touch is None:
             frame_number, self._last = self._reel.approach_frame(frame_number)
@@ -116,7 +116,7 @@ class ReplaySession:
 
 
 def plan_replay_order(player: Player) -> ReplayOrder | None:
-    """Return the order in which frames of a script are computed; None if all are independent."""
+    """Return the order in which frames of a script are computed; None if all frames are independent."""
     scene = player.scene
     if player.remembers:
         return IN_ORDER

@@ -1,4 +1,4 @@
-"""Costs of a frame, by stage: on the panel of its image, and for all scenes on one sheet."""
+"""Computation times of a frame, shown on a panel in its image, and on one sheet for all scenes."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ LINE_LEGEND = "green estimate, pink simulated (FEM), blue 95 % of its centre"
 
 
 def list_cost_lines(frame: Frame, deformer: str) -> list[str]:
-    """Build the panel's lines for a frame of a deformer, most important first."""
+    """Build the text lines of a frame's panel, the most important line first; `deformer` is the deformer's name."""
     answer, found = frame.deformation, frame.estimate
     source, spent = shorten_source(answer.source or deformer), frame.seconds.items()
     doubt = [] if answer.outcome[0].good else [answer.outcome[0].value]
@@ -34,12 +34,12 @@ def list_cost_lines(frame: Frame, deformer: str) -> list[str]:
 
 
 def _format_length(length: float, error: float | None) -> str:
-    """Format a length and its error [m] in millimetres; an unknown error is given at the image's top."""
+    """Format a length [m] in millimetres, with its error [m] unless the error is None."""
     return f"{1e3 * length:.2f} {'mm' if error is None else f'+- {format_bound(error, 1)}'}"
 
 
 def draw_cost_panel(frame: Frame, deformer: str) -> np.ndarray:
-    """Draw a panel on the shown image (H, W, 3): deformer, loads, and milliseconds by stage; also of an estimate."""
+    """Return the shown image (H, W, 3) with a panel: deformer, loads, times by stage [ms], and the estimate if any."""
     seen = frame.picture.segmentation
     # The panel may hide cortex, but no tool, line or text.
     hides = (frame.taken > 0) | (seen != DRAPE), (frame.taken > 0) | (seen == TOOL)
@@ -54,7 +54,7 @@ def draw_cost_panel(frame: Frame, deformer: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """Image (H, W, 3) uint8; median milliseconds of a frame by stage; the tumour's largest mean motion [mm]."""
+    """Image (H, W, 3) uint8, median time of a frame by stage [ms], and the tumour's largest mean displacement [mm]."""
 
     image: np.ndarray
     milliseconds: dict[str, float]
@@ -62,12 +62,12 @@ class Thumbnail:
 
     @property
     def total_milliseconds(self) -> float:
-        """Milliseconds of a whole frame."""
+        """Total time of a frame, summed over the stages [ms]."""
         return sum(self.milliseconds.values())
 
 
 def render_thumbnail(player: Player, deformer: str) -> Thumbnail:
-    """Render a small image of the frame after the last cut in which the tumour has moved most, by a `deformer`."""
+    """Render a small image of the frame with the largest tumour motion after the last resection step of a scene."""
     every = max(1, (len(player.scene.times) - 1) // (RENDERED_FRAMES - 1))
     frames = list(player.play_frames(every))
     best = max(frames, key=lambda frame: (_count_cuts(player, frame), frame.moved))
@@ -91,7 +91,7 @@ def _compute_medians(frames: list[Frame]) -> dict[str, float]:
 
 
 def tile_images(images: list[np.ndarray], columns: int = 3) -> np.ndarray:
-    """Arrange images (H, W, 3) uint8 of one size in rows of a sheet; empty cells are dark."""
+    """Arrange images (H, W, 3) uint8 of equal size in rows on one sheet; empty cells are dark."""
     blank = np.full_like(images[0], 12)
     whole = [*images, *[blank] * (-len(images) % columns)]
     return np.concatenate(

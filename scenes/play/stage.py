@@ -1,4 +1,4 @@
-"""Visible parts of an anatomy: open cortex, drape with a hole, tool; and the tumour beneath them."""
+"""Rendered parts of a scene: open cortex, drape with a hole, tool, and the hidden tumour."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from .observer import TumourObserver
 CORTEX, DRAPE, TOOL, TUMOUR = 1, 2, 3, 4
 """Segmentation ids."""
 NAMES = {CORTEX: "cortex", DRAPE: "drape", TOOL: "tool", COTTON: "cotton", GLOVE: "glove"}
-"""Names of the visible layers: the tumour is never visible."""
+"""Names of the visible layers (the tumour is never visible)."""
 
 CORTEX_COLOUR = (0.86, 0.60, 0.54)  # Colour of the cortex (RGB, 0 to 1).
 TOOL_COLOUR = (0.78, 0.80, 0.83)  # Colour of the tool (RGB, 0 to 1).
@@ -46,14 +46,14 @@ TRUTH_COLOUR = (0.90, 0.35, 0.78)
 DARK_SHARES = (0.33, 0.16, 0.17)  # Share of the cortex colour (RGB) that the scan's black keeps.
 RELIEF_DEPTH = 1.5e-3  # Depth of black below white [m].
 OPENING = Opening((CORTEX,), ((DRAPE, "under the drape"),), "seen through bone")
-"""Layer through which the tumour is seen, and text for the occluders."""
+"""Layer under which the tumour is drawn as visible (cortex), and text for the occluding layers."""
 SIMULATED = "simulated (FEM)"  # Name of the line of the tumour computed by FEM.
 # Names of the lines in an image of a prediction.
 PREDICTED_LINES = LegendNames("predicted tumour", "95 % error band", "in the scan")
 ESTIMATED_LINES = LegendNames(
     "estimated tumour", "", "in the scan", ("95 % of its centre", SIMULATED), "estimate moved"
 )
-"""Names of the lines in an image of a prediction, and in one of an estimate."""
+"""Names of the lines in an image of an estimate."""
 # Depth under the surface at which the scan is read [m]: the edge of grey matter mixes with fluid.
 READING_DEPTH = 2.0e-3
 # Largest distance from the craniotomy edge, under the bone, at which the cortex may become visible [m].
@@ -68,7 +68,7 @@ DRAPE_SLOPE = 3.0  # Slope of the drape beyond the hole, down to the depth of th
 
 @dataclass(frozen=True, eq=False)
 class CortexSurface:
-    """Part of the surface: mesh vertices (n,), their triangles (m, 3), the scan, and its sampling points (n, 3) [m]."""
+    """Part of the FEM surface: mesh vertices (n,), triangles (m, 3), scan, and points (n, 3) [m] to sample the scan."""
 
     vertices: np.ndarray
     triangles: np.ndarray
@@ -77,7 +77,7 @@ class CortexSurface:
     colour: np.ndarray | tuple[float, float, float] = CORTEX_COLOUR
 
     def build_layer(self, positions: np.ndarray) -> Layer:
-        """Return the layer at `positions` (V, 3) [m]."""
+        """Return the rendered layer for mesh vertices at `positions` (V, 3) [m]."""
         rest = None if self.texture is None else self.rest_points
         return Layer(
             "cortex", CORTEX, positions[self.vertices], self.triangles, self.colour, 0.5, solid=self.texture, rest=rest
@@ -86,9 +86,9 @@ class CortexSurface:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """Rendered parts of a scene; positions are those of all mesh vertices (V, 3) [m].
+    """Rendered parts of a scene on an anatomy. All `positions` (V, 3) [m] are positions of all mesh vertices.
 
-    `device`: Warp device for rendering; `observer`: estimates the tumour position in a scene with observations.
+    `device`: Warp device for rendering. `observer`: observer of a scene with an observation model; else None.
     """
 
     scene: Scene
@@ -104,7 +104,7 @@ class Stage:
         return self.site.anatomy if self.remaining_body is None else self.remaining_body.anatomy
 
     def select_stage(self, loads: Loads) -> Stage:
-        """Return the stage of the first load case: after its completed resection steps."""
+        """Return the stage after the resection steps that are completed in the first load case."""
         cause = loads.get(Resected)
         return self if cause is None else self._after[int(cause.done[0])]
 
@@ -119,7 +119,7 @@ class Stage:
 
     @cached_property
     def without_fine_cortex(self) -> Stage:
-        """The stage with the FEM surface as its cortex."""
+        """Copy of the stage that renders the FEM surface as the cortex, without gyri and vessels."""
         return replace(self, scene=replace(self.scene, look=replace(self.scene.look, natural=False)))
 
     @cached_property
@@ -130,7 +130,7 @@ class Stage:
 
     @cached_property
     def camera(self) -> Camera:
-        """Initial camera of the scene. A static camera is always this object: a `Renderer` caches its backdrop."""
+        """Initial camera of the scene. A static camera is always this object: a `Renderer` caches its background."""
         return self.scene.viewpoint.build_camera(self.site)
 
     @cached_property
@@ -142,10 +142,10 @@ class Stage:
         return replace(lamp, position=site.origin + turned, strength=look.lamp, ambient=look.ambient)
 
     def build_visible_cortex(self, positions: np.ndarray) -> Layer:
-        """Build the open cortex, and the cortex just under the bone's edge, which becomes visible if the brain shifts.
+        """Build the layer of the open cortex and of the cortex near the bone's edge, which brain shift may expose.
 
-        If the brain separates from the skull, the surface beyond the drape's hole is rendered below it. The drape
-        follows the scan's surface, and a sliding gyrus would penetrate it.
+        If the brain can separate from the skull, the surface outside the drape's hole is rendered deeper, so that a
+        sliding gyrus does not penetrate the drape, which follows the undeformed surface.
         """
         layer = self._build_fine(positions) if self.scene.look.natural else self._visible.build_layer(positions)
         if not any(isinstance(effect, SkullContact) for effect in self.scene.effects):
@@ -161,7 +161,7 @@ class Stage:
 
     @cached_property
     def coarse_gyri(self) -> FineCortex:
-        """The open cortex within the drape's hole, with coarse gyri."""
+        """Open cortex inside the drape's hole, with coarse gyri."""
         mesh, site = self.anatomy.mesh, self.site
         fine = build_fine_cortex(site, mesh, self.anatomy.open_surface, self.intensity, RELIEF_EDGE)
         away = site.compute_axis_distance(fine.surface.interpolate(mesh.nodes[fine.vertices]))
@@ -170,7 +170,7 @@ class Stage:
 
     @cached_property
     def gyri_parts(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """Bright crowns and dark sulci of `relief`: its vertices (n,), and triangles (m, 3) of them."""
+        """Bright crowns and dark sulci of `coarse_gyri`: vertices (n,) of each part, and triangles (m, 3) among them."""
         triangles, colour = self.coarse_gyri.surface.triangles, self.coarse_gyri.colour
         dark = colour[triangles].mean(axis=(1, 2)) < DARK_SHARE * colour.mean(axis=1).max()
         crowns, sulci = (np.unique(triangles[some], return_inverse=True) for some in (~dark, dark))
@@ -178,13 +178,13 @@ class Stage:
 
     @cached_property
     def brain_surface(self) -> Layer:
-        """Undeformed surface of the brain without the open cortex."""
+        """Layer of the undeformed brain surface without the open cortex."""
         mesh, craniotomy = self.anatomy.mesh, self.anatomy.craniotomy
         vertices, triangles = np.unique(mesh.surface[~craniotomy[mesh.surface].all(axis=1)], return_inverse=True)
         return Layer("brain", CORTEX, mesh.nodes[vertices], triangles, CORTEX_COLOUR)
 
     def build_layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
-        """Build cortex at `positions` (V, 3) [m], drape, and a tool, if any, at T_world_tool `pose` (4, 4)."""
+        """Build the layers of cortex at `positions` (V, 3) [m], drape, and tool at T_world_tool `pose` (4, 4) if any."""
         tool, look = self.scene.tool, self.scene.look
         if pose is None or not look.natural or not has_instrument(tool):
             return self._list_layers(positions, self.compute_tool_corners(pose))
@@ -193,7 +193,7 @@ class Stage:
         return [*self._list_layers(positions, None), *placed]
 
     def compute_tool_corners(self, pose: np.ndarray | None) -> np.ndarray | None:
-        """Compute the corners (t, 3) [m] of the tool's surface at T_world_tool `pose` (4, 4), if there is one."""
+        """Compute the tool's surface corners (t, 3) [m] at T_world_tool `pose` (4, 4); None without tool or pose."""
         if self.scene.tool is None or pose is None:
             return None
         return np.asarray(self.scene.tool.mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
@@ -209,15 +209,15 @@ class Stage:
         return [*seen, Layer("tool", TOOL, corners, faces, TOOL_COLOUR, gloss=0.8, shininess=90.0, casts_shadow=True)]
 
     def render(self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None) -> Picture:
-        """Render the image of `layers` by a camera."""
+        """Render the layers of `build_layers` with a camera."""
         return self._draw(camera, self.build_layers(positions, pose))
 
     def render_view(
         self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, coarse: bool, frame_number: int = 0
     ) -> Picture:
-        """Return frame `frame_number` with the look's camera effects in the round field of the scene's microscope.
+        """Render frame `frame_number` with blur and noise, and with the round field of view of a microscope if any.
 
-        If `coarse`, it has half the resolution.
+        If `coarse`, the image is rendered with half the resolution and enlarged.
         """
         seen_by, look = _halve_resolution(camera) if coarse else camera, self.scene.look
         picture = self.render(seen_by, positions, pose)
@@ -227,7 +227,7 @@ class Stage:
         return scale_image(picture, camera.width, camera.height) if coarse else picture
 
     def render_with_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
-        """Render as `render`, with the tool given by its corners (t, 3) [m]; None: without a tool."""
+        """Render the layers with a tool given by its surface corners (t, 3) [m]; None: without tool."""
         return self._draw(camera, self._list_layers(positions, corners))
 
     def _draw(self, camera: Camera, layers: Sequence[Layer]) -> Picture:
@@ -246,16 +246,16 @@ class Stage:
 
     @cached_property
     def _renderers(self) -> dict[tuple[int, ...], Renderer]:
-        """Renderers by the triangle counts of the layers: with a tool and without."""
+        """Cached renderers, by the triangle counts of the layers (with and without tool)."""
         return {}
 
     def build_tumour(self, positions: np.ndarray) -> Layer:
-        """Return the tumour's surface at `positions` (V, 3) [m]."""
+        """Return the layer of the tumour's surface for mesh vertices at `positions` (V, 3) [m]."""
         vertices, triangles = self._tumour
         return Layer("tumour", TUMOUR, positions[vertices], triangles, TUMOUR_COLOUR)
 
     def smooth_tumour(self, tumour: Layer) -> Layer:
-        """Return a layer of the tumour's surface with rounded facets: for its outline, not for measurements."""
+        """Return a tumour layer with rounded facets, to draw the outline; measurements use the original surface."""
         surface = self.rounded_tumour
         return replace(
             tumour,
@@ -265,27 +265,27 @@ class Stage:
         )
 
     def build_fem_tumour(self, positions: np.ndarray) -> Layer:
-        """Return the tumour surface computed by FEM, drawn for comparison with an estimate."""
+        """Return the layer of the tumour surface computed by FEM, drawn for comparison with an estimate."""
         return replace(self.build_tumour(positions), name="truth", colour=np.array(TRUTH_COLOUR))
 
     @cached_property
     def tumour_at_rest(self) -> Layer:
-        """The tumour's surface in the scan."""
+        """Layer of the tumour's undeformed surface."""
         return self.build_tumour(self.site.anatomy.mesh.nodes)
 
     @cached_property
     def smooth_tumour_at_rest(self) -> Layer:
-        """The tumour's surface in the scan, with rounded facets."""
+        """Layer of the tumour's undeformed surface, with rounded facets."""
         return self.smooth_tumour(self.tumour_at_rest)
 
     @property
     def tumour_vertices(self) -> np.ndarray:
-        """Mesh vertices (n,) of the tumour's surface, in the order in which they are drawn."""
+        """Mesh vertices (n,) of the tumour's surface, in the vertex order of the layer."""
         return self._tumour[0]
 
     @property
     def visible_vertices(self) -> np.ndarray:
-        """Mesh vertices (n,) of the layer of `build_visible_cortex`, in the order in which they are drawn."""
+        """Mesh vertices (n,) of the visible FEM surface, in the vertex order of its layer."""
         return self._visible.vertices
 
     @cached_property
@@ -294,7 +294,7 @@ class Stage:
 
     @cached_property
     def rounded_tumour(self) -> EmbeddedSurface:
-        """Fine surface with rounded facets on the tumour's surface."""
+        """Fine surface with rounded facets, embedded in the tumour's surface."""
         at, triangles = self.site.anatomy.mesh.nodes[self._tumour[0]], self._tumour[1]
         fine = build_embedded_surface(at, triangles, lambda points: np.full(len(points), TUMOUR_EDGE))
         return replace(fine, depth=np.full_like(fine.depth, TUMOUR_DEPTH), rounding=0.5, max_height=TUMOUR_HEIGHT)
@@ -310,14 +310,14 @@ class Stage:
 
     @cached_property
     def fine_cortex(self) -> FineCortex:
-        """Fine surface that embeds gyri and vessels in the visible FEM surface."""
+        """Fine surface with gyri and vessels, embedded in the visible FEM surface."""
         if self.remaining_body is None:
             return _build_whole_cortex(self.site, self.intensity)
         return build_fine_cortex(self.site, self.anatomy.mesh, _list_visible(self.site, self.anatomy), self.intensity)
 
     @cached_property
     def scan_texture(self) -> Solid | None:
-        """The scan as a solid texture, with the vessels of the scene; None without scan and vessels."""
+        """Solid texture of the scan with the vessels of the scene; None without scan and without vessels."""
         model, seed = self.scene.observation_model, self.scene.look.vessels
         if isinstance(model, StereoObservation) and model.vessels:
             seed = model.seed
@@ -327,7 +327,7 @@ class Stage:
 
     @cached_property
     def head_scan_texture(self) -> Solid | None:
-        """The scan of the whole head as a solid texture, if there is one."""
+        """Solid texture of the scan of the whole head; None without scan."""
         if self.intensity is None:
             return None
         values = self.intensity.apply_window(self.site.anatomy.mesh)
@@ -339,7 +339,7 @@ class Stage:
 
 
 def _list_visible(site: CraniotomyFrame, anatomy: Anatomy) -> np.ndarray:
-    """List the surface triangles (S, 3) of open cortex and edge."""
+    """List the surface triangles (S, 3) of the open cortex, and of the cortex near the craniotomy edge."""
     mesh = anatomy.mesh
     away = np.linalg.norm(mesh.nodes[mesh.surface] - site.origin, axis=2).min(axis=1)
     return mesh.surface[away < site.radius + RIM_DISTANCE]
@@ -347,11 +347,11 @@ def _list_visible(site: CraniotomyFrame, anatomy: Anatomy) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _build_whole_cortex(site: CraniotomyFrame, intensity: Intensity | None) -> FineCortex:
-    """Build the fine cortex of a body without resection, the same object for all scenes of a patient."""
+    """Build the fine cortex of an anatomy without resection; the cached result is shared by all scenes of a patient."""
     return build_fine_cortex(site, site.anatomy.mesh, _list_visible(site, site.anatomy), intensity)
 
 
 @lru_cache(maxsize=2)
 def _halve_resolution(camera: Camera) -> Camera:
-    """Return a camera with half the pixels along each side, the same object for the same camera."""
+    """Return a camera with half the pixels along each side; the result is cached."""
     return camera.scale(0.5)

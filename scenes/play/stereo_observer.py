@@ -1,4 +1,4 @@
-"""Observer of the open cortex in stereo images of a microscope, which estimates the tumour position."""
+"""Observer that estimates the tumour position from stereo images of a microscope."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from .stereo_update import FirstView, StereoPair, observe_first_pair, observe_po
 
 @dataclass(frozen=True, eq=False)
 class StereoObserver:
-    """Observer that renders both eyes' images, with camera noise, and locates the tumour from both. Loads are not used.
+    """Observer that renders noisy images of both eyes and locates the tumour from this stereo pair, without loads.
 
-    `stage` is the rendered stage.
+    `stage`: rendered parts of the scene.
     """
 
     stage: Stage
@@ -29,7 +29,7 @@ class StereoObserver:
     observation_model: StereoObservation
 
     def estimate(self, frame_number: int, positions: np.ndarray, corners: np.ndarray | None = None) -> TumourEstimate:
-        """Estimate the tumour in a frame; arguments: see `PointObserver.estimate`. Rendering time is not counted."""
+        """Estimate the tumour position in a frame, without rendering in `seconds`; see `PointObserver.estimate`."""
         shot, anatomy = self.render_pair(frame_number, positions, corners), self.stage.site.anatomy
         tips = NO_POINTS.now if corners is None else find_touched_point(anatomy, positions, corners)
         _ = self._first_shot  # rendered here, so that its time is not counted
@@ -37,7 +37,7 @@ class StereoObserver:
         return locate_tumour(anatomy, self.locator, lambda: self.observe(shot, tips), positions, begun)
 
     def observe(self, pair: StereoPair, contact_points: np.ndarray) -> Observation:
-        """Extract the observation from a stereo pair, with contact points of a tool, `contact_points` (k, 3) [m].
+        """Extract the observation from a stereo pair; `contact_points` (k, 3) [m] are points where a tool touches.
 
         Raises
         ------
@@ -50,9 +50,9 @@ class StereoObserver:
         return observe_points(site, self.first_view, pair, self._build_microscope(1), contact_points)
 
     def render_pair(self, frame_number: int, positions: np.ndarray, corners: np.ndarray | None = None) -> StereoPair:
-        """Render both eyes' images of a frame, for positions (V, 3) [m] and a tool's corners (t, 3) [m].
+        """Render the stereo pair of a frame, for mesh vertices at `positions` (V, 3) [m] and tool corners (t, 3) [m].
 
-        Number -1 is before the first frame.
+        Frame number -1 is the state before the first frame.
         """
         scene = self.stage.scene
         time = float(scene.times[min(max(frame_number, 0), len(scene.times) - 1)])
@@ -68,7 +68,7 @@ class StereoObserver:
 
     @cached_property
     def first_view(self) -> FirstView:
-        """First image pair, of the brain as in the scan.
+        """Matched first image pair, which shows the undeformed brain.
 
         Raises
         ------
@@ -85,11 +85,11 @@ class StereoObserver:
 
     @cached_property
     def _stages(self) -> tuple[Stage, Stage]:
-        """Stages of the two cameras: a stage caches the image of its last camera."""
+        """One stage for each camera, because a stage caches the background of its last camera."""
         return replace(self.stage), replace(self.stage)
 
     def _add_noise(self, picture: np.ndarray, number: int, eye: int) -> np.ndarray:
-        """Add camera noise to an image (H, W, 3) uint8; the image of the right camera (1) is darker."""
+        """Add camera noise to an image (H, W, 3) uint8, and darken the image of the right eye (1)."""
         random = np.random.default_rng([self.observation_model.seed, 2 + number, eye])
         noise = self.observation_model.noise * random.standard_normal(picture.shape, np.float32)
         lit = np.float32(1.0 - eye * self.observation_model.darker) * picture + noise
@@ -101,11 +101,11 @@ class StereoObserver:
 
 @dataclass(frozen=True, eq=False)
 class MicroscopeTrackingError:
-    """Rigid error of a tracked microscope about the centre (3,) [m] of the craniotomy."""
+    """Rigid tracking error of a microscope, with its rotation about the centre (3,) [m] of the craniotomy."""
 
     error: RigidError
     centre: np.ndarray
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
-        """Return positions (n, 3) [m] with the tracking error."""
+        """Add the tracking error to positions (n, 3) [m]."""
         return self.error.apply(places, self.centre)

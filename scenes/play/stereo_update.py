@@ -1,4 +1,4 @@
-"""Observation of the open cortex from a stereo pair: points with their positions in the scan, or a point cloud."""
+"""Observation of the open cortex from a stereo pair: points with correspondences in the scan, or a point cloud."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -50,9 +50,9 @@ LARGE_MOTION_HINT = (
     f" Or the cortex has moved by about {1e3 * STEREO.max_motion:g} mm or more since the first pair, farther than "
     "it is searched for: begin with a new scan."
 )
-"""Reasons why points of the first pair may not be found again."""
+"""Part of an error message: a reason why points of the first pair are not found in a later pair."""
 Rigid = Callable[[np.ndarray], np.ndarray]
-"""Function that adds the error of a tracked microscope to positions (n, 3) [m]."""
+"""Function that adds the tracking error of a microscope to positions (n, 3) [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class StereoPair:
     cameras, images
         Cameras of the left and the right eye; images (H, W, 3) uint8.
     tool
-        The surface of the tool in view, corners (t, 3) [m] and faces (f, 3), if there is one: its pose is known.
+        Surface of the tracked tool in view: corners (t, 3) [m] and faces (f, 3); None without tool.
     """
 
     cameras: tuple[Camera, Camera]
@@ -72,12 +72,12 @@ class StereoPair:
     tool: tuple[np.ndarray, np.ndarray] | None = None
 
     def rectify(self, site: CraniotomyFrame) -> StereoView:
-        """Rectify the pair to windows centred on an opening.
+        """Rectify the pair; both rectified images are centred on the craniotomy.
 
         Raises
         ------
         InputError
-            Swapped cameras, or a camera that does not see the opening.
+            Swapped cameras, or a camera that does not see the craniotomy.
         """
         masks = None if self.tool is None else tuple(compute_silhouette(camera, *self.tool) for camera in self.cameras)
         target = cast(tuple[float, float, float], tuple(site.origin.tolist()))
@@ -92,16 +92,16 @@ class StereoPair:
 
 @dataclass(frozen=True, eq=False)
 class FirstView:
-    """First image pair.
+    """First image pair, with points that later pairs are compared with.
 
     Parameters
     ----------
     stereo_view
         Rectified view of the pair.
     pixels, rest_positions
-        Pixels (n, 2) of cortex points, and their positions in the scan (n, 3) [m]. Searched: `requested_count`.
-    static_pixels, static_positions
-        Pixels (m, 2) of the surroundings of the opening, and their positions (m, 3) [m].
+        Pixels (n, 2) of cortex points, and their positions (n, 3) [m] in the scan; n <= `requested_count`.
+        static_pixels, static_positions
+            Pixels (m, 2) of static points around the craniotomy, and their positions (m, 3) [m].
     """
 
     stereo_view: StereoView
@@ -113,12 +113,12 @@ class FirstView:
 
 
 def observe_first_pair(site: CraniotomyFrame, pair: StereoPair, count: int, add_rigid_error: Rigid) -> FirstView:
-    """Match the first pair, of an undeformed brain: `count` points, each at the nearest point of the scan.
+    """Match about `count` points of the first pair, which shows the undeformed brain, with the scan's nearest points.
 
     Raises
     ------
     InputError
-        See `StereoPair.rectify`; too few points; points too far from the scan's cortex.
+        See `StereoPair.rectify`; also if too few points are found, or if they are too far from the scan's cortex.
     """
     view = pair.rectify(site)
     pixels = build_pixel_grid(site, view, count)
@@ -139,12 +139,12 @@ def observe_first_pair(site: CraniotomyFrame, pair: StereoPair, count: int, add_
 def observe_points(
     site: CraniotomyFrame, first_view: FirstView, pair: StereoPair, add_rigid_error: Rigid, contact_points: np.ndarray
 ) -> Observation:
-    """Track the points of the first pair in a later pair; `contact_points` (k, 3) [m] are contact points of a tool.
+    """Observe the points of the first pair in a later pair; a tool touches the cortex at `contact_points` (k, 3) [m].
 
     Raises
     ------
     InputError
-        See `StereoPair.rectify`; too few points; apparent motion of the surroundings; motions outside the search range.
+        See `StereoPair.rectify`; too few points; moving surroundings; motions larger than the search range.
     """
     view = pair.rectify(site)
     check_surroundings_static(first_view, view, add_rigid_error)
@@ -165,9 +165,9 @@ def observe_points(
 def observe_point_cloud(
     site: CraniotomyFrame, pair: StereoPair, count: int, add_rigid_error: Rigid, contact_points: np.ndarray
 ) -> Observation:
-    """Return `count` cortex points without correspondences, from one pair.
+    """Observe about `count` cortex points without correspondences, from one pair.
 
-    For arguments and errors see `observe_points`.
+    For the other arguments and the errors see `observe_points`.
     """
     view = pair.rectify(site)
     pixels = build_pixel_grid(site, view, count)
@@ -180,7 +180,7 @@ def observe_point_cloud(
 
 
 def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.ndarray:
-    """Build a regular grid of about `count` pixels (n, 2) of the left window, over the drape's hole."""
+    """Build a regular grid of about `count` pixels (n, 2) of the left rectified image, inside the drape's hole."""
     reach = HOLE_RATIO * site.clearance - STEREO.min_drape_distance
     step = reach * np.sqrt(np.pi / count)
     ticks = np.arange(-np.floor(reach / step), np.floor(reach / step) + 1) * step
@@ -191,12 +191,12 @@ def build_pixel_grid(site: CraniotomyFrame, view: StereoView, count: int) -> np.
 
 
 def triangulate_pixels(site: CraniotomyFrame, view: StereoView, pixels: np.ndarray) -> StereoCloud:
-    """Triangulate pixels (n, 2), and keep the points inside the drape's hole.
+    """Triangulate pixels (n, 2) of the left rectified image; return the points inside the drape's hole.
 
     Raises
     ------
     InputError
-        Epipolar rows of the two eyes do not match.
+        The image rows of the two eyes do not match.
     """
     try:
         found = triangulate_cloud(view, pixels)
@@ -207,7 +207,7 @@ def triangulate_pixels(site: CraniotomyFrame, view: StereoView, pixels: np.ndarr
 
 
 def find_static_points(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels (m, 2) of the left window that show surroundings of the opening, and their positions (m, 3) [m]."""
+    """Return left pixels (m, 2) that show points around the craniotomy, and the positions (m, 3) [m] of the points."""
     ticks = np.linspace(0.0, view.geometry.size - 1.0, 40)
     pixels = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     found = triangulate_cloud(view, pixels)
@@ -217,7 +217,7 @@ def find_static_points(site: CraniotomyFrame, view: StereoView) -> tuple[np.ndar
 
 
 def check_surroundings_static(first_view: FirstView, view: StereoView, add_rigid_error: Rigid) -> None:
-    """Raise InputError if the surroundings of the opening seem to have moved since the first pair."""
+    """Raise InputError if the surroundings of the craniotomy seem to have moved since the first pair."""
     which, there = track_pixels(first_view.stereo_view, view, first_view.static_pixels)
     try:
         found = triangulate_cloud(view, there)
@@ -235,7 +235,7 @@ def check_surroundings_static(first_view: FirstView, view: StereoView, add_rigid
 
 
 def find_nearest_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of the scan's cortex nearest to points (n, 3) [m], and their distances (n,) [m]."""
+    """Return the scan's cortex points (n, 3) [m] that are nearest to `points` (n, 3) [m], and distances (n,) [m]."""
     if not len(points):
         return points, np.zeros(0)
     anatomy = site.anatomy
@@ -244,12 +244,12 @@ def find_nearest_on_cortex(site: CraniotomyFrame, points: np.ndarray) -> tuple[n
 
 
 def scale_deviations(sigma: np.ndarray) -> np.ndarray:
-    """Scale standard deviations (n,) [m] of independent noise to a locator's `sigma`, which adds correlated noise."""
+    """Scale standard deviations (n,) [m] of independent noise to `sigma` of a locator, which adds correlated noise."""
     return sigma * (SIGMA / NOISE.independent_error)
 
 
 def require_points(count: int, requested: int, other_reason: str = "") -> None:
-    """Raise InputError if too few of the searched points are visible; `other_reason` is added to the message."""
+    """Raise InputError if `count` is too small a share of the `requested` points; `other_reason` joins the message."""
     if count < STEREO.min_found_share * requested:
         raise InputError(
             f"both eyes see {count} of {requested} places of the cortex surely: check light, focus and texture, and "

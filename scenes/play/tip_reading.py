@@ -1,4 +1,4 @@
-"""Distance from tool tip to tumour that is displayed at the tool, with its error bound."""
+"""Distance from tool tip to tumour, displayed at the tool, with its error bound."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,12 @@ from ..script.tool import Instrument, Probe
 
 @dataclass(frozen=True)
 class TipDistance:
-    """Distance from tip to tumour.
+    """Distance from tool tip to tumour, with its error bound.
 
     Parameters
     ----------
     distance
-        [m].
+        Distance [m].
     bound
         95 % bound on the difference from the FEM distance [m]; None if not available.
     """
@@ -36,9 +36,9 @@ class TipDistance:
 def predict_tip_distance(
     deformer: Deformer, loads: Loads, solution: Deformation, tool: Instrument | None, drawn_distance: float
 ) -> TipDistance | None:
-    """Read the distance in the first load case of a solution; None unless a single ball pushes or is moved.
+    """Predict the distance from tip to tumour in the first load case of a solution.
 
-    A distance by FEM has no bound. A trained model has no bound outside of its training range.
+    Returns None unless the only active tool is a ball. FEM gives no bound; a trained model none outside its range.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def predict_tip_distance(
 def measure_tip_distance(
     anatomy: Anatomy, loads: Loads, solution: Deformation, tool: Instrument | None, lift: float
 ) -> TipDistance | None:
-    """Measure the distance in a solution of any deformer, without error bound.
+    """Measure the tip distance in any deformer's solution, without bound; None unless the only active tool is a ball.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def measure_tip_distance(
     Raises
     ------
     InputError
-        A solution without open cortex or tumour.
+        The solution does not contain the open cortex or the tumour.
     """
     ball = _get_ball(loads, tool)
     if ball is None:
@@ -81,6 +81,6 @@ def measure_tip_distance(
 
 
 def _get_ball(loads: Loads, tool: Instrument | None) -> Probe | None:
-    """Return the tool if it is a ball and the only tool that pushes or is moved; else None."""
+    """Return `tool` if it is a ball and the only tool that pushes or moves; else None."""
     alone = len(loads.get_all(Pushed)) + len(loads.get_all(Touching)) == 1
     return tool if alone and isinstance(tool, Probe) else None

@@ -1,4 +1,4 @@
-"""Notice about a task that takes a noticeable time."""
+"""Notice to the user while a task takes a long time."""
 
 import threading
 import time as clock
@@ -9,27 +9,27 @@ POLL_INTERVAL = 0.1  # Polling interval [s].
 
 
 class WaitingNotice:
-    """Thread that passes the running task and its duration to `say`, and an empty line at its end."""
+    """Thread that calls `show` with the running task and its duration, and with an empty line at the end."""
 
     def __init__(self, show: Callable[[str], None]) -> None:
         self._say = show
         self._since: float | None = None
         self._what = ""
         self.noticed = False
-        """True while the line is shown."""
+        """True while the notice is shown."""
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="busy", daemon=True)
         self._thread.start()
 
     def begin_work(self, task: str) -> None:
-        """Mark the start or continuation of work on `task`."""
+        """Report the start of work on `task`, or the continuation of work with another task."""
         with self._lock:
             self._what = task
             self._since = clock.perf_counter() if self._since is None else self._since
 
     def end_work(self) -> None:
-        """Mark the end of the work."""
+        """Report the end of the work; a shown notice is cleared."""
         with self._lock:
             self._since = None
             if self.noticed:
@@ -37,7 +37,7 @@ class WaitingNotice:
             self.noticed = False
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop the thread."""
         self._closed.set()
         self._thread.join()
 
