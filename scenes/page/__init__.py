@@ -1,1 +1,1 @@
-"""Demo page: display, deformers and requests."""
+"""Demo page: display of a scene, its deformers, and the requests of users."""

@@ -1,4 +1,4 @@
-"""Computations behind a page that report their progress: costs of the effects, refined error."""
+"""Background computations of a page that report their progress: costs of the effects, and the refined error."""
 
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -18,21 +18,21 @@ from .requests import Requests
 
 
 class BackgroundStudy:
-    """Computation in a thread, repeated at each start; `show` receives results or the failure of `task` (HTML)."""
+    """Thread that runs `task` at each start; `show` receives each result of the task, or its failure as HTML."""
 
     def __init__(self, task: Callable[[], Iterator[Any]], lock: threading.Lock, show: Callable[[Any], None]) -> None:
-        """Prepare the study, which holds `lock` while it runs: no other solver is built at that time."""
+        """Prepare the study. While the study runs, it keeps `lock`, so that no other solver is built."""
         self.work, self.lock, self.show = task, lock, show
         self.closed, self.thread = threading.Event(), threading.Thread()
 
     def start(self) -> None:
-        """Start the study, unless it is running."""
+        """Start the study unless it is running."""
         if not self.thread.is_alive():
             self.thread = threading.Thread(target=self._run, name="study", daemon=True)
             self.thread.start()
 
     def close(self) -> None:
-        """End the study after the step in progress."""
+        """Stop the study after its current step, without waiting."""
         self.closed.set()
 
     def _run(self) -> None:
@@ -50,7 +50,7 @@ class BackgroundStudy:
 def build_studies(
     patient: PatientSetup, scene: Scene, requests: Requests, lock: threading.Lock, get_browser: Callable[[], Browser]
 ) -> tuple[BackgroundStudy, ...]:
-    """Build the studies of a scene's effects and of the requested load, which the page of `get_browser` shows."""
+    """Build two studies, the costs of a scene's effects and the refined error of the requested load, for a page."""
 
     def refine() -> Iterator[str]:
         number, _, touch, _ = requests.read_current()

@@ -1,4 +1,4 @@
-"""Comparison of a page's deformers with FEM: the shown solution, and a table of time and accuracy."""
+"""Comparison of a page's deformers with FEM: error of the shown solution, and a table of times and errors."""
 
 import time as clock
 from collections.abc import Sequence
@@ -25,10 +25,10 @@ FEM_SHOWN, FEM_REFERENCE = "this is the result of the FEM solver", "the truth is
 
 @dataclass(frozen=True)
 class Comparison:
-    """Error of a deformer relative to an FEM solution: mean and maximum, and the motion [m].
+    """Comparison of a deformer with the FEM solution of frame `number`, over the tumour's nodes.
 
-    doubt is the reason why the FEM solution is unreliable. mean and largest are None if the shown solution is by FEM.
-    distance is that from tip to tumour by FEM [m].
+    `mean` and `largest` error [m] are None if FEM computed the shown solution. `motion` [m] is the mean displacement,
+    `distance` [m] the distance from tip to tumour, both by FEM. `warning` is the reason if FEM is unreliable (or "").
     """
 
     number: int
@@ -41,9 +41,9 @@ class Comparison:
 
 
 def compare_with_fem(fem: FemResult, player: Player, is_fem: bool, solution: Deformation | None = None) -> Comparison:
-    """Compare a deformer with an FEM solution, for the same loads.
+    """Compare the deformer of a player with an FEM solution of the same loads.
 
-    `solution` is the deformer's solution of these loads, if it depends on previous ones.
+    `solution` is the deformer's solution of these loads, computed if None. If `is_fem`, the errors are None.
     """
     nodes = player.stage.select_stage(fem.loads).anatomy.tumour_nodes
     motion = float(np.linalg.norm(fem.deformation.restrict(nodes).displacement[0], axis=1).mean())
@@ -61,16 +61,16 @@ def compare_with_fem(fem: FemResult, player: Player, is_fem: bool, solution: Def
 
 
 def compute_node_errors(fem: FemResult, player: Player, shown: Deformation) -> np.ndarray:
-    """Return the distance (n,) [m] of each tumour node in a solution from its position by FEM."""
+    """Return the distance (n,) [m] of each tumour node between the solution `shown` and the FEM solution."""
     nodes = player.stage.select_stage(fem.loads).anatomy.tumour_nodes
     displacements = (solution.restrict(nodes).displacement[0] for solution in (fem.deformation, shown))
     return np.linalg.norm(np.subtract(*displacements), axis=1)
 
 
 def format_comparison(comparison: Comparison | None, stale: bool, waiting_text: str, fem_text: str = FEM_SHOWN) -> str:
-    """Format the comparison; a comparison of a previous load is grey and marked, with the state of the FEM solver.
+    """Format the comparison as HTML; if `stale`, it is grey, marked as of a previous load, and ends in `waiting_text`.
 
-    `fem_text` is the text for a solution by FEM itself.
+    `fem_text` is the text for a solution that FEM computed.
     """
     if comparison is None:
         return f'<p class="stale">{escape(waiting_text)}</p>'
@@ -87,18 +87,18 @@ def format_comparison(comparison: Comparison | None, stale: bool, waiting_text: 
 
 
 def describe_change(fem: FemResult, player: Player, solution: Deformation, disabled: Sequence[str]) -> str:
-    """Describe the tumour's distance from its position under all effects, for a solution with some effects disabled."""
+    """Describe the mean distance (HTML) of the tumour between a solution with `disabled` effects and one with all."""
     mean = 1e3 * float(compute_node_errors(fem, player, solution).mean())
     return f"<p>without {escape(', '.join(disabled))} the tumour position differs by {mean:.2f} mm</p>"
 
 
 @dataclass
 class PageState:
-    """State of the page: the request, its solution, the frame, and the FEM comparison.
+    """State of the page: last request, its solution, the rendered frame, and the comparison with FEM.
 
-    `goal` is the request that the frame is on the way to, `request` the one that it fulfils, `look` the display.
-    If nothing changes for `still_time` [s], the page is still, from `still_at` on [s]. Images in motion are coarse if
-    the `render_time` of a sharp one is above `max_render_time` [s].
+    `goal` is the user's request, `request` the request that the shown frame fulfils, and `look` its display settings.
+    The page is still from the time `still_at` [s], after `still_time` [s] without change. Before, images are coarse if
+    a sharp image needs a `render_time` above `max_render_time` [s].
     """
 
     goal: tuple | None = None
@@ -122,19 +122,19 @@ class PageState:
     max_render_time: float = 0.015
 
     def choose_resolution(self) -> bool:
-        """Return True if the next image is to be coarse."""
+        """Choose the resolution of the next image, and restart the waiting time; return True if the image is coarse."""
         time = clock.perf_counter()
         self.coarse = self.render_time > self.max_render_time and time < self.still_at
         self.still_at = time + self.still_time
         return self.coarse
 
     def record_rendering(self, seconds: float) -> None:
-        """Record the duration of rendering the image."""
+        """Record the rendering time of an image [s]; the time of a coarse image is scaled to that of a sharp image."""
         self.render_time = seconds * (COARSE_SAVING if self.coarse else 1.0)
 
     @property
     def is_still(self) -> bool:
-        """True if nothing has changed for some time."""
+        """True if nothing has changed for `still_time`."""
         return clock.perf_counter() >= self.still_at
 
 
@@ -145,7 +145,7 @@ MAX_RECENT_LOADS = 120  # Number of last loads that are kept for each deformer.
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """A deformer's medians over `loads` loads; `is_optimal`: True on the Pareto front of both, None without ranking."""
+    """Median time and error of a deformer over `loads` loads; `is_optimal`: on the Pareto front (None: not ranked)."""
 
     name: str
     milliseconds: float
@@ -155,26 +155,26 @@ class ComparisonRow:
 
 
 class AccuracyTimeTable:
-    """Milliseconds and mean distance from the finite elements, by deformer and load."""
+    """Table of times [ms] and mean errors relative to FEM [mm], by deformer and load."""
 
     def __init__(self) -> None:
         self._times: dict[str, dict[str, float]] = {}
         self._errors: dict[str, dict[str, float]] = {}
 
     def record_time(self, deformer: str, load_id: str, seconds: float) -> None:
-        """Record the time of a deformer for a load, named by its stamp."""
+        """Record the time [s] of a deformer for the load `load_id`."""
         _store_recent(self._times.setdefault(deformer, {}), load_id, 1e3 * seconds)
 
     def record_error(self, deformer: str, load_id: str, error: float) -> None:
-        """Record the error of a deformer for a load, relative to the converged FEM solution."""
+        """Record the mean error [m] of a deformer for the load `load_id`, relative to the FEM solution."""
         _store_recent(self._errors.setdefault(deformer, {}), load_id, 1e3 * error)
 
     @property
     def rows(self) -> list[ComparisonRow]:
-        """Rows of the deformers with a time and an error, fastest first.
+        """Rows of the deformers that have a time and an error, the fastest deformer first.
 
-        If there are loads that all deformers were shown, only these count, and the rows are ranked. Otherwise each row
-        uses its own loads, without ranking: medians over different loads are not comparable.
+        If all deformers share some loads, only these loads count, and the rows are ranked. Otherwise each row uses the
+        deformer's own loads, and rows are not ranked, because medians over different loads are not comparable.
         """
         loads_of = {name: self._times.get(name, {}).keys() & missed.keys() for name, missed in self._errors.items()}
         loads_of = {name: loads for name, loads in loads_of.items() if loads}
@@ -192,7 +192,7 @@ class AccuracyTimeTable:
 
 
 def _store_recent(numbers: dict[str, float], load: str, value: float) -> None:
-    """Store the newest value of a load, and drop the load that was stored first."""
+    """Store the newest value of a load; above `MAX_RECENT_LOADS` loads, drop the oldest load."""
     numbers.pop(load, None)
     numbers[load] = value
     if len(numbers) > MAX_RECENT_LOADS:

@@ -1,4 +1,4 @@
-"""Controls of the page, labelled for users."""
+"""Controls of the page, such as menus, sliders and switches, with labels and hints for users."""
 
 from collections.abc import Callable
 
@@ -23,9 +23,9 @@ MAX_FORCE = 0.4  # End of the force slider [N].
 MAX_DEPTH = 8.0  # End of the depth slider [mm], where the scene's script does not go deeper.
 MAX_TILT = 40.0  # End of the direction sliders [deg].
 STATIC_CAMERA = "stays"
-"""Label of a static camera."""
+"""Label of the menu entry for a static camera."""
 PLAN = "solver details (advanced)"
-"""Label of the note on the solvers."""
+"""Label of the note that lists the solvers."""
 REFINED_ERROR = "refined error"
 """Label of the note on the refined error."""
 REFINE_HINT = "solves this load for 16 sampled patients in the background, for minutes"  # Hint of the switch.
@@ -51,10 +51,10 @@ def build_controls(
     effect_switches: Folder,
     refine_error: Callable[[], None],
 ) -> list[Slider | Dropdown | Toggle | Folder | Note]:
-    """Build all controls of a scene that these deformers support.
+    """Build all controls of a scene; `deformers` are the names of the available deformers.
 
-    `set_mode` receives the control mode of the tool, `move` values of its touch, see `Requests.take_over`;
-    `effect_switches` are the switches of the effects; `refine_error` starts the refinement of the error.
+    Callbacks: `set_mode` receives the control mode of the tool, `move` receives changed values of the tool input (see
+    `Requests.take_over`), and `refine_error` starts the refinement of the error.
     """
     cameras = "scene default", STATIC_CAMERA, *PATHS
 
@@ -89,7 +89,7 @@ def build_controls(
 
 
 def build_style_controls(current_style: Style, set_style: Callable[[Style], None]) -> Dropdown:
-    """Build the choice of overlay styles."""
+    """Build the menu of the overlay styles."""
     styles: dict[str, Style] = {label: style for style, label in STYLES.items()}
     return Dropdown(
         "overlay",
@@ -102,7 +102,7 @@ def build_style_controls(current_style: Style, set_style: Callable[[Style], None
 
 
 def build_registration_control(scene: Scene, requests: Requests) -> Dropdown:
-    """Build the choice of the registration of the scan to the patient."""
+    """Build the menu of the registration error between scan and patient."""
     names: dict[str, Registration] = {describe_registration(size): name for name, size in REGISTRATIONS.items()}
     current = describe_registration(REGISTRATIONS[requests.registration or scene.registration])
     hint = "error of the scan's registration to the patient; it is part of the error of the tumour's position"
@@ -110,14 +110,14 @@ def build_registration_control(scene: Scene, requests: Requests) -> Dropdown:
 
 
 def build_slice_control(current_position: str, set_position: Callable[[str], None]) -> Dropdown:
-    """Build the choice of slice positions."""
+    """Build the menu of the position of the scan slices."""
     places = TUMOUR_MIDDLE, TIP
     hint = "position of the scan slices (tab slices)"
     return Dropdown("slices", places, current_position or places[0], set_position, hint=hint)
 
 
 def build_camera_sliders(scene: Scene, site: CraniotomyFrame, requests: Requests) -> tuple[Slider, Slider]:
-    """Build the sliders of the camera's tilt and distance, with the scene's values."""
+    """Build the sliders of the camera's tilt and distance; they start at the scene's values."""
     camera = scene.viewpoint.build_camera(site)
     offset = camera.centre - scene.viewpoint.find_target(site)
     distance = float(np.linalg.norm(offset))
@@ -144,7 +144,7 @@ def is_animated(scene: Scene, site: CraniotomyFrame) -> bool:
 def build_tool_controls(
     scene: Scene, site: CraniotomyFrame, requests: Requests, set_mode: Callable[[str], None], move: Callable[..., None]
 ) -> list[Slider | Dropdown]:
-    """Build the controls of the tool (control mode, position, direction) and of the slices, in patient directions."""
+    """Build controls of the tool (mode, strength, position, direction) and of the slices; labels name patient sides."""
     assert scene.tool is not None
     limit = max(0.5, np.floor(2e3 * (site.clearance - scene.tool.radius)) / 2.0)
     sides = name_edge_directions(scene.viewpoint.build_camera(site).T_camera_world[:3, :3])
@@ -175,7 +175,7 @@ def build_tool_controls(
 
 
 def to_slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
-    """Convert a touch to the values of the tool's sliders, by label."""
+    """Convert a tool input to the values of the tool's sliders, by slider label."""
     strength = {"depth [mm]": 1e3 * touch.depth} if scene.posed else {"force [N]": touch.force}
     positions = {"place right [mm]": 1e3 * touch.x, "place up [mm]": 1e3 * touch.y}
     tilts = {f"direction {key} [deg]": np.degrees(tilt) for key, tilt in zip(("right", "up"), touch.tilt, strict=True)}
@@ -183,7 +183,7 @@ def to_slider_values(scene: Scene, touch: Touch) -> dict[str, float]:
 
 
 def build_strength_slider(scene: Scene, requests: Requests, move: Callable[..., None]) -> Slider:
-    """Build the slider of the force, or of the depth of a posed tool."""
+    """Build the slider of the tool force, or of the depth if the scene moves the tool by its pose."""
     touch = requests.touch
     if scene.posed:
         low = -1e3 * IDLE_HEIGHT

@@ -1,4 +1,4 @@
-"""Plot of error against time of the deformers on the loads that were shown, as an SVG."""
+"""Plot (SVG) of the deformers' errors against their times, on the loads that the page has shown."""
 
 from collections.abc import Sequence
 from html import escape
@@ -15,7 +15,7 @@ LABEL_WIDTH = 70  # Labels nearer than this side by side are parted [SVG unit].
 
 
 def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
-    """Plot error [mm] against time [ms], both logarithmic; ranked only if all deformers have the same loads."""
+    """Return an SVG plot of error [mm] against time [ms] on logarithmic axes, with a caption; empty without rows."""
     if not rows:
         return ""
     if rows[0].is_optimal is not None:
@@ -51,7 +51,7 @@ def format_cost_plot(rows: Sequence[ComparisonRow]) -> str:
 
 
 def describe_cost_row(row: ComparisonRow) -> str:
-    """Describe the time and the error of a deformer."""
+    """Describe the time and the error of one deformer in a line of text."""
     error = f"{row.millimetres:.3f}" if row.millimetres >= MIN_ERROR else f"under {MIN_ERROR:.3f}"
     return f"{_format_name(row)}: {row.milliseconds:.1f} ms, error {error} mm, {_format_load_count(row.loads)}"
 
@@ -61,7 +61,7 @@ def _format_name(row: ComparisonRow) -> str:
 
 
 def _scale_axis(values: Sequence[float], start: float, end: float) -> tuple[list[float], list[tuple[float, float]]]:
-    """Return the positions of values on a logarithmic axis between two ends, and those of the powers of ten."""
+    """Return positions of values on a logarithmic axis from `start` to `end`, and pairs (power of ten, position)."""
     low, high = np.floor(np.log10(min(values))), np.ceil(np.log10(max(values)))
     span = max(high - low, 1.0)
 
@@ -72,7 +72,7 @@ def _scale_axis(values: Sequence[float], start: float, end: float) -> tuple[list
 
 
 def _draw_text(x: float, y: float, text: str, anchor: str) -> str:
-    """Return a text element of the SVG."""
+    """Return an SVG text element at (x, y)."""
     return f'<text x="{x:.0f}" y="{y:.0f}" text-anchor="{anchor}">{escape(text)}</text>'
 
 

@@ -1,4 +1,4 @@
-"""Main loop of the page: a scripted or manual tool, any deformer, and comparison with FEM in the background."""
+"""Main loop of the demo page: scripted or manual tool, any deformer, and comparison with FEM in the background."""
 
 import sys
 import threading
@@ -59,7 +59,7 @@ MESSAGE_TIME = 2.0  # Time for which a playing page shows why a frame is skipped
 
 
 class Demo:
-    """Scene on a page, played by `run`; users can change to another built-in scene."""
+    """Page that plays a scene with `run`; users can select another built-in scene."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class Demo:
         style: Style = "window",
         origins: tuple[str, ...] = (),
     ) -> None:
-        """Open the page; `anatomy` describes the brain, and `get_scene` builds a scene by name."""
+        """Open the page at `host` and `port`; `anatomy` describes the brain, and `get_scene` finds a scene by name."""
         self.patient, self.anatomy, self.first, self.find = patient, anatomy, scene, get_scene
         self.build_lock = threading.Lock()
         self._set_scene(scene, deformer)
@@ -89,12 +89,12 @@ class Demo:
         self.asked, self.drawn = self.wish.read_current(), 0
 
     def run(self, seconds: float = float("inf")) -> int:
-        """Play for the given time; return the number of frames drawn. Failures are reported on the page and skipped.
+        """Play for `seconds` and return the number of drawn frames. The page reports a failed frame, and skips it.
 
         Raises
         ------
         InputError
-            FEM of the first scene is not available, and no other deformer was requested.
+            The FEM solver of the first scene cannot be built, and no other deformer was requested.
         """
         self.drawn, end = 0, clock.perf_counter() + seconds
         while (remaining := end - clock.perf_counter()) > 0.0:
@@ -107,7 +107,7 @@ class Demo:
         return self.drawn
 
     def _report_skipped_frame(self, error: Exception, end: float) -> None:
-        """Show why a frame is skipped, for `MESSAGE_TIME` or until a user requests another frame; then resume."""
+        """Show why a frame is skipped, until a user requests another frame or `MESSAGE_TIME` is over; then resume."""
         self.busy.end_work()
         message = str(error)
         if not isinstance(error, InputError):
@@ -124,7 +124,7 @@ class Demo:
         self.wish.step_playback(self.asked[0], len(self.stage.scene.times))
 
     def _run(self, seconds: float) -> None:
-        """Play until the time is over or something fails."""
+        """Play for `seconds`, or until an exception is raised."""
         state, end = PageState(), clock.perf_counter() + seconds
         while clock.perf_counter() < end:
             start = clock.perf_counter()
@@ -141,12 +141,12 @@ class Demo:
             clock.sleep(max(MIN_REST, pause))
 
     def _show_tool_holder(self) -> None:
-        """Show each user who controls the tool."""
+        """Show on the page of each user which user controls the tool."""
         tool, holder, connected = self.stage.scene.tool, self.wish.holder, self.browser.here
         self.browser.show_line(lambda client: "" if tool is None else describe_tool_control(client, holder, connected))
 
     def close(self) -> None:
-        """Stop the page and the FEM threads."""
+        """Stop the page, its background studies and the FEM threads."""
         self.busy.close()
         for study in self.studies:
             study.close()
@@ -156,16 +156,16 @@ class Demo:
 
     @property
     def stage(self) -> Stage:
-        """Drawn stage, with all effects."""
+        """Rendered parts of the scene, with all effects."""
         return self.cast.get_stage()
 
     @property
     def fem_worker(self) -> FemWorker:
-        """FEM worker with all effects: the reference for the models."""
+        """FEM worker that solves with all effects; its solution is the reference for the models."""
         return self.cast.get_worker()
 
     def _set_scene(self, scene: Scene, deformer: str) -> None:
-        """Set the scene and the deformer, with new solvers, requests and readings."""
+        """Set the scene and the deformer, with new solvers, requests and recorded values."""
         self.cast, self.tally = SceneSolvers(self.patient, scene, deformer, self.build_lock), AccuracyTimeTable()
         self.history = History(list_plot_lines(scene))
         # Number of the shown frame.
@@ -174,7 +174,7 @@ class Demo:
         self.studies = build_studies(self.patient, scene, self.wish, self.build_lock, lambda: self.browser)  # not open
 
     def _change_scene(self, name: str) -> None:
-        """Play another scene; if this anatomy does not support it, keep the scene and show the reason."""
+        """Play the scene `name`; if this anatomy does not support it, keep the current scene and show the reason."""
         previous = self.cast, self.tally, self.wish, self.history, self.studies
         self.busy.begin_work(f"preparing the scene {name}")
         try:
@@ -198,7 +198,7 @@ class Demo:
         self.dismissed = [solver for solver in self.dismissed if solver.thread.is_alive()] + previous[0].stop_soon()
 
     def update_page(self, state: PageState) -> int:
-        """Update the page towards the requested state; return the number of rendered frames, 0 or 1."""
+        """Perform one step of the page towards the requested state; return the number of rendered frames, 0 or 1."""
         self.asked = self.wish.read_current()
         if self.asked == state.request:
             self._mark_shown()
@@ -211,13 +211,13 @@ class Demo:
         return 0
 
     def _mark_shown(self) -> None:
-        """Mark the request as shown: nothing is pending, and playback continues."""
+        """Mark the request as shown: clear the notice, withdraw pending solves, and advance the playback."""
         self.busy.end_work()
         self.cast.stop_all()
         self.wish.step_playback(self.asked[0], len(self.stage.scene.times))
 
     def _find_result(self, state: PageState) -> FemResult | None:
-        """Return the solution of the request, or of a frame on the way to it; None until there is one."""
+        """Return the solution of the requested frame or of a frame in between; None while no solution is available."""
         number, name, touch, disabled = self.asked
         request, scene = (number, touch), self.stage.scene
         if name != "fem" and not disabled:  # no model was trained with effects disabled
@@ -236,7 +236,7 @@ class Demo:
         return self.cast.solve(disabled, request, state.shown, 1.0 / scene.frames_per_second)
 
     def _show_undeformed(self, state: PageState) -> None:
-        """Show the undeformed body while no solution is available."""
+        """Show the undeformed brain while no solution is available."""
         number, _, touch, _ = self.asked
         stage = replace(self.stage, observer=None)  # no ground truth is available yet
         player = Player(stage, RestDeformer(stage.site.anatomy), self.wish.style)
@@ -247,7 +247,7 @@ class Demo:
         state.shows_undeformed = True
 
     def _draw(self, state: PageState, solution: FemResult) -> None:
-        """Draw a solution, and request its comparison with FEM unless FEM computed it."""
+        """Draw a solution on the page, and request the FEM solution for comparison unless FEM computed the solution."""
         number, name, touch, disabled = self.asked
         look = self.wish.look
         player = replace(self._get_player(self.asked, look), coarse=state.choose_resolution())
@@ -274,13 +274,13 @@ class Demo:
             self._show_touch(tool_touch, lambda: self.wish.tool == SCRIPT)
 
     def _show_touch(self, touch: Touch, condition: Callable[[], bool]) -> None:
-        """Set the tool's sliders to a touch, at which manual control would start."""
+        """Set the tool's sliders to the values of `touch` if `condition` is true: manual control starts there."""
         if self.stage.scene.tool is not None:
             for label, value in to_slider_values(self.stage.scene, touch).items():
                 self.browser.put(label, value, condition)
 
     def _draw_in_style(self, state: PageState) -> None:
-        """Render the shown solution in another style."""
+        """Render the shown solution again with the current display settings."""
         assert state.frame is not None and state.request is not None
         frame, state.look, state.coarse = state.frame, self.wish.look, False
         player, seconds = self._get_player(state.request, state.look), frame.seconds["deform"]
@@ -289,17 +289,17 @@ class Demo:
         self._show_side_panels(state.frame, player)
 
     def _get_player(self, request: tuple, look: Display) -> Player:
-        """Return the player of a request, in the given style."""
+        """Return the player of a request, with the display settings `look`."""
         _, name, _, disabled = request
         return replace(self.cast.get_player_with_camera("fem" if disabled else name, disabled, look), style=look.style)
 
     def _show_side_panels(self, frame: Frame, player: Player) -> None:
-        """Show slices of a frame, and the chart of recent values, when there is time for it."""
+        """Show slices of a frame and the chart of recent values, as soon as the browser has time."""
         through, history = self.wish.through, self.history
         self.browser.show_beside(lambda: (render_slices(frame, player, through), history.draw_chart()))
 
     def _update_comparison(self, state: PageState) -> None:
-        """Show the FEM solution for the displayed frame, and whether it belongs to the same load."""
+        """Compare the displayed frame with the newest FEM solution; show the result, marked if the loads differ."""
         assert state.frame is not None and state.request is not None
         _, name, _, disabled = state.request
         name = "fem" if disabled else name
@@ -344,12 +344,12 @@ class Demo:
         self.browser.show(state.frame.number, state.image, text, self.asked[0])
 
     def _build_loads(self, number: int, touch: Touch | None) -> Loads:
-        """Return the loads of a frame under all effects of the scene."""
+        """Return the loads of frame `number` under all effects of the scene; `touch` replaces the scripted input."""
         scene, time = self.stage.scene, float(self.stage.scene.times[number])
         return scene.build_loads(self.stage.site, touch or scene.path(time), time)
 
     def _build_contents(self, deformer: str) -> tuple:
-        """Build the contents of the page: bodies, playback, controls, title, text."""
+        """Build the contents of the page: surfaces, playback, controls, title and caption."""
         scene, names = self.stage.scene, self.patient.list_deformers(self.stage.scene)
         effects = build_effect_switches(self.patient, scene, self.wish, self.studies[0].start)
         actions = self._set_control, self._take_over, effects, self.studies[1].start
@@ -362,7 +362,7 @@ class Demo:
         )
 
     def _play(self, plays: bool) -> None:
-        """Handle the play button: in a static scene the script takes the tool. A pause keeps the reached frame."""
+        """Handle the play button: playing a static scene returns the tool to the script; a pause keeps the frame."""
         self.wish.play(plays)
         if not plays and self.reached is not None:
             self.wish.set(number=self.reached)
@@ -372,7 +372,7 @@ class Demo:
             self.browser.put("tool", self.wish.tool)
 
     def _set_control(self, tool: str, **values: int) -> None:
-        """Change the tool control by the menu or the frame slider; the menu is updated after pending messages."""
+        """Change the tool control after use of the menu or the frame slider, and update the menu."""
         if tool == HAND:
             self._start_manual_control()
         self.wish.set(tool=tool, holder=self._get_user() if tool == HAND else None, **values)
@@ -380,7 +380,7 @@ class Demo:
             self.browser.put("tool", tool)
 
     def _take_over(self, **values: float) -> None:
-        """Switch to manual control after a slider was moved."""
+        """Switch to manual control with the values of a moved slider."""
         self._start_manual_control()
         self.wish.set(holder=self._get_user())
         self.wish.take_over(**values)
@@ -388,12 +388,12 @@ class Demo:
         self.browser.put("tool", HAND)
 
     def _start_manual_control(self) -> None:
-        """Initialise manual control, when the script has the tool, from the touch of the frame shown."""
+        """Initialise manual control from the shown frame's tool input, if the script controls the tool."""
         if self.wish.tool == SCRIPT:
             number = self.wish.number if self.reached is None else self.reached
             scene = self.stage.scene
             self.wish.set(touch=scene.path(float(scene.times[number])))
 
     def _get_user(self) -> int | None:
-        """Return the user whose change is processed now."""
+        """Return the number of the user whose change is being processed; None outside of such a change."""
         return None if self.browser.deed is None else self.browser.deed.client

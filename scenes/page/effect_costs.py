@@ -1,4 +1,4 @@
-"""Switches of a scene's effects, with the time that each effect costs and the tumour motion that it causes."""
+"""Switches of a scene's effects, labelled with the FEM time and the tumour motion that each effect adds."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -32,7 +32,7 @@ Figures = Mapping[str, tuple[float | None, float | None]]
 def build_effect_switches(
     patient: PatientSetup, scene: Scene, requests: Requests, measure: Callable[[], None]
 ) -> Folder:
-    """Build the switches of a scene's effects with their recorded costs; `measure` starts a measurement."""
+    """Build a folder of effect switches with their recorded costs, and a switch that calls `measure`."""
     record = patient.find_effect_record(scene)
     figures: Figures = {} if record is None else record.effects
     switches = (
@@ -48,7 +48,7 @@ def build_effect_switches(
 
 
 def measure_costs(patient: PatientSetup, scene: Scene) -> Iterator[dict[str, str]]:
-    """Yield the text of an effect's switch and of the note (HTML), by label, whenever an effect is measured.
+    """Measure the effects; after each effect, yield new texts of its switch and of the note (HTML), by label.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def measure_costs(patient: PatientSetup, scene: Scene) -> Iterator[dict[str, str
 
 
 def format_switch_label(effect_name: str, figures: Figures) -> str:
-    """Return the text of an effect's switch: its name, the time that it adds and the motion that it causes."""
+    """Return the label of an effect's switch: name, added time per frame [ms], and added tumour motion [mm]."""
     milliseconds, motion = figures.get(effect_name, (None, None))
     if milliseconds is None or motion is None:
         return f"{describe_effect(effect_name)}: {'cannot be disabled' if effect_name in figures else 'not measured'}"
@@ -76,7 +76,7 @@ def format_switch_label(effect_name: str, figures: Figures) -> str:
 
 
 def format_costs(patient: PatientSetup, scene: Scene, record: EffectRecord | None, source: str) -> str:
-    """Describe the source and metrics of the figures, the whole scene, and effects that are always on (HTML)."""
+    """Describe (HTML) source and metrics of the figures, results of the full scene, and effects that are always on."""
     sentences = [source] if record is None else [source, f"Of each effect: {METRICS}", *_list_findings(record)]
     switchable = list_switchable_effects(scene, patient.anatomy)
     names = (type(effect).__name__ for effect in scene.get_effects_on(patient.anatomy))

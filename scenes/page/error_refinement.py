@@ -1,4 +1,4 @@
-"""Refinement of the error of the load on a page, by an ensemble for this load."""
+"""Refined error of the load that a page shows, from an ensemble of solutions of this load."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,9 +14,9 @@ DRAWS = 16  # Number of sampled patients: two for each fitted parameter.
 
 
 def refine_error(patient: PatientSetup, scene: Scene, touch: Touch, time: float, count: int = DRAWS) -> Iterator[str]:
-    """Yield the progress (HTML) of an ensemble of a scene whose tool stays at a touch, and its error at a time [s].
+    """Solve an ensemble of a scene whose tool stays at `touch`; yield the progress, then the error at a time [s].
 
-    `count` is the number of sampled patients.
+    The yielded texts are HTML. `count` is the number of sampled patients (ensemble members).
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""FEM thread of a page: it solves the newest frame, to show it or to compare a model with it."""
+"""FEM thread of a page, which solves the newest requested frame for display or for comparison with a model."""
 
 import os
 import threading
@@ -17,16 +17,16 @@ from ..script.scene import Scene
 from ..script.tool_paths import Touch
 
 FrameRequest = tuple[int, Touch | None]
-"""Number of a frame, and the touch under manual control, else None."""
+"""Frame number, and manual tool input (None: the tool follows the script)."""
 # Pause between comparisons with FEM while playing, relative to the duration of one: leaves few CPU cores to the images.
 COMPARISON_REST = 2.0 if (os.cpu_count() or 1) < 4 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class FemResult:
-    """Solution of one frame: frame number, loads, deformation, duration [s], and the request.
+    """FEM or model solution of one frame: frame number, loads, deformation, duration [s], and the request.
 
-    The frame may be one on the way to the requested one.
+    The frame may be an intermediate frame before the requested frame.
     """
 
     number: int
@@ -37,16 +37,16 @@ class FemResult:
 
 
 class FemWorker:
-    """Thread that solves the newest frame by FEM; older pending requests are dropped.
+    """Thread that solves the newest requested frame by FEM; older pending requests are dropped.
 
-    The thread pauses while an image is drawn, and after a solve if a request asks for that.
-    It is prepared at the first request. Frames on the way to the requested one are solved too. If FEM fails, `failure`
-    is the reason, and no further frames are solved; if loads are rejected, only that frame is skipped, and `refused` is
-    its request. After the setup, `player` has the solver, and `plan` lists its solvers as sentences.
+    The thread pauses while an image is drawn, and after a solve for the `rest` of the request. The first request builds
+    the solver. Intermediate frames before the requested frame are solved too. `truth` is the newest solution. If loads
+    are rejected, `failure` is the reason and `refused` the request, and the thread continues; after any other exception
+    the thread ends. When the solver is built, `player` contains it, and `plan` describes its solvers in sentences.
     """
 
     def __init__(self, patient: PatientSetup, scene: Scene, build_lock: threading.Lock) -> None:
-        """Start the thread; it holds `build_lock` while it builds the solver: only one is built at a time."""
+        """Start the thread, which keeps `build_lock` while it builds the solver: solvers are built one at a time."""
         self.newest: FrameRequest | None = None
         self.truth: FemResult | None = None
         self.failure: Exception | None = None
@@ -61,10 +61,10 @@ class FemWorker:
         self.thread.start()
 
     def request_frame(self, number: int, touch: Touch | None, rest: float = 0.0) -> None:
-        """Replace the pending request; `touch` is the manual one, if the user has the tool.
+        """Replace the pending request; `touch` is the manual tool input, or None if the tool follows the script.
 
-        Nothing is solved twice: the request may be the one in progress, or the last one that was solved. `rest` is the
-        pause before the next solve, relative to the duration of the last.
+        A request that is in progress or was solved last is not solved again. `rest` is the pause before the next solve,
+        relative to the duration of the last solve.
         """
         result, request = self.truth, (number, touch)
         with self.wake:
@@ -76,12 +76,12 @@ class FemWorker:
                 self.wake.notify_all()
 
     def drop_request(self) -> None:
-        """Withdraw the request: nothing is solved after the current step."""
+        """Withdraw the pending request; the thread stops solving after the current step."""
         with self.wake:
             self.newest = None
 
     def wait_for_newer(self, request: FrameRequest, previous: FemResult | None, seconds: float) -> FemResult | None:
-        """Wait up to `seconds` for another solution than `previous` for a request; None after that time."""
+        """Wait up to `seconds` for a solution of `request` other than `previous`; return None after that time."""
 
         def find_newer() -> FemResult | None:
             result = self.truth
@@ -91,13 +91,13 @@ class FemWorker:
             return self.wake.wait_for(find_newer, seconds)
 
     def stop_soon(self) -> None:
-        """Request the end of the thread after the current solve, without waiting."""
+        """Tell the thread to end after the current solve; return without waiting."""
         with self.wake:
             self.closed.set()
             self.wake.notify_all()
 
     def close(self) -> None:
-        """Stop after the current solve, and wait for the thread's end."""
+        """Stop the thread after the current solve, and wait for its end."""
         self.stop_soon()
         self.thread.join()
 
@@ -132,7 +132,7 @@ class FemWorker:
                 self.wake.notify_all()
 
     def _wait_for_request(self) -> FrameRequest | None:
-        """Return the newest request, once there is one and the pause is over; None at the end."""
+        """Wait for a request and the end of the pause; return the newest request, or None if the worker is closed."""
         with self.wake:
             while not self.closed.is_set():
                 left = self.solved_at + self.rest * self.solve_time - clock.perf_counter()
@@ -142,7 +142,7 @@ class FemWorker:
             return None
 
     def _prepare_session(self, patient: PatientSetup, scene: Scene) -> ReplaySession | None:
-        """Build the FEM session; None if the request was withdrawn while this thread waited for the lock."""
+        """Build the FEM session; return None if the request was withdrawn while the thread waited for the lock."""
         with self.build_lock:
             if self.closed.is_set() or self.newest is None:
                 return None

@@ -1,4 +1,4 @@
-"""Requests of a page's users, and the line that describes who controls the tool."""
+"""Requests of a page's users, and the text line that names the user who controls the tool."""
 
 import threading
 from collections.abc import Collection
@@ -14,7 +14,7 @@ SCRIPT, HAND = "automatic", "manual"  # Control of the tool: scripted, manual.
 
 
 class Display(NamedTuple):
-    """Display of a solution: overlay style, path and position of the camera, position of the slices, registration."""
+    """Display settings of a solution: overlay style, camera motion and position, slice position, and registration."""
 
     style: Style
     path: str = ""
@@ -26,11 +26,11 @@ class Display(NamedTuple):
 
 @dataclass
 class Requests:
-    """Requests of the users, written by the page's threads and read by the loop, under its lock.
+    """Requests of the users, which the page's threads write and the main loop reads, under `lock`.
 
-    `path` is the name of the camera's motion; "": the scene's own. `tilt` [rad] and `distance` [m] move the camera;
-    None: as the scene has it, as for `registration`. `through` is the position of the slices. `clocked` is true if
-    the scene evolves without tool input: otherwise manual control pauses the script.
+    `path` is the name of the camera's motion; "" means the scene's motion. `tilt` [rad] and `distance` [m] are those of
+    the camera; None, as for `registration`, means the scene's value. `through` is the position of the slices. If
+    `clocked`, the scene evolves without tool input; otherwise manual control pauses the script.
     """
 
     deformer: str
@@ -51,50 +51,50 @@ class Requests:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def set(self, **values: object) -> None:
-        """Change several requests at once."""
+        """Set several attributes at once, under the lock."""
         with self.lock:
             for name, value in values.items():
                 setattr(self, name, value)
 
     def take_over(self, right: float | None = None, up: float | None = None, **values: float) -> None:
-        """Switch to manual control with some values of the touch changed; `right` and `up` tilt the force [rad]."""
+        """Switch to manual control with changed values of the tool input; `right` and `up` tilt the force [rad]."""
         with self.lock:
             tilt = self.touch.tilt[0] if right is None else right, self.touch.tilt[1] if up is None else up
             self.touch, self.tool = replace(self.touch, tilt=tilt, **values), HAND
             self.plays = self.plays and self.clocked
 
     def play(self, plays: bool) -> None:
-        """Play or pause; in a scene that is static without tool input, playing returns the tool to the script."""
+        """Play or pause. If the scene is static without tool input, playing returns the tool to the script."""
         with self.lock:
             self.plays = plays
             if plays and not self.clocked:
                 self.tool = SCRIPT
 
     def switch_effect(self, effect: str, enabled: bool) -> None:
-        """Switch an effect on or off."""
+        """Enable or disable an effect, given by its class name."""
         with self.lock:
             self.off = self.off - {effect} if enabled else self.off | {effect}
 
     @property
     def look(self) -> Display:
-        """Display style of a solution."""
+        """Current display settings."""
         with self.lock:
             return Display(self.style, self.path, self.through, self.tilt, self.distance, self.registration)
 
     def read_current(self) -> tuple[int, str, Touch | None, frozenset[str]]:
-        """Return frame number, deformer, manual touch (None: the script's) and disabled effects."""
+        """Return frame number, deformer, manual tool input (None: scripted) and class names of disabled effects."""
         with self.lock:
             return self.number, self.deformer, self.touch if self.tool == HAND else None, self.off
 
     def step_playback(self, number: int, frame_count: int) -> None:
-        """Advance playback after a frame was shown, unless a user has requested another one meanwhile."""
+        """Advance the playback after frame `number` was shown, unless a user has requested another frame meanwhile."""
         with self.lock:
             if self.plays and self.number == number:
                 self.number = (number + 1) % frame_count
 
 
 def describe_tool_control(client_id: int, controlling_id: int | None, connected_ids: Collection[int]) -> str:
-    """Describe who controls the tool, for one client.
+    """Describe for one client which client controls the tool, in Markdown.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Deformers of a scene on a page: trained models, and FEM, which runs in its own threads."""
+"""Deformers of a scene on a page: trained models, and FEM solvers in their own threads."""
 
 import threading
 import time as clock
@@ -20,22 +20,22 @@ from .fem_worker import FemResult, FemWorker, FrameRequest
 from .requests import Display
 
 ALL_ACTIVE: frozenset[str] = frozenset()
-"""Disabled effects when all effects are active."""
+"""Empty set of disabled effects: all effects are active."""
 
 
 class SceneSolvers:
-    """Stages, models and FEM solvers of one scene, with all its effects or without some.
+    """Stages, trained models and FEM solvers of one scene, with all effects or with some effects disabled.
 
-    `playable` is true if one of them is ready to compute.
+    `playable` is True if a trained model was requested or an FEM solver is ready.
     """
 
     def __init__(self, patient: PatientSetup, scene: Scene, deformer: str, build_lock: threading.Lock) -> None:
-        """Start with the `deformer` of that name. FEM solvers are built one at a time, under `build_lock`.
+        """Start with the deformer named `deformer`. FEM solvers are built one at a time, under `build_lock`.
 
         Raises
         ------
         InputError
-            A deformer that does not support the scene.
+            The deformer does not support the scene.
         """
         self.patient, self.build_lock = patient, build_lock
         # Not on a GPU: rendering while a solver's thread records a CUDA graph would be recorded, too.
@@ -52,7 +52,7 @@ class SceneSolvers:
             self.get_player(deformer)
 
     def get_stage(self, disabled_effects: frozenset[str] = ALL_ACTIVE) -> Stage:
-        """Return the stage of the scene without some effects, with unchanged tissue."""
+        """Return the stage of the scene without the disabled effects, with unchanged tissue."""
         if disabled_effects not in self.stages:
             scene = self.stages[ALL_ACTIVE].scene
             for effect in scene.get_effects_on(self.patient.anatomy):
@@ -61,14 +61,14 @@ class SceneSolvers:
         return self.stages[disabled_effects]
 
     def get_worker(self, disabled_effects: frozenset[str] = ALL_ACTIVE) -> FemWorker:
-        """Return the FEM worker of the scene without some effects."""
+        """Return the FEM worker of the scene without the disabled effects; start the worker if it does not exist."""
         if disabled_effects not in self.solvers:
             scene = self.get_stage(disabled_effects).scene
             self.solvers[disabled_effects] = FemWorker(self.patient, scene, self.build_lock)
         return self.solvers[disabled_effects]
 
     def get_player(self, name: str, disabled_effects: frozenset[str] = ALL_ACTIVE) -> Player:
-        """Return the player of the scene without some effects: a trained model, or FEM with a solution."""
+        """Return the player `name` of the scene without the disabled effects; FEM must have its solver already."""
         if (name, disabled_effects) not in self.players:
             stage = self.get_stage(disabled_effects)
             if name == "fem":
@@ -81,7 +81,7 @@ class SceneSolvers:
         return self.players[name, disabled_effects]
 
     def get_player_with_camera(self, deformer: str, disabled_effects: frozenset[str], display: Display) -> Player:
-        """Return the player with the camera and the registration of a display style."""
+        """Return the player `deformer` with the camera and the registration of the display settings."""
         player = self.get_player(deformer, disabled_effects)
         key = disabled_effects, display.path, display.tilt, display.distance, display.registration
         if key[1:] == ("", None, None, None):
@@ -101,14 +101,14 @@ class SceneSolvers:
         return replace(player, stage=self.camera_stages[key])
 
     def _build_trained(self, name: str, scene: Scene) -> Deformer:
-        """Return a trained model. Its FEM fallback is built under `build_lock`, on the CPU like the stages."""
+        """Return the trained model `name`. An FEM fallback is built under `build_lock`, on the CPU like the stages."""
         with self.build_lock if name == GUARDED else nullcontext():
             return replace(self.patient, device="cpu").build_deformer(name, scene)
 
     def predict(self, model_name: str, request: FrameRequest) -> FemResult:
-        """Compute a trained model's solution; its FEM fallback starts from the last one.
+        """Compute a trained model's solution of a request; an FEM fallback starts from the model's last solution.
 
-        A model that integrates its tissue in time computes the previous frames first.
+        A model that integrates relaxing tissue in time computes the previous frames first.
         """
         start, player = clock.perf_counter(), self.get_player(model_name)
         if player.follows:
@@ -122,7 +122,7 @@ class SceneSolvers:
         return FemResult(request[0], loads, deformation, clock.perf_counter() - start, request)
 
     def compare_models(self, reference: FemResult, table: AccuracyTimeTable, excluded_model: str) -> None:
-        """Record time and error of FEM and of each trained model but `excluded_model`, for an FEM solution's load."""
+        """Record in `table` times and errors of FEM and the models except `excluded_model`, for `reference`'s load."""
         digest, scene = compute_loads_digest(reference.loads), self.get_stage().scene
         table.record_time("fem", digest, reference.deformation.cost.total)
         table.record_error("fem", digest, 0.0)
@@ -136,14 +136,14 @@ class SceneSolvers:
     def solve(
         self, disabled_effects: frozenset[str], request: FrameRequest, previous: FemResult | None, timeout: float
     ) -> FemResult | None:
-        """Return the FEM solution of a frame, or of one on the way to it. The solver is started if necessary.
+        """Return the FEM solution of the requested frame or of a frame in between; start the worker if necessary.
 
         Parameters
         ----------
         previous
-            Solution that is already available.
+            Solution that the page already has; another solution is returned.
         timeout
-            Maximum time to wait for another [s]; None is returned after it.
+            Maximum waiting time [s], after which None is returned.
 
         Raises
         ------
@@ -163,20 +163,20 @@ class SceneSolvers:
         return result
 
     def _replace_pending(self, worker: FemWorker, request: FrameRequest) -> None:
-        """Request the next displayed solution, and drop the previous request."""
+        """Send the request for the next displayed solution to `worker`, and drop the request of another worker."""
         if self.pending is not None and self.pending[0] is not worker:
             self.pending[0].drop_request()
         self.pending = worker, request
         worker.request_frame(*request)
 
     def stop_all(self) -> None:
-        """Withdraw the pending request: the worker stops after the current step."""
+        """Withdraw the pending request; its worker stops after the current step."""
         if self.pending is not None:
             self.pending[0].drop_request()
             self.pending = None
 
     def stop_soon(self) -> list[FemWorker]:
-        """Stop the FEM workers without waiting for their current steps; return those that are still running."""
+        """Stop the FEM workers without waiting for their current solves; return the workers that are still running."""
         for worker in self.solvers.values():
             worker.stop_soon()
         return [worker for worker in self.solvers.values() if worker.thread.is_alive()]

@@ -1,4 +1,4 @@
-"""Side panels of the page's 3-D view: slices of the scan around the tumour, and recent readings."""
+"""Side panels of the page's 3-D view: slices of the scan, and charts of recent values."""
 
 from dataclasses import replace
 
@@ -25,14 +25,14 @@ TUMOUR_MOTION = Trace("tumour moved", "mm", "#4cf28c", "band: motion error (95 %
 
 
 def list_plot_lines(scene: Scene) -> tuple[Trace, ...]:
-    """Return the plotted quantities of a scene: without a tool, the displacement of the tumour."""
+    """Return the plotted quantities: tip distance and force, or the tumour's displacement if the scene has no tool."""
     if scene.tool is None:
         return (TUMOUR_MOTION,)
     return DISTANCE, FORCE if scene.posed else SET_FORCE
 
 
 def build_history_sample(frame: Frame, scene: Scene, time: float) -> Sample:
-    """Build the readings, with errors, of a frame that is shown at a time [s], in the order of `list_plot_lines`."""
+    """Build the plotted values and errors of a frame shown at a time [s], in the order of `list_plot_lines`."""
     if scene.tool is None:
         location = frame.estimate.location if frame.estimate is not None else None
         error = frame.tumour_error.bound if location is None else location.p95
@@ -43,7 +43,7 @@ def build_history_sample(frame: Frame, scene: Scene, time: float) -> Sample:
 
 
 def get_tool_force(loads: Loads, deformation: Deformation) -> tuple[float | None, float | None]:
-    """Return the tool force and its error [N]: a prescribed force has no error. None: not available."""
+    """Return the tool force and its error bound [N], each None if not available; a prescribed force has the error 0."""
     pushed = loads.get_all(Pushed)
     if pushed:
         return float(np.linalg.norm(pushed[0].force[0])), 0.0
@@ -55,7 +55,7 @@ def get_tool_force(loads: Loads, deformation: Deformation) -> tuple[float | None
 
 
 def render_slices(frame: Frame, player: Player, position: str) -> np.ndarray:
-    """Render three slices (h, 3 h, 3) uint8 through the tumour's centre, or through the tool's tip if there is one."""
+    """Render three slices (h, 3 h, 3) uint8 of a frame through `position`: `TUMOUR_MIDDLE` or `TIP`."""
     stage, positions = player.stage.select_stage(frame.loads), player.estimate_positions(frame)
     other_layers, tool = [], player.scene.tool
     if tool is not None and frame.pose is not None:
@@ -69,7 +69,7 @@ def render_slices(frame: Frame, player: Player, position: str) -> np.ndarray:
 
 
 def draw_slices_through(stage: Stage, cut: SlicedSurfaces, position: str) -> np.ndarray:
-    """Draw three slices (h, 3 h, 3) uint8 of a stage's scan through one of the places above (no tip: the centre)."""
+    """Draw three slices (h, 3 h, 3) uint8 of a stage's scan through the tip (if requested and available) or centre."""
     tumour = cut.current if len(cut.current.vertices) else stage.tumour_at_rest
     centre = 0.5 * (tumour.vertices.min(axis=0) + tumour.vertices.max(axis=0))
     return draw_slices(stage.head_scan_texture, cut.tip if position == TIP and cut.tip is not None else centre, cut)

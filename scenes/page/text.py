@@ -1,4 +1,4 @@
-"""Text of the page, as HTML: scene, anatomy, result and its reliability."""
+"""Text of the page (HTML): scene, anatomy, result and reliability of the result."""
 
 from collections.abc import Sequence
 from html import escape
@@ -43,16 +43,16 @@ EFFECTS = {
     "Bonded": "bond to the skull",
     "Slide": "sliding along the skull",
 }
-"""Names of a scene's effects for users."""
+"""Names of effects for users, by class name."""
 
 
 def describe_effect(effect_name: str) -> str:
-    """Return the name of an effect class for users."""
+    """Return the name for users of an effect, given by its class name."""
     return EFFECTS.get(effect_name, effect_name)
 
 
 def format_caption(patient: PatientSetup, scene: Scene, anatomy: str) -> str:
-    """Describe the image: visible parts, meaning of the lines, and anatomy."""
+    """Build the caption of the image (HTML): tumour location, scene title, legend of the lines, and anatomy."""
     title = " ".join(scene.title.split())
     estimate_note = "" if scene.observation_model is None else f" {ESTIMATE_EXPLANATION}"
     return (
@@ -63,7 +63,7 @@ def format_caption(patient: PatientSetup, scene: Scene, anatomy: str) -> str:
 
 
 def format_page_legend(scene: Scene) -> str:
-    """Build the legend of the lines, each with a sample."""
+    """Build the legend (HTML) of the lines in a scene's images, with a sample of each line."""
     scan_key = ('stroke="#ddd" stroke-width="2" stroke-dasharray="1.5 3"', "tumour in the scan")
     predicted, fem, region = (to_svg_stroke(colour) for colour in (TUMOUR_COLOUR, TRUTH_COLOUR, ELLIPSOID_COLOUR))
     hidden_key = (f'{predicted} stroke-width="3" stroke-dasharray="5 3"', "hidden by tool, drape or bone")
@@ -88,7 +88,7 @@ def format_page_legend(scene: Scene) -> str:
 
 
 def format_legend(entries: Sequence[tuple[str, str]]) -> str:
-    """Return a legend of lines, given the SVG attributes and the meaning of each."""
+    """Build a legend (HTML) of lines from pairs of SVG line attributes and meaning."""
     samples = (
         f'<span><svg width="26" height="8"><line x1="1" y1="4" x2="25" y2="4" {attributes}/></svg>{text}</span>'
         for attributes, text in entries
@@ -108,14 +108,14 @@ def describe_scene(patient: PatientSetup, scene: Scene, anatomy: str) -> str:
 
 
 def describe_fem(patient: PatientSetup, scene: Scene) -> str:
-    """Describe element and tissue of the FEM model of a scene."""
+    """Describe element type and tissue of the FEM model of a scene."""
     element, elasticity = patient.choose_element(scene), scene.elasticity
     regions = (f"; the {name_region(key)} of {describe_tissue(tissue)}" for key, tissue in elasticity.regions.items())
     return f"{ELEMENTS.get(element, element)}, {describe_tissue(elasticity.default)}{''.join(regions)}"
 
 
 def describe_tissue(tissue: Tissue | None) -> str:
-    """Return a tissue's law and constants."""
+    """Describe a tissue's law and constants."""
     if tissue is None:
         return "a tissue for each region"
     relaxation = ", viscoelastic" if tissue.prony else ""
@@ -128,14 +128,14 @@ def describe_tissue(tissue: Tissue | None) -> str:
 
 
 def describe_deformer(name: str) -> str:
-    """Describe a deformer."""
+    """Return the description of a deformer for users, given its name."""
     if name == GUARDED:
         return "fast model with FEM check"
     return "FEM (reference)" if name == "fem" else f"fast model ({name})"
 
 
 def describe_solve(scene: Scene, name: str, number: int, touch: Touch | None) -> str:
-    """Describe the running solve: a frame of the script, or the manual touch."""
+    """Describe the running solve: a frame of the script, or the manual tool input."""
     if touch is None:
         return f"solving frame {number} ({describe_deformer(name)})"
     strength = f"depth {1e3 * touch.depth:.1f} mm" if scene.posed else f"{touch.force:.2f} N"
@@ -143,19 +143,19 @@ def describe_solve(scene: Scene, name: str, number: int, touch: Touch | None) ->
 
 
 def format_pending(shown_frame: int, requested_frame: int, frame_count: int) -> str:
-    """Describe an image that does not show the requested frame yet."""
+    """Describe (HTML) that the requested frame is not shown yet, and which frame is shown."""
     way = f" frame {shown_frame} of {frame_count - 1} is shown, on the way to frame {requested_frame}"
     progress = way if shown_frame != requested_frame else ""
     return f'<p class="stale">Result pending:{progress or " it is being computed"}.</p>'
 
 
 def format_solver_list(solvers: Sequence[str]) -> str:
-    """List the solvers of FEM in HTML; empty without solvers."""
+    """Format sentences on the FEM solvers as an HTML list; empty without solvers."""
     return f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in solvers)}</ul>" if solvers else ""
 
 
 def describe_result(deformation: Deformation, deformer: str) -> str:
-    """Describe the source of a solution and its error; as a warning with the reason, if it is unreliable."""
+    """Describe (HTML) the source of a solution and its error; an unreliable solution gets a warning with the reason."""
     outcome = deformation.outcome[0]
     source = f"<b>{escape(_describe_guarded(outcome) if deformer == GUARDED else describe_deformer(deformer))}</b>"
     if outcome is Outcome.EXTRAPOLATED:
@@ -178,13 +178,13 @@ def describe_result(deformation: Deformation, deformer: str) -> str:
 
 
 def _describe_guarded(outcome: Outcome) -> str:
-    """Describe whether the model or FEM computed the solution of a guarded model."""
+    """Describe the source of a guarded model's solution: the model, or FEM."""
     by_model = outcome in (Outcome.PREDICTED, Outcome.EXTRAPOLATED)
     return "fast model" if by_model else "FEM, because the error bound of the fast model is too large"
 
 
 def format_position_error(error: TumourError) -> str:
-    """Describe the error of the tumour position relative to the patient, which includes more than the model."""
+    """Describe (HTML) the error of the tumour position relative to the patient, from all sources of error."""
     if error.bound is None:
         return (
             "<p>Tumour position error: not known. <code>sulcus uncertainty SCENE</code> estimates it for a scripted "
@@ -211,7 +211,7 @@ def format_report(
     frame_count: int,
     disabled_effects: Sequence[str] = (),
 ) -> str:
-    """Build the report of a solution: distance, motion and warnings; reliability, loads and times on demand."""
+    """Build the report (HTML) of a frame: distance, motion, warnings and cost plot; further details are collapsed."""
     remaining = stage.select_stage(frame.loads).remaining_body
     facts = [f"frame {frame.number} of {frame_count - 1}", f"{frame.time:.2f} s", *([frame.acts] if frame.acts else [])]
     if frame.distance_error is not None and frame.distance_error < np.inf:
@@ -238,7 +238,7 @@ def format_report(
 
 
 def format_motion(frame: Frame) -> str:
-    """Describe the tumour's displacement with its errors: of the model, and of the tumour in the patient."""
+    """Describe the tumour's displacement, with the model's error and the error relative to the patient."""
     motion = f"tumour moved {1e3 * frame.moved:.2f} mm{'' if frame.estimate is None else ' (estimate)'}"
     if frame.moved_error is not None:
         error = f"motion error {hud.format_bound(frame.moved_error, 1)}"
@@ -250,7 +250,7 @@ def format_motion(frame: Frame) -> str:
 
 
 def describe_estimate(estimate: TumourEstimate) -> list[str]:
-    """Describe an estimate, its error and its input; or the reason of its rejection."""
+    """Describe (HTML parts) an estimate with its error and input, or the reason why the observation was rejected."""
     reference = f"simulated (FEM): {format_length(estimate.true_distance)}"
     if estimate.location is None:
         return [
@@ -269,9 +269,9 @@ def describe_estimate(estimate: TumourEstimate) -> list[str]:
 
 
 def format_tip_distance(distance: float, error: float | None, is_inside: bool) -> str:
-    """Return the page's first line: from the tip to the tumour's surface, with its error [m], as HTML.
+    """Format the distance [m] from the tip to the tumour's surface as the page's first line (HTML).
 
-    None: not known.
+    `error` is the error bound [m]; None: not known.
     """
     length = format_length(distance, error)
     text = f"tip inside the tumour, {length} below its surface" if is_inside else f"tip to tumour {length}"
@@ -279,6 +279,6 @@ def format_tip_distance(distance: float, error: float | None, is_inside: bool) -
 
 
 def format_length(length: float, error: float | None = None) -> str:
-    """Format a length and its error [m] in millimetres, without line breaks."""
+    """Format a length and its error [m] in millimetres, as HTML without line breaks."""
     text = hud.format_millimetres(length, error).replace("+-", "\N{PLUS-MINUS SIGN}")
     return text.replace(" ", "&nbsp;")

@@ -28,7 +28,7 @@ LETTER_DISTANCE = 12e-3  # Distance of the orientation letters from the brain [m
 
 
 def build_page_bodies(stage: Stage) -> list[SceneSurface]:
-    """Build the undeformed bodies: brain, open cortex, tumour, FEM tumour, ellipsoid of an estimate, and tool."""
+    """Build surfaces of the 3-D view: undeformed brain, cortex, tumour and FEM tumour; ellipsoid and tool if any."""
     tool, site, tumour = stage.scene.tool, stage.site, stage.build_tumour(stage.site.anatomy.mesh.nodes)
     wire = SceneSurface("finite elements", tumour.vertices, tumour.triangles, STALE_COLOUR, wireframe=True)
     bodies = [*build_brain(stage), wire]
@@ -45,7 +45,7 @@ def build_page_bodies(stage: Stage) -> list[SceneSurface]:
 
 
 def build_brain(stage: Stage) -> list[SceneSurface]:
-    """Build the undeformed brain, open cortex and tumour."""
+    """Build the surfaces of the undeformed brain, open cortex and tumour, and of the craniotomy edge."""
     brain, scan, cortex = stage.brain_surface, stage.tumour_at_rest, split_cortex(stage, stage.site.anatomy.mesh.nodes)
     return [
         SceneSurface("brain", brain.vertices, brain.triangles, BRAIN_COLOUR, side="back"),
@@ -57,13 +57,13 @@ def build_brain(stage: Stage) -> list[SceneSurface]:
 
 
 def split_cortex(stage: Stage, positions: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """Split the open cortex at `positions` (V, 3) [m] into bright crowns and dark sulci: name, vertices, triangles."""
+    """Split the open cortex at `positions` (V, 3) [m] into crowns and sulci: names, vertices, triangles of both."""
     points = stage.coarse_gyri.surface.compute_vertices(positions[stage.coarse_gyri.vertices])
     return [(name, points[used], faces) for name, (used, faces) in zip(CORTEX_COLOURS, stage.gyri_parts, strict=True)]
 
 
 def build_craniotomy_edge(stage: Stage) -> SceneSurface:
-    """Build a ring of bone round the craniotomy."""
+    """Build the surface of a ring of bone round the craniotomy."""
     site, (points, _, edge) = stage.site, cut_hole(stage.site)
     inner = points[edge] + DRAPE_HEIGHT * site.axis
     outward = inner - site.origin
@@ -75,7 +75,7 @@ def build_craniotomy_edge(stage: Stage) -> SceneSurface:
 
 
 def build_static_bodies(stage: Stage) -> list[SceneLabel | SceneImage]:
-    """Build the static bodies: orientation letters round the brain, and planes of the scan behind the tumour."""
+    """Build static objects of the 3-D view: orientation letters round the brain, and scan planes behind the tumour."""
     surroundings: list[SceneLabel | SceneImage] = [*list_orientation_labels(stage.site)]
     scan, centre = stage.head_scan_texture, stage.tumour_at_rest.vertices.mean(axis=0)
     for plane in PLANES if scan is not None else ():
@@ -89,7 +89,7 @@ def build_static_bodies(stage: Stage) -> list[SceneLabel | SceneImage]:
 
 
 def list_orientation_labels(site: CraniotomyFrame) -> list[SceneLabel]:
-    """Return the labels of the patient's sides around the brain."""
+    """Return the orientation letters (R, L, A, P, S, I) around the brain."""
     nodes = site.anatomy.mesh.nodes
     centre, half_size = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0)), 0.5 * np.ptp(nodes, axis=0) + LETTER_DISTANCE
     offsets = np.kron(np.diag(half_size), [[1.0], [-1.0]])
@@ -103,7 +103,7 @@ def choose_viewpoint(site: CraniotomyFrame) -> SceneViewpoint:
 
 
 def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
-    """Move the bodies of the 3-D view to their positions in a frame."""
+    """Move cortex, tumour, ellipsoid and tool of the 3-D view to their positions in a frame."""
     positions, tool = player.estimate_positions(frame), player.scene.tool
     stage = player.stage.select_stage(frame.loads)
     tumour = stage.build_tumour(positions)
@@ -117,11 +117,11 @@ def move_bodies(browser: Browser, frame: Frame, player: Player) -> None:
 
 
 def move_fem_tumour(browser: Browser, stage: Stage, fem_result: FemResult, player: Player) -> None:
-    """Show the tumour position that FEM computes with all effects."""
+    """Move the FEM tumour of the 3-D view to its position in an FEM solution."""
     tumour = stage.select_stage(fem_result.loads).build_tumour(player.compute_positions(fem_result.deformation))
     browser.move("finite elements", tumour.vertices, tumour.triangles)
 
 
 def render_page_image(frame: Frame) -> np.ndarray:
-    """Return a frame's image (H, W, 3) uint8 with the orientation letters."""
+    """Return a frame's image (H, W, 3) uint8 with orientation letters."""
     return draw_orientation_labels(frame.shown, frame.camera.T_camera_world[:3, :3], frame.taken)

@@ -62,7 +62,7 @@ def measure_outline_error(frame: Frame, mask: np.ndarray) -> float:
 
 
 def measure_true_outline_error(frame: Frame, mask: np.ndarray) -> float:
-    """Compute the distance [pixel] between the drawn FEM tumour's outline and a mask's outline; ignore the estimate's."""
+    """Compute the distance [pixel] of the FEM tumour's drawn outline from a mask's; ignore the estimate's outline."""
     above = _mask_foreground(frame) | find_colour(frame.shown, average_colour(TUMOUR_COLOUR))
     return measure_outline_distance(frame.shown, average_colour(TRUTH_COLOUR), mask, above, 2 * sum(TRUE_STROKES))
 

@@ -170,7 +170,7 @@ class Stage:
 
     @cached_property
     def gyri_parts(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-        """Bright crowns and dark sulci of `coarse_gyri`: vertices (n,) of each part, and triangles (m, 3) among them."""
+        """Bright crowns and dark sulci of `coarse_gyri`: vertices (n,) of each part, and its triangles (m, 3)."""
         triangles, colour = self.coarse_gyri.surface.triangles, self.coarse_gyri.colour
         dark = colour[triangles].mean(axis=(1, 2)) < DARK_SHARE * colour.mean(axis=1).max()
         crowns, sulci = (np.unique(triangles[some], return_inverse=True) for some in (~dark, dark))
@@ -184,7 +184,7 @@ class Stage:
         return Layer("brain", CORTEX, mesh.nodes[vertices], triangles, CORTEX_COLOUR)
 
     def build_layers(self, positions: np.ndarray, pose: np.ndarray | None) -> list[Layer]:
-        """Build the layers of cortex at `positions` (V, 3) [m], drape, and tool at T_world_tool `pose` (4, 4) if any."""
+        """Build layers of cortex at `positions` (V, 3) [m], drape, and tool at T_world_tool `pose` (4, 4) if any."""
         tool, look = self.scene.tool, self.scene.look
         if pose is None or not look.natural or not has_instrument(tool):
             return self._list_layers(positions, self.compute_tool_corners(pose))

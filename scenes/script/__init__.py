@@ -1,1 +1,1 @@
-"""Definition of scenes: tool paths, site, tool, posture, debulking."""
+"""Definition of scenes: tool, tool paths, craniotomy, camera, head pose, resection and error models."""

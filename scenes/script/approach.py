@@ -1,4 +1,4 @@
-"""Entry point and direction of a planned trajectory, which a scene's tool then follows."""
+"""Entry point and direction of a planned trajectory, which the tool of a scene follows."""
 
 from dataclasses import dataclass, replace
 
@@ -20,9 +20,9 @@ ITERATIONS = 6  # Number of iterations from a point in the tangent plane to one 
 
 @dataclass(frozen=True)
 class Approach:
-    """Entry point of the tool in the tangent plane (x, y) [m], and tilt of its path against the axis [rad].
+    """Entry point (x, y) [m] of a tool in the tangent plane, and tilt [rad] of the tool path, both as in `Touch`.
 
-    Both as in `Touch`; with `along_line`, a shaft is aligned with the path.
+    If `along_line` is True, the shaft of the tool is aligned with the trajectory.
     """
 
     x: float
@@ -31,7 +31,7 @@ class Approach:
     along_line: bool = False
 
     def shift_path(self, path: Path) -> Path:
-        """Return the tool path shifted from the centre to the entry, and along the trajectory."""
+        """Return a tool path moved from the centre of the craniotomy to the entry point, with the approach's tilt."""
 
         def along(time: float) -> Touch:
             touch = path(time)
@@ -41,9 +41,9 @@ class Approach:
         return along
 
     def align_tool(self, tool: Instrument) -> Instrument:
-        """Return the tool with its shaft along the line.
+        """Return the tool with its shaft along the trajectory, if `along_line`.
 
-        A blade keeps its orientation, on which its contact depends.
+        Any tool other than a `Probe` keeps its orientation, because its contact depends on the orientation.
         """
         if not (self.along_line and isinstance(tool, Probe)):
             return tool
@@ -52,13 +52,13 @@ class Approach:
 
 
 def parse_approach(markup: Markup, site: CraniotomyFrame) -> Approach:
-    """Compute the approach of a line markup, or of a point, which is approached along the axis.
+    """Compute the approach from a markup: a line, or a point that the tool approaches along the craniotomy's axis.
 
     Raises
     ------
     InputError
-        Markups of another kind. A line that misses the opening, runs along it, or ends far from it; a point that is not
-        on it.
+        Another kind of markup; a line that misses the open cortex, is too oblique, or ends too far from the cortex; a
+        point too far from the cortex.
     """
     points, path = markup.points, markup.path
     if markup.kind == "Fiducial" and len(points) == 1:
@@ -102,7 +102,7 @@ def parse_approach(markup: Markup, site: CraniotomyFrame) -> Approach:
 
 
 def _compute_approach(site: CraniotomyFrame, entry: np.ndarray, way: np.ndarray) -> Approach:
-    """Return the approach at a point (3,) [m] of the cortex, in a direction (3,)."""
+    """Compute the approach with an entry point (3,) [m] on the cortex and a direction (3,)."""
     axes = np.stack([site.right, site.up])
     place = axes @ (entry - site.origin)
     for _ in range(ITERATIONS):
@@ -112,7 +112,7 @@ def _compute_approach(site: CraniotomyFrame, entry: np.ndarray, way: np.ndarray)
 
 
 def _find_entry(corners: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarray | None:
-    """Compute the first intersection of a line with triangles (S, 3, 3) from outside (3,) [m]; None if the line misses.
+    """Compute the first intersection (3,) [m] of a line with triangles (S, 3, 3) [m]; None if there is no intersection.
 
     Möller, Trumbore 1997, J. Graphics Tools 2:21-28.
     """

@@ -26,7 +26,7 @@ class HandSettings:
 
 
 class CameraPath(Protocol):
-    """Camera path: a pure function of the initial camera, its target point (3,) [m], and a time [s]."""
+    """Camera motion: a pure function of the initial camera, the target point (3,) [m] and a time [s]."""
 
     def __call__(self, camera: Camera, target: np.ndarray, time: float) -> Camera:
         """Return the camera at a time [s]."""
@@ -35,19 +35,19 @@ class CameraPath(Protocol):
 
 @dataclass(frozen=True)
 class HandHeld:
-    """Hand-held camera with breathing motion: the same seed gives the same motion.
+    """Hand-held camera with breathing motion; equal seeds give equal motions.
 
     Parameters
     ----------
     shift, turn
-        Standard deviations of its translation along and its rotation about each axis [m], [rad].
+        Standard deviations of the translation along each axis [m], and of the rotation about each axis [rad].
     breath
         Amplitude of the breathing motion [m].
 
     Raises
     ------
     InputError
-        A seed below 0.
+        The seed is below 0.
     """
 
     seed: int = 0
@@ -71,14 +71,14 @@ class HandHeld:
 
 @dataclass(frozen=True)
 class Orbit:
-    """Camera that orbits its target to and fro, and keeps looking at it.
+    """Camera that swings around its target, and always looks at the target.
 
-    `reach` [rad] to each side, about the vertical axis of its image; `period` [s].
+    The rotation about the vertical image axis has the amplitude `reach` [rad] and the `period` [s].
 
     Raises
     ------
     InputError
-        A period that is not > 0.
+        The period is not > 0.
     """
 
     reach: float = float(np.radians(20.0))
@@ -98,7 +98,7 @@ class Orbit:
 
 @dataclass(frozen=True)
 class Focus:
-    """Microscope setting from a time [s] on: working distance and zoom, as multiples of the initial ones."""
+    """Microscope setting from the time `since` [s]: working distance and zoom relative to their initial values."""
 
     since: float
     distance: float
@@ -107,22 +107,22 @@ class Focus:
 
 @dataclass(frozen=True)
 class Microscope:
-    """Microscope that is moved along its axis, zoomed and refocused on its target.
+    """Microscope that moves along its axis, zooms, and refocuses on its target.
 
     Parameters
     ----------
     settings
         Settings, in temporal order.
     takes
-        Duration of each change [s].
+        Duration of each change of the setting [s].
     focal_length
-        Focal length of the focusing lens [m]: magnification increases slightly at nearer focus. It is shorter than all
-        distances.
+        Focal length of the focusing lens [m], shorter than all distances. The magnification increases slightly at
+        nearer focus.
 
     Raises
     ------
     InputError
-        Settings without order, or a change that takes no time; a distance or a zoom that is not above 0.
+        Settings that are not in temporal order, or a duration, distance or zoom that is not > 0.
     """
 
     settings: tuple[Focus, ...] = (Focus(0.8, 1.0, 1.6), Focus(2.0, 1.25, 1.0), Focus(3.0, 1.0, 1.0))
@@ -151,7 +151,7 @@ class Microscope:
 
 @lru_cache(maxsize=16)
 def sample_hand_waves(seed: int, settings: HandSettings = HandSettings()) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sample frequencies [Hz], phases [rad] and amplitudes (6, n) of a hand's motion, for 3 shifts and 3 turns."""
+    """Sample frequencies [Hz], phases [rad] and amplitudes, each (6, n), of a hand's 3 translations and 3 rotations."""
     random = np.random.default_rng(seed)
     count, frequencies = settings.wave_count, (settings.drift_frequencies, settings.tremor_frequencies)
     bands = [random.uniform(*band, (6, count)) for band in frequencies]
@@ -160,7 +160,7 @@ def sample_hand_waves(seed: int, settings: HandSettings = HandSettings()) -> tup
 
 
 def sample_hand_motion(seed: int, time: float, settings: HandSettings = HandSettings()) -> np.ndarray:
-    """Return six numbers (6,) that vary smoothly with time [s] about 0, with a standard deviation of 1."""
+    """Compute the normalised hand motion (6,) at a time [s]: smooth functions with mean 0 and unit deviation."""
     frequencies, phases, sizes = sample_hand_waves(seed, settings)
     return (sizes * np.sin(2.0 * np.pi * frequencies * time + phases)).sum(axis=1)
 
@@ -170,4 +170,4 @@ PATHS: dict[str, Callable[[int], CameraPath]] = {
     "microscope": lambda seed: Microscope(),
     "orbit": lambda seed: Orbit(),
 }
-"""Paths by name, each from a seed."""
+"""Functions that build a camera path from a seed, by name."""

@@ -1,4 +1,4 @@
-"""Open cortex with a coordinate frame: contact points and directions of tools."""
+"""Coordinate system of a craniotomy, with contact points and directions of tools."""
 
 from dataclasses import dataclass
 
@@ -15,28 +15,28 @@ HOLE_RATIO = 0.98
 
 @dataclass(frozen=True, eq=False)
 class CraniotomyFrame(OpenCortex):
-    """Open cortex with a coordinate frame, contact points and directions of tools."""
+    """Open cortex with the coordinate system of its craniotomy; computes contact points and directions of tools."""
 
     def compute_reach(self, radius: float) -> float:
-        """Return the maximum distance [m] of a tool of this `radius` from the axis, as limited by the bone."""
+        """Return the maximum distance [m] from the axis that bone permits a tool of this `radius` [m]."""
         return max(0.0, HOLE_RATIO * self.clearance - radius)
 
     def clip_to_opening(self, point: np.ndarray, radius: float) -> np.ndarray:
-        """Move a point (3,) [m] towards the axis, to where the bone stops a tool of this `radius` [m]."""
+        """Return a point (3,) [m], moved towards the axis if bone would stop a tool of this `radius` [m] before it."""
         arm = point - self.origin
         aside = arm - (arm @ self.axis) * self.axis
         length = float(np.linalg.norm(aside))
         return point - max(0.0, 1.0 - self.compute_reach(radius) / max(length, np.finfo(float).tiny)) * aside
 
     def find_contact(self, x: float, y: float, radius: float) -> Place:
-        """Return the material point of the open cortex nearest to the place (x, y) [m] of its tangent plane.
+        """Return the material point of the open cortex that is nearest to the position (x, y) [m] in the tangent plane.
 
-        A tool of this `radius` [m] stays inside the opening: a place beyond is moved to where the bone stops the tool.
+        A tool of this `radius` [m] stays inside the craniotomy: see `clip_to_opening`.
         """
         return self.find_nearest(self.clip_to_opening(self.origin + x * self.right + y * self.up, radius))
 
     def compute_direction(self, touch: Touch) -> np.ndarray:
-        """Compute the unit direction (3,) of a touch's force: inwards, with the touch's tilt."""
+        """Compute the unit direction (3,) of the force of a tool input: the inward axis, tilted by `touch.tilt`."""
         along = self.axis + np.tan(touch.tilt[0]) * self.right + np.tan(touch.tilt[1]) * self.up
         return along / np.linalg.norm(along)
 
@@ -45,12 +45,12 @@ class CraniotomyFrame(OpenCortex):
 
 
 def build_craniotomy_frame(anatomy: Anatomy) -> CraniotomyFrame:
-    """Return the frame of an anatomy's open cortex.
+    """Build the coordinate system of an anatomy's craniotomy.
 
     Raises
     ------
     InputError
-        An anatomy without open cortex.
+        The anatomy has no open cortex.
     """
     frame = open_cortex(anatomy)
     return CraniotomyFrame(anatomy, frame.origin, frame.axis, frame.right, frame.up)

@@ -1,4 +1,4 @@
-"""Schedule of a resection: a corridor to the tumour, and the tumour in shares."""
+"""Schedule of a resection: first a corridor to the tumour, then equal parts of the tumour."""
 
 from dataclasses import dataclass
 
@@ -13,30 +13,30 @@ from .craniotomy_frame import build_craniotomy_frame
 
 @dataclass(frozen=True)
 class Debulking:
-    """Resection of a corridor to the tumour, then of the tumour from the top, in equal shares; one share remains.
+    """Resection of a corridor to the tumour, then of equal parts of the tumour from its top; the last part remains.
 
     Parameters
     ----------
     times
-        Time of each step [s], in order: the corridor, then one share after another.
+        Ascending times of the steps [s]: first the corridor, then the parts of the tumour.
     corridor
-        Radius of the corridor [m]; larger on coarse meshes.
+        Minimum radius of the corridor [m]; on coarse meshes the corridor is wider.
     """
 
     times: tuple[float, ...]
     corridor: float = 5e-3
 
     def count_done(self, time: float) -> int:
-        """Count the steps done at a time [s]."""
+        """Return the number of completed steps at a time [s]."""
         return int(np.searchsorted(self.times, time, side="right"))
 
     def build_resection(self, anatomy: Anatomy) -> Resection:
-        """Select the tetrahedra of each step.
+        """Build the resection: the tetrahedra that each step removes from an anatomy.
 
         Raises
         ------
         InputError
-            No open cortex, or a tumour with too few tetrahedra for the shares.
+            The anatomy has no open cortex, or its tumour has fewer tetrahedra than there are parts.
         """
         mesh, site = anatomy.mesh, build_craniotomy_frame(anatomy)
         tumour = np.flatnonzero(anatomy.in_tumour)

@@ -17,7 +17,7 @@ MIN_VISIBLE = 0.95  # Share of the tumour's outline that should lie inside the c
 MAX_TILT = 0.8  # Largest tilt [rad]: an oblique view shows motion along the axis of the craniotomy.
 TILTS = np.linspace(MAX_TILT, 0.0, 17)  # Tilts that are tried [rad].
 TURNS = np.radians([0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0, 90.0, -90.0, 120.0, -120.0, 150.0, -150.0])
-"""Turns of the tilt's direction about the axis that are tried [rad]; 0: towards the lower edge of the image."""
+"""Candidate azimuths of the tilt about the axis [rad]; 0: towards the lower edge of the image."""
 FILLED = 0.94  # Share of the image that the framed points fill.
 MIN_FIELD = 45e-3  # Smallest height of the field of view [m]: a tool must be recognised.
 RIM_COUNT = 48  # Number of points on the edge of the craniotomy.
@@ -27,9 +27,9 @@ FIELD = np.radians(16.0)  # Vertical field of view while directions are compared
 
 @dataclass(frozen=True, eq=False)
 class Framing:
-    """Direction (3,) from the target to the camera, target (3,) [m] and vertical field of view [rad].
+    """View of a camera: direction (3,) from target to camera, target (3,) [m], and vertical field of view [rad].
 
-    `visible_share` is the share of the undeformed tumour's outline inside the craniotomy.
+    `visible_share` is the share of the undeformed tumour's outline that the camera sees inside the craniotomy.
     """
 
     direction: np.ndarray
@@ -42,10 +42,10 @@ class Framing:
 def find_framing(
     site: CraniotomyFrame, distance: float, aspect_ratio: float, direction: tuple[float, float] | None = None
 ) -> Framing:
-    """Find the most oblique view in which the tumour's outline lies inside the craniotomy.
+    """Find the most oblique view in which the tumour's outline is inside the craniotomy.
 
-    Without such a view, the one that shows most of the outline. The image contains the craniotomy, the outline and its
-    error band.
+    If there is no such view, the view with the largest share of the outline is used. The image contains the
+    craniotomy, the outline and its error band.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def find_framing(
     aspect_ratio
         Width of the image over its height.
     direction
-        Tilt from the outward normal and turn about the axis [rad], to use instead of the best one.
+        Tilt from the outward normal and azimuth about the axis [rad]; None: the best candidate.
     """
     anatomy = site.anatomy
     surface = anatomy.mesh.nodes[np.unique(anatomy.tumour_surface)]
@@ -83,13 +83,13 @@ def find_framing(
 
 
 def compute_view_direction(site: CraniotomyFrame, tilt: float, azimuth: float = 0.0) -> np.ndarray:
-    """Return the unit direction (3,) to a camera tilted from the outward normal [rad], towards `-up` at turn 0."""
+    """Return the unit direction (3,) to a camera with tilt [rad] from the outward normal; azimuth 0 [rad] is `-up`."""
     aside = np.cos(azimuth) * site.up + np.sin(azimuth) * site.right
     return -np.cos(tilt) * site.axis - np.sin(tilt) * aside
 
 
 def build_hole_edges(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the edge of the drape's hole (n, 3) [m]: its upper border, and the cortex below."""
+    """Return two edges (n, 3) [m] of the drape's hole: the edge on the drape, and the points of the cortex below."""
     angle = np.linspace(0.0, 2.0 * np.pi, RIM_COUNT, endpoint=False)
     circle = np.outer(np.cos(angle), site.right) + np.outer(np.sin(angle), site.up)
     flat = site.origin + HOLE_RATIO * site.clearance * circle
@@ -99,7 +99,7 @@ def build_hole_edges(site: CraniotomyFrame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def compute_visible_share(camera: Camera, surface: np.ndarray, hole_edges: tuple[np.ndarray, np.ndarray]) -> float:
-    """Return the share of a surface's outline inside the opening, as a camera sees it; surface (n, 3) [m]."""
+    """Return the share of the outline of a surface (n, 3) [m] that a camera sees inside the edges of the hole."""
     hull = _find_hull(camera.project(surface)[0])
     steps = np.linalg.norm(np.roll(hull, -1, axis=0) - hull, axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
@@ -123,9 +123,9 @@ def _find_hull(points: np.ndarray) -> np.ndarray:
 def fit_field_of_view(
     points: np.ndarray, site: CraniotomyFrame, view_direction: np.ndarray, distance: float, aspect_ratio: float
 ) -> tuple[np.ndarray, float]:
-    """Return the target (3,) [m] and vertical field of view [rad] of a camera whose image just contains points (n, 3).
+    """Return target (3,) [m] and vertical field of view [rad] of a camera whose image just contains points (n, 3) [m].
 
-    The camera is `distance` [m] from the target, in the direction `view_direction` (3,).
+    The camera is at `distance` [m] from the target, in the unit direction `view_direction` (3,).
     """
     target, half = points.mean(axis=0), 0.1
     for _ in range(4):

@@ -1,4 +1,4 @@
-"""Head pose as pure functions of time: direction of gravity and fluid level."""
+"""Head poses as pure functions of time: direction of gravity and CSF level."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,21 +15,21 @@ SUPINE = (0.0, -1.0, 0.0)  # Direction of gravity for a patient lying supine (RA
 
 @dataclass(frozen=True)
 class HeadPose:
-    """Head pose at one time, independent of head size.
+    """Head pose at one time: direction of gravity, and CSF level relative to the head size.
 
     Parameters
     ----------
     direction
-        Direction of gravity (3,), in RAS, of any length > 0.
+        Direction of gravity (3,) in RAS coordinates, of any length > 0.
     fluid
-        Fluid level against gravity: from 0, completely drained, to 1, above the highest vertex.
+        CSF level, measured against gravity: from 0 (completely drained) to 1 (above the highest vertex).
     """
 
     direction: tuple[float, float, float] = SUPINE
     fluid: float = 1.0
 
     def build_posture(self, nodes: np.ndarray) -> Posture:
-        """Build the load case of a body with nodes (V, 3) [m]."""
+        """Build the load of gravity and CSF for a mesh with nodes (V, 3) [m], as one load case."""
         down = np.array(self.direction) / np.linalg.norm(self.direction)
         return Posture(down[None], np.array([compute_fluid_level(nodes, down, self.fluid)]), np.ones(1))
 
@@ -41,19 +41,19 @@ Lie = Callable[[float], HeadPose]
 
 
 def get_supine_pose(time: float) -> HeadPose:
-    """Return the pose of the scan, at any time [s]: supine, under fluid."""
+    """Return the head pose of the scan at any time [s]: supine, completely covered by CSF."""
     return HeadPose()
 
 
 def build_drainage(duration: float, level: float = 0.0) -> Lie:
-    """Return a supine pose whose fluid falls to a share of its height within `duration`."""
+    """Build a function of a supine pose whose CSF level falls to `level` (0 to 1) within `duration` [s]."""
     return lambda time: HeadPose(fluid=1.0 - (1.0 - level) * smooth_step(time / duration))
 
 
 def build_drained_turn(drain_time: float, pause_time: float, turn_time: float, angle: float, level: float = 0.0) -> Lie:
-    """Build a pose: supine while fluid falls to a share `level`, a pause, then a turn by `angle` [rad]; times in s.
+    """Build a function of a pose: the CSF level falls to `level` in `drain_time`; after a pause, the head turns.
 
-    A positive angle brings the left side down; the turn takes `turn_time` [s].
+    The turn by `angle` [rad] takes `turn_time`; a positive angle lowers the left side. All times are in seconds.
     """
     falling = build_drainage(drain_time, level)
 

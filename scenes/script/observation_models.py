@@ -1,4 +1,4 @@
-"""Observation models of the open cortex with their errors: the only input of an estimate of the tumour position."""
+"""Observation models of the open cortex with their errors; observations are the only input of a tumour estimate."""
 
 from dataclasses import dataclass
 
@@ -9,21 +9,21 @@ from sim.errors import InputError
 
 @dataclass(frozen=True)
 class PointObservation:
-    """Observation of moving points of the open cortex, with errors. Force and tissue are unknown.
+    """Observation of tracked points of the open cortex, with errors. Force and tissue are not observed.
 
-    Points occluded by the tool are not observed. The contact point of its tip is observed too.
+    Points that the tool occludes are not observed. The contact point of the tool is also observed.
 
     Parameters
     ----------
     points
-        Number of points, evenly by area inside the drape's hole; the same in all frames.
+        Number of points, random with uniform density inside the drape's hole; the same points in all frames.
     white, smooth
-        Errors along each axis, as standard deviations [m]. The white one is independent between points and frames; the
-        smooth one is constant in time and spatially correlated over 15 mm.
+        Standard deviations of two errors along each axis [m]. The white error is independent between points and
+        frames; the smooth error is constant in time and spatially correlated over 15 mm.
     shift, turn
-        Size of the rigid error, constant in time: a translation [m], and a rotation [rad] about the points' centroid.
+        Size of the rigid error, constant in time: translation [m], and rotation [rad] about the points' centroid.
     seed
-        Seed of points and errors: the same seed gives the same images.
+        Seed of points and errors; equal seeds give equal observations.
     """
 
     points: int = 100
@@ -38,26 +38,26 @@ class PointObservation:
 class StereoObservation:
     """Observation of points of the open cortex by the stereo images of an operating microscope.
 
-    The first stereo pair shows the undeformed brain. Points are detected in images: their depth by stereo, their motion
-    by the left image. The scan shows no vessels, so synthetic ones are drawn on the cortex.
+    The first stereo pair shows the undeformed brain. Points are tracked in the left images, and triangulated in each
+    stereo pair. Since the scan shows no vessels, synthetic vessels are drawn on the cortex.
 
     Parameters
     ----------
     points
-        Number of points searched, evenly over the drape's hole.
+        Approximate number of searched points, on a regular grid over the drape's hole.
     noise
         Standard deviation of the image noise [grey level of 255], independent between images.
     darker
         Relative loss of brightness of the right eye, 0 <= `darker` < 1.
     shift, turn
-        Size of the rigid error of a tracked microscope: a translation [m], and a rotation [rad] about the centre of the
-        opening. The first pair has its own error; all later ones share another.
+        Size of the rigid error of the tracked microscope: translation [m], and rotation [rad] about the centre of the
+        craniotomy. The first pair has one error, and all later pairs share another error.
     named
-        True if points are tracked. Otherwise they are a point cloud without correspondences in the scan.
+        True if points are tracked; False if they are a point cloud without correspondences in the scan.
     vessels
         True if vessels are drawn.
     seed
-        Seed of vessels, noise and rigid errors: the same seed gives the same images.
+        Seed of vessels, noise and rigid errors; equal seeds give equal images.
 
     Raises
     ------

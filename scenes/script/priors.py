@@ -1,4 +1,4 @@
-"""Prior distributions of parameters that are not measured during surgery, with sources."""
+"""Prior distributions of the parameters that are not measured during surgery, with their sources."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MESH, REGISTRATION, SEGMENTATION = "mesh", "registration", "segmentation"  # Nam
 TOOL, SKULL = "tool's place", "skull"  # Names of contributors.
 MIN_SKULL_PROBABILITY = 0.01  # Smallest total probability of a scene's skull models.
 COMBINED = "several together"
-"""Interaction: difference from the sum of the single contributions."""
+"""Name of the interaction: difference between the joint effect and the sum of the single contributions."""
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class ParameterPrior:
     Parameters
     ----------
     name
-        Printed name.
+        Name for printed tables.
     law
-        "normal" has mean 0 here.
+        Type of distribution; "normal" has mean 0.
     range
-        Lower and upper limit; for "normal" the standard deviation, twice.
+        Lower and upper limit; for "normal", both entries are the standard deviation.
     meaning
-        Meaning of the number, with its unit.
-    source
-        Source of the values.
+        Meaning of the parameter, with its unit.
+        source
+            Literature source of the values.
     """
 
     name: str
@@ -49,7 +49,7 @@ class ParameterPrior:
     source: str
 
     def compute_quantiles(self, probabilities: np.ndarray) -> np.ndarray:
-        """Return the quantiles of the distribution at probabilities `probabilities` (n,) in (0, 1)."""
+        """Return the quantiles (n,) of the distribution at `probabilities` (n,) in (0, 1)."""
         low, high = self.range
         match self.law:
             case "uniform":
@@ -108,24 +108,24 @@ SEGMENTATION_PRIOR = ParameterPrior(
 )  # fmt: skip
 MESH_PRIORS = MESH_PRIOR, SLIDING_MESH_PRIOR, SINKING_MESH_PRIOR  # Priors of the mesh error.
 PRIORS = (STIFFNESS, POISSON, RATIO, SKULL_PRIOR, TIP, *MESH_PRIORS, REGISTRATION_PRIOR, SEGMENTATION_PRIOR)
-"""All priors; the error of a trained model is added if one is used."""
+"""All priors. The error of a trained model is a further contribution if a model is used."""
 
 
 @dataclass(frozen=True)
 class PatientSample:
-    """Sample of body and tool parameters.
+    """Sample of the unknown parameters of tissue, skull, tool and mesh.
 
     Parameters
     ----------
     stiffness, poisson, ratio
-        Young's modulus over the scene's; Poisson's ratio; the tumour's Young's modulus over the brain's, as a multiple
-        of the scene's.
+        Young's modulus of the brain relative to the scene; Poisson's ratio; ratio of the Young's moduli of tumour and
+        brain, relative to the ratio in the scene.
     skull
         Number in [0, 1) that selects one of the skull conditions that a scene may have.
     tip
-        Position error of the tool (3,) [m]: to the right, up, and inwards.
+        Position error (3,) [m] of the tool: to the right, upwards and inwards.
     mesh
-        Mesh error, in standard deviations of its prior. Positive: the motion is longer.
+        Mesh error [standard deviations of its prior]; a positive error makes the motion longer.
     """
 
     stiffness: float
@@ -137,7 +137,7 @@ class PatientSample:
 
 
 def sample_priors(count: int, seed: int = 0) -> list[PatientSample]:
-    """Draw `count` samples that cover each prior evenly (a Latin hypercube: McKay, Beckman, Conover 1979)."""
+    """Draw `count` samples by Latin hypercube sampling of the priors (McKay, Beckman, Conover 1979)."""
     random = np.random.default_rng(seed)
 
     def shares() -> np.ndarray:
@@ -154,15 +154,15 @@ def sample_priors(count: int, seed: int = 0) -> list[PatientSample]:
 def sample_from_fit(
     tissue: FittedTissue, young: float, skulls: Sequence[str], count: int, seed: int = 0, tumour_ratio: float = 1.0
 ) -> list[PatientSample]:
-    """Draw `count` samples whose tissue and skull are from a fit; the other parameters as in `sample_priors`.
+    """Draw `count` samples with tissue and skull from a fit, and all other parameters from `sample_priors`.
 
-    `young` [Pa] is the scene's own modulus, `tumour_ratio` its tumour's relative stiffness, and `skulls` its possible
-    skulls. Parameters that were not fitted keep their prior.
+    `young` [Pa] is Young's modulus of the scene's brain, `tumour_ratio` the stiffness of the scene's tumour relative to
+    the brain, and `skulls` the scene's possible skull conditions. Parameters that were not fitted keep their prior.
 
     Raises
     ------
     InputError
-        The fitted skull is not allowed by the scene.
+        The fitted skull condition is not possible in the scene.
     """
     if sum(tissue.skulls[name] for name in skulls) < MIN_SKULL_PROBABILITY:
         raise InputError(
@@ -181,12 +181,12 @@ def sample_from_fit(
 
 
 def sample_rigid_errors(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Sample errors of registration (count, 3) and of segmentation (count,) [m]."""
+    """Sample registration errors (count, 3) [m] and segmentation errors (count,) [m]."""
     random = np.random.default_rng([seed, 1])
     shift = REGISTRATION_PRIOR.range[1] * random.standard_normal((count, 3))
     return shift, SEGMENTATION_PRIOR.range[1] * random.standard_normal(count)
 
 
 def choose_name(probability: float, names: Sequence[str]) -> str:
-    """Return the name that a share in [0, 1) selects, all with equal probability."""
+    """Return the name that a number in [0, 1) selects; all names have equal probability."""
     return names[min(int(probability * len(names)), len(names) - 1)]

@@ -1,4 +1,4 @@
-"""Registration of the scan to the patient: a setting of a scene."""
+"""Registration of the scan to the patient, as a setting of a scene."""
 
 from collections.abc import Mapping
 from typing import Literal

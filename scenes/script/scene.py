@@ -1,4 +1,4 @@
-"""Definition of a scene: effects, scripted tool, camera, accuracy and limits of its metrics."""
+"""Definition of a scene: effects, scripted tool, camera, solver accuracy, and limits of the metrics."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ class Bounds:
     overlap
         Minimum intersection over union of the silhouettes of the drawn tumour and the FEM tumour.
     error
-        Maximum mean distance between the predicted tumour and the FEM tumour [m].
+        Maximum mean distance between the drawn tumour and the FEM tumour [m].
     pixels
-        Largest difference between our projection and OpenCV's [pixel].
+        Maximum distance between the projections by the scene's camera and by OpenCV [pixel].
     drawn
-        Maximum distance between the outline in the image and that by FEM [pixel]. In a scene with an observation model:
-        between the drawn and the computed outline of the estimate.
+        Maximum distance between the outline in the image and the outline by FEM [pixel]; in a scene with an
+        observation model, the outline computed from the estimate.
     visible
         Minimum share of the tumour's silhouette that drape and bone leave visible.
     covered, removed
-        In a scene with an observation model: minimum share of frames whose ellipsoid contains the true tumour centroid.
-        Minimum share of the tumour motion, over all frames, that the estimate removes.
+        For a scene with an observation model: minimum share of frames whose ellipsoid contains the true tumour
+        centroid, and minimum of 1 - (sum of errors) / (sum of tumour motions), over all frames.
     """
 
     overlap: float = 0.95
@@ -86,32 +86,32 @@ TOOL_EFFECTS = (ToolForce, ToolContact, Retraction)
 
 @dataclass(frozen=True)
 class Scene:
-    """Scripted scene. Times in seconds; the loads at a time follow from its effects.
+    """Scripted scene: effects, tool and camera as functions of time [s]. The effects determine the loads at a time.
 
     Parameters
     ----------
     path, tool
-        Motion of the tool, and the tool; None: no tool is in view.
+        Motion of the tool, and the tool; None: scene without tool.
     lying
-        Head pose, used with `Gravity`.
+        Head pose as a function of time, used by `Gravity`.
     surgery
-        Resection, if any.
+        Schedule of a resection; None: no resection.
     observation_model
-        Observation model of the open cortex, if the tumour position is estimated from observations; the deformer's
-        solution is then the ground truth.
+        Observation model of the open cortex, from which the tumour position is estimated; the deformer's solution is
+        then the ground truth. None: the tumour position is predicted by the deformer.
     registration
-        Registration of the scan to the patient: "perfect", as simulated images have it, or "clinical".
+        Registration of the scan to the patient: "perfect", as in simulated images, or "clinical".
     deformer
-        Trained model that plays the scene where it supports it, with its bound; None: the one with the smallest bound,
-        with FEM where it is unreliable.
+        Name of the default deformer: a model family, or a trained model that supports the scene. None: the model with
+        the smallest error bound, with FEM as fallback if the bound is weak.
     element
-        Element, one of `sim.elements.ELEMENTS`; None: the recommended one for the mesh.
+        Element type, a key of `sim.elements.ELEMENTS`; None: the recommended type for the mesh.
 
     Raises
     ------
     InputError
-        A tool's force or pose without a tool; a duration or a frame rate that is not a number > 0; more than
-        `MAX_FRAMES` frames.
+        An effect that needs a tool in a scene without tool; a duration or a frame rate that is not a number > 0; more
+        than `MAX_FRAMES` frames.
     """
 
     name: str
@@ -149,12 +149,12 @@ class Scene:
             )
 
     def replace_tissue(self, tissue: Tissue | None, element: str | None) -> Scene:
-        """Return the scene with another tissue, element, or both; tissue that relaxes keeps its Prony series.
+        """Return the scene with another tissue, another element type, or both (None: unchanged).
 
         Raises
         ------
         InputError
-            A law that cannot relax, in a scene whose tissue does.
+            The scene's tissue relaxes, and the law of the new tissue has no relaxation. (The Prony series is kept.)
         """
         if tissue is None:
             return self if element is None else replace(self, element=element)
@@ -170,11 +170,11 @@ class Scene:
 
     @property
     def elasticity(self) -> Elasticity:
-        """Tissue of the scene; without laws if there is none."""
+        """Tissue of the scene; an `Elasticity` without material laws if the scene has no tissue."""
         return next((effect for effect in self.effects if isinstance(effect, Elasticity)), Elasticity(None))
 
     def replace_regions(self, regions: Mapping[int, Tissue]) -> Scene:
-        """Return the scene with the tissues of some regions replaced, by label."""
+        """Return the scene with other tissues of some regions, given by label."""
 
         def made(effect: Effect) -> Effect:
             own = isinstance(effect, Elasticity)
@@ -184,38 +184,38 @@ class Scene:
 
     @property
     def times(self) -> np.ndarray:
-        """Time of every frame (n,) [s]."""
+        """Times (n,) [s] of all frames."""
         return np.arange(round(self.duration * self.frames_per_second) + 1) / self.frames_per_second
 
     @property
     def max_depth(self) -> float:
-        """Largest depth of the scripted tool at any frame [m]."""
+        """Largest depth of the scripted tool over all frames [m]."""
         return max(self.path(time).depth for time in self.times.tolist())
 
     def get_effects_on(self, anatomy: Anatomy) -> tuple[Effect, ...]:
-        """Return the effects on an anatomy: without skull contact if there is no skull, and with the resection."""
+        """Return the effects on an anatomy, with the resection, and without skull contact if there is no skull."""
         gone = () if anatomy.slide_normal.any() else (SkullContact,)
         kept = tuple(effect for effect in self.effects if not isinstance(effect, gone))
         return kept if self.surgery is None else (*kept, _build_resection(self.surgery, anatomy))
 
     def find_contact(self, site: CraniotomyFrame, touch: Touch) -> Place:
-        """Return the material point that the tool touches."""
+        """Return the material point of the cortex that the tool touches at a tool input."""
         assert self.tool is not None
         return site.find_contact(touch.x, touch.y, self.tool.radius)
 
     @property
     def posed(self) -> bool:
-        """True if the tool is moved by its pose, not by a force."""
+        """True if the pose of the tool is prescribed instead of its force."""
         return any(isinstance(effect, ToolContact | Retraction) for effect in self.effects)
 
     def compute_tip(self, site: CraniotomyFrame, touch: Touch) -> np.ndarray:
-        """Compute the contact point (3,) [m] of a moved tool, limited by the craniotomy edge."""
+        """Compute the tip (3,) [m] of a tool with prescribed pose, limited by the craniotomy edge."""
         assert self.tool is not None
         asked = self.find_contact(site, touch).point + touch.depth * site.compute_direction(touch)
         return site.clip_to_opening(asked, self.tool.radius)
 
     def describe_stop(self, site: CraniotomyFrame, touch: Touch) -> str:
-        """Describe that the bone's edge stops the tool before the requested touch; empty if it does not."""
+        """Describe by how much the bone's edge stops the tool before its target; empty if the target is reached."""
         if self.tool is None:
             return ""
         asked = site.origin + touch.x * site.right + touch.y * site.up
@@ -225,17 +225,17 @@ class Scene:
         return f"the bone's edge stops the tool {1e3 * beyond:.1f} mm short" if beyond > STOP_TOLERANCE else ""
 
     def compute_pose(self, site: CraniotomyFrame, touch: Touch) -> np.ndarray:
-        """Compute T_world_tool (4, 4) of a moved tool, which faces the tissue in every direction of motion."""
+        """Compute T_world_tool (4, 4) of a tool with prescribed pose, which faces along the craniotomy's axis."""
         assert self.tool is not None
         return self.tool.pose(self.compute_tip(site, touch), site.axis, site.right)
 
     def build_loads(self, site: CraniotomyFrame, touch: Touch, time: float) -> Loads:
-        """Build one load case: the cause of every effect that has one; without causes, only time advances."""
+        """Build one load case at a time [s], which contains the loads of all effects for this tool input."""
         causes = (self._build_cause(effect, site, touch, time) for effect in self.get_effects_on(site.anatomy))
         return Loads(tuple(cause for cause in causes if cause is not None), np.array([time]))
 
     def _build_cause(self, effect: Effect, site: CraniotomyFrame, touch: Touch, time: float) -> Cause | None:
-        """Build the cause of an effect of the scene at a time."""
+        """Build the load of an effect at a time [s]; None if the effect has no load."""
         match effect:
             case ToolForce():
                 return self._build_pushed(site, touch)
@@ -264,7 +264,7 @@ class Scene:
 
 @lru_cache(8)
 def _build_resection(surgery: Debulking, anatomy: Anatomy) -> Resection:
-    """Build a resection, cached because every frame needs it."""
+    """Build a resection; the result is cached because every frame needs the resection."""
     return surgery.build_resection(anatomy)
 
 
@@ -276,15 +276,15 @@ SCENES = (
 
 
 def find_scene(name: str) -> Scene:
-    """Return a built-in scene by name, or the SCENE of a user's own file by its path, which ends in .py.
+    """Return a built-in scene by name, or the object SCENE of a Python file by its path, which ends in .py.
 
     The file is executed as Python code, with all rights of the user.
 
     Raises
     ------
     InputError
-        No scene has this name. Or the file is missing, does not run or has no SCENE. Or the scene's path gives
-        no Touch, or its tissue fails `sim.check_tissue`.
+        No scene has this name. The file is missing, raises an exception, or has no SCENE. The scene's path does not
+        return a `Touch`, or its tissue fails `sim.check_tissue`.
 
     Examples
     --------
@@ -300,7 +300,7 @@ def find_scene(name: str) -> Scene:
 
 
 def check_scene_exists(name: str) -> None:
-    """Raise InputError if a name is neither a built-in scene nor an existing file. No file is executed or read."""
+    """Raise InputError if a name is no built-in scene and does not end in .py. No file is executed or read."""
     if name not in SCENES and not name.endswith(".py"):
         raise InputError(
             f"no scene is called {name!r}: choose one of {', '.join(SCENES)}, or name a file of your own, MY_SCENE.py."

@@ -1,4 +1,4 @@
-"""Sampling of a scene's tool poses, as a user sets them on the page: position on the cortex, and depth."""
+"""Sampling of tool poses of a scene: positions on the open cortex, and depths, as a user can set on the page."""
 
 import numpy as np
 from scipy.stats import qmc
@@ -16,15 +16,15 @@ DEPTH_MARGIN = 1.05  # Largest sampled depth over the largest depth of the scrip
 
 
 def sample_scene_poses(scene: Scene, site: CraniotomyFrame, count: int, seed: int) -> tuple[BuiltIn, Loads]:
-    """Sample `count` poses of a scene's tool, and return both: places uniform by area, each with eight depths.
+    """Return the shape of a scene's tool, and `count` sampled poses: positions uniform by area, 8 depths at each.
 
-    Load i depends on the seed and on i alone: places are a Halton sequence, shifted by the seed (Cranley, Patterson
-    1976, SIAM J. Numer. Anal. 13:904-914), and each eighth of the depths has one pose of a place.
+    Load i depends only on the seed and on i: positions are a Halton sequence, shifted by the seed (Cranley, Patterson
+    1976, SIAM J. Numer. Anal. 13:904-914), and the 8 depths of a position are in 8 equal depth intervals.
 
     Raises
     ------
     InputError
-        A scene without a ball, capsule or blade that is moved by its pose into the tissue.
+        The scene does not move a ball, capsule or blade into the tissue by a prescribed pose.
     """
     deepest = DEPTH_MARGIN * scene.max_depth
     shape = None if scene.tool is None else scene.tool.shape

@@ -1,4 +1,4 @@
-"""Tools: shape, rendering and pose."""
+"""Surgical tools of scenes: contact shape, rendered surface and pose."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,22 +13,22 @@ SHAFT_RADIUS = 1.8e-3  # Default radius of a tool's shaft [m].
 
 
 def build_sphere(subdivisions: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Return a sphere of radius 1: vertices (n, 3), and triangles (m, 3), which point outwards."""
+    """Return a sphere of radius 1: vertices (n, 3), and triangles (m, 3) with outward orientation."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     return np.asarray(ball.vertices), np.asarray(ball.faces)
 
 
 def build_capsule(radius: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return a rod with round ends, from the origin along +z: vertices (n, 3) [m], and triangles (m, 3)."""
+    """Return a capsule that starts at the origin and extends along +z: vertices (n, 3) [m] and triangles (m, 3)."""
     rod = trimesh.creation.capsule(length, radius, count=(20, 20))
     rod.apply_translation([0.0, 0.0, -float(rod.bounds[0, 2])])
     return np.asarray(rod.vertices), np.asarray(rod.faces)
 
 
 def add_shaft(shape: BuiltIn, shaft_end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the surface of a tool with a known shape only, on a straight shaft to `shaft_end` (3,) [m].
+    """Return the surface of a tool's contact shape, with a straight shaft from its centre to `shaft_end` (3,) [m].
 
-    Vertices (n, 3) [m] in the tool's own frame, and triangles (m, 3).
+    Returns vertices (n, 3) [m] in tool coordinates, and triangles (m, 3).
     """
     core = get_core(shape)
     ball = core.radius * build_sphere(3)[0]
@@ -41,17 +41,17 @@ def add_shaft(shape: BuiltIn, shaft_end: np.ndarray) -> tuple[np.ndarray, np.nda
 class Instrument(Protocol):
     """Interface of a scene's tool: `Probe`, `Blade`, or an instrument of your own as a frozen dataclass.
 
-    In its own frame [m] its lowest point is the origin and its shaft is along +z.
+    In tool coordinates [m], the lowest point of the tool is the origin, and the shaft points along +z.
     """
 
     @property
     def radius(self) -> float:
-        """Radius of its footprint when it pushes, and of the space around its tip that it needs in an opening [m]."""
+        """Radius of the footprint of a pushing tool, and of the space around the tip inside the craniotomy [m]."""
         ...
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """Surface mesh for rendering; it is read in every frame."""
+        """Surface mesh for rendering in tool coordinates; each frame reads this property."""
         ...
 
     @property
@@ -60,25 +60,25 @@ class Instrument(Protocol):
         ...
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
-        """Return T_world_tool (4, 4) of a tool at `tip` (3,) [m], from outside; inward, aside: unit vectors (3,)."""
+        """Return T_world_tool (4, 4) of a tool that touches `tip` (3,) [m] from outside; unit vectors `inward`, `aside`."""
         ...
 
 
 @dataclass(frozen=True)
 class Probe:
-    """Palpation ball on a shaft.
+    """Palpation tool: a ball on a shaft.
 
     Parameters
     ----------
     radius
-        Radius of the ball, and of its footprint on the tissue [m].
+        Radius of the ball, and of the ball's footprint on the tissue [m].
     shaft
-        Radius of the shaft [m], in the plain look.
+        Radius of the shaft [m], in the plain appearance.
     length
-        Length of the shaft [m], in the plain look.
+        Length of the shaft [m], in the plain appearance.
     lean, turn
-        Angle between the shaft and the outward normal, and azimuth of the shaft about the normal [rad]: 0 is away
-        from the line of sight.
+        Angle between the shaft and the outward normal, and azimuth of the shaft about the normal [rad]; azimuth 0 is
+        the direction `aside` of `pose`.
     """
 
     radius: float = 7e-3
@@ -89,7 +89,7 @@ class Probe:
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """Surface in the tool's own frame [m]: lowest point of the ball at the origin, the shaft along +z."""
+        """Surface in tool coordinates [m]: the lowest point of the ball is the origin, the shaft points along +z."""
         ball = trimesh.creation.icosphere(subdivisions=3, radius=self.radius)
         ball.apply_translation([0.0, 0.0, self.radius])
         shaft = trimesh.creation.cylinder(self.shaft, self.length, sections=24)
@@ -101,7 +101,7 @@ class Probe:
 
     @property
     def grip(self) -> tuple[float, float]:
-        """Radius of the grip, and its distance from the centre of the ball [m]."""
+        """Radius of the grip, and distance of the grip from the centre of the ball [m]."""
         return 2.2 * self.shaft, 0.55 * self.length
 
     @property
@@ -110,10 +110,10 @@ class Probe:
         return Ball(self.radius)
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
-        """T_world_tool (4, 4): the ball touches `tip` (3,) [m] from outside; the shaft leans towards `aside` (3,).
+        """Return T_world_tool (4, 4): the ball touches `tip` (3,) [m] from outside; the shaft leans towards `aside`.
 
-        `turn` turns that from `aside` towards `aside` x `inward`; these are unit vectors (3,). The ball turns about its
-        centre, so contact does not depend on the lean.
+        A positive `turn` rotates the shaft from `aside` towards `aside` x `inward`, which are unit vectors (3,). The
+        ball rotates about its centre, so that the contact does not depend on `lean`.
         """
         centre = tip - self.radius * inward
         aside = np.cos(self.turn) * aside + np.sin(self.turn) * np.cross(aside, inward)
@@ -127,16 +127,16 @@ class Probe:
 
 @dataclass(frozen=True)
 class Blade:
-    """Brain spatula: a flat blade with a round edge, on an arm that leads up from one end.
+    """Brain spatula: a flat blade with a round edge, and an arm that leads upwards from one end.
 
     Parameters
     ----------
     width, length
         Width and length of the blade [m].
     edge
-        Radius of the edge [m]; the blade is twice as thick.
+        Radius of the edge [m]; the thickness of the blade is 2 `edge`.
     arm
-        Length of the arm [m], in the plain look.
+        Length of the arm [m], in the plain appearance.
     """
 
     width: float = 0.012
@@ -146,7 +146,7 @@ class Blade:
 
     @property
     def radius(self) -> float:
-        """Circumscribed radius around its tip: the space that it needs in an opening [m]."""
+        """Circumscribed radius around the tip [m]: the space that the blade needs inside the craniotomy."""
         return 0.5 * float(np.hypot(self.width, self.length))
 
     @property
@@ -156,7 +156,7 @@ class Blade:
 
     @cached_property
     def mesh(self) -> trimesh.Trimesh:
-        """Surface in the tool's own frame [m]: the blade's face downwards through the origin, the arm along +z."""
+        """Surface in tool coordinates [m]: the blade's lower face contains the origin, the arm points along +z."""
         core = get_core(self.shape)
         ball = trimesh.creation.icosphere(subdivisions=2, radius=self.edge).vertices
         corners = core.centre + core.half * np.array([[x, y, 0.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
@@ -166,7 +166,7 @@ class Blade:
         return blade + arm
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
-        """T_world_tool (4, 4): the middle of its face at `tip` (3,) [m], facing `inward` (3,), wide along `aside`."""
+        """Return T_world_tool (4, 4): the blade's face at `tip` (3,) [m] faces `inward`; its width is along `aside`."""
         T = np.eye(4)
         T[:3, :3] = np.column_stack([aside, np.cross(-inward, aside), -inward])
         T[:3, 3] = tip

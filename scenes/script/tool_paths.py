@@ -1,4 +1,4 @@
-"""Scripted tool motion as pure functions of time: what a surgeon's hand does, without a surgeon."""
+"""Scripted tool motion, which replaces a surgeon's hand, as pure functions of time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ class Touch:
     Parameters
     ----------
     x, y
-        Position on the open cortex, in its tangent plane, from its centre [m].
+        Position in the tangent plane of the open cortex, relative to its centre [m].
     force
-        Force [N]; zero is no contact.
+        Force [N]; 0: no contact.
     tilt
-        Direction of the force against the inward normal, towards x and y [rad].
+        Angles [rad] between force and inward normal, towards x and towards y.
     depth
-        Depth of a moved tool beyond first contact with the undeformed tissue [m], along that direction; negative in the
-        air.
+        Depth [m] of a tool with prescribed pose beyond first contact with the undeformed tissue, in the direction of
+        `tilt`; negative: above the tissue.
     """
 
     x: float = 0.0
@@ -31,7 +31,7 @@ class Touch:
 
 
 Path = Callable[[float], Touch]
-"""Function of time [s] that returns a touch."""
+"""Function of time [s] that returns the tool input."""
 
 IDLE_HEIGHT = 4e-3  # Height of an idle tool above the tissue [m].
 
@@ -41,12 +41,12 @@ MIN_VISIBLE_FORCE = 2e-3
 
 
 def compute_tool_height(force: float) -> float:
-    """Return the height [m] above the tissue of a drawn tool that pushes with a force [N]: `IDLE_HEIGHT` when idle."""
+    """Return the height [m] above the tissue at which a tool with this force [N] is drawn: `IDLE_HEIGHT` at 0 N."""
     return IDLE_HEIGHT * max(0.0, 1.0 - force / MIN_VISIBLE_FORCE)
 
 
 def smooth_step(t: float) -> float:
-    """Return the minimum-jerk polynomial 6 t^5 - 15 t^4 + 10 t^3, from 0 to 1 for t from 0 to 1, at rest at both ends.
+    """Return the minimum-jerk polynomial 6 t^5 - 15 t^4 + 10 t^3, with t clipped to [0, 1] and zero slope at the ends.
 
     Flash, Hogan 1985, J. Neurosci. 5:1688-1703.
     """
@@ -55,12 +55,12 @@ def smooth_step(t: float) -> float:
 
 
 def keep_idle(time: float) -> Touch:
-    """Return no contact at any time [s]."""
+    """Return a tool input without contact, at any time [s]."""
     return Touch()
 
 
 def press(force: float, rise: float = 1.5, hold: float = 1.0, at: tuple[float, float] = (0.0, 0.0)) -> Path:
-    """Press one position up to `force` [N] within `rise` [s], hold [s], and release as slowly.
+    """Build a path that presses one position: rise to `force` [N] in `rise` [s], stay `hold` [s], release in `rise`.
 
     Examples
     --------
@@ -79,7 +79,7 @@ def press(force: float, rise: float = 1.5, hold: float = 1.0, at: tuple[float, f
 def slide(
     force: float, start: tuple[float, float], end: tuple[float, float], seconds: float, rise: float = 0.5
 ) -> Path:
-    """Press with `force` [N], move from `start` to `end` [m] within `seconds`, and release."""
+    """Build a path that presses with `force` [N], moves from `start` to `end` [m] within `seconds`, and releases."""
 
     def path(time: float) -> Touch:
         share = smooth_step((time - rise) / seconds)
@@ -91,7 +91,7 @@ def slide(
 
 
 def draw(force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tuple[float, float] = (0.0, 0.0)) -> Path:
-    """Press, then draw the tissue aside: the force turns by `tilt` [rad] towards x while it rises; hold; release."""
+    """Build a path that presses, tilts the force by `tilt` [rad] towards x, stays for `hold` [s], and releases."""
 
     def path(time: float) -> Touch:
         drawn = smooth_step((time - 0.5 * rise) / rise)
@@ -104,7 +104,7 @@ def draw(force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tu
 def palpate(
     depth: float, start: tuple[float, float], end: tuple[float, float], seconds: float, rise: float = 0.8
 ) -> Path:
-    """Lower by `IDLE_HEIGHT` [m], then to `depth` [m] in `rise` [s], slide from `start` to `end` [m], lift off."""
+    """Build a path that lowers to `depth` [m] in `rise` [s], slides from `start` to `end` [m], and lifts off."""
     stroke = slide(1.0, start, end, seconds, rise)
 
     def path(time: float) -> Touch:
@@ -117,7 +117,7 @@ def palpate(
 def lay(
     depth: float, tilt: float = 0.0, rise: float = 1.5, at: tuple[float, float] = (0.0, 0.0), hold: float = np.inf
 ) -> Path:
-    """Lower by `IDLE_HEIGHT` and on to `depth` [m] within `rise` [s], `tilt` [rad] towards x; hold [s]; lift off."""
+    """Build a path that lowers to `depth` [m] in `rise` [s] with a `tilt` [rad] towards x, stays, and lifts off."""
 
     def path(time: float) -> Touch:
         share = smooth_step(time / rise) - smooth_step((time - rise - hold) / rise)
@@ -127,14 +127,14 @@ def lay(
 
 
 def _interpolate_depth(share: float, depth: float) -> float:
-    """Return the depth [m] of a tool after a share of its way from the air to `depth` [m]."""
+    """Return the depth [m] of a tool after a share (0 to 1) of the distance from `IDLE_HEIGHT` to `depth` [m]."""
     return share * (IDLE_HEIGHT + depth) - IDLE_HEIGHT
 
 
 def stroke_cortex(force: float, radius: float, speed: float) -> Path:
-    """Stroke without a pause at `speed` [m/s] in straight lines between points of a circle of `radius` [m].
+    """Build a path of straight strokes at `speed` [m/s], without pause, between points of a circle of `radius` [m].
 
-    Successive points differ by the golden angle: no stroke is repeated, and strokes cover the circle evenly.
+    Successive points differ by the golden angle, so that no stroke is repeated and strokes cover the circle evenly.
     """
     turn = np.pi * (3.0 - np.sqrt(5.0))
     stroke = 2.0 * radius * np.sin(turn / 2.0)

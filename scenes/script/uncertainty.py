@@ -1,4 +1,4 @@
-"""Error bounds of the displayed tumour position: results of an ensemble, stored next to the anatomy."""
+"""Error bounds of the displayed tumour position, from ensembles of solutions, stored next to the anatomy."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -31,22 +31,22 @@ BOUND_DEVIATIONS = 1.96  # Bound at 95 % of a Gaussian [standard deviations].
 
 @dataclass(frozen=True)
 class TumourError:
-    """Expected error of the tumour position shown in a frame.
+    """Expected error of the tumour position that a frame shows.
 
     Parameters
     ----------
     prior
-        95 % bound on the maximum error over its surface [m], without observation; None: not known.
+        95 % bound on the maximum error over the tumour's surface [m], without observation; None: not known.
     main_source
         Name of the largest contributor to `prior`.
     observed
-        Bound with observations of the brain [m]; None without observations.
+        95 % bound [m] with observations of the brain; None without observations.
     moved
-        95 % bound on the error of its mean displacement since the scan [m], without observation.
+        95 % bound on the error of the tumour's mean displacement since the scan [m], without observation.
     is_rough
-        True if `prior` is a rough estimate, as in `Uncertainty.guess` and by `MotionError`.
+        True if `prior` is a rough estimate: see `Uncertainty.is_rough` and `MotionError`.
     registration
-        Standard deviation along each axis [m] of the registration that the bound includes; None: not available.
+        Standard deviation along each axis [m] of the registration error in the bound; None: not available.
     """
 
     prior: float | None
@@ -65,7 +65,7 @@ class TumourError:
 
     @property
     def bound(self) -> float | None:
-        """Valid bound [m]: with the observation if there is one."""
+        """95 % bound [m] that applies: `observed` if there is an observation, else `prior`."""
         return self.prior if self.observed is None else self.observed
 
 
@@ -81,30 +81,30 @@ class Uncertainty:
     scene, mark
         Name of the scene, and its fingerprint, see `compute_scene_mark`.
     draws, failed
-        Number of samples, and of those without equilibrium: these are excluded.
+        Number of samples, and number of samples without equilibrium, which are excluded.
     times
-        [s].
+        Times [s].
     worst, middle
-        95th percentile of the errors [m] with a clinical registration: largest on the tumour's surface, and centroid.
+        95th percentiles [m], with a clinical registration, of the maximum surface error and of the centroid's error.
     registered
         `worst` with a perfect registration [m].
     moved, motion
-        Mean motion of the tumour's surface [m], and 95th percentile of the error of its mean displacement [m], without
-        registration and segmentation.
+        Mean displacement of the tumour's surface [m], and 95th percentile of the error of the mean displacement [m],
+        without registration and segmentation.
     parts
-        Root mean square over draws of the maximum surface error [m], by contributor.
+        Root mean square over samples of the maximum surface error [m], by contributor.
     frames
-        Number of frames that the draws' tissue was fitted to; 0: it was drawn from priors.
+        Number of frames to which the samples' tissue was fitted; 0: tissue sampled from priors.
     folded
-        Number of draws with inverted tetrahedra, which is unphysical, such as under a tool on soft tumour. 0 in files
+        Number of samples with inverted tetrahedra (unphysical, for example under a tool on a soft tumour). 0 in files
         without this entry.
     numbers
-        Number of parameters by which the parts are fitted to the draws; 0 in files without this entry.
+        Number of parameters that were fitted to the samples to obtain `parts`; 0 in files without this entry.
     patients
-        Number of synthetic patients, none of them among the draws, on which the bound was tested.
+        Number of synthetic test patients, not among the samples, on which the bound was tested.
     covered, deviation
-        Share of their errors that the bound covered, over all moments but the first, and the share's standard deviation
-        from the number of patients; None: not tested.
+        Empirical coverage: share of the test patients' errors below the bound, over all times except the first; and
+        standard deviation of this share due to the number of patients. None: not tested.
     """
 
     scene: str
@@ -127,16 +127,16 @@ class Uncertainty:
 
     @property
     def has_few_draws(self) -> bool:
-        """True if fewer than two draws were solved per fitted parameter."""
+        """True if fewer than two samples were solved per fitted parameter."""
         return self.draws - self.failed < 2 * self.numbers
 
     @property
     def is_rough(self) -> bool:
-        """True if the bound is only a rough estimate: few draws, or a load beyond the range of the tissue law."""
+        """True if the bound is only a rough estimate: few samples, or samples with inverted tetrahedra."""
         return self.has_few_draws or self.folded > 0
 
     def evaluate(self, time: float, model_bound: float = 0.0, registration: Registration = "clinical") -> TumourError:
-        """Return the error at a time [s], where a trained model adds its own bound [m]."""
+        """Return the error at a time [s], including the error bound [m] of a trained model."""
         deviation = REGISTRATIONS[registration]
         parts = {name: self.interpolate(values, time) for name, values in self.parts.items()}
         parts[SURROGATE] = model_bound / BOUND_DEVIATIONS
@@ -148,21 +148,21 @@ class Uncertainty:
         return TumourError(worst, largest, moved=moved, is_rough=self.is_rough, registration=deviation)
 
     def interpolate(self, values: tuple[float, ...], time: float) -> float:
-        """Interpolate one of the lists linearly at a time [s]."""
+        """Interpolate a list of values linearly at a time [s]."""
         return float(np.interp(time, self.times, values))
 
 
 @dataclass(frozen=True)
 class MotionError:
-    """Error in proportion to the motion, for loads without an ensemble: a rough estimate from one of similar loads.
+    """Rough error estimate in proportion to the motion, for loads without an ensemble, fitted to a similar ensemble.
 
     Parameters
     ----------
     rest
         95 % bound on the error of the undeformed tumour [m], by registration.
     surface, mean
-        Largest ratio, over the times of the ensemble, of the bound on the surface error from deformation, and of that
-        on the mean displacement, to the mean motion.
+        Ratios to the mean motion, maximum over the ensemble's times: of the bound on the surface error due to
+        deformation (`surface`), and of the bound on the error of the mean displacement (`mean`).
     """
 
     rest: Mapping[Registration, float]
@@ -170,14 +170,14 @@ class MotionError:
     mean: float
 
     def evaluate(self, motion: float, model_bound: float, registration: Registration) -> TumourError:
-        """Return the error at a mean motion [m], where a trained model adds its own bound [m]."""
+        """Return the error at a mean motion [m], including the error bound [m] of a trained model."""
         worst = float(np.linalg.norm([self.rest[registration], self.surface * motion, model_bound]))
         moved = float(np.hypot(self.mean * motion, model_bound))
         return TumourError(worst, moved=moved, is_rough=True, registration=REGISTRATIONS[registration])
 
 
 def fit_motion_error(ensemble: Uncertainty) -> MotionError | None:
-    """Fit the error of a scene's motion in proportion to it; None if the tumour hardly moves in the scene."""
+    """Fit the error in proportion to the motion to an ensemble; None if the tumour hardly moves in its scene."""
     moved, worst, mean = (np.array(values) for values in (ensemble.moved, ensemble.registered, ensemble.motion))
     if moved.max() < MIN_MOTION:
         return None
@@ -188,7 +188,7 @@ def fit_motion_error(ensemble: Uncertainty) -> MotionError | None:
 
 
 def compute_scene_mark(scene: Scene, site: CraniotomyFrame, element: str) -> str:
-    """Compute the fingerprint of a scene: 16 hexadecimal digits of its loads, its anatomy and the priors."""
+    """Compute the fingerprint (16 hexadecimal digits) of a scene's loads and effects, its anatomy and the priors."""
     times = np.linspace(0.0, scene.duration, 25).tolist()
     # Rounded, because sines differ between machines in the last digit.
     acts = [np.round(_list_parameters(scene, time), 6).tolist() for time in times]
@@ -198,7 +198,7 @@ def compute_scene_mark(scene: Scene, site: CraniotomyFrame, element: str) -> str
 
 
 def _list_parameters(scene: Scene, time: float) -> list[float]:
-    """Return the parameters of tool and head at a time [s]."""
+    """List the parameters of tool input and head pose at a time [s]."""
     touch, lying = scene.path(time), scene.lying(time)
     return [touch.x, touch.y, touch.force, *touch.tilt, touch.depth, *lying.direction, lying.fluid]
 
@@ -209,7 +209,7 @@ def to_uncertainty_path(anatomy: Path) -> Path:
 
 
 def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
-    """Read the uncertainties of a file, by scene; empty without a file.
+    """Read the uncertainties of a file, by scene name; empty if the file does not exist.
 
     Raises
     ------
@@ -223,9 +223,9 @@ def read_uncertainties(path: Path) -> dict[str, Uncertainty]:
 
 
 def _read(row: dict) -> Uncertainty:
-    """Read one scene's uncertainty; every list is as long as the times, and has finite numbers.
+    """Convert one entry of a file to an `Uncertainty`; check that lists are finite and as long as the times.
 
-    Files without `registered` and `motion` get an upper estimate from the parts.
+    If `registered` or `motion` is missing, an upper estimate is computed from the parts.
     """
     lists = {name: tuple(map(float, row[name])) for name in LISTS}
     parts = {str(name): tuple(map(float, values)) for name, values in row["parts"].items()}
@@ -247,7 +247,7 @@ def _read(row: dict) -> Uncertainty:
 
 
 def write_uncertainties(path: Path, uncertainties: Iterable[Uncertainty]) -> None:
-    """Add scenes to a file; replace those with the same name."""
+    """Add the uncertainties of scenes to a file; entries of the same scenes are replaced."""
     scenes = read_uncertainties(path) | {one.scene: one for one in uncertainties}
     rows = {name: asdict(scenes[name]) for name in sorted(scenes)}
     stored = {"format": FORMAT, "unit": "m", "level": LEVEL, "scenes": rows}
@@ -256,7 +256,7 @@ def write_uncertainties(path: Path, uncertainties: Iterable[Uncertainty]) -> Non
 
 
 def _round_numbers(value: object) -> object:
-    """Round numbers to a micrometre, because the sampling error of an ensemble is larger."""
+    """Round all numbers in nested lists and dicts to a micrometre; the sampling error of an ensemble is larger."""
     match value:
         case dict():
             return {name: _round_numbers(one) for name, one in value.items()}

@@ -1,4 +1,4 @@
-"""Camera and look of a scene: the camera's place and motion, lamp, colour of the cortex, and what covers it."""
+"""Camera and appearance of a scene: camera pose and motion, light, colour of the cortex, and occluders."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Cottonoid:
     Parameters
     ----------
     x, y
-        Centre in the tangent plane of the open cortex [m].
+        Centre of the square in the tangent plane of the open cortex [m].
     side
         Side length [m].
     angle
-        Rotation angle in that plane [rad].
+        Rotation angle in the tangent plane [rad].
     """
 
     x: float
@@ -41,32 +41,32 @@ BallInstrument = Literal["dissector", "forceps", "suction"]
 
 @dataclass(frozen=True)
 class Appearance:
-    """Light, colour and occluders of the cortex.
+    """Appearance of a scene: light, colour and occluders of the cortex, and camera effects.
 
     Parameters
     ----------
     lamp, ambient
-        Intensities of the lamp and of the ambient light, scene-linear.
+        Intensities of the lamp and of the ambient light, in linear (not sRGB) units.
     turn
-        Rotation angle of the lamp about the axis of the opening [rad].
+        Rotation angle of the lamp about the axis of the craniotomy [rad].
     tint
-        Factors for the cortex's red, green and blue.
+        Factors on the red, green and blue colour of the cortex.
     vessels
-        Seed of vessels rendered on the cortex; None: only those of the scan.
+        Seed of vessels that are rendered on the cortex; None: no added vessels.
     cottonoids
-        Cottonoids on the cortex.
+        Squares of cotton on the cortex.
     finger
-        Direction in the tangent plane of a gloved finger that reaches over the opening's edge [rad]; None: no finger.
+        Angle in the tangent plane [rad] of a gloved finger that extends over the craniotomy edge; None: no finger.
     natural
-        True: gyri, sulci and vessels on a fine surface just below the FEM surface, instead of scan and `vessels`;
-        a drape with folds, and instruments with their shapes. False: the FEM surface itself and simple tools, as in
-        data sets.
+        True: gyri, sulci and vessels on a fine surface just below the FEM surface, instead of scan and `vessels`; a
+        drape with folds, and realistic instruments. False: the FEM surface, a plain drape and simple tools, as in data
+        sets.
     instrument
-        In the natural look, the instrument of a `Probe`: "dissector" ends in a steel ball; "forceps", of bipolar
-        coagulation, and "suction", a tube, have a ball of cotton at their tips.
+        Instrument that represents a `Probe` if `natural`: "dissector" with a steel ball at its end, or "forceps"
+        (bipolar) or "suction" (a tube) with a ball of cotton at the tip.
     aperture, noise
-        Diameter of the camera's lens [m], which blurs what is nearer or farther than the open cortex; standard
-        deviation of its shot noise [share of white]. 0: none.
+        Diameter of the camera's lens [m], which blurs objects nearer or farther than the open cortex; standard
+        deviation of the shot noise [share of white]. 0: no blur, no noise.
 
     Raises
     ------
@@ -97,9 +97,9 @@ class Appearance:
 
 
 PLAIN_APPEARANCE = Appearance()
-"""Look of data sets: the FEM surface, with the scan as its texture."""
+"""Appearance of data sets: the FEM surface, with the scan as texture."""
 NATURAL_APPEARANCE = Appearance(natural=True)
-"""Default look of scenes."""
+"""Default appearance of scenes."""
 
 
 WORKING_DISTANCE = 0.30  # Distance of an operating microscope from the cortex [m].
@@ -116,11 +116,11 @@ class Viewpoint:
     distance
         Distance from the target [m]: by default the working distance of an operating microscope.
     tilt
-        Angle [rad] of the direction to the camera, from the outward normal towards the site's `up`. None: as oblique as
-        the tumour stays visible through the craniotomy, see `find_framing`.
+        Angle [rad] between the direction to the camera and the outward normal, towards `up` of the craniotomy. None:
+        the most oblique view in which the tumour is visible through the craniotomy, see `find_framing`.
     fov
-        Vertical field of view [rad]. None: the image contains craniotomy, tumour and error band, if the distance is
-        the default.
+        Vertical field of view [rad]. None: at the default distance, the image contains craniotomy, tumour and error
+        band.
     width, height
         Image size [pixel].
     calibration
@@ -128,15 +128,15 @@ class Viewpoint:
     path
         Motion, zoom and focus of the camera; None: static.
     eye
-        Optical path of an operating microscope, whose axes meet at the site; None: the centre.
+        Eye of an operating microscope, whose optical axes meet at the target; None: single central camera.
     field
-        Radius of a microscope's circular field, relative to half of the image's longer side: the shown image is dark
-        beyond. Image processing ignores it. None: the complete image.
+        Radius of a microscope's circular field of view, relative to half of the image's longer side; the displayed
+        image is dark outside. None: the complete image.
 
     Raises
     ------
     InputError
-        A calibration for another image size, another eye than left and right, or a field that is not > 0.
+        A calibration that does not fit the image size, an invalid `eye`, or a `field` that is not > 0.
     """
 
     distance: float = WORKING_DISTANCE
@@ -161,22 +161,22 @@ class Viewpoint:
                 raise InputError(str(error)) from error
 
     def calibrate(self, calibration: Calibration) -> Viewpoint:
-        """Return this viewpoint with a calibrated camera and its image size."""
+        """Return the viewpoint with a calibrated camera, and the image size of the calibration."""
         return replace(self, calibration=calibration, width=calibration.width, height=calibration.height)
 
     def find_target(self, site: CraniotomyFrame) -> np.ndarray:
-        """Return the target point of the camera (3,) [m]."""
+        """Return the target point (3,) [m] at which the camera looks."""
         if self.tilt is not None and (self.fov is not None or self.calibration is not None):
             return site.origin + TARGET_DEPTH * site.axis
         return self.find_framing(site).target
 
     def find_framing(self, site: CraniotomyFrame) -> Framing:
-        """Return the framing of the tumour, with this viewpoint's tilt if it has one."""
+        """Return the framing of the tumour, with the tilt of this viewpoint unless the tilt is None."""
         direction = None if self.tilt is None else (-self.tilt, 0.0)
         return find_framing(site, WORKING_DISTANCE, self.width / self.height, direction)
 
     def build_camera(self, site: CraniotomyFrame, time: float = 0.0) -> Camera:
-        """Return the camera that looks at a site at a time [s]."""
+        """Build the camera that looks at a craniotomy, at a time [s] of its path."""
         target = self.find_target(site)
         outward = self.find_framing(site).direction if self.tilt is None else compute_view_direction(site, -self.tilt)
         fov = self.find_framing(site).fov if self.fov is None else self.fov
