@@ -1,1 +1,1 @@
-"""The report: what accuracy costs in time."""
+"""Report of the accuracy and computation time of deformation models."""

@@ -1,4 +1,4 @@
-"""Adaptation time of a row to a body whose tumour was debulked by a fifth."""
+"""Time that a model needs to adapt to an anatomy after resection of a fifth of its tumour."""
 
 import time as clock
 from collections.abc import Callable
@@ -23,7 +23,7 @@ REMOVED_SHARE = 0.2  # Removed share of the tumour's volume.
 def debulk_tumour(anatomy: Anatomy) -> Anatomy:
     """Return the anatomy without the central fifth of its tumour.
 
-    Vertices without a tetrahedron are removed, too.
+    Vertices that belong to no remaining tetrahedron are removed too.
     """
     mesh = anatomy.mesh
     tumour = np.flatnonzero(anatomy.in_tumour)
@@ -39,12 +39,12 @@ def debulk_tumour(anatomy: Anatomy) -> Anatomy:
 
 
 def build_debulked_study(study: ReportStudy) -> ReportStudy:
-    """Return the study of the debulked body, after `simulate_debulked` has made its data."""
+    """Return the study of the debulked anatomy, whose data set `simulate_debulked` has written."""
     return replace(study, data=_to_answers_path(study))
 
 
 def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> None:
-    """Solve the data's own loads on the debulked body; `progress` receives the number of newly solved rows."""
+    """Solve the data set's loads on the debulked anatomy; `progress` receives the number of newly solved loads."""
     path = _to_answers_path(study)
     if path.exists():
         progress(len(study.dataset.loads) + len(study.dataset.unit_good))
@@ -66,7 +66,7 @@ def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> 
 
 
 def read_simulation_seconds(study: ReportStudy) -> float | None:
-    """Read the seconds of `simulate_debulked`; None if there was no run, or an interrupted one."""
+    """Read the duration [s] of `simulate_debulked`; None if there was no run, or if it was interrupted."""
     return read_noted_seconds(_to_answers_path(study))
 
 

@@ -1,4 +1,4 @@
-"""Charts of the report, one question each."""
+"""Charts of the report; each chart answers one question."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -20,9 +20,9 @@ Place = tuple[float, float]
 
 
 def find_front(rows: Sequence[ReportRow]) -> frozenset[str]:
-    """Return the names of the rows on the Pareto front of milliseconds and mean distance from the reference.
+    """Return the names of the rows on the Pareto front of time per load and mean distance from the reference.
 
-    Rows of another law, and of the reference's own elements, are excluded: their distance is no model error.
+    Rows with another material law, or with the reference's elements, are excluded: their distance is no model error.
     """
     return find_pareto_front({row.name: place for row in rows if row.against == ERROR and (place := _place_time(row))})
 
@@ -32,26 +32,26 @@ def _place_time(row: ReportRow) -> Place | None:
 
 
 def _place(x: float | None, figures: ErrorFigures | None) -> Place | None:
-    """Return x and the mean distance [mm], if both are positive, as logarithmic axes require; else None."""
+    """Return x and the mean distance [mm]; None unless both are positive, as logarithmic axes require."""
     return None if not x or figures is None or not figures.mm.mean > 0.0 else (x, figures.mm.mean)
 
 
 def build_error_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
-    """Build the chart of error against time; bars are the central 95 % of the loads. None without rows.
+    """Build the chart of error against time per load, with bars for the central 95 % of the loads; None without rows.
 
-    Rows that show only their tolerance would be far below all others, and are omitted.
+    Rows that differ from the reference only by their solver tolerance are omitted, because their errors are tiny.
     """
     return _scatter(rows, "Which model is most accurate in the time available?", "milliseconds a load", _place_time)
 
 
 def build_batch_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
-    """Build the chart of error against time where all loads are solved together; None without rows."""
+    """Build the chart of error against time per load if all loads are solved in one batch; None without rows."""
     title = "And in a batch, as for training data or uncertainty?"
     return _scatter(rows, title, "milliseconds a load, all together", lambda row: _place(row.batch_ms, row.reference))
 
 
 def build_effects_chart(records: Sequence[EffectRecord]) -> ChartPanel | None:
-    """Build the chart of cost and influence of each effect of a scene; None without records."""
+    """Build the chart of added time and added tumour motion of each recorded effect; None without records."""
     dots = tuple(
         Dot(f"{name}, {record.scene}", name, ms, mm, hint=f"{record.scene}, {record.day}, {record.machine}")
         for record in records
@@ -71,13 +71,13 @@ def build_preparation_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
 
 
 def build_adaptation_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
-    """Build the chart of error against the time until a model includes a resection; None without rows."""
+    """Build the chart of error against the time that a model needs to adapt to a resection; None without rows."""
     title = "How long until a model knows that tissue was removed?"
     return _scatter(rows, title, "seconds until the first load", lambda row: _place(row.adapt, row.reference))
 
 
 def build_cortex_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
-    """Build the chart of the error at the open cortex, which a camera sees; None without rows."""
+    """Build the chart of the error at the open cortex against time per load; None without rows."""
 
     def place(row: ReportRow) -> Place | None:
         mean = float(np.mean(row.cortex_mm)) if row.cortex_mm else 0.0
@@ -89,13 +89,13 @@ def build_cortex_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
 
 
 def build_pose_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
-    """Build the chart of the error where the tool's motion is given, not its force; None without rows."""
+    """Build the chart of error against time if the tool's motion is prescribed, not its force; None without rows."""
     title = "And if the motion of the tool is known, not its force?"
     return _scatter(rows, title, "milliseconds a load", lambda row: _place(row.median, row.pose), lambda row: ())
 
 
 def build_force_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
-    """Build the chart of the error against the force, for the rows of the front; None without rows."""
+    """Build the chart of error against force, for the rows on the Pareto front; None without rows."""
     best, curves = find_front(rows), []
     for row in rows:
         if row.name in best and row.reference:
@@ -108,7 +108,7 @@ def build_force_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
 
 
 def build_learning_chart(rows: Sequence[ReportRow]) -> ChartPanel | None:
-    """Build the chart of a learner's error against the number of training loads; None without learners."""
+    """Build the chart of a trained model's error against the number of training loads; None without trained models."""
     curves = tuple(
         Curve(row.name, tuple((float(count), each.mm.mean) for count, each in row.curve)) for row in rows if row.curve
     )
@@ -124,9 +124,9 @@ def _scatter(
     find: Callable[[ReportRow], Place | None],
     get_errors: Callable[[ReportRow], Sequence[float]] = attrgetter("load_mm"),
 ) -> ChartPanel | None:
-    """Build a chart of rows at the places found; rows off the Pareto front are pale, and the front is drawn.
+    """Build a scatter chart of rows at the positions that `find` returns; None if there is no position.
 
-    Bars are the central range of `get_errors`, the errors of each load [mm].
+    The Pareto front is drawn; other rows are pale. Bars are the central 95 % of the load errors [mm] of `get_errors`.
     """
     places = {row.name: place for row in rows if row.against != TOLERANCE_ALONE and (place := find(row))}
     best = find_pareto_front(
@@ -149,13 +149,13 @@ def _scatter(
 
 
 def _find_central_range(load_mm: Sequence[float]) -> tuple[float, float] | None:
-    """Return the range of the central 95 % of loads, if a logarithmic axis can show it."""
+    """Return the central 95 % range of the loads' errors [mm]; None if a logarithmic axis cannot show the range."""
     low, high = np.percentile(load_mm, [2.5, 97.5]).tolist() if load_mm else (0.0, 0.0)
     return (low, high) if low > 0.0 else None
 
 
 def _describe(row: ReportRow) -> str:
-    """Describe a row in one line, for its dot."""
+    """Describe a row in one line: errors, times and command."""
     assert row.reference is not None
     error = f"mean {format_number(row.reference.mm.mean)} mm ({format_number(row.reference.percent.mean)} %)"
     loads = (
@@ -180,7 +180,7 @@ CHARTS = {
 
 
 def format_number(value: float | None) -> str:
-    """Format a number with three digits."""
+    """Format a number with three significant digits; None: an empty string."""
     if value is None:
         return ""
     return "< 0.0001" if 0.0 < value < 1e-4 else f"{value:.0f}" if value >= 100.0 else f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""Rows of finite elements and of other families: each test load alone, from rest."""
+"""Rows of FEM variants and model families: each test load is solved alone, from the undeformed configuration."""
 
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -44,15 +44,15 @@ KINDS = {
     **dict.fromkeys(("mass-spring", "xpbd"), SPRINGS),
     **dict.fromkeys(("boundary-elements", "condensed", "explicit", "element-free"), MECHANICS),
 }
-"""Kind of each family, which has one colour in a plot."""
+"""Kind of each model family; a plot has one colour for each kind."""
 
 
 @dataclass(frozen=True)
 class FemVariant:
-    """FEM variant; None means the value of the data set.
+    """Variant of the FEM model; None for law or element means the value of the data set.
 
-    `mesh`: `OWN_MESH`, `HALVED_MESH` (every edge), or the number of nodes of the template. Default precision: single,
-    or double for tolerances that single precision cannot reach. Default device: that of the study.
+    `mesh` is `OWN_MESH`, `HALVED_MESH` (every edge is halved), or the number of nodes of a template mesh. The default
+    precision is single, or double if single precision cannot reach the tolerance; the default device is the study's.
     """
 
     name: str
@@ -72,18 +72,18 @@ class FemVariant:
 
 @dataclass(frozen=True)
 class FamilySpec:
-    """Family of `FAMILIES`, on the mesh of the data set."""
+    """Model family of `FAMILIES`, on the mesh of the data set."""
 
     name: str
 
 
 def measure_elements(study: ReportStudy, spec: FemVariant) -> ReportRow:
-    """Measure the row of a FEM variant.
+    """Measure errors and times of an FEM variant, as a row of the report.
 
     Raises
     ------
     InputError
-        Input that `Fem` rejects; a law that the data's tissue has no constants for.
+        Input that `Fem` rejects, or a law for which the data set's tissue has no constants.
     """
     body = find_body(study, spec.mesh)
     fem, set_up = time_work(_build_fem, study, spec, body)
@@ -104,12 +104,12 @@ def measure_elements(study: ReportStudy, spec: FemVariant) -> ReportRow:
 
 
 def measure_family(study: ReportStudy, spec: FamilySpec) -> ReportRow:
-    """Measure the row of a family.
+    """Measure errors and times of a model family, as a row of the report.
 
     Raises
     ------
     InputError
-        Tissue or anatomy that the family rejects.
+        The family rejects the tissue or the anatomy.
     """
 
     def build(body: Anatomy) -> Deformer:
@@ -124,7 +124,7 @@ def measure_family(study: ReportStudy, spec: FamilySpec) -> ReportRow:
 
 
 def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: Loads) -> ReportRow:
-    """Return the row with errors and times of the loads, one by one."""
+    """Return `row` with the errors and times of `model`, which solves the loads one by one, then in a batch."""
     own, drawn = study.anatomy, study.read_nodes
     same = model.anatomy is own
     located = None if same else locate(model.anatomy.mesh, own.mesh.nodes[drawn])
@@ -160,7 +160,7 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
 
 
 def _build_fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
-    """Build FEM for single loads."""
+    """Build the FEM solver of a variant for single loads on `body`."""
     effects = build_push_effects(body, change_law(study.get_tissue_on(body), spec.law))
     return Fem(
         body, effects, spec.accuracy, spec.device or study.device, None, spec.element or study.element, live=True
@@ -168,7 +168,7 @@ def _build_fem(study: ReportStudy, spec: FemVariant, body: Anatomy) -> Fem:
 
 
 def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
-    """Describe the kind of difference from the reference."""
+    """Return the kind of difference from the reference: `ERROR`, `DIFFERENCE` or `TOLERANCE_ALONE`."""
     if change_law(study.tissue, spec.law) != study.tissue:
         return DIFFERENCE
     same = (spec.element or study.element) == study.reference_element and spec.mesh == (
@@ -178,7 +178,7 @@ def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
 
 
 def find_body(study: ReportStudy, mesh: str) -> Anatomy:
-    """Return the body on a mesh by name; meshes of the template are built once and cached."""
+    """Return the anatomy on the mesh `mesh` of a `FemVariant`; template meshes are built once and stored."""
     if mesh == OWN_MESH:
         return study.anatomy
     if mesh == HALVED_MESH:
@@ -187,29 +187,29 @@ def find_body(study: ReportStudy, mesh: str) -> Anatomy:
 
 
 def build_template_mesh(folder: Path, size: int) -> Path:
-    """Return the template's brain of about `size` nodes; build the mesh if it does not exist."""
+    """Return the path of a template mesh of about `size` nodes; build the mesh if the file does not exist."""
     return build_mesh_once(folder / f"template_{size}.vtu", Tumour(), MeshPlan(size))
 
 
 def build_mesh_once(path: Path, tumour: Tumour, plan: MeshPlan) -> Path:
-    """Return the path of a mesh of the template's brain with a tumour; build it if it does not exist."""
+    """Return `path` of a template mesh with a tumour; build the mesh if the file does not exist."""
     if not path.exists():
         write_anatomy(path, make_anatomy(build_template_subject(tumour), plan))
     return path
 
 
 def get_law_name(tissue: Elasticity) -> str | None:
-    """Return the name of the brain's law."""
+    """Return the name of the brain's material law; None if the tissue has no default law."""
     return None if tissue.default is None else tissue.default.law
 
 
 def change_law(tissue: Elasticity, law: str | None) -> Elasticity:
-    """Return the tissue with another law and unchanged constants, in all regions.
+    """Return the tissue with another material law and unchanged constants in all regions (None: the same tissue).
 
     Raises
     ------
     InputError
-        A tissue whose constants are not E and nu.
+        The constants of a tissue are not E and nu.
     """
     if law is None:
         return tissue
@@ -224,7 +224,7 @@ def change_law(tissue: Elasticity, law: str | None) -> Elasticity:
 
 
 def move_pushes_onto(body: Anatomy, loads: Loads) -> Loads:
-    """Return the pushes moved to the nearest points of another mesh's open cortex."""
+    """Return the loads with each push moved to the nearest point of the open cortex of `body`."""
     (pushed,) = loads.get_all(Pushed)
     corners = body.mesh.nodes[body.open_surface]
     return Loads(

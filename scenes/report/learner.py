@@ -1,4 +1,4 @@
-"""Row of a learner: trained without the discs, without the sectors, and with decreasing numbers of loads."""
+"""Row of a trained model: training without held-out discs, without held-out sectors, and with fewer loads."""
 
 from dataclasses import dataclass, replace
 
@@ -22,13 +22,13 @@ MIN_LOADS = 64  # Smallest number of training loads of a learning curve.
 
 @dataclass(frozen=True)
 class LearnerSpec:
-    """Learner of `train.LEARNERS`."""
+    """Model type of `train.LEARNERS`."""
 
     name: str
 
 
 def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
-    """Measure the row of a learner.
+    """Train a model of this type, and measure errors, coverage and times as a row of the report.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
     nodes, truth = study.anatomy.tumour_nodes, study.data_displacement
 
     def judged(model: Deformer, split: DiscSplit) -> tuple[ErrorFigures | None, float]:
-        """Return the errors relative to the data's own solutions of held-out loads."""
+        """Return errors relative to the data set's solutions of the held-out loads, and the extrapolated share."""
         rows = np.flatnonzero(split.test_mask)
         return _compute_errors(model, study.converged.select(rows), truth[rows], nodes)
 
@@ -95,7 +95,7 @@ def list_counts(max_loads: int) -> list[int]:
 def compute_coverage_beyond(
     study: ReportStudy, spec: LearnerSpec, outside: Loads, reference: np.ndarray
 ) -> dict[str, float]:
-    """Return the coverage of the 95 % bounds outside their guarantee, from FEM solutions (B, n, 3) [m] of `outside`."""
+    """Return the coverage of 95 % bounds on held-out discs and on loads `outside` (FEM: `reference` (B, n, 3) [m])."""
     trained = train(study.dataset, [spec.name], expansion=study.expansion)
     model, found = trained.models[spec.name], trained.held_out_coverage.get(spec.name)
     shares = {} if found is None else {"discs": found.shares[0]}
@@ -105,7 +105,7 @@ def compute_coverage_beyond(
 
 
 def _measure_adaptation(study: ReportStudy, spec: LearnerSpec) -> tuple[float | None, ErrorFigures | None]:
-    """Return the seconds of simulation and training on the debulked body, and errors there; None without simulation."""
+    """Return the adaptation time [s] to the debulked anatomy, and the errors there; both None without simulation."""
     seconds = read_simulation_seconds(study)
     if seconds is None:
         return None, None
@@ -119,7 +119,7 @@ def _measure_adaptation(study: ReportStudy, spec: LearnerSpec) -> tuple[float | 
 
 
 def _train_model(study: ReportStudy, spec: LearnerSpec, split: DiscSplit) -> tuple[Deformer, SolveCounts]:
-    """Train a model on the training loads of a split; also return the numbers of solves used."""
+    """Train a model on the training loads of a split; return the model and the numbers of FEM solves used."""
     trained = train(study.dataset, [spec.name], split=split, expansion=study.expansion)
     solves = trained.scores[0].solves
     assert solves is not None
@@ -129,7 +129,7 @@ def _train_model(study: ReportStudy, spec: LearnerSpec, split: DiscSplit) -> tup
 def _compute_errors(
     model: Deformer, loads: Loads, truth: np.ndarray, nodes: np.ndarray
 ) -> tuple[ErrorFigures | None, float]:
-    """Compute errors against `truth` (B, k, 3) [m], and the share of loads that the model marks as extrapolated."""
+    """Compute errors relative to `truth` (B, k, 3) [m], and the share of loads that the model marks as extrapolated."""
     result = model.deform(loads, at=nodes)
     flagged = [outcome is Outcome.EXTRAPOLATED for outcome in result.outcome]
     return compute_figures(result.displacement, truth, loads), float(np.mean(flagged)) if flagged else 0.0

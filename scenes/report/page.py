@@ -1,4 +1,4 @@
-"""The report as files: a page that needs nothing else, plots, a table for spreadsheets, and every number as JSON."""
+"""Files of the report: a self-contained HTML page, plots, tables (CSV), and all numbers as JSON."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -45,7 +45,7 @@ NOTES = (  # Paragraphs below the tables.
 
 @dataclass(frozen=True)
 class Section:
-    """Rows of one data set, sentences about data and reference, digest of the anatomy, tissue, and scene effects."""
+    """Section of the report for one data set: rows, sentences about data and reference, and effect records."""
 
     name: str
     about: tuple[str, ...]
@@ -56,7 +56,7 @@ class Section:
 
 
 def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> None:
-    """Write `index.html`, `report.json`, and for each section `NAME.csv` and its plots, each atomically."""
+    """Write `index.html`, `report.json`, and for each section `NAME.csv` and plots, each file atomically."""
     bodies = []
     for section in sections:
         plots = []
@@ -94,7 +94,7 @@ SUMMARY_HEADS = (
 
 
 def _format_summary(rows: Sequence[ReportRow]) -> str:
-    """Return one line for each model: accuracy, time, preparation, adaptability, memory, outcomes."""
+    """Format the summary table (HTML): errors, times, memory and outcomes of each model; empty without rows."""
     best = find_front(rows)
     lines = []
     for row in rows:
@@ -111,7 +111,7 @@ def _format_summary(rows: Sequence[ReportRow]) -> str:
 
 
 def _format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
-    """Format a table from lines, each with a class and cells."""
+    """Format an HTML table from column titles and lines, each a CSS class and its cells."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(
         f'<tr class="{kind}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>' for kind, cells in lines
@@ -120,7 +120,7 @@ def _format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]
 
 
 def _flatten(value: Any, name: str = "") -> Iterable[tuple[str, Any]]:
-    """Flatten nested numbers and texts to dotted names, as in reference.mm.mean."""
+    """Yield the values in nested dicts and lists with dotted names, such as reference.mm.mean."""
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else None
     if inside is None:
         yield name, value

@@ -1,4 +1,4 @@
-"""Error of a model whose tool is moved as in the reference, with whatever force its tissue requires for that."""
+"""Error of a model whose tool moves as in the reference; the force is adjusted to obtain this motion."""
 
 from collections.abc import Callable
 
@@ -18,10 +18,10 @@ MAX_STEP_RATIO = 0.5  # Maximum change of a force in an iteration, relative to t
 
 
 def measure_pose_error(study: ReportStudy, solve: Solve) -> ErrorFigures | None:
-    """Compute errors at the tumour where every footprint's mean motion is that of the reference.
+    """Compute errors at the tumour if each footprint's mean motion equals that in the reference.
 
-    None without a converged load. `solve` returns displacements (n, m, 3) [m] at `study.read_nodes` of test loads (n,)
-    by number, under forces (n, 3) [N].
+    Returns None if no load converges. `solve(rows, force)` returns displacements (n, m, 3) [m] at `study.read_nodes`
+    for the test loads with numbers `rows` (n,) under forces (n, 3) [N].
     """
     truth, mesh, (pushed,) = get_reference(study), study.anatomy.mesh, study.test_loads.get_all(Pushed)
     weights = compute_footprint_weights(mesh.nodes, mesh.surface, pushed.point, pushed.footprint)[:, study.read_nodes]
@@ -33,16 +33,16 @@ def measure_pose_error(study: ReportStudy, solve: Solve) -> ErrorFigures | None:
 
 
 def compute_motion(weights: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Compute the mean motion (n, 3) [m] of footprints with weights (n, m) in displacements (n, m, 3) [m]."""
+    """Compute the mean displacement (n, 3) [m] of footprints with weights (n, m), from displacements (n, m, 3) [m]."""
     return np.einsum("nm,nmi->ni", weights, field)
 
 
 def find_field_of_motion(
     solve: Solve, force: np.ndarray, target: np.ndarray, weights: np.ndarray, good: np.ndarray
 ) -> np.ndarray:
-    """Find displacements (n, m, 3) [m] in which footprints move by `target` (n, 3) [m], starting from `force` (n, 3).
+    """Find displacements (n, m, 3) [m] in which footprints with `weights` (n, m) move by `target` (n, 3) [m].
 
-    Broyden's "good" method (Broyden 1965) for each load's force. `good` (n,) becomes False where it does not converge.
+    Broyden's "good" method (Broyden 1965) from each `force` (n, 3). `good` (n,): solved loads; False if not converged.
     """
     force, rows = force.copy(), np.flatnonzero(good)
     field = np.zeros((*weights.shape, 3))

@@ -1,4 +1,4 @@
-"""Reference of the rows: reference solutions, stored load by load, and FEM solutions beyond the data."""
+"""Reference solutions for the rows, stored load by load, and FEM solutions beyond the training range."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ BATCH_LOADS = 16  # Number of loads solved together where a batch is faster: an 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSolutions:
-    """Solutions of n loads: displacement (n, k, 3) [m]; good (n,) bool, which converged.
+    """Solutions of n loads: displacements (n, k, 3) [m], and `good` (n,) bool, True for converged loads.
 
     `seconds` (n,): duration of each solve [s].
     """
@@ -35,9 +35,9 @@ class ReferenceSolutions:
 
 
 def solve_reference(study: ReportStudy, progress: Callable[[int], object], accuracy: Accuracy = REFERENCE) -> None:
-    """Solve the compared loads with the reference's element, and store each at `study.read_nodes`.
+    """Solve the test loads with the reference's element type, and store each solution at `study.read_nodes`.
 
-    `progress` receives the number of newly solved loads. Stored solutions are not solved again.
+    `progress` receives the number of newly available loads. Loads with a stored solution are not solved again.
     """
 
     def made() -> tuple[Fem, LocatedPoints]:
@@ -56,7 +56,7 @@ def solve_reference(study: ReportStudy, progress: Callable[[int], object], accur
 
 
 def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
-    """Solve the loads beyond the training range like the data's own loads, and store each at the tumour."""
+    """Solve the loads beyond the training range with the data set's FEM model; store each solution at the tumour."""
 
     def made() -> tuple[Fem, LocatedPoints]:
         body = study.anatomy
@@ -67,12 +67,12 @@ def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
 
 
 def get_reference(study: ReportStudy) -> ReferenceSolutions:
-    """Read the solutions of `solve_reference`."""
+    """Read the stored solutions of `solve_reference`, at `study.read_nodes`."""
     return _read(study, "reference", len(study.test_loads))
 
 
 def get_solutions_beyond(study: ReportStudy) -> ReferenceSolutions:
-    """Read the solutions of `solve_beyond`."""
+    """Read the stored solutions of `solve_beyond`, at the tumour's vertices."""
     return _read(study, "beyond", len(study.loads_beyond))
 
 

@@ -1,4 +1,4 @@
-"""Row of the report: errors, milliseconds, memory, and cost of preparation."""
+"""Row of the report: errors, computation times, memory, and preparation time of one model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ MIN_LOADS_FOR_P99 = 1000  # Minimum number of loads for a 99th percentile.
 
 @dataclass(frozen=True)
 class ErrorSpread:
-    """Mean, 95 and 99.9 percentile, and maximum of distances over load x vertex; no 99.9 percentile for few loads."""
+    """Mean, 95th and 99.9th percentile and maximum of distances over loads x vertices; `p999`: None for few values."""
 
     mean: float
     p95: float
@@ -31,7 +31,7 @@ class ErrorSpread:
 
 @dataclass(frozen=True)
 class ForceDecile:
-    """A tenth of the loads by force [N]: mean and largest distance [mm], and the mean in % of the motion."""
+    """Decile of the loads by force [N]: range of forces, mean and maximum distance [mm], mean in % of the motion."""
 
     least: float
     greatest: float
@@ -42,9 +42,9 @@ class ForceDecile:
 
 @dataclass(frozen=True)
 class ErrorFigures:
-    """Distances between solutions: number of loads and values, in mm and in % of each load's motion, by force.
+    """Distances between two sets of solutions: numbers of loads and values, mean motion [mm], and statistics.
 
-    `worst` is of each load's worst vertex, over the loads [mm].
+    `mm` and `percent` (of a load's motion) are over all values, `worst` [mm] over the loads' maxima, `tenths` by force.
     """
 
     loads: int
@@ -57,9 +57,9 @@ class ErrorFigures:
 
 
 def compute_distance_figures(distance: np.ndarray, reference: np.ndarray, force: np.ndarray) -> ErrorFigures | None:
-    """Compute errors from distances (B, n) [m] to a `reference` (B, n, 3) [m] and forces (B,) [N]; None without loads.
+    """Compute statistics of distances (B, n) [m] from a `reference` (B, n, 3) [m], by `force` (B,) [N].
 
-    A load's motion is the mean displacement of its n vertices in `reference`.
+    Returns None without loads. A load's motion is the mean displacement of its n vertices in `reference`.
     """
     if not len(distance):
         return None
@@ -82,7 +82,7 @@ def compute_distance_figures(distance: np.ndarray, reference: np.ndarray, force:
 
 
 def compute_figures(result: np.ndarray, reference: np.ndarray, loads: Loads) -> ErrorFigures | None:
-    """Compute the errors of `result` (B, n, 3) [m] against `reference` (B, n, 3) [m] under pushes."""
+    """Compute the errors of `result` (B, n, 3) [m] relative to `reference` (B, n, 3) [m] for loads that are pushes."""
     (pushed,) = loads.get_all(Pushed)
     return compute_distance_figures(np.linalg.norm(result - reference, axis=2), reference, split_forces(pushed)[0])
 
@@ -90,7 +90,7 @@ def compute_figures(result: np.ndarray, reference: np.ndarray, loads: Loads) -> 
 def compare_with_reference(
     study: ReportStudy, result: np.ndarray, good: np.ndarray, nodes: np.ndarray
 ) -> ErrorFigures | None:
-    """Compute the errors of solutions (n, k, 3) [m] at vertices (k,) of the test loads where both are `good` (n,)."""
+    """Compute errors of `result` (n, k, 3) [m] at vertices `nodes` (k,), for test loads with both solutions good."""
     truth = get_reference(study)
     rows = np.flatnonzero(good & truth.good)
     known = np.isin(study.read_nodes, nodes)
@@ -98,9 +98,9 @@ def compare_with_reference(
 
 
 def compute_load_errors(study: ReportStudy, result: np.ndarray, good: np.ndarray, nodes: np.ndarray) -> dict[str, Any]:
-    """Compute the mean distance of each test load from the reference [mm] at vertices `nodes` (k,), in two parts.
+    """Compute each test load's mean distance from the reference [mm]: `load_mm` (tumour), `cortex_mm` (open cortex).
 
-    `load_mm`: at the tumour; `cortex_mm`: at the open cortex, empty if `nodes` lacks it. As `compare_with_reference`.
+    A part is empty if `nodes` (k,) does not contain its vertices. For the arguments see `compare_with_reference`.
     """
     truth = get_reference(study)
     rows = np.flatnonzero(good & truth.good)
@@ -116,7 +116,7 @@ def compute_load_errors(study: ReportStudy, result: np.ndarray, good: np.ndarray
 
 
 def summarise_times(seconds: Sequence[float]) -> dict[str, Any]:
-    """Summarise the wall times of single loads [s]."""
+    """Return fields of a `ReportRow` in milliseconds from the wall times of single loads [s]."""
     ms = 1e3 * np.array(seconds)
     p99 = float(np.percentile(ms, 99.0)) if len(ms) >= MIN_LOADS_FOR_P99 else None
     low, high = np.percentile(ms, [2.5, 97.5]).tolist()
@@ -125,58 +125,58 @@ def summarise_times(seconds: Sequence[float]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class ReportRow:
-    """Measurements of one deformation model; None where nothing was measured.
+    """Measurements of one deformation model; a value is None if it was not measured.
 
     Parameters
     ----------
     name, family
         Name and family of the deformation model.
     state
-        "measured", or the reason why not.
+        "measured", or the reason why the model was not measured.
     against
         `ERROR`; `DIFFERENCE` for another law; `TOLERANCE_ALONE` for the reference's own elements.
     reference
-        Distances from the reference on the compared loads.
+        Distances from the reference on the test loads.
     own_fem
-        Distances from the FEM that it was trained on, by set of loads: "discs", "sectors", "beyond".
+        Distances from the FEM model of the training data, by set of loads: "discs", "sectors", "beyond".
     flagged
-        Share of each set that it marks as extrapolated.
+        Share of loads that the model marks as extrapolated, by set of loads.
     covered
-        Share of the loads of "discs" and "beyond" whose largest error is within the bound at 0.95.
+        Share of the loads in "discs" and in "beyond" whose maximum error is within the 95 % bound.
     load_mm, cortex_mm
-        Mean distance from the reference of each compared load [mm], at the tumour and at the open cortex.
+        Mean distance from the reference of each test load [mm], at the tumour and at the open cortex.
     pose
-        Distances from the reference where the tool is moved as there, instead of pushed with the same force.
+        Distances from the reference if the tool moves as in the reference, instead of pushing with the same force.
     failed
-        Test loads without a solution; they are excluded from all figures.
+        Number of test loads without a solution, which are excluded from all figures.
     outcomes
         Numbers of test loads by the name of their `Outcome`.
     median, p99, central_ms
-        Time per load [ms], one at a time; p99 only for at least 1,000; range of the central 95 %.
+        Time per load [ms], solved one at a time: median, 99th percentile (None below 1,000 loads), central 95 %.
     batch_ms
-        Time per load [ms] where all compared loads are solved together.
+        Time per load [ms] if all test loads are solved in one batch.
     bare
-        Time per load [ms] of the trained model alone in NumPy: no bound, no limits, same kind of code for all.
+        Time per load [ms] of the trained model alone in NumPy, without error bound and without range checks.
     timed
         Number of timed loads.
     set_up
-        Time before the first load [s].
+        Set-up time before the first load [s].
     memory, card
-        Peak memory of its process, and of the GPU [GiB].
+        Peak memory [GiB] of the measuring process, and of the GPU.
     loads, units, series
-        Numbers of FEM solves used: loads, unit responses of the open cortex, terms of the power series.
+        Numbers of FEM solves for training: loads, unit responses of the open cortex, terms of the power series.
     inside
-        Number of those for the tumour inside held-out discs.
+        Number of unit responses for the tumour at nodes inside held-out discs.
     solving
-        Duration of all these solves [s], if recorded.
+        Duration of all FEM solves for training [s]; None if not recorded.
     learning
         Duration of training [s], without the solves.
     adapt
-        Time [s] to adapt to a tumour debulked by a fifth: set-up, or solves and fitting, again.
+        Time [s] to adapt to an anatomy with a fifth of the tumour resected: new set-up, or new solves and training.
     adapted
-        Distances from FEM of the debulked body after that, on held-out discs; None for FEM.
+        Distances of the adapted model from FEM of the debulked anatomy, on held-out discs; None for FEM.
     curve
-        Distances from the FEM that it was trained on, on the discs, by number of training loads.
+        Distances from the FEM model of the training data, on held-out discs, by number of training loads.
     plan
         Description of the solvers that FEM tries for a load.
     command
@@ -219,14 +219,14 @@ class ReportRow:
 
     @property
     def preparation(self) -> float | None:
-        """Time before the first load [s], if known: set-up, or solves and training."""
+        """Time before the first load [s]: set-up, or solves and training; None if not recorded."""
         if self.learning is None:
             return self.set_up
         return None if self.solving is None else self.learning + self.solving
 
 
 def describe_reference_error(fine: bool, rows: Sequence[ReportRow]) -> str:
-    """Describe the error of the reference itself, from the row of its element on the mesh with edges twice as long."""
+    """Describe the error of the reference, from the row "FEM p2" on the mesh with edges twice as long."""
     coarse = next((row.reference for row in rows if row.name == "FEM p2"), None)
     if not fine or coarse is None:
         return (

@@ -1,4 +1,4 @@
-"""Rows of the report, each measured in its own process, by a resumable run."""
+"""Measurement of the report's rows, each in its own process; measured rows are stored, and a run can be resumed."""
 
 import json
 import os
@@ -45,11 +45,11 @@ from .study import ReportStudy
 
 Spec = FemVariant | FamilySpec | LearnerSpec
 FAMILY_NAMES = {FemVariant: "finite elements", FamilySpec: "other families", LearnerSpec: "trained models"}
-"""Names of kinds of rows by type."""
+"""Names of the kinds of rows, by type of specification."""
 
 
 def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
-    """Import all modules that rows need, and start Warp silently; on a GPU also PyTorch."""
+    """Import all modules that the measurement of rows needs, and start Warp silently; return the study."""
     find_device("auto", "float32")
     if study.on_card:
         import_module("torch")
@@ -59,7 +59,7 @@ def prepare_rows(device: str, study: ReportStudy) -> ReportStudy:
 def measure_row(study: ReportStudy, spec: Spec) -> ReportRow:
     """Measure the row of a deformation model.
 
-    `ReportRow.state` gives the reason for a missing one.
+    If the model cannot be measured, the row contains only its name, and the reason as `ReportRow.state`.
     """
     try:
         if not isinstance(spec, LearnerSpec):
@@ -75,7 +75,7 @@ def measure_row(study: ReportStudy, spec: Spec) -> ReportRow:
 
 
 def _measure_on_one_core(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
-    """Measure a learner on one core: small products take longer, and times vary more, on several."""
+    """Measure a trained model on one core: on several cores, small products take longer and times vary more."""
     with limit_to_one_thread():
         return measure_learner(study, spec)
 
@@ -88,9 +88,9 @@ CORES = 4  # Number of CPU cores per measured learner, which uses one; the other
 
 
 def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
-    """List the FEM variant of the data set, and variants that differ in one factor; also in the mesh if `remesh`.
+    """List the FEM variant of the data set, and the variants that differ from it in one factor.
 
-    The reference itself is left out: it would show only its tolerance.
+    The factor may be the mesh if `remesh`. The reference's element is excluded: it would show only its tolerance.
     """
     known = (study.element, "" if study.fine else study.reference_element)
     meshes = {} if not remesh else MESHES if study.is_shipped else {"halved edges": HALVED_MESH}
@@ -123,17 +123,17 @@ def list_all_combinations(study: ReportStudy) -> tuple[FemVariant, ...]:
 
 
 def list_family_specs() -> tuple[FamilySpec, ...]:
-    """List a specification for each of `FAMILIES`."""
+    """List a specification for each model family of `FAMILIES`."""
     return tuple(FamilySpec(name) for name in FAMILIES)
 
 
 def list_learner_specs(series: bool = True) -> tuple[LearnerSpec, ...]:
-    """List a specification for each learner of `surrogate`, those of the power series only if `series`."""
+    """List a specification for each model type of `surrogate`; power-series models are included only if `series`."""
     return tuple(LearnerSpec(name) for name in LEARNERS if series or name not in SERIES_MODELS)
 
 
 def measure_in_process(slot: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
-    """Measure a row in its own process, which starts immediately and measures once it enters `slot`."""
+    """Measure a row in its own process, which starts immediately, and begins to measure when `slot` is free."""
     try:
         # Data that the study has already read are not copied to the process.
         with process_pool(["cpu"], prepare_rows, replace(study)) as children, slot:
@@ -143,12 +143,12 @@ def measure_in_process(slot: AbstractContextManager[object], study: ReportStudy,
 
 
 def measure_on_worker(study: ReportStudy, spec: Spec) -> ReportRow:
-    """Measure a row on a Dask worker, or read its file; without peak memory, which is of all rows of the worker.
+    """Measure a row on a Dask worker, or read its file. `memory` is None: one worker process measures several rows.
 
     Raises
     ------
     InputError
-        A worker that does not see the study's files.
+        The worker cannot read the study's files.
     """
     if not study.data.is_file():
         raise InputError(f"a worker does not see {study.data}: put it in a folder that all machines share.")
@@ -156,12 +156,12 @@ def measure_on_worker(study: ReportStudy, spec: Spec) -> ReportRow:
 
 
 def measure_on_workers(study: ReportStudy, specs: Sequence[Spec], address: str) -> Iterator[ReportRow]:
-    """Yield a row for each of the `specs` as `measure_rows`, measured by the workers of a Dask scheduler.
+    """Yield a row for each of the `specs`, measured by the workers of the Dask scheduler at `address`.
 
     Raises
     ------
     InputError
-        A scheduler that cannot be reached, or that ends; see `measure_on_worker`.
+        The scheduler cannot be reached or ends; see also `measure_on_worker`.
     """
     from distributed.scheduler import KilledWorker
 
@@ -188,10 +188,10 @@ def measure_rows(
 ) -> Iterator[ReportRow]:
     """Yield a row for each of the `specs`; rows with unchanged inputs are read from files.
 
-    Measured rows are stored immediately. By default each has its own process. FEM rows are measured one by
-    one; of trained models one for every `CORES` CPU cores. On a GPU, where FEM takes one of
-    those, trained models are measured at the same time. Rows that `run` measures in this process are measured one by
-    one, unless `cores` is given.
+    Measured rows are stored immediately. By default each row has its own process. FEM rows are measured one at a
+    time; trained models are measured in parallel, one for every `CORES` CPU cores. With FEM on a GPU, FEM takes
+    one of these places, and trained models are measured at the same time. If `run` measures rows in this process,
+    they are measured one at a time unless `cores` is given.
     """
     cores = cores or (1 if run else os.cpu_count() or 1)
     beside = cores >= 2 * CORES and (study.on_card if on_card is None else on_card)
@@ -215,7 +215,7 @@ def measure_rows(
 
 
 def _run_ahead(work: Callable[[Spec], ReportRow], specs: Sequence[Spec], ahead: int) -> Iterator[ReportRow]:
-    """Yield the rows in order, while further ones run ahead. After a stop, no other row begins."""
+    """Yield the rows in order, while up to `ahead` further rows are measured. After a stop, no further row begins."""
     waiting: deque[Future[ReportRow]] = deque()
     with ThreadPoolExecutor(ahead + 1) as threads:
         try:
@@ -244,7 +244,7 @@ def _get_row(study: ReportStudy, run: Run, spec: Spec) -> ReportRow:
 
 
 def _format_power(tolerance: float) -> str:
-    """Format a tolerance, for example 0.01 as 1e-2."""
+    """Format a tolerance as a power of ten, for example 0.01 as 1e-2."""
     return f"{tolerance:.0e}".replace("e-0", "e-")
 
 
@@ -254,7 +254,7 @@ def _compute_row_digest(study: ReportStudy, spec: Spec) -> str:
 
 
 def _read_kept_row(path: Path, digest: str) -> ReportRow | None:
-    """Read the row in a file; None if it is missing, incomplete, or of other inputs."""
+    """Read the row in a file; None if the file is missing or invalid, or if the row has other inputs."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8-sig"))
         return msgspec.convert(stored["row"], ReportRow) if stored["digest"] == digest else None

@@ -1,4 +1,4 @@
-"""Bodies and loads of the protocol of Tonutti, Gras, Yang 2017: their own mesh, read from a file, and the template."""
+"""Meshes and loads of the protocol of Tonutti, Gras, Yang 2017: the authors' mesh from a file, or the template."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,17 +33,17 @@ SEED_ARRAYS = {
     "held": ("iu", 1),
     "force_nodes": ("iu", 1),
 }
-"""Required arrays of a mesh file: kinds of NumPy types, and dimensions."""
+"""Required arrays of a mesh file: allowed kinds of NumPy types, and number of dimensions, by name."""
 REMEDY = "Give an .npz file with nodes_mm (V, 3), tets (T, 4), region (T,), held (h,) and force_nodes (p,)."
 
 
 def read_seed_mesh(path: Path, count: int) -> tuple[Anatomy, Loads]:
-    """Read the authors' mesh and build at most `count` loads at its `force_nodes`; the free surface is the craniotomy.
+    """Read the authors' mesh, and build at most `count` loads at its `force_nodes`; its free surface is open cortex.
 
     Raises
     ------
     InputError
-        A file that cannot be read, arrays that are missing or do not belong together, a mesh that `TetMesh` rejects.
+        The file cannot be read, arrays are missing or inconsistent, or `TetMesh` rejects the mesh.
     """
     with wrap_errors(path, "a mesh of the seed's protocol", REMEDY), path.open("rb") as file:
         arrays = Archive(file, REMEDY, MAX_SEED_BYTES).read_arrays(SEED_ARRAYS)
@@ -70,7 +70,7 @@ def read_seed_mesh(path: Path, count: int) -> tuple[Anatomy, Loads]:
 
 
 def make_seed_template(folder: Path, count: int) -> tuple[Anatomy, Loads]:
-    """Return the template's brain like the authors', kept in `folder`, and at most `count` of the published loads."""
+    """Return a template anatomy similar to the authors', stored in `folder`, and at most `count` published loads."""
     plan = MeshPlan(craniotomy=SEED_CRANIOTOMY)
     body = read_anatomy(build_mesh_once(folder / "meshes" / "seed_template.vtu", SEED_TUMOUR, plan))
     return body, draw("seed", body, count, 0)

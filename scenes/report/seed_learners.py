@@ -1,4 +1,4 @@
-"""Learners of the published experiment: a regressor for each tenth vertex of the tumour, from 13 features.
+"""Models of the published experiment: a regressor from 13 features for every tenth vertex of the tumour.
 
 Tonutti, Gras, Yang 2017, "A machine learning approach for real-time modelling of tissue deformation in image-guided
 neurosurgery", Artif. Intell. Med. 80:39-47. Substitutes: `BayesianNetwork` for MATLAB's `trainbr`; `Svr` for its
@@ -24,22 +24,22 @@ from .seed_network import BayesianNetwork
 
 VertexRegressor = BayesianNetwork | Svr
 PUBLISHED: dict[str, Callable[[], VertexRegressor]] = {"published-ann": BayesianNetwork, "published-svr": Svr}
-"""Published regressors by name."""
+"""Functions that build the published regressors, by name."""
 VERTEX_STRIDE = 10  # One of this many tumour vertices has a model, as in the authors' animation: all take hours.
 
 
 @dataclass(frozen=True, eq=False)
 class VertexModels:
-    """Regressors of some tumour vertices, from features of a load to magnitude and direction angles.
+    """Regressors for k tumour vertices, from features of a load to magnitude and direction angles of displacement.
 
     Parameters
     ----------
     sites
-        Vertices (k, 3) [m].
-    centroid
-        Mean of all vertices (3,) [m].
-    regressors
-        k regressors.
+        Undeformed positions (k, 3) [m] of the vertices.
+        centroid
+            Mean (3,) [m] of all mesh vertices.
+        regressors
+            Regressor of each vertex.
     """
 
     sites: np.ndarray
@@ -47,22 +47,22 @@ class VertexModels:
     regressors: tuple[VertexRegressor, ...]
 
     def predict(self, pushed: Pushed) -> np.ndarray:
-        """Predict the displacements (B, k, 3) [m] under B pushes."""
+        """Predict the displacements (B, k, 3) [m] of the vertices under B pushes."""
         features = compute_features(self.sites, self.centroid, pushed)
         angular = [one.predict(X) for one, X in zip(self.regressors, features, strict=True)]
         return convert_from_angles(np.stack(angular, axis=1).astype(np.float64))
 
 
 def select_vertices(anatomy: Anatomy) -> np.ndarray:
-    """Return every tenth vertex (k,) of the tumour."""
+    """Return every tenth vertex (k,) of the tumour, as mesh vertex numbers."""
     return anatomy.tumour_nodes[::VERTEX_STRIDE]
 
 
 def compute_features(sites: np.ndarray, centroid: np.ndarray, pushed: Pushed) -> np.ndarray:
     """Compute the published features (k, B, 13) of B pushes for vertices `sites` (k, 3) [m].
 
-    Force [N] (3), its direction angles [rad] (3), distance from point to vertex and to `centroid` (3,) [m]; the angle
-    [rad] between the force and the line to the vertex; axis (3) and angle [rad] of the rotation from one to the other.
+    Features: force (3) [N], direction angles of the force (3) [rad], distances from the loaded point to the vertex and
+    to `centroid` (3,) [m], angle between force and line to the vertex [rad], axis (3) and angle [rad] of this rotation.
     """
     direction = split_forces(pushed)[1]
     line = sites[:, None] - pushed.point
@@ -86,12 +86,12 @@ def convert_to_angles(displacement: np.ndarray) -> np.ndarray:
 
 
 def convert_from_angles(angular: np.ndarray) -> np.ndarray:
-    """Convert to displacements (..., 3) [m]; angles that belong to no direction are not corrected."""
+    """Convert magnitude [m] and direction angles [rad] (..., 4) to displacements (..., 3) [m], without correction."""
     return angular[..., :1] * np.cos(angular[..., 1:])
 
 
 def fit_vertex_models(name: str, anatomy: Anatomy, pushed: Pushed, displacement: np.ndarray) -> VertexModels:
-    """Fit one of `PUBLISHED` to displacements (B, k, 3) [m] of `select_vertices` under B pushes."""
+    """Fit the regressor `name` of `PUBLISHED` to displacements (B, k, 3) [m] of `select_vertices` under B pushes."""
     sites, centroid = anatomy.mesh.nodes[select_vertices(anatomy)], anatomy.mesh.nodes.mean(axis=0)
     angular = convert_to_angles(np.asarray(displacement, np.float64)).transpose(1, 0, 2)
 

@@ -1,4 +1,4 @@
-"""Neural network of Tonutti, Gras, Yang 2017: four hidden units for each output, with Bayesian regularisation."""
+"""Neural network of Tonutti, Gras, Yang 2017: four hidden units per output, with Bayesian regularisation."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Self
@@ -12,18 +12,18 @@ MIN_SQUARED_ERROR = 1e-20  # Smallest sum of squared errors of outputs in [-1, 1
 
 @dataclass(eq=False)
 class BayesianNetwork:
-    """Network of tanh units for each output, with weight decay from the evidence.
+    """Network of tanh units for each output, with weight decay estimated from the evidence.
 
-    Minimises beta E_D + alpha E_W, half the sums of squared errors and of squared weights, by Levenberg-Marquardt;
-    alpha and beta are estimated before every step: Foresee, Hagan 1997, "Gauss-Newton approximation to Bayesian
-    learning", ICNN 3:1930-1935. As MATLAB's `trainbr`, which Tonutti, Gras, Yang 2017 used: features and outputs scaled
-    to [-1, 1], weights initialised by Nguyen and Widrow's rule, the same damping, at most 1,000 steps. Differences: it
-    stops when a step improves its objective by less than `min_gain`, and all rows are training rows.
+    Training minimises beta E_D + alpha E_W by Levenberg-Marquardt; E_D and E_W are half the sums of squared errors and
+    of squared weights. Alpha and beta are estimated before every step: Foresee, Hagan 1997, "Gauss-Newton approximation
+    to Bayesian learning", ICNN 3:1930-1935. As in MATLAB's `trainbr`, which Tonutti, Gras, Yang 2017 used, features and
+    outputs are scaled to [-1, 1], weights are initialised by Nguyen and Widrow's rule, and there are at most 1,000
+    steps. In contrast, training stops at a relative gain below `min_gain`, and all rows are training rows.
 
     Parameters
     ----------
     hidden
-        Hidden units of each network: 61 weights with 13 features.
+        Number of hidden units of each network; 4 units and 13 features give 61 weights.
     steps
         Maximum number of steps.
     min_gain
@@ -38,7 +38,7 @@ class BayesianNetwork:
     seed: int = 0
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> Self:
-        """Fit to rows X (n, f), Y (n, r)."""
+        """Fit the r networks to features X (n, f) and outputs Y (n, r); return this object."""
         self.middle_, self.half_ = compute_unit_range(X)
         self.offset_, self.scale_ = compute_unit_range(Y)
         x, y = (X - self.middle_) / self.half_, ((Y - self.offset_) / self.scale_).T
@@ -62,13 +62,13 @@ class BayesianNetwork:
         return self
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        """Predict outputs (B, r) of features (B, f)."""
+        """Predict outputs (B, r) from features (B, f)."""
         outputs = evaluate(self.weights_, (X - self.middle_) / self.half_)[1].T
         return outputs * self.scale_ + self.offset_
 
 
 class GaussNewtonTerms(NamedTuple):
-    """J^T J (r, P, P), J^T e (r, P) and e^T e (r,) of errors e (n,) of each network, and their derivatives J (n, P)."""
+    """J^T J (r, P, P), J^T e (r, P) and e^T e (r,), for the errors e (n,) of each network with Jacobian J (n, P)."""
 
     hessian: np.ndarray
     gradient: np.ndarray
@@ -76,14 +76,14 @@ class GaussNewtonTerms(NamedTuple):
 
 
 def compute_unit_range(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return centre and half width of the range of each column (n, f); the half width of a constant column is one."""
+    """Return centres and half widths (f,) of the ranges of columns (n, f); a constant column has the half width 1."""
     low, high = values.min(axis=0), values.max(axis=0)
     half = 0.5 * (high - low)
     return 0.5 * (high + low), np.where(half > 1e-9 * np.maximum(np.abs(low), np.abs(high)), half, 1.0)
 
 
 def initialise_weights(outputs: int, features: int, hidden: int, random: np.random.Generator) -> np.ndarray:
-    """Draw weights (r, P) of `outputs` networks: hidden x (features and bias), then those of the output.
+    """Draw initial weights (r, P) of `outputs` networks: hidden x (features and bias), then output weights and bias.
 
     Nguyen, Widrow 1990, "Improving the learning speed of 2-layer neural networks", IJCNN 3:21-26.
     """
@@ -96,7 +96,7 @@ def initialise_weights(outputs: int, features: int, hidden: int, random: np.rand
 
 
 def evaluate(weights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return hidden units (r, n, hidden) and outputs (r, n) of networks `weights` (r, P) at x (n, f)."""
+    """Return hidden units (r, n, hidden) and outputs (r, n) of networks with `weights` (r, P) at inputs x (n, f)."""
     hidden = (weights.shape[1] - 1) // (x.shape[1] + 2)
     inner = weights[:, : -hidden - 1].reshape(len(weights), hidden, -1)
     units = np.tanh(x @ inner[:, :, :-1].transpose(0, 2, 1) + inner[:, None, :, -1])
@@ -104,7 +104,7 @@ def evaluate(weights: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def linearise(weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> GaussNewtonTerms:
-    """Linearise the errors of networks `weights` (r, P) on y (r, n) at x (n, f)."""
+    """Linearise the errors of networks with `weights` (r, P), for inputs x (n, f) and target outputs y (r, n)."""
     units, outputs = evaluate(weights, x)
     count, rows, hidden = units.shape
     lever = (1.0 - units**2) * weights[:, None, -hidden - 1 : -1]
@@ -117,7 +117,7 @@ def linearise(weights: np.ndarray, x: np.ndarray, y: np.ndarray) -> GaussNewtonT
 
 
 def _compute_objective(weights: np.ndarray, error: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Compute beta E_D + alpha E_W (r,)."""
+    """Compute the objective beta E_D + alpha E_W (r,) of each network."""
     return 0.5 * (beta * error + alpha * np.square(weights).sum(axis=1))
 
 
@@ -130,9 +130,9 @@ def take_damped_step(
     beta: np.ndarray,
     damping: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Take a Levenberg-Marquardt step of each network: weights, relative gain of the objective, next damping.
+    """Take a Levenberg-Marquardt step of each network.
 
-    A network that does not improve with any damping keeps its weights, with a gain of zero.
+    Returns weights, relative gains and next damping. A network that no damping improves keeps its weights (gain 0).
     """
     weights, damping, gain = weights.copy(), damping.copy(), np.zeros(len(weights))
     before = _compute_objective(weights, terms.error, alpha, beta)
@@ -155,7 +155,7 @@ def solve_regularised(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solve symmetric, positive semi-definite systems (r, P, P) for right-hand sides (r, P).
 
     With fewer rows than weights the fit can be exact: the estimated noise is then zero, and the damping vanishes in
-    round-off. If one matrix is singular, all get a multiple of the identity of the size of their round-off.
+    round-off. If any matrix is singular, a multiple of the identity at round-off level is added to each matrix.
     """
     try:
         return np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
@@ -166,7 +166,7 @@ def solve_regularised(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def count_effective_weights(hessian: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-    """Count the weights (r,) that the data determine: the sum of l / (l + alpha), l the eigenvalues of beta J^T J.
+    """Compute the effective number of weights (r,): the sum of l / (l + alpha) over the eigenvalues l of beta J^T J.
 
     MacKay 1992, "A practical Bayesian framework for backpropagation networks", Neural Comput. 4:448-472.
     """
@@ -177,6 +177,6 @@ def count_effective_weights(hessian: np.ndarray, alpha: np.ndarray, beta: np.nda
 def estimate_precisions(
     weights: np.ndarray, error: np.ndarray, effective: np.ndarray, rows: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate MacKay's alpha and beta (r,) at a stationary evidence: gamma / 2 E_W and (n - gamma) / 2 E_D."""
+    """Estimate MacKay's alpha = gamma / (2 E_W) and beta = (n - gamma) / (2 E_D), (r,) each, gamma = `effective`."""
     spare = np.maximum(rows - effective, 1.0)
     return effective / np.square(weights).sum(axis=1), spare / np.maximum(error, MIN_SQUARED_ERROR)

@@ -1,4 +1,4 @@
-"""Experiment of Tonutti, Gras, Yang 2017: each force position is left out once, and predicted from the others."""
+"""Experiment of Tonutti, Gras, Yang 2017: each force position is held out once, and predicted from the others."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -42,40 +42,40 @@ Predict = Callable[[Loads], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class LoadedRows(Dataset):
-    """Some rows of a data set, with displacements (n, k, 3) [m] of ascending vertices `nodes` (k,) in memory."""
+    """Rows of a data set in memory, with displacements (n, k, 3) [m] of ascending vertices `nodes` (k,)."""
 
     nodes: np.ndarray
     displacement: np.ndarray
 
     def read_displacement(self, nodes: np.ndarray) -> np.ndarray:
-        """Return displacements (n, k, 3) [m] of vertices that are in memory."""
+        """Return displacements (n, k, 3) [m] of `nodes` (k,), which must be in memory."""
         return self.displacement[:, np.searchsorted(self.nodes, nodes)]
 
 
 @dataclass(frozen=True)
 class SeedStudy(ReportStudy):
-    """Study of the protocol, with linear tetrahedra (p1) as reference, as the authors had."""
+    """Study of the protocol; the reference has linear tetrahedra (p1), as in the publication."""
 
     reference_element: str = "p1"
 
     @cached_property
     def test_loads(self) -> Loads:
-        """The first of the converged loads, which are in random order."""
+        """First `loads` converged loads; the loads are in random order."""
         return self.converged.select(slice(0, self.loads))
 
     @cached_property
     def positions(self) -> np.ndarray:
-        """Positions (m, 3) [m] of the forces."""
+        """Distinct positions (m, 3) [m] of the forces."""
         return np.unique(self.pushed.point, axis=0)
 
     @cached_property
     def position(self) -> np.ndarray:
-        """Number (B,) of each load's position."""
+        """Index (B,) of each converged load's position in `positions`."""
         return find_nearest(self.pushed.point, self.positions)[0]
 
     @cached_property
     def solutions(self) -> np.ndarray:
-        """Displacements (B, m, 3) [m] of the converged loads at `drawn`."""
+        """Displacements (B, m, 3) [m] of the converged loads at `read_nodes`."""
         return self.dataset.read_displacement(self.read_nodes)[self.dataset.good]
 
     @cached_property
@@ -84,7 +84,7 @@ class SeedStudy(ReportStudy):
         return self.solutions[:, np.searchsorted(self.read_nodes, select_vertices(self.anatomy))].astype(np.float64)
 
     def load_rows(self, rows: np.ndarray) -> LoadedRows:
-        """Return a data set of some converged loads (n,)."""
+        """Return a data set with the converged loads of indices `rows` (n,)."""
         data, numbers = self.dataset, np.flatnonzero(self.dataset.good)[rows]
         return LoadedRows(
             path=data.path,
@@ -101,7 +101,7 @@ class SeedStudy(ReportStudy):
 
 
 def simulate_seed(study: SeedStudy, body: Anatomy, loads: Loads, progress: Callable[[int, int], None]) -> None:
-    """Solve the loads with p1 and the authors' tissue into the study's data set, or resume."""
+    """Solve the loads with p1 and the authors' tissue; write the study's data set, or resume an incomplete one."""
     tissue = Elasticity(SEED_TISSUE)
     effects = (*build_push_effects(body, tissue), NodalForce())
     fem = Fem(body, effects, NO_STRAIN_LIMIT, study.device, None, study.reference_element)
@@ -110,7 +110,7 @@ def simulate_seed(study: SeedStudy, body: Anatomy, loads: Loads, progress: Calla
 
 
 def list_seed_specs() -> tuple[Spec, ...]:
-    """List the published learners, the learners of this project, elements and other families."""
+    """List specifications of the published models, this project's model types, element types and model families."""
     return (
         *(LearnerSpec(name) for name in (*PUBLISHED, "linear", *LEARNED_MODELS)),
         *(FemVariant(f"FEM {element}", element=element) for element in ("p1", "smoothed", "p2")),
@@ -119,13 +119,13 @@ def list_seed_specs() -> tuple[Spec, ...]:
 
 
 def measure_seed_rows(study: SeedStudy) -> Iterator[ReportRow]:
-    """Solve the loads of the other models, and yield all rows; stored ones are read."""
+    """Solve the reference of the test loads, then yield all rows; stored rows are read from files."""
     solve_reference(study, lambda count: None, NO_STRAIN_LIMIT)
     return measure_rows(study, list_seed_specs(), measure_seed_row)
 
 
 def measure_seed_row(study: ReportStudy, spec: Spec) -> ReportRow:
-    """Measure a row of the protocol; `ReportRow.state` gives the reason for a missing one."""
+    """Measure a row of the protocol; if this is not possible, `ReportRow.state` gives the reason."""
     if not isinstance(spec, LearnerSpec):
         return measure_row(study, spec)
     assert isinstance(study, SeedStudy)
@@ -136,7 +136,7 @@ def measure_seed_row(study: ReportStudy, spec: Spec) -> ReportRow:
 
 
 def measure_seed_learner(study: SeedStudy, spec: LearnerSpec) -> ReportRow:
-    """Measure a learner that is trained once for each position, without the loads there, and tested on these.
+    """Train a model for each force position without the loads at this position, and measure it on these loads.
 
     Raises
     ------
@@ -181,7 +181,7 @@ def _fit_learner(study: SeedStudy, name: str, number: int, training: np.ndarray)
 
 
 def describe_seed_study(study: SeedStudy, rows: tuple[ReportRow, ...]) -> tuple[str, ...]:
-    """Describe the experiment, and which published errors its rows meet."""
+    """Describe the experiment in sentences, and compare the errors of the rows with the published limits."""
     found = {row.name: row.reference for row in rows if row.reference is not None}
     verdicts = [
         f"{name} {found[name].mm.mean:.2g} mm (below {most:g} mm: {'met' if found[name].mm.mean < most else 'not met'})"

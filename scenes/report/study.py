@@ -1,4 +1,4 @@
-"""Study of a report: the played loads, inside and beyond the training range, and the seconds that its files took."""
+"""Study of a report: its test loads, inside and beyond the training range, and the recorded durations of solves."""
 
 import json
 from collections.abc import Callable
@@ -30,25 +30,25 @@ from ..script.shipped_files import get_template_path
 
 @dataclass(frozen=True)
 class ReportStudy:
-    """Data set of a report, and number of compared loads.
+    """Data set of a report, with the numbers of compared loads and the settings of the reference.
 
     Parameters
     ----------
     data
         Data set of `sulcus simulate`, which defines anatomy, tissue, element and loads of the report.
     folder
-        Folder of meshes and solutions.
+        Folder in which meshes, solutions and rows are stored.
     device
         "auto", "cpu" or "cuda".
     loads, beyond, timed
-        Held-out loads that are compared with the reference; loads beyond the training range; single loads that are
-        timed.
+        Numbers of loads: held-out loads that are compared with the reference, loads beyond the training range, and
+        single loads that are timed.
     fine
         True if the reference mesh is refined by halving every edge.
     poses
-        True if models are compared with tools moved as in the reference, too.
+        True if models are also compared with tools that move as in the reference.
     reference_element
-        Element of the reference.
+        Element type of the reference.
     """
 
     data: Path
@@ -73,7 +73,7 @@ class ReportStudy:
 
     @cached_property
     def expansion(self) -> Expansion:
-        """Power series of the FEM model, shared by all training on the data."""
+        """Power series of the FEM model, shared by all models that are trained on the data set."""
         return Expansion(self.dataset, self.device, table_path=self.folder / "answers" / f"series-{self.digest}.npz")
 
     @property
@@ -83,37 +83,37 @@ class ReportStudy:
 
     @cached_property
     def is_shipped(self) -> bool:
-        """True if the body is the shipped template, of which other meshes can be built."""
+        """True if the anatomy is the shipped template, of which other meshes can be built."""
         return self.anatomy.digest == read_anatomy(get_template_path()).digest
 
     @cached_property
     def tissue(self) -> Elasticity:
-        """Tissue of the data set, with that of regions."""
+        """Tissue of the data set, including the tissues of regions."""
         stated = self.dataset.provenance
         return read_tissue_text(stated) if TISSUE_KEY in stated else Elasticity()
 
     def get_tissue_on(self, body: Anatomy) -> Elasticity:
-        """Return the tissue for a body that may lack some of the regions."""
+        """Return the tissue of the data set, restricted to the regions of the mesh of `body`."""
         return self.tissue.restrict(np.unique(body.mesh.region).tolist())
 
     @property
     def element(self) -> str:
-        """Element of the data set."""
+        """Element type of the data set."""
         return self.dataset.provenance.get("element", "p1")
 
     @cached_property
     def patch(self) -> Patch:
-        """The open cortex."""
+        """Open cortex of the anatomy, on which the loads act."""
         return open_patch(self.anatomy)
 
     @cached_property
     def read_nodes(self) -> np.ndarray:
-        """Sorted vertices (m,) of tumour and open cortex: where the reference is read."""
+        """Sorted vertices (m,) of tumour and open cortex, at which solutions are compared."""
         return np.union1d(self.patch.nodes, self.anatomy.tumour_nodes)
 
     @cached_property
     def converged(self) -> Loads:
-        """Converged loads of the data set; a split has a row for each."""
+        """Converged loads of the data set, in the order of the rows of a split."""
         return self.dataset.loads.select(np.flatnonzero(self.dataset.good))
 
     @property
@@ -123,7 +123,7 @@ class ReportStudy:
         Raises
         ------
         InputError
-            Loads of another kind.
+            The data set contains loads other than pushes.
         """
         pushed = self.converged.get_only(Pushed)
         if pushed is None:
@@ -132,17 +132,17 @@ class ReportStudy:
 
     @cached_property
     def data_displacement(self) -> np.ndarray:
-        """The data's own solutions (B, k, 3) [m] of `converged`, at the tumour's vertices."""
+        """Displacements (B, k, 3) [m] of the loads `converged` at the tumour's vertices, from the data set."""
         return self.dataset.read_displacement(self.anatomy.tumour_nodes)[self.dataset.good]
 
     @cached_property
     def disc_split(self) -> DiscSplit:
-        """Discs of cortex left out."""
+        """Split of the converged loads by held-out discs of the cortex."""
         return hold_out_discs(self.pushed.point, self.patch)
 
     @cached_property
     def test_loads(self) -> Loads:
-        """Loads of the left-out discs, spread evenly over their forces."""
+        """At most `loads` loads of the held-out discs, chosen evenly over the sorted forces."""
         rows = np.flatnonzero(self.disc_split.test_mask)
         rows = rows[np.argsort(split_forces(self.pushed)[0][rows], kind="stable")]
         chosen = np.unique(np.linspace(0, len(rows) - 1, min(self.loads, len(rows))).round().astype(int))
@@ -150,7 +150,7 @@ class ReportStudy:
 
     @cached_property
     def loads_beyond(self) -> Loads:
-        """Loads beyond the training range: stronger, more oblique, nearer to the rim, in equal parts."""
+        """Loads beyond the training range: in equal parts stronger, more oblique, and nearer to the craniotomy edge."""
         pushed = self.converged.select(np.flatnonzero(self.disc_split.test_mask)).get(Pushed)
         training = self.converged.select(np.flatnonzero(self.disc_split.training_mask)).get(Pushed)
         assert pushed is not None and training is not None
@@ -158,7 +158,7 @@ class ReportStudy:
 
     @cached_property
     def digest(self) -> str:
-        """Hash of all inputs of the solutions."""
+        """Hash of all inputs that determine the reference solutions."""
         data = self.dataset
         on = "cuda" if self.on_card else "cpu"
         stated = repr((sorted(data.provenance.items()), self.loads, self.beyond, self.fine, on, get_version("sulcus")))
@@ -172,7 +172,7 @@ KINDS = ("stronger", "more oblique", "nearer to the rim")  # Kinds of loads beyo
 
 
 def draw_loads_beyond(patch: Patch, training: Pushed, pattern: Pushed, count: int) -> Loads:
-    """Draw `count` loads, a third of each of `KINDS`, otherwise distributed as `pattern`; deterministic."""
+    """Draw `count` loads, a third of each kind in `KINDS`, otherwise distributed as `pattern`; deterministic."""
     random = np.random.default_rng(0)
     rows = random.integers(len(pattern.point), size=count)
     kind = np.arange(count) % len(KINDS)
@@ -188,13 +188,13 @@ def draw_loads_beyond(patch: Patch, training: Pushed, pattern: Pushed, count: in
 
 
 def _compute_max_angle(patch: Patch, pushed: Pushed) -> float:
-    """Compute the largest angle between force and inward normal [rad]."""
+    """Compute the largest angle [rad] between a push's force and the inward normal."""
     cosine = np.einsum("bi,bi->b", split_forces(pushed)[1], patch.find_normals(pushed.point))
     return float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
 
 
 def _turn_from_normal(direction: np.ndarray, normal: np.ndarray, angle: float, more: np.ndarray) -> np.ndarray:
-    """Tilt `normal` (B, 3) by `angle` [rad] and `more` (B,) [degrees], at most 85; return unit directions (B, 3)."""
+    """Return unit directions (B, 3): `normal` tilted to `direction` by `angle` [rad] + `more` [deg], at most 85 deg."""
     along = direction - np.einsum("bi,bi->b", direction, normal)[:, None] * normal
     length = np.linalg.norm(along, axis=1, keepdims=True)
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
@@ -204,7 +204,7 @@ def _turn_from_normal(direction: np.ndarray, normal: np.ndarray, angle: float, m
 
 
 def _sample_near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Sample points (B, 3) [m] whose footprints (B,) [m] extend beyond the rim by a tenth to half of their radius."""
+    """Sample points (B, 3) [m] whose footprints of radii (B,) [m] extend beyond the edge by 0.1 to 0.5 radii."""
     points = patch.place_points(random.random((4096, 3)))[0]
     ratio = patch.compute_edge_distance(points)[None] / footprint[:, None]
     wanted = random.uniform(*EDGE_DISTANCES, len(footprint))[:, None]
@@ -212,13 +212,13 @@ def _sample_near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Gene
 
 
 def note_seconds(path: Path, seconds: float) -> None:
-    """Keep the seconds that a file took to make, in a JSON file of its name."""
+    """Store the duration [s] of the computation of a file, in a JSON file with the same name."""
     with write_atomically(_to_json_path(path), ".json") as partial:
         partial.write_text(json.dumps({"seconds": seconds}))
 
 
 def read_noted_seconds(path: Path) -> float | None:
-    """Read the stored value; None if missing or incomplete."""
+    """Read the duration [s] that `note_seconds` stored; None if it is missing or incomplete."""
     try:
         return float(json.loads(_to_json_path(path).read_text())["seconds"])
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
@@ -230,11 +230,11 @@ def _to_json_path(made: Path) -> Path:
 
 
 def tabulate_series(study: ReportStudy, progress: Callable[[int, int], object]) -> None:
-    """Compute the series table if the tissue is recorded; `progress` receives the numbers of places done and in all."""
+    """Compute the power-series table if the data set records its tissue; `progress` receives (done, total) places."""
     if "tissue" in study.dataset.provenance:
         replace(study.expansion, progress=progress).table  # noqa: B018 (asking makes it)
 
 
 def measure_series_seconds(study: ReportStudy, learner: str) -> float:
-    """Return the seconds spent on the table, if this learner uses it."""
+    """Return the time [s] spent on the power-series table; 0 if the model type does not use the table."""
     return study.expansion.table.seconds if learner in SERIES_MODELS else 0.0

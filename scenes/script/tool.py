@@ -60,7 +60,7 @@ class Instrument(Protocol):
         ...
 
     def pose(self, tip: np.ndarray, inward: np.ndarray, aside: np.ndarray) -> np.ndarray:
-        """Return T_world_tool (4, 4) of a tool that touches `tip` (3,) [m] from outside; unit vectors `inward`, `aside`."""
+        """Return T_world_tool (4, 4) of a tool that touches `tip` (3,) [m]; unit vectors `inward` and `aside` (3,)."""
         ...
 
 

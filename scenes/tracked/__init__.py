@@ -1,1 +1,1 @@
-"""Overlay on a real or rendered video; files of a real camera."""
+"""Tumour overlay on real or rendered videos with tracked tools, and files of real cameras and trackers."""

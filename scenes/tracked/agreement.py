@@ -1,4 +1,4 @@
-"""Consistency of an external tracker's poses with the printed targets in the images."""
+"""Consistency of an external tracker's poses with the printed targets that are visible in the images."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ REMEDY = "see --poses and --clock"  # Remedy in warnings.
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """Positions of printed targets relative to the bodies that carry them, in the last images.
+    """Positions of printed targets, observed in the last images, relative to the tracked bodies that carry them.
 
     Parameters
     ----------
     positions
-        Positions in the body's frame (n, 3) [m], by the target's name.
-    inconsistencies
-        Inconsistency of the poses with the last image of the target, by its name; empty: none.
+        Positions (n, 3) [m] of a target in the coordinate system of its body, by target name.
+        inconsistencies
+            Inconsistency between the poses and the last image of a target, by target name; empty text: consistent.
     settings
         Limits of the warnings.
     """
@@ -48,13 +48,13 @@ class Agreement:
 
     @property
     def inconsistency(self) -> str:
-        """Description of the inconsistency of the poses; empty: none."""
+        """Description of the first inconsistency between poses and images; empty if all targets are consistent."""
         return next(filter(None, self.inconsistencies.values()), "")
 
     def add_image(self, name: str, target_pose: Pose, body_pose: Pose, swapped_pose: Pose | None) -> Agreement:
-        """Add an image: observed target pose, its body's pose, and the body's pose with swapped files.
+        """Return the agreement with a new image: target pose, its body's pose, and this pose if the files were swapped.
 
-        All are in one frame. A target whose position is too uncertain is skipped.
+        All poses are in the same coordinate system. A target whose position is too uncertain is skipped.
         """
         if np.linalg.eigvalsh(target_pose.covariance[:3, :3])[-1] > self.settings.max_pose_deviation**2:
             return self
@@ -67,12 +67,12 @@ class Agreement:
 
 
 def _compute_target_position(target: Pose, body: Pose) -> np.ndarray:
-    """Return the position of a target in a body's frame (3,) [m]."""
+    """Return the position (3,) [m] of a target in the coordinate system of a body."""
     return (np.linalg.inv(body.T_camera_target) @ target.T_camera_target)[:3, 3]
 
 
 def _describe_doubt(name: str, places: np.ndarray, swapped: np.ndarray | None, settings: AgreementSettings) -> str:
-    """Describe the inconsistency of positions (n, 3) [m] of a target on its body; the newest is the last."""
+    """Describe the inconsistency of positions (n, 3) [m] of a target on its body, oldest first; empty if consistent."""
     away = float(np.linalg.norm(places[-1]))
     nearer = swapped is not None and settings.swap_ratio * np.linalg.norm(swapped) < away
     if nearer and away > settings.min_swap_distance:

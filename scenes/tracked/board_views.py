@@ -1,4 +1,4 @@
-"""Views of the calibration board in a folder of images or a video."""
+"""Detection of the calibration board in a folder of images or a video."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,12 @@ from sim.runtime.outside_files import wrap_errors
 
 @dataclass(frozen=True)
 class BoardDetections:
-    """Detections of the board.
+    """Detections of the calibration board in a set of images.
 
     Parameters
     ----------
     views
-        Views of the board, from the images that show it.
+        Detected views of the board, one for each image that shows the board.
     width, height
         Size of all images [pixel].
     image_count
@@ -36,7 +36,7 @@ def detect_board(path: Path, board: Target, size: tuple[int, int] | None = None)
     Raises
     ------
     InputError
-        Unreadable input, images of different sizes or of another one than given, or no visible board.
+        Unreadable input, images that differ in size or do not have the required size, or no visible board.
     """
     views, count, first, detector = [], 0, "", Detector([board])
     with wrap_errors(path, "images of a board", REMEDY):

@@ -1,4 +1,4 @@
-"""Calibration files of real cameras: intrinsics of OpenCV and ROS, and hand-eye transforms."""
+"""Calibration files of real cameras: intrinsics in OpenCV's and ROS's formats, and hand-eye transforms."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ from sim.runtime.outside_files import to_path, wrap_errors
 
 SUFFIXES = (".yaml", ".yml")  # Endings of calibration files.
 INTRINSICS = "sulcus intrinsics"
-"""Format of the covariance file of a calibration."""
+"""Name of the format of a calibration's covariance file."""
 FORMATS = {"opencv": to_opencv_text, "ros": to_ros_text}  # Writers of calibration files, by format.
 # Remedy in error messages.
 HAND_EYE_REMEDY = "Give what `sulcus calibrate --hand-eye A.csv B.csv --json` prints, B being the camera."
@@ -22,15 +22,15 @@ ROTATION_TOLERANCE = 1e-4  # Tolerance of a rotation's columns from length 1 and
 
 
 def read_calibration(path: str | Path) -> Calibration:
-    """Return the calibration in a YAML file of OpenCV, or of ROS's camera_info.
+    """Read a camera's calibration from a YAML file in the format of OpenCV or of ROS's camera_info.
 
-    OpenCV: image_width, image_height, camera_matrix, distortion_coefficients. ROS: also distortion_model.
+    Keys: image_width, image_height, camera_matrix, distortion_coefficients; ROS: also distortion_model.
 
     Raises
     ------
     InputError
-        A missing file, one that is too large or of another kind; input that `ar.optics.calibration.parse_calibration`
-        rejects.
+        The file is missing, too large or of another kind, or `ar.optics.calibration.parse_calibration` rejects its
+        content.
     """
     path = to_path(path)
     with wrap_errors(path, "a camera's calibration", REMEDY):
@@ -45,12 +45,12 @@ def read_calibration(path: str | Path) -> Calibration:
 
 
 def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
-    """Read the covariance (9, 9) that `sulcus calibrate` writes with a calibration, K.json for K.yaml; None: no file.
+    """Read the covariance (9, 9) of a calibration K.yaml from the K.json of `sulcus calibrate`; None: no such file.
 
     Raises
     ------
     InputError
-        A file of that name and kind with an invalid covariance.
+        The file exists, and its covariance is invalid.
     """
     beside = to_path(path).with_suffix(".json")
     if not beside.is_file() or beside.stat().st_size > MAX_TEXT_LENGTH:
@@ -66,7 +66,7 @@ def read_intrinsic_covariance(path: str | Path) -> np.ndarray | None:
 
 
 def build_intrinsics_header(calibration: Calibration, covariance: np.ndarray) -> dict[str, object]:
-    """Build the K.json of a calibration: its values (9,) and their covariance (9, 9), 0 where they are exact."""
+    """Build the content of a calibration's K.json: 9 parameters and their covariance (9, 9), 0 if they are exact."""
     from ar.tracking.intrinsics import PARAMETERS, to_parameters
 
     return {
@@ -81,19 +81,19 @@ def build_intrinsics_header(calibration: Calibration, covariance: np.ndarray) ->
 
 
 def write_exact_intrinsics(path: str | Path, calibration: Calibration) -> None:
-    """Write, atomically, the K.json of an exactly known camera, for example of a rendered video.
+    """Write the K.json of an exactly known camera, for example of a rendered video, atomically.
 
     Raises
     ------
     InputError
-        A file that cannot be written.
+        The file cannot be written.
     """
     with write_atomically(to_path(path), ".json") as partial:
         partial.write_text(json.dumps(build_intrinsics_header(calibration, np.zeros((9, 9)))) + "\n", encoding="utf-8")
 
 
 def write_calibration(path: str | Path, calibration: Calibration, form: Literal["opencv", "ros"] = "opencv") -> None:
-    """Write a calibration as OpenCV's YAML or ROS's, .yaml or .yml, atomically.
+    """Write a calibration as a YAML file (.yaml, .yml) in OpenCV's or ROS's format, atomically.
 
     Raises
     ------
@@ -110,14 +110,14 @@ def write_calibration(path: str | Path, calibration: Calibration, form: Literal[
 
 
 def read_hand_eye(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read X (4, 4) [m] with x_body = X x_camera, and the covariance (6, 6) of the camera's position and rotation.
+    """Read a hand-eye transform X (4, 4) [m], x_body = X x_camera, and its covariance (6, 6) of position and rotation.
 
-    The residuals of the motions are used as standard deviations along [m] and about [rad] each axis.
+    The file's residuals are used as standard deviations along each axis [m] and about each axis [rad].
 
     Raises
     ------
     InputError
-        A missing or invalid file; a transform that is not rigid, or invalid residuals.
+        The file is missing or invalid, the transform is not rigid, or the residuals are invalid.
     """
     from ar.tracking.rigid import is_rigid
 

@@ -1,4 +1,4 @@
-"""Poses of tool and reference by an external tracker, at the times of the images and in the camera's frame."""
+"""Poses of tool and reference from an external tracker, at image times and in camera coordinates."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ MAX_TIME_GAP = 1.0
 def track_images(
     images: Iterable[NamedImage], calibration: Calibration, body: str, reference: str
 ) -> Iterator[TrackedPose]:
-    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `reference` of a visible one of them.
+    """Yield for each image the pose of `body` relative to `reference`; each is "tool", "patient", "board" or "camera".
 
     Raises
     ------
     ValueError
-        Images of another size than the camera was calibrated at.
+        The images do not have the size of the calibration.
     """
     targets = {each.name: each for each in list_targets()}
     wanted = [each for each in (body, reference) if each != "camera"]
@@ -52,14 +52,14 @@ def track_images(
 
 
 def track_video(path: Path, calibration: Calibration, body: str, reference: str, rate: float) -> Iterator[TrackedPose]:
-    """Yield a row per image: pose of `body` (tool, patient, board, camera) in the `reference` of a visible one of them.
+    """Yield for each image of a video the pose of `body` relative to `reference`: tool, patient, board or camera.
 
-    Times are the stamps in the images, or else those of the video.
+    Times are the time stamps in the images, or else the times of the video; `rate` [1/s] is that of an image folder.
 
     Raises
     ------
     InputError
-        Unreadable input, or images of another size than the camera was calibrated at.
+        Unreadable input, or images that do not have the size of the calibration.
     """
     count = 0
     with wrap_errors(path, "a video", REMEDY):
@@ -74,13 +74,13 @@ def track_video(path: Path, calibration: Calibration, body: str, reference: str,
 
 
 def _set_stamped_time(picture: NamedImage) -> NamedImage:
-    """Return an image with the time of its stamp, if it has one."""
+    """Return an image with the time of its time stamp; without a stamp, the image is unchanged."""
     stamp = read_time_stamp(picture.grey)
     return picture if stamp is None else replace(picture, time=stamp)
 
 
 def _select_pose(state: TrackedTargets, wanted: list[str]) -> tuple[PoseStatus, Pose | None, str]:
-    """Return the pose of the first target, relative to the second if given; else the verdict on the missing target."""
+    """Return status, pose of the first target (relative to the second, if any) and name of a missing target."""
     for name in wanted:
         if name not in state.poses:
             return state.statuses[name], None, name
@@ -90,16 +90,16 @@ def _select_pose(state: TrackedTargets, wanted: list[str]) -> tuple[PoseStatus, 
 
 @dataclass(frozen=True, eq=False)
 class CameraMount:
-    """Pose of the camera in the tracker's frame.
+    """Mounting of the camera: its pose in the coordinate system of the tracker or of a tracked body.
 
     Parameters
     ----------
     T_body_camera
-        (4, 4) [m]: from the camera to the body that it is fixed to.
+        Transform (4, 4) [m] from the camera to the body to which the camera is fixed.
     covariance
-        Covariance (6, 6) of a camera translation [m] and a small rotation about it [rad], in the axes of that body.
+        Covariance (6, 6) of a translation [m] and a small rotation [rad] of the camera, in the axes of the body.
     poses
-        Poses of that body; None: the tracker's own frame.
+        Tracked poses of the body; None: the body is the tracker itself.
     """
 
     T_body_camera: np.ndarray
@@ -109,16 +109,16 @@ class CameraMount:
 
 @dataclass(frozen=True, eq=False)
 class ExternalTracker:
-    """Poses of another tracker.
+    """External tracker: poses of tool and reference, clock offset, and mounting of the camera.
 
     Parameters
     ----------
     tool_poses, reference_poses
         Poses of the tool and of the patient's reference.
     clock
-        Offset of its clock from that of the images.
-    mount
-        Pose of the camera; None: its images determine it relative to the printed reference.
+        Time offset between the clocks of the tracker and the images.
+        mount
+            Mounting of the camera; None: the images determine the camera's pose relative to the printed reference.
     """
 
     tool_poses: PoseStream
@@ -127,11 +127,11 @@ class ExternalTracker:
     mount: CameraMount | None = None
 
     def find_tool_pose(self, time: float) -> Pose | None:
-        """Return the tool relative to the reference, in the image of a time [s]; None if the poses are missing."""
+        """Return the tool's pose relative to the reference at an image's time [s]; None if a pose is missing."""
         return self._interpolate_pose(time, self._interpolate_tool)
 
     def find_reference_pose(self, time: float) -> Pose | None:
-        """Return the reference in the camera's frame, in the image of a time [s]; None if it is unknown."""
+        """Return the reference's pose in camera coordinates at an image's time [s]; None if a pose is missing."""
         return self._interpolate_pose(time, self._locate_in_camera)
 
     @property
@@ -140,10 +140,10 @@ class ExternalTracker:
         return replace(self, tool_poses=self.reference_poses, reference_poses=self.tool_poses)
 
     def compare_targets(self, time: float, observed: Mapping[str, Pose], agreement: Agreement) -> Agreement:
-        """Check these poses against the printed targets that are visible in the image of a time [s].
+        """Compare the poses with printed targets visible in the image at a time [s]; return the updated `agreement`.
 
-        `observed` has the targets in the camera's frame, by name. If images determine the camera relative to the
-        reference, only the tool's poses can be compared.
+        `observed`: target poses in camera coordinates, by name. Without a `mount`, only the tool's poses can be
+        compared, relative to the visible reference.
         """
         reference, tool = (observed.get(target().name) for target in (build_patient_reference, build_tool_cube))
         if self.mount is None:
@@ -158,12 +158,12 @@ class ExternalTracker:
 
     @property
     def pose_streams(self) -> dict[str, PoseStream]:
-        """Streams of poses by body: tool, patient, and a tracked camera."""
+        """Pose streams by body: "tool", "patient", and "camera" if a tracked body carries the camera."""
         camera = {} if self.mount is None or self.mount.poses is None else {"camera": self.mount.poses}
         return {"tool": self.tool_poses, "patient": self.reference_poses, **camera}
 
     def describe_mismatch(self, time: float) -> str:
-        """Describe the body whose poses are all far from the image of a time [s], and by how much; empty: none."""
+        """Describe the first body whose poses all begin after or end before an image's time [s]; empty if none does."""
         for name, stream in self.pose_streams.items():
             at = stream.to_stream_time(time + self.clock.offset)
             first, last = stream.times[[0, -1]].tolist()
@@ -174,13 +174,13 @@ class ExternalTracker:
         return ""
 
     def compute_age(self, time: float) -> float | None:
-        """Return the age [s] of the poses at an image's time [s]; None if current ones exist."""
+        """Return the age [s] of the oldest last pose at an image's time [s]; None if all current poses exist."""
         time = time + self.clock.offset
         missing = [each.compute_age(time) for each in self.pose_streams.values() if each.interpolate(time) is None]
         return max(missing) if missing else None
 
     def _interpolate_pose(self, time: float, pose_at: Callable[[float], Pose | None]) -> Pose | None:
-        """Return a pose at an image's time [s]; its covariance includes the motion during the clock error."""
+        """Return `pose_at`'s pose at an image's time [s]; its covariance includes motion during the clock error."""
         time, error = time + self.clock.offset, self.clock.error
         pose = pose_at(time)
         if pose is None or error == 0.0:
@@ -214,7 +214,7 @@ class ExternalTracker:
 def estimate_video_clock(
     images: Iterable[NamedImage], calibration: Calibration, tool_poses: PoseStream, reference_poses: PoseStream
 ) -> Clock:
-    """Estimate the clock offset between the tracker and a video that shows the printed cube and reference.
+    """Estimate the time offset between the tracker and a video that shows the printed cube and reference.
 
     Raises
     ------

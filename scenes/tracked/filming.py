@@ -1,4 +1,4 @@
-"""Synthetic videos of a scene by a realistic camera, with printed targets in view and their ground truth."""
+"""Synthetic videos of a scene with printed targets, by a realistic camera, and their ground truth."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ USUAL_CALIBRATION = Calibration(
 )
 """Default camera of a video."""
 VIEW = replace(OBLIQUE_VIEWPOINT, distance=0.32).calibrate(USUAL_CALIBRATION)
-"""View from arm's length: it shows the opening, the reference near it and the tool's cube."""
+"""Viewpoint that shows the craniotomy, the reference near the craniotomy, and the tool's cube."""
 # Centre of the reference relative to the craniotomy, to the right, up and outwards [m].
 REFERENCE_POSITION = (-0.078, 0.010, 0.022)
 REFERENCE_ROTATION = (28.0, -24.0)  # Rotation of the reference about x and y from the line of sight [deg].
@@ -47,18 +47,18 @@ KINDS = {
     "smear": "the image is smeared by motion",
     "gap": "there are no images",
 }
-"""Disturbances of a video, with their description."""
+"""Descriptions of the disturbances of a video, by kind."""
 
 
 def scale_distance(view: Viewpoint) -> Viewpoint:
-    """Return the camera at the distance at which its image shows as much as that of `VIEW`."""
+    """Return the viewpoint at the distance at which a calibrated camera's image shows as much as with `VIEW`."""
     assert view.calibration is not None
     longer = (view.calibration.focal[1] / view.height) / (USUAL_CALIBRATION.focal[1] / USUAL_CALIBRATION.height)
     return replace(view, distance=longer * VIEW.distance)
 
 
 def place_reference(site: CraniotomyFrame, camera: Camera) -> np.ndarray:
-    """Return T_scan_patient (4, 4) of the reference near a site, facing `camera`."""
+    """Return T_scan_patient (4, 4) [m] of a reference that is near the craniotomy and faces `camera`."""
     right, up, outwards = REFERENCE_POSITION
     middle = site.origin + right * site.right + up * site.up - outwards * site.axis
     T = np.eye(4)
@@ -71,12 +71,12 @@ def place_reference(site: CraniotomyFrame, camera: Camera) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Disturbance of the images from one time to another [s].
+    """Disturbance of the images of a video, from a start time to an end time [s].
 
     Raises
     ------
     InputError
-        A kind that is not in `KINDS`, or times without order.
+        The kind is not in `KINDS`, or the times are not in order.
     """
 
     kind: str
@@ -92,7 +92,7 @@ class Disturbance:
 
 @dataclass(frozen=True)
 class Artefacts:
-    """Image degradation: blur [pixel] and noise [of 255] as standard deviations, and disturbances."""
+    """Image degradation: standard deviations of blur [pixel] and noise [grey level of 255], and disturbances."""
 
     blur: float = 0.5
     noise: float = 2.0
@@ -100,24 +100,24 @@ class Artefacts:
     seed: int = 0
 
     def list_disturbances(self, time: float) -> set[str]:
-        """Return the disturbances at a time [s]."""
+        """Return the kinds of the disturbances at a time [s]."""
         return {each.kind for each in self.disturbances if each.start <= time < each.end}
 
 
 @dataclass(frozen=True, eq=False)
 class VideoFrame:
-    """Image with its ground truth.
+    """Image of a synthetic video with its ground truth.
 
     Parameters
     ----------
     time
-        [s].
-    image
+        Time of the image [s].
+        image
         Image (H, W, 3) uint8.
     T_camera_scan, T_scan_tool
-        Poses (4, 4) [m].
-    displacement
-        Displacements (n, 3) [m] of the tumour's surface vertices, in the stage's order.
+        True poses (4, 4) [m].
+        displacement
+            True displacements (n, 3) [m] of the tumour's surface vertices, in the order of `Stage.tumour_vertices`.
     """
 
     time: float
@@ -129,19 +129,19 @@ class VideoFrame:
 
 @dataclass(frozen=True, eq=False)
 class Mounts:
-    """Printed targets of a video: the tool with its cube, and T_scan_patient (4, 4) of the reference."""
+    """Printed targets of a video: tool with its cube, and pose T_scan_patient (4, 4) [m] of the reference."""
 
     tool: TrackedTool
     T_scan_patient: np.ndarray
 
 
 def mount_targets(player: Player) -> Mounts:
-    """Mount a cube on the scene's tool and a reference near the opening, both facing the initial camera.
+    """Place a cube on the scene's tool and a reference near the craniotomy; both face the initial camera.
 
     Raises
     ------
     InputError
-        A scene whose tool cannot be tracked.
+        The scene has no tool on which a cube can be mounted.
     """
     scene, site, camera = player.scene, player.site, player.camera
     shape = None if scene.tool is None else scene.tool.shape
@@ -162,9 +162,9 @@ def mount_targets(player: Player) -> Mounts:
 def register_with_error(
     site: CraniotomyFrame, targets: Mounts, shift_mm: float, angle_deg: float, seed: int
 ) -> Registration:
-    """Draw the reference's registration to the scan, with one random error of the given standard deviations.
+    """Sample a registration of the reference to the scan, with one random rigid error.
 
-    The deviations are along and about each axis through the opening's centre.
+    `shift_mm` and `angle_deg` are its standard deviations along and about each axis through the craniotomy's centre.
     """
     deviations = np.repeat([1e-3 * shift_mm, np.radians(angle_deg)], 3)
     error = deviations * np.random.default_rng([seed, 1]).standard_normal(6)
@@ -174,10 +174,10 @@ def register_with_error(
 
 
 def render_frames(player: Player, mounts: Mounts, artefacts: Artefacts, step: int = 1) -> Iterator[VideoFrame]:
-    """Render the images of a scene, one in `step` frames; the deformer's solutions are the ground truth.
+    """Render every `step`-th frame of a scene as a video image; the deformer's solutions are the ground truth.
 
-    With a rolling shutter, each row is rendered from its own camera pose; tool and tissue are those of the image's
-    time. The ground-truth camera of such an image is that of the row that shows the tumour's centroid.
+    With a rolling shutter, each image row is rendered from its own camera pose, with tool and tissue at the image's
+    time. The ground-truth camera of such an image is the camera of the row that shows the tumour's centroid.
     """
     tool, site, stage, last = player.scene.tool, player.site, player.stage, None
     assert tool is not None
@@ -232,7 +232,7 @@ def _render_image(
     wrong: set[str],
     camera: Camera,
 ) -> np.ndarray:
-    """Render a camera's image (H, W, 3) uint8 with targets T_scan_target (4, 4), some of them covered by a hand."""
+    """Render a camera's image (H, W, 3) uint8 with targets at T_scan_target (4, 4); a hand covers those in `wrong`."""
     sharp = renderer.render(camera, moving).colour
     shown = render_targets(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
     for target, T in targets:
@@ -242,11 +242,11 @@ def _render_image(
 
 
 NAMES = {"tool": "tool", "patient": "reference"}
-"""Disturbance that covers each target."""
+"""Kind of the disturbance that covers a target, by target name."""
 
 
 def _draw_hand(colour: np.ndarray, camera: Camera, target: Target, T_scan_target: np.ndarray) -> np.ndarray:
-    """Draw a hand in front of a target."""
+    """Draw a hand in front of a target, and return the new image."""
     T = camera.T_camera_world @ T_scan_target
     outline = target.outline
     where = find_window(replace(camera, T_camera_world=np.eye(4)), outline @ T[:3, :3].T + T[:3, 3], 0.1, 0.0)
@@ -257,7 +257,7 @@ def _draw_hand(colour: np.ndarray, camera: Camera, target: Target, T_scan_target
 
 
 def _apply_disturbances(image: np.ndarray, noise: Artefacts, wrong: Sequence[str] | set[str], frame: int) -> np.ndarray:
-    """Apply blur, noise and the global disturbances to an image."""
+    """Return an image with the disturbances of the whole image (over-exposure, smear), blur and noise."""
     out = image.astype(np.float32)
     if "bright" in wrong:
         out *= BRIGHT_FACTOR

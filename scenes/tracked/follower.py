@@ -1,4 +1,4 @@
-"""Frame-by-frame tracking with a real camera: tumour position, its error, and lost targets."""
+"""Frame-by-frame tracking with a real camera: position and error of the tumour, and handling of lost targets."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -52,7 +52,7 @@ TOOL, PATIENT = build_tool_cube().name, build_patient_reference().name  # Names 
 
 
 class TumourState(Enum):
-    """State of the tumour in an image."""
+    """State of the tumour position that is drawn in an image."""
 
     GOOD = "where it is now"
     REST = "as in the scan"
@@ -65,34 +65,34 @@ class TumourState(Enum):
 
 @dataclass(frozen=True, eq=False)
 class TrackingResult:
-    """Tracking result of an image.
+    """Tracking result of one image.
 
     Parameters
     ----------
     time
         Time of the image [s].
     state, warning
-        State of the tumour, and the reason why it is limited or unreliable, for users; empty if it is reliable.
+        State of the tumour position, and the reason for users if the position is limited or unreliable, else empty.
     targets
-        Detected targets.
+        Detected printed targets.
     motion
         Estimated motion of the brain.
     camera
         Camera with T_camera_scan; None if the reference has been lost for longer than `FollowerSettings.hold_time`.
     T_scan_tool, tip_covariance
-        Pose (4, 4) [m] and covariance (3, 3) [m^2], if the tool is visible.
+        Pose (4, 4) [m] of the tool, and covariance (3, 3) [m^2] of its tip; None if the tool's pose is not available.
     bound
-        95 % bound on the tumour's error across the line of sight [m]; None if unknown.
+        95 % bound on the tumour's error across the line of sight [m]; None if not available.
     sources
-        Contributions to the bound, by source [m].
+        Contributions to `bound` [m], by source.
     reference_time, tool_time
-        Time of the last detection of the reference, and of the tool relative to it [s]; None: never.
+        Times [s] of the last pose of the reference, and of the last pose of the tool relative to it; None: never.
     interval
-        Shortest interval between two images up to now [s].
-    was_near
-        True once the tool has been near the head: until then the registration may be of another patient.
-    image_speed
-        Recent speed of the brain across the image [m/s]; None: not known.
+        Shortest interval between two previous images [s].
+        was_near
+            True if the tool has been near the head; before that, the registration may be that of another patient.
+        image_speed
+            Recent maximum speed of the brain across the image [m/s]; None: not known.
     agreement
         Consistency of an external tracker's poses with printed targets in the images.
     """
@@ -116,13 +116,13 @@ class TrackingResult:
 
     @property
     def is_reliable(self) -> bool:
-        """True if the tumour is drawn as reliable."""
+        """True if the drawn tumour position is reliable."""
         return self.state in (TumourState.GOOD, TumourState.REST)
 
 
 @dataclass(frozen=True, eq=False)
 class Follower:
-    """Tracker of reference and tool in the images of a calibrated camera, which computes the brain's motion.
+    """Tracker of reference and tool in the images of a calibrated camera, with the resulting motion of the brain.
 
     Parameters
     ----------
@@ -135,9 +135,9 @@ class Follower:
     motion
         Model of the brain's motion under the tool.
     external
-        Poses of an external tracker, which replace those of the cube; with a tracked camera, also of the reference.
+        External tracker, whose poses replace those of the cube and, if it has a `mount`, also those of the reference.
     intrinsic_covariance
-        Covariance (9, 9) of the camera's calibration, of `ar.tracking.intrinsics.PARAMETERS`; None: not available.
+        Covariance (9, 9) of the calibration's `ar.tracking.intrinsics.PARAMETERS`; None: not available.
     settings
         Limits and factors.
     """
@@ -152,12 +152,12 @@ class Follower:
 
     @cached_property
     def tracker(self) -> Tracker:
-        """Tracker of the required targets."""
+        """Tracker of the required printed targets."""
         wanted = (build_patient_reference(),) if self.tool is None else (build_patient_reference(), build_tool_cube())
         return Tracker(self.calibration.build_camera(np.eye(4)), wanted)
 
     def step(self, grey_image: np.ndarray, time: float, previous: TrackingResult | None = None) -> TrackingResult:
-        """Compute the tracking result of an image (H, W) uint8 taken at a time [s], from the result `previous`.
+        """Compute the tracking result of an image (H, W) uint8 taken at a time [s]; `previous` is the last result.
 
         Raises
         ------
@@ -172,7 +172,7 @@ class Follower:
         return replace(known, interval=min(previous.interval, apart) if apart > 0.0 else previous.interval)
 
     def _compare_targets(self, known: TrackingResult, before: TrackingResult | None) -> TrackingResult:
-        """Check external poses against printed targets; if inconsistent, the tumour position is unreliable."""
+        """Compare external poses with printed targets; if they are inconsistent, mark the result as unreliable."""
         if self.external is None:
             return known
         agreement = Agreement() if before is None else before.agreement
@@ -182,7 +182,7 @@ class Follower:
         return replace(known, state=TumourState.UNSURE, warning=known.agreement.inconsistency, bound=None, sources={})
 
     def _compute_result(self, grey: np.ndarray, time: float, before: TrackingResult | None) -> TrackingResult:
-        """Compute the result of `step`, for any intervals."""
+        """Compute the tracking result of one image, without updating `interval` and `agreement`."""
         apart = None if before is None else time - before.time
         usual = 0.0 if before is None else before.interval
         longest = max(self.settings.max_gap, self.settings.max_gap_intervals * usual)
@@ -222,7 +222,7 @@ class Follower:
     def _describe_implausible(
         self, camera: Camera, tool: np.ndarray | None, before: TrackingResult | None
     ) -> tuple[str, bool]:
-        """Describe why the registration is implausible for this patient; and return the updated `near`."""
+        """Return why the registration is implausible for this patient (or ""), and the updated `was_near`."""
         stage, near = self.motion.stage, before is not None and before.was_near
         theirs = "is this its registration?" if self.external is None else "are these its poses and registration?"
         misplaced, near = ("", near) if tool is None else describe_misplaced_tool(self.tool, tool, stage, near, theirs)
@@ -232,7 +232,7 @@ class Follower:
     def _build_without_reference(
         self, tracked: TrackedTargets, time: float, before: TrackingResult | None
     ) -> TrackingResult:
-        """Return the result without a visible reference: the overlay keeps its position for a short time."""
+        """Return the result of an image without reference; the overlay keeps its position for `hold_time`."""
         seen = None if before is None else before.reference_time
         motion = self.motion.rest_motion if before is None else before.motion
         held = before is not None and seen is not None and 0.0 <= time - seen < self.settings.hold_time + TIME_ROUNDING
@@ -245,9 +245,9 @@ class Follower:
         )  # fmt: skip
 
     def _compute_pace(self, reference: Pose, time: float, before: TrackingResult | None) -> float | None:
-        """Return the recent maximum speed of the brain across the image [m/s]; None if unknown.
+        """Return the recent maximum speed of the brain across the image [m/s]; None if not available.
 
-        A hand trembles: the speed during one image may be larger than that between two images.
+        A maximum is used because, with hand tremor, the speed during one image may exceed the speed between images.
         """
         last = None if before is None else before.targets.poses.get(PATIENT)
         if before is None or last is None or not time > before.time:
@@ -260,7 +260,7 @@ class Follower:
     def _compute_motion(
         self, tracked: TrackedTargets, reference: Pose, time: float, before: TrackingResult | None, shutter: float
     ) -> TrackingResult:
-        """Compute the motion under the tool, by its pose relative to the reference; a `shutter` adds an error [m]."""
+        """Compute the brain's motion from the tool's pose relative to the reference; `shutter` adds an error [m]."""
         tool_time, last = (None, None) if before is None else (before.tool_time, before.motion)
         beside = self._find_tool(tracked, reference, time)
         if self.tool is None or beside is None:
@@ -283,14 +283,14 @@ class Follower:
         return TrackingResult(time, state, words, tracked, motion, None, pose, spread, tool_time=time)
 
     def _find_tool(self, tracked: TrackedTargets, reference: Pose, time: float) -> Pose | None:
-        """Return the tool's cube relative to the reference."""
+        """Return the pose of the tool's cube relative to the reference; None if the pose is not available."""
         if self.external is not None:
             return self.external.find_tool_pose(time)
         cube = tracked.poses.get(TOOL)
         return None if cube is None else cube.transform_to(reference)
 
     def _describe_age(self, time: float) -> str:
-        """Describe the age of an external tracker's last poses if current ones are missing; else empty."""
+        """Describe the age of the external tracker's last poses; empty if current poses exist."""
         age = None if self.external is None else self.external.compute_age(time)
         if self.external is None or age is None:
             return ""
@@ -301,7 +301,7 @@ class Follower:
     def _compute_band(
         self, reference: Pose, middle: np.ndarray, motion: BrainMotion, shutter: float
     ) -> tuple[float, dict[str, float]]:
-        """Compute the error bound of the tumour's `middle` (3,) [m] across the line of sight, and its parts."""
+        """Compute the error bound [m] of the tumour centroid `middle` (3,) [m] across the line of sight, by source."""
         place, beside = self.registration.transform_point(middle)
         at, tracked = reference.transform_point(place)
         turned = reference.T_camera_target[:3, :3]
@@ -325,12 +325,12 @@ class Follower:
 
 
 def describe_large_error(error_bound: float) -> str:
-    """Describe an error `error_bound` [m] that is too large for a reliable position."""
+    """Return the warning that an error bound [m] is too large for a reliable position."""
     return f"the place is known to {1e3 * error_bound:.0f} mm only: do not rely on it"
 
 
 def compute_tip_covariance(registration: Registration, tool: TrackedTool, tool_pose: Pose) -> np.ndarray:
-    """Compute a tool tip's covariance (3, 3) [m^2] in the scan: by pose, tool calibration and registration."""
+    """Compute the covariance (3, 3) [m^2] of a tool tip in the scan, from pose, tool calibration and registration."""
     T = registration.T_patient_scan
     arm, tracked = tool_pose.transform_point(tool.T_cube_tool[:3, 3])
     turned = tool_pose.T_camera_target[:3, :3]
@@ -340,7 +340,7 @@ def compute_tip_covariance(registration: Registration, tool: TrackedTool, tool_p
 
 
 def compute_error_radius(covariance: np.ndarray, view_direction: np.ndarray) -> float:
-    """Return the radius [m] of 95 % of an error with covariance (3, 3) [m^2] across a line of sight along (3,)."""
+    """Return the 95 % radius [m] of an error with covariance (3, 3) [m^2], across a direction of view (3,)."""
     ray = view_direction / np.linalg.norm(view_direction)
     plane = np.eye(3) - np.outer(ray, ray)
     largest = float(np.linalg.eigvalsh(plane @ covariance @ plane)[-1])

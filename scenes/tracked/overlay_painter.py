@@ -1,4 +1,4 @@
-"""Tumour overlay on a real image: reliable position in colour, last known position in grey, nothing when lost."""
+"""Tumour overlay on a real image: reliable positions in colour, last known positions in grey."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,25 +30,25 @@ from .tracked_tool import TrackedTool
 
 NO_CONTACT_TEXT = "the tool does not touch: as in the scan"  # Text in the image.
 SEEN_THROUGH = Opening((CORTEX,), (), "seen through bone or drape")
-"""Layer through which the tumour is seen: the drape's hole; everything else may be bone."""
+"""Layer under which the tumour is drawn as visible: the cortex in the drape's hole; elsewhere bone may hide it."""
 GREY_STATES = (TumourState.NO_TOOL, TumourState.STALE, TumourState.NO_REFERENCE)
-"""States in which the tumour is drawn in grey, and dotted."""
+"""States in which the tumour is drawn as a grey dotted outline."""
 
 
 @dataclass(frozen=True, eq=False)
 class Painter:
-    """Renderer of tracking results over images.
+    """Renderer that draws tracking results on images.
 
     Parameters
     ----------
     stage
-        Stage with the brain to draw.
-    tool
-        Tool that occludes the tumour; None: no tool.
+        Rendered parts of the brain.
+        tool
+            Tracked tool, which may occlude the tumour; None: no tool.
     style
-        See `ar.overlay.composite.composite`.
+        Overlay style, see `ar.overlay.composite.composite`.
     device
-        Warp device.
+        Warp device for rendering.
     """
 
     stage: Stage
@@ -57,11 +57,10 @@ class Painter:
     device: str = "cpu"
 
     def paint(self, image: np.ndarray, tracking: TrackingResult, occlusion_mask: np.ndarray | None = None) -> Overlaid:
-        """Draw a tracking result on an image (H, W, 3) uint8.
+        """Draw a tracking result on an image (H, W, 3) uint8, and return the composite image.
 
-        covered (H, W) bool marks foreground in front of the brain, such as a hand. Nothing is drawn over it, and the
-        image
-        shows the share of the tumour that it hides.
+        `occlusion_mask` (H, W) bool marks foreground in front of the brain, such as a hand. Nothing is drawn on the
+        foreground, and a text line in the image reports the share of the tumour that the foreground hides.
         """
         if tracking.state in GREY_STATES or tracking.camera is None:
             return self._draw_grey(image, tracking, occlusion_mask)
@@ -85,7 +84,7 @@ class Painter:
         return composite(picture, camera, tumour, self.style, cover, Marks(band, gauge, before), words)
 
     def _describe_hidden(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
-        """Describe the foreground's share of the tumour in the image, if it is noticeable."""
+        """Describe the share of the tumour that the foreground hides; empty if the share is negligible."""
         box = find_pixel_box(camera, tumour.vertices)
         if covered is None or box is None or self.style == "none":
             return ()
@@ -95,19 +94,19 @@ class Painter:
         return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= MIN_REPORTED_SHARE else ()
 
     def _build_layers(self, known: TrackingResult) -> list[Layer]:
-        """Build the layers to render: open cortex above the tumour, drape around it as in videos, and tool."""
+        """Build the layers to render: open cortex, drape around the craniotomy, and tool if its pose is available."""
         tool = self.build_tool_layer(known)
         return [*self.stage.build_layers(known.motion.positions, None), *([] if tool is None else [tool])]
 
     def build_tool_layer(self, tracking: TrackingResult, with_cube: bool = True) -> Layer | None:
-        """Return the tool's surface if its pose is available, with or without its cube."""
+        """Return the tool's surface, with its marker cube if `with_cube`; None if the pose is not available."""
         pose = tracking.T_scan_tool
         if self.tool is None or pose is None:
             return None
         return Layer("tool", TOOL, *self.tool.build_surface(pose, with_cube), TOOL_COLOUR)
 
     def measure_tip_distance(self, tracking: TrackingResult, tumour: Layer) -> DistanceGauge | None:
-        """Measure from the tool's tip to the tumour, with the error of both; None if a position is unknown."""
+        """Measure the distance from tip to tumour, with its error bound; None if the error of either is unknown."""
         if tracking.T_scan_tool is None or tracking.tip_covariance is None or tracking.bound is None:
             return None
         gauge = measure_tip_gauge(tracking.T_scan_tool[:3, 3], tumour)
@@ -116,7 +115,7 @@ class Painter:
         return DistanceGauge(gauge.tip, gauge.nearest_point, error=float(np.hypot(spread, tracking.motion.error)))
 
     def _draw_grey(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None) -> Overlaid:
-        """Draw the outline in grey at the last position, if there is one, with the reason."""
+        """Draw the warning and, if a camera pose is available, a grey outline at the last tumour position."""
         over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
         if known.camera is not None and self.style != "none":
             self._draw_dotted(over, known.camera, self.stage.build_tumour(known.motion.positions))
@@ -135,7 +134,7 @@ class Painter:
 
 
 def format_top_lines(tracking: TrackingResult) -> Sequence[str]:
-    """Describe the tumour position and its error, for the top of the image."""
+    """Describe the tumour's state and overlay error, as lines for the top of the image; empty without a bound."""
     if tracking.bound is None:
         return ()
     largest = max(tracking.sources, key=lambda name: tracking.sources[name])

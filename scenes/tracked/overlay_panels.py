@@ -1,4 +1,4 @@
-"""Side panels of an overlay page's 3-D view: slices of the scan, and recent readings."""
+"""Side panels of an overlay page's 3-D view: slices of the scan, and charts of recent values."""
 
 import numpy as np
 
@@ -19,12 +19,12 @@ OVERLAY_ERROR = Trace(
 
 
 def list_plot_lines(has_tool: bool) -> tuple[Trace, ...]:
-    """Return the plotted quantities of each image."""
+    """Return the plotted quantities: distance from tip to tumour (if there is a tool), and overlay error."""
     return (DISTANCE, OVERLAY_ERROR) if has_tool else (OVERLAY_ERROR,)
 
 
 def build_history_sample(tracking: TrackingResult, gauge: DistanceGauge | None, has_tool: bool, time: float) -> Sample:
-    """Build the readings of an image that is shown at a time [s], in the order of `list_plot_lines`."""
+    """Build the plotted values of an image that is shown at a time [s], in the order of `list_plot_lines`."""
     within = 1e3 * tracking.bound if tracking.is_reliable and tracking.bound is not None else None
     if not has_tool:
         return Sample(time, (within,), (0.0,))
@@ -34,9 +34,9 @@ def build_history_sample(tracking: TrackingResult, gauge: DistanceGauge | None, 
 
 
 def render_slices(tracking: TrackingResult, painter: Painter, position: str) -> np.ndarray:
-    """Render three slices (h, 3 h, 3) uint8 of the scan, through one of the places of `scenes.page.side_panels`.
+    """Render three slices (h, 3 h, 3) uint8 of the scan through `position`, a label in `scenes.page.side_panels`.
 
-    The error band is that of the motion: tracking and registration do not move the tumour in the scan.
+    The error band shows the error of the motion only: tracking and registration do not move the tumour in the scan.
     """
     stage, tool = painter.stage, painter.build_tool_layer(tracking, with_cube=False)
     tip = None if tracking.T_scan_tool is None else tracking.T_scan_tool[:3, 3]

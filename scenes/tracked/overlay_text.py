@@ -1,4 +1,4 @@
-"""Text of an overlay's page, as HTML: overlay state, reasons of unreliable results, and both errors."""
+"""Text of an overlay's page (HTML): state of the overlay, reasons for unreliable results, and errors."""
 
 from html import escape
 
@@ -19,7 +19,7 @@ STATE_TEXTS = {  # Texts on the page, by the state of the tumour.
 
 
 def describe_overlay(name: str, model: str, has_tool: bool) -> str:
-    """Describe the image: its source, the meaning of the lines, and the deformation model."""
+    """Build the caption (HTML) of the page: source `name` of the images, legend of the lines, deformation `model`."""
     now, doubt = to_svg_stroke(TUMOUR_COLOUR), to_svg_stroke(DOUBTFUL_COLOUR)
     keys = [
         (f'{now} stroke-width="3"', "tumour now"),
@@ -40,9 +40,9 @@ def describe_overlay(name: str, model: str, has_tool: bool) -> str:
 
 
 def format_report(overlay: Overlay, tip_gauge: DistanceGauge | None, has_tool: bool, image_name: str) -> str:
-    """Build the report of an image: distance first, then state, both errors, and processing time.
+    """Build the report (HTML) of an image: distance from tip to tumour, state, errors, and processing time.
 
-    `image_name` names the image.
+    `image_name` is the description of the image.
     """
     seen = overlay.result
     parts = [format_distance(tip_gauge, seen.is_reliable)] if has_tool else []
@@ -61,14 +61,14 @@ def format_report(overlay: Overlay, tip_gauge: DistanceGauge | None, has_tool: b
 
 
 def format_distance(tip_gauge: DistanceGauge | None, is_reliable: bool) -> str:
-    """Return the distance from tip to tumour with its error, where there is one that may be relied on."""
+    """Format the distance from tip to tumour (HTML), with its error if the position is reliable."""
     if tip_gauge is None:
         return '<p class="number">tip to tumour: not known</p>'
     return format_tip_distance(tip_gauge.distance, tip_gauge.error if is_reliable else None, tip_gauge.is_inside)
 
 
 def format_overlay_error(tracking: TrackingResult) -> str:
-    """Describe the error of the outline across the view, by source."""
+    """Describe (HTML) the error bound of the outline across the line of sight, with its contributions by source."""
     if not tracking.is_reliable or tracking.bound is None:
         return "<p>Overlay error: not known.</p>"
     stated = [f"{name} {format_bound(length, 2)}" for name, length in tracking.sources.items() if length > 0.0]

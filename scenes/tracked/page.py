@@ -1,4 +1,4 @@
-"""Page of a video, or of a live camera, with the tumour overlay."""
+"""Page that shows a video or a live camera with the tumour overlay."""
 
 import time as clock
 from collections import deque
@@ -37,18 +37,18 @@ MAX_KEPT_RESULTS = 20_000  # Number of results kept for a table and a summary, w
 
 @dataclass(eq=False)
 class OverlayPage:
-    """Page of one video, or of one camera.
+    """Page that shows one video or one camera with the tumour overlay.
 
     Parameters
     ----------
     follower, painter
-        Tracker of its images, and overlay renderer.
+        Tracker of the images, and renderer of the overlay.
     name, model
         Name of the video or the camera, and description of the deformation model.
     host, port
         Address of the server.
     frames
-        Number of images of the video; 0: it is a camera.
+        Number of images of the video; 0: live camera.
     origins
         Further addresses of the page, see `ar.page.browser.Browser`.
     """
@@ -81,7 +81,7 @@ class OverlayPage:
     tints: dict[str, tuple[float, float, float]] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        """Open the page; for errors see `ar.page.browser.Browser`."""
+        """Open the page in a server; for errors see `ar.page.browser.Browser`."""
         stage, tool, calibration = self.painter.stage, self.painter.tool, self.follower.calibration
         self.style, self.history = self.painter.style, History(list_plot_lines(self.has_tool))
         bodies = build_brain(stage)
@@ -113,20 +113,20 @@ class OverlayPage:
         return self.painter.tool is not None
 
     def close(self) -> None:
-        """Stop the page."""
+        """Stop the page and its notice thread."""
         self.notice.close()
         self.browser.close()
 
     def play(self, video: SeekableVideo, seconds: float = np.inf) -> list[Overlay]:
-        """Play a video in a loop for the given time; return the last results, without colours.
+        """Play a video in a loop for `seconds`; return the last overlays, without images and meshes.
 
-        No image is skipped: if processing is slower than the video, playback slows down. An image that is not the next
-        one is tracked like a first image.
+        No image is skipped: if processing is slower than the video, the playback slows down. After a jump, an image is
+        tracked like a first image.
 
         Raises
         ------
         ValueError
-            An unreadable video, or one of another size than the camera's; the page reports it, too.
+            The video is unreadable, or its size is not that of the calibration; the page shows the error too.
         """
         due = clock.perf_counter()
         end, known = due + seconds, None
@@ -157,7 +157,7 @@ class OverlayPage:
         return list(self.overlays)
 
     def _find_next_number(self, count: int, due: bool) -> int | None:
-        """Return the number of the image to be shown, if it is not the current one."""
+        """Return the number of the next image to show; None if the shown image stays."""
         wanted, first = self.number, self.number < 0
         if self.requested:
             wanted = self.requested.pop()
@@ -166,14 +166,14 @@ class OverlayPage:
         return None if wanted == self.number else wanted
 
     def watch(self, images: Iterator[NamedImage | None], seconds: float = np.inf) -> list[Overlay]:
-        """Show a camera's images until it ends, or the time is over; None stands for a missing image.
+        """Show a camera's images for `seconds` or until the camera ends; a None in `images` is a missing image.
 
-        Return the last results, without colours. An outdated image is dimmed, and marked as old.
+        Returns the last overlays, without images and meshes. An outdated image is dimmed, and marked as old.
 
         Raises
         ------
         ValueError
-            Images of another size than the camera's; the page reports it, too.
+            The images' size is not that of the calibration; the page shows the error too.
         """
         came = clock.perf_counter()
         end, known = came + seconds, None
@@ -195,7 +195,7 @@ class OverlayPage:
         return list(self.overlays)
 
     def _report_silence(self, seconds: float) -> None:
-        """Report that a camera has given no image for `seconds`."""
+        """Report on the page that the camera has delivered no image for `seconds`."""
         if seconds < UNPLUGGED_TIME:
             self._mark_outdated(f"no image for {self.follower.settings.max_gap:g} s")
         else:
@@ -203,7 +203,7 @@ class OverlayPage:
 
     @contextmanager
     def _show_failure(self, end: float) -> Iterator[None]:
-        """Show the reason of a failure on the page for some time, then raise the error again."""
+        """Show a ValueError on the page for `FAILURE_TIME`, at most until `end`; then raise the error again."""
         try:
             yield
         except ValueError as error:
@@ -213,11 +213,11 @@ class OverlayPage:
             raise
 
     def _build_painter(self) -> Painter:
-        """Return the painter with the requested style."""
+        """Return the painter with the overlay style that the user selected."""
         return replace(self.painter, style=self.style)
 
     def _show(self, taken: TimedImage, one: Overlay, number: int, place: str) -> None:
-        """Show an image with its report, and record its readings."""
+        """Show an image with its report, and record its values for the charts."""
         before = self.number
         self.source, self.newest, self.number, self.image_name = taken, one, number, place
         self.overlays.append(one.drop_mesh())
@@ -228,13 +228,13 @@ class OverlayPage:
         self._draw(one)
 
     def _measure_gauge(self, known: TrackingResult) -> DistanceGauge | None:
-        """Measure from tip to tumour; None if the tumour is drawn in grey or not at all."""
+        """Measure the distance from tip to tumour; None if the tumour is not drawn in colour."""
         if known.state in GREY_STATES:
             return None
         return self.painter.measure_tip_distance(known, self.painter.stage.build_tumour(known.motion.positions))
 
     def _draw(self, one: Overlay) -> None:
-        """Show an image, its text, bodies, slices and chart on the page."""
+        """Show an overlay's image, text, 3-D surfaces, slices and chart on the page."""
         known, look, painter = one.result, self.through, self.painter
         self.drawn_style = self.style, self.through
         said = format_report(one, self._measure_gauge(known), self.has_tool, self.image_name)
@@ -255,7 +255,7 @@ class OverlayPage:
             self.browser.tint(name, colour)
 
     def _draw_in_style(self) -> None:
-        """Draw the newest image in another style, if requested."""
+        """Draw the newest image again if the user has selected another style or slice position."""
         if self.newest is None or self.source is None or self.drawn_style == (self.style, self.through):
             return
         assert self.source.source.colour is not None
@@ -264,7 +264,7 @@ class OverlayPage:
         self._draw(self.newest)
 
     def _mark_outdated(self, why: str, hint: str = "") -> None:
-        """Mark the last image as old, unless it is marked already."""
+        """Mark the last image as old for the reason `why`, unless it is already marked so."""
         said = f"{why}: what is shown is old"
         if self.drawn_style == (said, self.style, self.through):
             return

@@ -1,4 +1,4 @@
-"""Plausibility of a registration for this patient: positions of the opening and of the tool relative to the head."""
+"""Plausibility of a registration for the patient in view, from the positions of craniotomy and tool."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ MAX_TOOL_DISTANCE = 1.0
 
 
 def describe_implausible_registration(registration: Registration, stage: Stage, camera: Camera) -> str:
-    """Describe why the opening's position in a registration is implausible for a camera; empty: plausible."""
+    """Describe why the craniotomy's position by a registration is implausible for a camera; empty if plausible."""
     opening = stage.site.origin
     middle = 0.5 * np.array([*build_patient_reference().faces[0].size, 0.0])
     away = float(np.linalg.norm(registration.transform_point(opening)[0] - middle))
@@ -30,13 +30,13 @@ def describe_implausible_registration(registration: Registration, stage: Stage, 
 
 
 def measure_head_distance(tip: np.ndarray, stage: Stage) -> float:
-    """Compute the distance [m] of a tool's tip (3,) [m] from the bounding box of the head's mesh."""
+    """Compute the distance [m] of a tool's tip (3,) [m] from the bounding box of the mesh."""
     nodes = stage.anatomy.mesh.nodes
     return float(np.linalg.norm(tip - np.clip(tip, nodes.min(axis=0), nodes.max(axis=0))))
 
 
 def describe_tool_penetration(tool: TrackedTool, T_scan_tool: np.ndarray, stage: Stage) -> str:
-    """Describe a tool pose (4, 4) [m] whose tip or markers are deep in the brain; empty: plausible."""
+    """Describe by how much tip or markers of a tool at a pose (4, 4) [m] are inside the brain; empty if plausible."""
     mesh = stage.anatomy.mesh
     corners = mesh.nodes[mesh.surface]
     for what, place in (("tip", np.zeros(3)), ("markers", np.linalg.inv(tool.T_cube_tool)[:3, 3])):
@@ -50,9 +50,9 @@ def describe_tool_penetration(tool: TrackedTool, T_scan_tool: np.ndarray, stage:
 def describe_misplaced_tool(
     tool: TrackedTool | None, T_scan_tool: np.ndarray, stage: Stage, was_near_head: bool, possible_cause: str
 ) -> tuple[str, bool]:
-    """Describe why a tool pose (4, 4) [m] is implausible; and return True if the tool has been near the head.
+    """Return why a tool pose (4, 4) [m] is implausible (or ""), and True if the tool has been near the head.
 
-    `was_near_head`: True if it was near before; `possible_cause`: question about the possible cause.
+    `was_near_head`: True if the tool was near before; `possible_cause`: question that is added to the text.
     """
     away = measure_head_distance(T_scan_tool[:3, 3], stage)
     was_near_head = was_near_head or away <= NEAR_DISTANCE

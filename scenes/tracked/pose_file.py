@@ -1,4 +1,4 @@
-"""Poses of a tracked body as a CSV file: seconds, millimetres and unit quaternions. Rows without a pose are blank."""
+"""CSV files of the poses of a tracked body: times [s], positions [mm] and unit quaternions; missing poses are blank."""
 
 import csv
 import warnings
@@ -34,23 +34,23 @@ QUATERNION_TOLERANCE = 0.01  # Tolerance of a quaternion's length from 1.
 MAX_COORDINATE = 100.0  # Largest distance of a position from the origin along an axis [m].
 UNITS = np.repeat([1e3, 1.0], 3)  # Conversion of the covariance from metres and radians to millimetres and radians.
 USUAL_DEVIATIONS = 0.25e-3, float(np.radians(0.1))
-"""Standard deviations of a tracker that reports none, along and about each axis [m], [rad]."""
+"""Default standard deviations of a tracker's poses, along each axis [m] and about each axis [rad]."""
 
 
 def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read poses from a file with the columns time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw.
 
-    Returns the numbers (n,) of the rows in the file, times (n,) [s] and poses (n, 4, 4) [m].
+    Returns the row numbers (n,) in the file, times (n,) [s] and poses (n, 4, 4) [m].
 
-    A pose maps the body's frame to the tracker's: x_tracker = T x_body. Rows without a pose are skipped, and so
-    are rows in which the tracker did not see the body, with a warning: a status that is not OK, zeros or the identity.
-    Other columns are ignored.
+    A pose maps body coordinates to tracker coordinates: x_tracker = T x_body. Rows without a pose are skipped. Rows in
+    which the tracker did not see the body (status not OK, pose of zeros, or identity) are skipped with a warning. Other
+    columns are ignored.
 
     Raises
     ------
     InputError
-        A missing file or one without these columns, times that do not ascend, quaternions that are not of length 1, or
-        places farther than 100 m.
+        The file is missing or lacks these columns, times do not ascend, quaternions do not have the length 1, or
+        positions are farther than 100 m.
     """
     times, poses, _ = _read(path)
     back = np.flatnonzero(np.diff(times) <= 0.0)
@@ -61,15 +61,15 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def read_pose_stream(path: str | Path) -> PoseStream:
-    """Read the poses of an external tracker, in a file of `read_poses`; its clock may restart at midnight.
+    """Read the poses of an external tracker from a file as in `read_poses`; the clock may restart at midnight.
 
-    Covariances are read from the columns `cov_00` to `cov_55`, as written by `write_poses`; default:
-    `USUAL_DEVIATIONS`.
+    Covariances are read from the columns `cov_00` to `cov_55` of `write_poses`; without these columns they are those
+    of `USUAL_DEVIATIONS`.
 
     Raises
     ------
     InputError
-        See `read_poses`; no pose, or an invalid covariance.
+        See `read_poses`; also if there is no pose, or an invalid covariance.
     """
     times, poses, covariances = _read(path)
     kept = ~np.isnan(poses[:, 0, 0])
@@ -82,7 +82,7 @@ def read_pose_stream(path: str | Path) -> PoseStream:
 
 
 def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times (n,), poses (n, 4, 4) and covariances (n, 6, 6) of all rows; without a pose they are NaN."""
+    """Read times (n,) [s], poses (n, 4, 4) [m] and covariances (n, 6, 6) of all rows; missing poses are NaN."""
     with_errors = (TIME, *PLACE, *TURN, *COVARIANCE)
     unseen = Counter[str]()
     columns = read_columns(path, {with_errors[:8], with_errors}, with_errors[1:], partial(_is_unseen, unseen=unseen))
@@ -125,7 +125,7 @@ def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _is_unseen(cells: Mapping[str, str], unseen: Counter[str]) -> bool:
-    """Return True if a row (cells by column) has a pose that the tracker did not see, and count it by its reason."""
+    """Return True if the tracker did not see the body in a row (cells by column); count the reason in `unseen`."""
     pose = {cells[name].strip().casefold() for name in (*PLACE, *TURN)}
     status = {name: cell.strip() for name, cell in cells.items() if name in STATUS or name.endswith("status")}
     why = [f"{name} {cell[:20]!r}" for name, cell in status.items() if cell.casefold() not in SEEN_VALUES]
@@ -135,7 +135,7 @@ def _is_unseen(cells: Mapping[str, str], unseen: Counter[str]) -> bool:
 
 
 def _read_covariances(columns: dict[str, np.ndarray], count: int) -> np.ndarray:
-    """Covariances (n, 6, 6) [m], [rad], of `write_poses`'s columns, or the default one."""
+    """Return covariances (n, 6, 6) [m, rad] from the columns of `write_poses`, or default covariances."""
     if COVARIANCE[0] not in columns:
         return np.tile(np.diag(np.repeat(np.square(USUAL_DEVIATIONS), 3)), (count, 1, 1))
     upper = np.zeros((count, 6, 6))
@@ -154,9 +154,9 @@ def _is_valid_covariance(matrices: np.ndarray) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class TrackedPose:
-    """Result of an image: its time [s], verdict on the body, pose if it is certain, and processing time [s].
+    """Tracking result of an image: time [s], status, pose (None if uncertain or missing), and processing time [s].
 
-    Without a pose, `missing_target` names the target of the verdict.
+    Without a pose, `missing_target` is the name of the target to which the status applies.
     """
 
     time: float
@@ -167,10 +167,10 @@ class TrackedPose:
 
 
 def write_poses(path: Path, rows: Iterable[TrackedPose], tip: np.ndarray) -> None:
-    """Write a row for each image, atomically; those without a pose have blanks.
+    """Write a CSV file with a row for each image, atomically; rows without a pose have blank cells.
 
-    `tip` (3,) [m] is the position of the tool's tip in its own frame. The covariance is of x, y, z [mm] and a small
-    rotation about the body's origin in the axes of the frame [rad]: the upper triangle, row by row.
+    `tip` (3,) [m] is the position of the tool's tip in body coordinates. The columns of the covariance are its upper
+    triangle, row by row, for x, y, z [mm] and a small rotation about the body's origin, in the camera's axes [rad].
     """
     with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
@@ -184,7 +184,7 @@ def write_poses(path: Path, rows: Iterable[TrackedPose], tip: np.ndarray) -> Non
 
 
 def _format_pose(pose: Pose, tip: np.ndarray) -> list[str]:
-    """Format position, rotation, tip with its root mean square error, and covariance."""
+    """Format the cells of a pose: position, rotation, tip with its root mean square error, and covariance."""
     T = pose.T_camera_target
     at, spread = pose.transform_point(tip)
     covariance = (pose.covariance * np.outer(UNITS, UNITS))[np.triu_indices(6)]

@@ -1,4 +1,4 @@
-"""Registration of the scan to the frame of the patient's reference, as a JSON file: millimetres, radians."""
+"""JSON files of the registration of the scan to the patient's reference, in millimetres and radians."""
 
 import json
 from pathlib import Path
@@ -24,15 +24,15 @@ _UNITS = np.repeat([1e3, 1.0], 3)  # Conversion of the covariance from metres an
 
 
 def read_registration(path: str | Path) -> Registration:
-    """Return the registration in a file of `sulcus register`.
+    """Read the registration in a file of `sulcus register`.
 
-    `T_patient_scan_mm` (4 x 4) maps a point of the scan, RAS, to the frame of the patient's reference. `covariance`
-    (6 x 6): translation [mm] in the reference's frame, and small rotation [rad] about `centre_mm` in the scan.
+    `T_patient_scan_mm` (4 x 4) maps scan coordinates (RAS) to coordinates of the patient's reference. `covariance`
+    (6 x 6): translation [mm] in the reference's axes, and small rotation [rad] about `centre_mm` in the scan.
 
     Raises
     ------
     InputError
-        No such file, another format, a transform that is not rigid, or an invalid covariance.
+        The file is missing or has another format, the transform is not rigid, or the covariance is invalid.
     """
     path = to_path(path)
     if not path.is_file():
@@ -65,7 +65,7 @@ def _read_scanned(stored: dict) -> RegisteredScan:
 
 
 def describe_scan(anatomy: Anatomy) -> RegisteredScan:
-    """Return the scan data of an anatomy for its registration; without a tumour the box's corners give the centre."""
+    """Return the data of an anatomy that a registration stores: digest, bounds, and tumour or box centre."""
     nodes = anatomy.mesh.nodes
     bounds = np.stack([nodes.min(axis=0), nodes.max(axis=0)])
     tumour = nodes[anatomy.tumour_nodes] if len(anatomy.tumour_nodes) else bounds
@@ -73,14 +73,14 @@ def describe_scan(anatomy: Anatomy) -> RegisteredScan:
 
 
 def describe_other_mesh(registration: Registration, anatomy: Anatomy, path: str | Path) -> str:
-    """Describe a registration that was made for another mesh of the same scan, or without a record of its mesh.
+    """Describe that a registration was made for another mesh of the same scan, or has no record of its mesh.
 
-    Empty if it was made for this mesh.
+    Returns an empty text if the registration was made for this mesh.
 
     Raises
     ------
     InputError
-        A registration for another anatomy: its bounds or its tumour differ by more than 5 mm from the anatomy's.
+        The registration is of another anatomy, whose bounds or tumour differ by more than 5 mm from this anatomy.
     """
     made, here = registration.scan, describe_scan(anatomy)
     if made is None:
@@ -110,7 +110,7 @@ def _check_covariance(covariance: np.ndarray) -> None:
 
 
 def to_json(registration: Registration) -> dict[str, object]:
-    """Build the file content of a registration."""
+    """Convert a registration to the JSON object of its file."""
     T = registration.T_patient_scan.copy()
     T[:3, 3] *= 1e3
     made = registration.scan
@@ -137,12 +137,12 @@ def to_json(registration: Registration) -> dict[str, object]:
 
 
 def write_registration(path: str | Path, registration: Registration) -> None:
-    """Write a registration, .json, atomically.
+    """Write a registration as a .json file, atomically.
 
     Raises
     ------
     InputError
-        A file that cannot be written, or a wrong file ending.
+        The file cannot be written, or the file ending is wrong.
     """
     with write_atomically(to_path(path), ".json") as partial:
         partial.write_text(json.dumps(to_json(registration), indent=1) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Short rendered video with temporarily covered markers, of a brain whose motion under the tool is known exactly."""
+"""Short rendered test video with temporarily covered markers, and exactly known motion of the brain."""
 
 import time as clock
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ from .filming import (
 SCENE = "palpate"
 """Scene of the video."""
 CAMERA = USUAL_CALIBRATION.resize_calibration(800, 600, allow_scaling=True)
-"""Camera of the video: fewer pixels than usual, so that it takes seconds."""
+"""Camera of the video, with fewer pixels than usual, so that rendering takes only seconds."""
 FRAME_RATE = 10.0  # Frame rate [1/s].
 DURATION = 1.7  # Length of the video [s].
 START_TIME = 0.5  # Start time in the scene [s]: the ball makes contact at 0.4 s.
@@ -45,13 +45,13 @@ TISSUE_SPREAD = 25e-3  # Standard deviation of the tissue displacement around a 
 
 @dataclass(frozen=True, eq=False)
 class DentDeformer:
-    """Deformer by a formula: tissue moves with the tool's tip, with a weight that decreases with distance."""
+    """Deformer by a formula: tissue moves with the tool's tip, by a share that decreases with distance from the tip."""
 
     anatomy: Anatomy
     site: CraniotomyFrame
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Compute the deformation under posed tools: tissue at a tip moves by the tip's depth below the open cortex."""
+        """Compute the deformation for tool poses; tissue at a tip moves by the tip's depth below the open cortex."""
         nodes = self.anatomy.mesh.nodes
         cause = loads.get(Touching)
         assert cause is not None
@@ -70,16 +70,16 @@ class DentDeformer:
 
 @dataclass(frozen=True, eq=False)
 class RenderedVideo:
-    """Images with their ground truth.
+    """Rendered video: images with their ground truth, and the scene that they show.
 
     Parameters
     ----------
     stage, targets, calibration, deformer
-        Scene, printed targets, camera, and deformer that gives the true motion.
+        Rendered parts of the scene, printed targets, camera, and deformer that computes the true motion.
     frames
         Images in temporal order.
     degradation
-        Image degradation, with covered targets and their times.
+        Image degradation, including the covered targets and their times.
     """
 
     stage: Stage
@@ -90,17 +90,17 @@ class RenderedVideo:
     degradation: Artefacts
 
     def get_image(self, frame: VideoFrame) -> NamedImage:
-        """Return an image in the form that a video reader yields."""
+        """Convert an image to the type that a video reader yields."""
         return to_named_image(f"{frame.time:.1f} s", frame.image, frame.time)
 
 
 def render_synthetic_video(patient: PatientSetup) -> RenderedVideo:
-    """Render the video of a patient's anatomy.
+    """Render the test video on a patient's anatomy.
 
     Raises
     ------
     InputError
-        An anatomy without open cortex.
+        The anatomy has no open cortex.
     """
     view = replace(VIEW.calibrate(CAMERA), path=HandHeld(0))
     whole = find_scene(SCENE)

@@ -1,4 +1,4 @@
-"""Loop over real images: track, compute the brain's motion, draw; with the latency of each overlay."""
+"""Loop over real images that tracks, computes the brain's motion and draws the overlay, with its latency."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ class Overlay:
     Parameters
     ----------
     result
-        Drawn tracking result.
+        Tracking result that is drawn.
     image
-        Image (H, W, 3) uint8.
-    seconds
+        Image (H, W, 3) uint8 with the overlay.
+        seconds
         Processing time from the image's arrival [s].
     centroid
-        Centroid of the drawn tumour in the scan (3,) [m].
+        Centroid (3,) [m] of the drawn tumour, in the scan.
     latency
-        Time from the image's acquisition to its overlay [s], for live images.
+        Time from the image's acquisition to its overlay [s]; None if the images are not live.
     has_stamp
-        True if the time was read from the image's pixels.
+        True if the time was read from a time stamp in the image's pixels.
     """
 
     result: TrackingResult
@@ -60,20 +60,20 @@ class Overlay:
     has_stamp: bool = False
 
     def drop_image(self) -> Overlay:
-        """Return the result without the image's colours, which take memory."""
+        """Return the overlay with an empty image, to save memory."""
         return replace(self, image=np.empty((0, 0, 3), np.uint8))
 
     def drop_mesh(self) -> Overlay:
-        """Return the result without the brain's vertex positions, and without the image's colours."""
+        """Return the overlay without the brain's vertex positions and with an empty image, to save memory."""
         motion = replace(self.result.motion, positions=np.empty((0, 3)), solution=None)
         return replace(self.drop_image(), result=replace(self.result, motion=motion))
 
 
 @dataclass(frozen=True, eq=False)
 class TimedImage:
-    """Image with its time [s], read from a stamp in its pixels if there is one, otherwise from the source.
+    """Image with its time [s], which is read from a time stamp in the pixels if present, else from the source.
 
-    `occluded` (H, W) bool is the foreground in front of the brain, such as a hand, if a mask is given.
+    `occluded` (H, W) bool is the mask of foreground in front of the brain, such as a hand; None without a mask.
     """
 
     source: NamedImage
@@ -82,14 +82,14 @@ class TimedImage:
 
 
 def read_timed_images(images: Iterator[NamedImage], masks: Iterator[NamedImage] | None = None) -> Iterator[TimedImage]:
-    """Yield images with their time stamps, and with their masks, in which pixels that are not black are foreground.
+    """Yield images with their times and foreground masks; pixels of a mask that are not black are foreground.
 
-    A 24-hour clock is continued at midnight.
+    Times continue after midnight if a 24-hour clock restarts.
 
     Raises
     ------
     ValueError
-        An image without a mask, a mask without an image, or one of another size.
+        An image without a mask, a mask without an image, or a mask that does not have the size of its image.
     """
     before, days = -np.inf, 0.0
     for number, picture in enumerate(images):
@@ -105,7 +105,7 @@ def read_timed_images(images: Iterator[NamedImage], masks: Iterator[NamedImage] 
 
 
 def _get_mask(masks: Iterator[NamedImage], picture: NamedImage, number: int) -> np.ndarray:
-    """Return the foreground mask of image `number`."""
+    """Return the foreground mask (H, W) bool of image `number`."""
     mask = next(masks, None)
     if mask is None:
         raise ValueError(f"{picture.name} has no mask: there are {number}. Give one for each image, in order.")
@@ -115,9 +115,9 @@ def _get_mask(masks: Iterator[NamedImage], picture: NamedImage, number: int) -> 
 
 
 def pace_images(images: Iterator[TimedImage]) -> Iterator[tuple[TimedImage, float]]:
-    """Yield images like a live camera: the newest image at each request, and the clock time [s] of image time 0.
+    """Yield images as a live camera would: at each request the newest image, with the clock time [s] of image time 0.
 
-    Images that arrive between requests are lost.
+    Older images that arrive between two requests are dropped.
     """
     waiting = next(images, None)
     if waiting is None:
@@ -135,12 +135,12 @@ def pace_images(images: Iterator[TimedImage]) -> Iterator[tuple[TimedImage, floa
 def draw_overlays(
     images: Iterator[TimedImage], follower: Follower, painter: Painter, live: bool = False
 ) -> Iterator[Overlay]:
-    """Yield every image with its overlay; `live`: in real time, so that late images are skipped and old ones marked.
+    """Yield the overlay of each image; if `live`, in real time: late images are skipped, and old images are marked.
 
     Raises
     ------
     ValueError
-        See `Follower.step`; also errors of the video.
+        See `Follower.step`; also errors of the video reader.
     """
     known: TrackingResult | None = None
     for taken, begun in pace_images(images) if live else ((each, None) for each in images):
@@ -152,9 +152,9 @@ def draw_overlays(
 def overlay_image(
     image: TimedImage, start_time: float | None, previous: TrackingResult | None, follower: Follower, painter: Painter
 ) -> Overlay:
-    """Compute the overlay of one image, from the result `previous`.
+    """Compute the overlay of one image; `previous` is the tracking result of the previous image.
 
-    `start_time` is the clock time [s] of the images' time 0, if they are live: old images are marked stale.
+    `start_time` is the clock time [s] of image time 0 for live images, of which old ones are marked stale; else None.
 
     Raises
     ------
@@ -173,14 +173,14 @@ def overlay_image(
 
 
 def mark_stale(tracking: TrackingResult, age: float) -> TrackingResult:
-    """Return the result of an image of the given age [s]: it is stale beyond `STALE_AGE`."""
+    """Return a tracking result, marked as stale if the image's age [s] exceeds `STALE_AGE`."""
     if age <= STALE_AGE or not tracking.is_reliable:
         return tracking
     return replace(tracking, state=TumourState.STALE, warning=f"stale, the image is {age:.1f} s old: do not rely on it")
 
 
 def summarise_latencies(overlays: list[Overlay]) -> dict[str, object]:
-    """Compute median, 95th percentile and histogram [ms] of the latency of live images, or else of processing times."""
+    """Compute median, 95th percentile and histogram [ms] of live images' latencies, or else of processing times."""
     live = [each.latency for each in overlays if each.latency is not None]
     milliseconds = 1e3 * np.array(live or [each.seconds for each in overlays])
     counts = np.histogram(milliseconds, [*LATENCY_EDGES, np.inf])[0]
@@ -195,11 +195,11 @@ def summarise_latencies(overlays: list[Overlay]) -> dict[str, object]:
 
 
 def write_tracking_table(path: Path, overlays: Sequence[Overlay], errors: Sequence[OverlayError | None]) -> None:
-    """Write a row for each image, atomically; unknown values are blank.
+    """Write a CSV file with a row for each image, atomically; cells without a value are blank.
 
-    The position is that of the tumour's centroid in the scan, RAS. `within_mm` is the 95 % bound across the line of
-    sight.
-    Four columns compare with the ground truth, if that is given; the last one names the space.
+    The position is the tumour's centroid in the scan (RAS). `within_mm` is the 95 % error bound across the line of
+    sight. Four columns contain the errors relative to the ground truth, if available. The last column names the
+    coordinate system.
     """
     with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")

@@ -1,4 +1,4 @@
-"""Random access to the images of a video by number."""
+"""Access to the images of a video by number."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -11,16 +11,16 @@ from .run import TimedImage, read_timed_images
 
 @dataclass(eq=False)
 class SeekableVideo:
-    """Video, or folder of images.
+    """Video or folder of images, whose images are read by number.
 
     Parameters
     ----------
     path
-        Path; for errors see `ar.tracking.image_sequences.read_video`.
+        Path of the video or folder; for errors see `ar.tracking.image_sequences.read_video`.
     rate
         Frame rate of a folder [1/s].
     count
-        Number of images, as far as known.
+        Number of images; corrected if the video ends earlier.
     """
 
     path: Path
@@ -30,7 +30,7 @@ class SeekableVideo:
     next_number: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
-        """Open the video."""
+        """Count the images and open the video."""
         self.count = count_frames(self.path)
         self.images = self._read_from(0)
 
@@ -38,7 +38,7 @@ class SeekableVideo:
         return read_timed_images(read_video(self.path, self.rate, with_colour=True, first_frame=number))
 
     def read_image(self, number: int) -> TimedImage | None:
-        """Return an image by its number; None if the video ends before this image; `count` is then corrected."""
+        """Return image `number`; None if the video ends before this image, and `count` is then corrected."""
         if number != self.next_number:
             # Read from the start: seeking in a video does not reach every frame.
             self.images = self._read_from(number)

@@ -1,4 +1,4 @@
-"""Brain motion under a tracked tool: deformation by a model or FEM from its pose, with its error."""
+"""Brain motion under a tracked tool: deformation computed from the tool's pose, with its error."""
 
 from dataclasses import dataclass
 
@@ -21,22 +21,22 @@ TOO_DEEP_WARNING = "the tool is farther inside the brain than the model knows: d
 
 @dataclass(frozen=True, eq=False)
 class BrainMotion:
-    """State of the brain.
+    """Deformed state of the brain, with its error.
 
     Parameters
     ----------
     positions
-        Positions of all mesh vertices (V, 3) [m]; undeformed for those that are not drawn.
+        Positions (V, 3) [m] of all mesh vertices; vertices without a computed displacement are undeformed.
     supported
-        True if a deformer supports the tool's pose.
+        True if a deformer computed the deformation.
     distance
-        Mean distance of the tumour's surface from its position in the scan [m].
+        Mean displacement of the tumour's surface from the scan [m].
     model_error, tool_error
-        95 % bounds on a vertex's error by the model, and by the error of the tool's position [m].
+        95 % bounds [m] on the error of a tumour vertex due to the model, and due to the error of the tool's position.
     warning
-        Reason why the motion is unreliable, as text for the image; empty if it is reliable.
+        Reason for the image why the motion is unreliable; empty if the motion is reliable.
     solution
-        The solution, from which the next one may start.
+        Solution from which the next solve may start.
     """
 
     positions: np.ndarray
@@ -49,28 +49,28 @@ class BrainMotion:
 
     @property
     def error(self) -> float:
-        """Known error of the motion at 95 % [m]."""
+        """95 % bound on the error of the motion due to model and tool position [m]."""
         return float(np.hypot(self.model_error, self.tool_error))
 
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """Deformation for the poses of a stage's tool; without a deformer the brain stays as in the scan."""
+    """Model of the brain's deformation for tool poses; without a deformer the brain stays undeformed."""
 
     stage: Stage
     deformer: Deformer | None = None
 
     @property
     def rest_motion(self) -> BrainMotion:
-        """The brain as in the scan."""
+        """Undeformed state of the brain."""
         return BrainMotion(self.stage.anatomy.mesh.nodes)
 
     def compute_motion(
         self, T_scan_tool: np.ndarray, tip_covariance: np.ndarray, previous: BrainMotion | None = None
     ) -> BrainMotion:
-        """Compute the brain under a tool at a pose (4, 4) [m], whose tip has an error covariance (3, 3) [m^2].
+        """Compute the state of the brain for a tool pose (4, 4) [m] with the tip's error covariance (3, 3) [m^2].
 
-        Its influence on the tumour is found by a second solution, for a tool that is 1.96 standard deviations deeper.
+        The influence of the tip's error is computed by a second solve with the tool 1.96 standard deviations deeper.
         """
         if self.deformer is None:
             return self.rest_motion
@@ -103,7 +103,7 @@ class ToolMotion:
     def _solve_poses(
         self, pose: np.ndarray, deeper: np.ndarray, start: Deformation | None
     ) -> tuple[Deformation, Deformation]:
-        """Compute the solutions of both poses; FEM starts from the last one."""
+        """Compute the solutions for `pose` and `deeper`; FEM starts from the solution `start`."""
         assert self.deformer is not None
         if isinstance(self.deformer, Learned):
             loads = Loads((Touching(np.stack([pose, deeper])[:, None]),))

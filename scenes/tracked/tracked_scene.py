@@ -1,4 +1,4 @@
-"""Scene of the brain under a tracked tool, and its deformer."""
+"""Scene of the brain under a tracked tool, and selection of its deformer."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
 
 REST = "rest"
-"""Name of the deformer that leaves the brain undeformed, as in the scan."""
+"""Name of the option value for which the brain stays undeformed, as in the scan."""
 
 
 def build_tracked_scene(args: argparse.Namespace, tool_shape: BuiltIn | None) -> Scene:
-    """Build the scene of the brain: the tool, moved by pose, and the skull."""
+    """Build the scene of the brain from command-line arguments: tissue, skull, and contact with a tool, if any."""
     from sim.effects import SKULLS, Elasticity, Held, ToolContact
 
     from ..script.scene import Scene
@@ -34,12 +34,12 @@ def build_tracked_scene(args: argparse.Namespace, tool_shape: BuiltIn | None) ->
 def build_requested_deformer(
     args: argparse.Namespace, patient: PatientSetup, scene: Scene, has_tool: bool
 ) -> tuple[Deformer | None, str]:
-    """Select the deformer of the brain under a tracked tool, if there is one, with its description.
+    """Build the requested deformer of the brain under a tracked tool, and its description.
 
     Raises
     ------
     InputError
-        A deformer that does not exist, or does not support the scene.
+        The deformer does not exist, or does not support the scene.
     """
     from ..play.deformers import GUARDED
 

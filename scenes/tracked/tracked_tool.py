@@ -1,4 +1,4 @@
-"""Tool that carries the printed cube: its shape, and its pose relative to the cube."""
+"""Tool that carries the printed cube: contact shape, transform to the cube, and JSON file."""
 
 import json
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ MAX_TIP_DISTANCE = 1.0  # Largest distance of a tool's tip from its cube [m].
 
 
 def build_nominal_cube() -> np.ndarray:
-    """Build T_cube_tool (4, 4) of a cube whose axes are the tool's, with the tip below its centre."""
+    """Build T_cube_tool (4, 4) [m] for a cube that is aligned with the tool, with its centre above the tip."""
     T = np.eye(4)
     T[2, 3] = -TIP_DISTANCE
     return T
@@ -38,11 +38,11 @@ class TrackedTool:
     Parameters
     ----------
     shape
-        Part of the tool that touches tissue.
+        Contact shape of the tool.
     T_cube_tool
-        Transform (4, 4) [m] from the tool's frame, whose origin is its lowest point, to the cube's.
-    tip_covariance
-        Calibration covariance (3, 3) [m^2] of that origin in the cube's frame.
+        Transform (4, 4) [m] from tool coordinates, whose origin is the tool's lowest point, to cube coordinates.
+        tip_covariance
+            Calibration covariance (3, 3) [m^2] of this lowest point in cube coordinates.
     """
 
     shape: BuiltIn
@@ -51,14 +51,14 @@ class TrackedTool:
 
     @cached_property
     def bare_mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Surface without the cube, which would occlude: vertices (n, 3) [m], triangles (m, 3)."""
+        """Surface of the tool without the cube: vertices (n, 3) [m] in tool coordinates, and triangles (m, 3)."""
         return add_shaft(self.shape, np.linalg.inv(self.T_cube_tool)[:3, 3])
 
     @cached_property
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Surface with the cube, as far as the shape is known: vertices (n, 3) [m] in its own frame, triangles (m, 3).
+        """Surface of the tool with the cube: vertices (n, 3) [m] in tool coordinates, and triangles (m, 3).
 
-        Only the printed faces are included, with their borders.
+        The cube is a box around its printed faces.
         """
         T_tool_cube, (vertices, triangles) = np.linalg.inv(self.T_cube_tool), self.bare_mesh
         box, sides = _build_cube()
@@ -66,13 +66,13 @@ class TrackedTool:
         return np.concatenate([vertices, at]), np.concatenate([triangles, sides + len(vertices)])
 
     def build_surface(self, T_scan_tool: np.ndarray, with_cube: bool = True) -> tuple[np.ndarray, np.ndarray]:
-        """Return the surface at a pose (4, 4) [m], with or without its cube: vertices (n, 3) [m], triangles (m, 3)."""
+        """Return vertices (n, 3) [m] and triangles (m, 3) of the tool at a pose (4, 4), with or without the cube."""
         vertices, triangles = self.mesh if with_cube else self.bare_mesh
         return vertices @ T_scan_tool[:3, :3].T + T_scan_tool[:3, 3], triangles
 
 
 def _build_cube() -> tuple[np.ndarray, np.ndarray]:
-    """Return the printed cube as a box in its own frame: corners (8, 3) [m], and triangles (12, 3)."""
+    """Return the printed cube as a box in cube coordinates: corners (8, 3) [m], and triangles (12, 3)."""
     half = float(max(abs(face.T_target_face[:3, 3]).max() for face in build_tool_cube().faces))
     signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -81,12 +81,12 @@ def _build_cube() -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_tool(path: str | Path) -> TrackedTool:
-    """Read the tool in a JSON file with lengths in millimetres.
+    """Read a tracked tool from a JSON file with lengths in millimetres.
 
     Raises
     ------
     InputError
-        A missing or invalid file; an invalid shape, or a transform that is not rigid.
+        The file is missing or invalid, the shape is invalid, or the transform is not rigid.
     """
     path = to_path(path)
     with wrap_errors(path, "a tracked tool", REMEDY):
@@ -114,7 +114,7 @@ def _check_rigid(T: np.ndarray) -> None:
 
 
 def write_tool(path: Path, tool: TrackedTool) -> None:
-    """Write a tool as JSON, in millimetres, atomically."""
+    """Write a tracked tool to a JSON file with lengths in millimetres, atomically."""
     T = tool.T_cube_tool.copy()
     T[:3, 3] *= 1e3
     stored = {

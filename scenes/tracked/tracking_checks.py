@@ -1,4 +1,4 @@
-"""Verification of an overlay by its pixels, with lost and recovered markers and late images."""
+"""Verification of an overlay by the pixels of its images, with lost and recovered markers and late images."""
 
 import time as clock
 from collections.abc import Iterator
@@ -42,21 +42,21 @@ CHECK = TrackingCheckSettings()
 
 @dataclass(frozen=True)
 class TrackingFigures:
-    """Worst metrics of a video.
+    """Worst metrics over the overlays of a video.
 
     Parameters
     ----------
     pictures
         Number of images.
     confident
-        Number of images in which a lost or old position is drawn in the colour of a known one.
+        Number of images in which a lost or old position is drawn in the colour of a reliable position.
     unsaid
-        Number of images with a lost or old position that do not show the reason in their pixels.
+        Number of images with a lost or old position that do not show the reason as text.
     back
-        Number of images until the tumour is drawn as known again, at the video's start and after disturbances;
+        Largest number of images until the tumour is drawn as reliable, at the video's start or after a disturbance;
         infinite: never.
     off
-        Distance of the outline of a known position from the true one [pixel].
+        Largest distance between a drawn reliable outline and the true outline [pixel].
     """
 
     pictures: int
@@ -77,13 +77,13 @@ class TrackingFigures:
         return [sentence for sentence, kept in rules.items() if not kept]
 
     def to_row(self) -> dict[str, float | None]:
-        """Convert to a row of JSON; None: not measured."""
+        """Convert the metrics to a JSON object; infinite values become None."""
         return {name: value if np.isfinite(value) else None for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True, eq=False)
 class ArrivingImage:
-    """Image at its arrival, with its age [s] and the required text, which is empty without a disturbance."""
+    """Image at its arrival, with its age [s], and the text that its overlay must show (empty: no disturbance)."""
 
     frame: VideoFrame
     age: float = 0.0
@@ -91,7 +91,7 @@ class ArrivingImage:
 
 
 def replay_images(video: RenderedVideo) -> Iterator[ArrivingImage]:
-    """Yield the images of a video in order: one is repeated, one is delayed, and one comes after a gap."""
+    """Yield the images of a video in order; one image is repeated, one is delayed, and one follows a gap."""
     before = 0.0
     for shot in video.frames:
         covered = video.degradation.list_disturbances(shot.time)
@@ -114,7 +114,7 @@ def build_default_pipeline(video: RenderedVideo, style: Style = "window") -> tup
 
 
 def measure_tracking(video: RenderedVideo, follower: Follower, painter: Painter) -> TrackingFigures:
-    """Track a video, draw the results, and measure what the images show."""
+    """Track a video, draw the overlays, and measure the metrics in the pixels of the overlays."""
     known: TrackingResult | None = None
     confident, unsaid, waits, worst, waiting, count = 0, 0, [0], 0.0, True, 0
     for event in replay_images(video):
@@ -138,7 +138,7 @@ def measure_tracking(video: RenderedVideo, follower: Follower, painter: Painter)
 
 
 def _has_warning(colour: np.ndarray, words: str, wanted: str) -> bool:
-    """Return True if the image contains text with the wanted beginning."""
+    """Return True if the text `words` begins with `wanted`, and the image shows this text as a warning."""
     lines = format_warning(words, colour.shape[1])
     return words.startswith(wanted) and all(
         has_text(colour, line, TEXT_SCALE, average_colour(WARNING_COLOUR)) for line in lines
@@ -146,7 +146,7 @@ def _has_warning(colour: np.ndarray, words: str, wanted: str) -> bool:
 
 
 def _measure_outline_error(film: RenderedVideo, shot: VideoFrame, colour: np.ndarray) -> float:
-    """Compute the distance between the outline in an image and the true one [pixel]."""
+    """Compute the distance [pixel] between the outline in an image and the true outline of the tumour."""
     camera, rest = film.calibration.build_camera(shot.T_camera_scan), film.stage.tumour_at_rest
     mask = compute_silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
     tool = compute_silhouette(camera, *film.targets.tool.build_surface(shot.T_scan_tool))

@@ -1,4 +1,4 @@
-"""Overlays compared with the ground truth of a video: errors of outline and tumour, and coverage of the band."""
+"""Ground truth of a video, and errors of overlays: outline, tumour position, and coverage of the error band."""
 
 import csv
 import json
@@ -34,13 +34,13 @@ class VideoGroundTruth:
     Parameters
     ----------
     anatomy
-        Digest of the anatomy in the video.
+        Digest of the anatomy that the video shows.
     times
         Times (F,) [s].
     T_camera_scan, T_scan_tool
         Poses (F, 4, 4) [m].
     displacement
-        Displacements (F, n, 3) [m] of the vertices of the tumour's surface, sorted by their numbers in the mesh.
+        Displacements (F, n, 3) [m] of the tumour's surface vertices, which are sorted by mesh vertex number.
     """
 
     anatomy: str
@@ -50,13 +50,13 @@ class VideoGroundTruth:
     displacement: np.ndarray
 
     def find_image(self, time: float) -> int | None:
-        """Return the number of the image taken at a time [s], to a millisecond; None without such an image."""
+        """Return the number of the image within 1 ms of a time [s]; None if there is no such image."""
         near = int(np.abs(self.times - time).argmin())
         return near if abs(self.times[near] - time) < 1e-3 else None
 
 
 def write_truth(path: Path, truth: VideoGroundTruth) -> None:
-    """Write the ground truth as .npz, atomically."""
+    """Write the ground truth as an .npz file, atomically."""
     with write_atomically(path, ".npz") as partial, partial.open("wb") as file:
         np.savez_compressed(
             file,
@@ -69,14 +69,14 @@ def write_truth(path: Path, truth: VideoGroundTruth) -> None:
 
 
 def read_truth(path: str | Path, digest: str, vertex_count: int, max_bytes: int = MAX_TRUTH_BYTES) -> VideoGroundTruth:
-    """Read the ground truth of an anatomy with this digest and number of `vertex_count` on its tumour's surface.
+    """Read the ground truth for an anatomy with this digest, and with `vertex_count` vertices on the tumour's surface.
 
-    The uncompressed arrays have at most `max_bytes` bytes.
+    `max_bytes` is the largest allowed size of the uncompressed arrays [bytes].
 
     Raises
     ------
     InputError
-        A missing or invalid file, or ground truth of another anatomy.
+        The file is missing or invalid, or contains the ground truth of another anatomy.
     """
     path = to_path(path)
     with wrap_errors(path, "the ground truth of a video", REMEDY), path.open("rb") as raw:
@@ -98,9 +98,9 @@ def read_truth(path: str | Path, digest: str, vertex_count: int, max_bytes: int 
 
 
 def write_truth_table(path: Path, truth: VideoGroundTruth, rest_surface: np.ndarray) -> None:
-    """Write the ground truth as a table, a row for each image; rest (n, 3) [m]: the tumour's surface in the scan.
+    """Write the ground truth as a CSV table, one row per image; `rest_surface` (n, 3) [m]: undeformed tumour surface.
 
-    Poses are rows of 12 numbers, of the matrix from the scan to the camera, and from the tool to the scan [mm].
+    A pose has 12 columns, the upper three rows of the matrix from scan to camera, or from tool to scan [mm].
     """
     names = [f"{what}_{row}{column}" for what in POSE_ARRAYS for row in range(3) for column in range(4)]
     with write_atomically(path, ".csv") as partial, partial.open("w", encoding="utf-8", newline="") as file:
@@ -116,16 +116,16 @@ def write_truth_table(path: Path, truth: VideoGroundTruth, rest_surface: np.ndar
 
 @dataclass(frozen=True)
 class OverlayError:
-    """Error of one overlay.
+    """Error of one overlay relative to the ground truth.
 
     Parameters
     ----------
     outline, overlap
-        Mean distance of the drawn outline from the true one [pixel]; intersection over union of the silhouettes.
-    centroid, maximum
-        Error of the tumour's centroid, and maximum over its surface, across the true line of sight [m].
+        Mean distance between the drawn and the true outline [pixel]; intersection over union of the silhouettes.
+        centroid, maximum
+            Error of the tumour's centroid and maximum error on its surface, across the true line of sight [m].
     is_covered
-        True if the maximum is within the band.
+        True if `maximum` is within the error band of the overlay.
     """
 
     outline: float
@@ -138,7 +138,7 @@ class OverlayError:
 def compute_overlay_error(
     tracking: TrackingResult, truth: VideoGroundTruth, calibration: Calibration, stage: Stage
 ) -> OverlayError | None:
-    """Compute the error of a tracking result; None if no position is drawn, or without ground truth at its time."""
+    """Compute the error of a tracking result; None if it has no camera pose or no ground truth at its time."""
     row = truth.find_image(tracking.time)
     if row is None or tracking.camera is None:
         return None
@@ -159,13 +159,13 @@ def compute_overlay_error(
 
 
 def _compute_lateral_lengths(apart: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Compute the lengths (n,) of vectors (n, 3) across the lines of sight to points (n, 3) of the camera's frame."""
+    """Compute lengths (n,) of vectors (n, 3) across the lines of sight to points (n, 3) in camera coordinates."""
     rays = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     return np.linalg.norm(apart - np.sum(apart * rays, axis=1, keepdims=True) * rays, axis=1)
 
 
 def _compute_edge_distance(true: np.ndarray, drawn: np.ndarray) -> float:
-    """Compute the mean distance [pixel] between the edges of a mask and the true mask; infinite without one."""
+    """Compute the mean distance [pixel] between the edges of two masks; infinite if a mask is empty."""
     edges = [mask & (np.asarray(binary_erosion(mask)) == 0) for mask in (true, drawn)]
     if not all(edge.any() for edge in edges):
         return np.inf
@@ -174,7 +174,7 @@ def _compute_edge_distance(true: np.ndarray, drawn: np.ndarray) -> float:
 
 
 def summarise_errors(results: Sequence[TrackingResult], errors: Sequence[OverlayError | None]) -> dict[str, object]:
-    """Compute medians and 95th percentiles over images whose tumour is drawn as known; number of wrong ones."""
+    """Compute medians and 95th percentiles over reliable overlays, and the number of overlays beyond their bound."""
     relied = [(each, error) for each, error in zip(results, errors, strict=True) if each.is_reliable and error]
     if not relied:
         return {"pictures": 0}

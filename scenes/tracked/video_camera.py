@@ -1,4 +1,4 @@
-"""Check that a video is of the given camera."""
+"""Check that a video was recorded by the calibrated camera."""
 
 from itertools import islice
 from pathlib import Path
@@ -18,22 +18,22 @@ IMAGE_STRIDE = 10  # Stride of the examined images.
 
 
 def check_video(path: Path, frame_rate: float, calibration: Calibration, camera: str) -> None:
-    """Reject an invalid video, or one of another camera, by its first images, before any long computation.
+    """Check in its first images that a video is valid and was recorded by the calibrated camera.
 
-    Without markers the focal length is not checked.
+    The focal length is checked only if markers are visible.
 
     Parameters
     ----------
     path, frame_rate
-        A video, or a folder of images with this frame rate [1/s].
-    camera
-        Name of the calibration's file.
+        Video, or folder of images with this frame rate [1/s].
+        camera
+            Name of the calibration file, for messages.
 
     Raises
     ------
     InputError
-        A missing or unreadable video, images of another size than the camera's, and focal lengths with a significant
-        error of more than 5 %.
+        The video is missing or unreadable, its images do not have the size of the calibration, or the focal length has
+        a significant error of more than 5 %.
     """
     targets = {target.name: target for target in list_targets()}
     detector, seen, count = Detector(tuple(targets.values())), [], 0
