@@ -1,1 +1,1 @@
-"""Cost of accuracy, errors of the tumour, and other effects that move it."""
+"""Analysis of accuracy and cost, of errors of the tumour position, and of influences on the tumour's motion."""

@@ -1,4 +1,4 @@
-"""Choice of a deformation model by its reported error and its measured time for a frame."""
+"""Choice of a deformation model by its reported error and its measured time per frame."""
 
 from collections.abc import Callable
 
@@ -23,10 +23,10 @@ MAX_LIVE_ERROR = 5e-5  # Largest distance of a node from the converged solution 
 def choose_within(
     patient: PatientSetup, scene: Scene, budget: tuple[float | None, float | None], notify: Callable[[str], object]
 ) -> ModelChoice:
-    """Choose among the deformers of a scene, timed on its frames, and the families with recorded figures.
+    """Choose a deformation model of a scene within a `budget`: largest error [mm] and largest time per frame [ms].
 
-    Families are timed when they are chosen by their recorded time, and the choice is made again. `budget`: largest
-    error [mm] and time [ms]; `notify` receives sentences for the user.
+    Candidates are the scene's deformers, timed on its frames, and the families with recorded figures. If a family is
+    chosen by its recorded time, it is timed here, and the choice is repeated. `notify` receives sentences for users.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def choose_within(
 
 
 def _time_frames(player: Player) -> float:
-    """Return the median time of a deformation [ms], on frames that are spread over the scene."""
+    """Return the median time of a deformation [ms], over frames that are evenly spaced in the scene."""
     seconds, last = [], None
     for number in np.linspace(0, len(player.scene.times) - 1, TIMED_FRAMES + 1).astype(int).tolist():
         last, spent = time_work(player.compute_deformation, player.build_loads(number), last)
@@ -70,7 +70,7 @@ def _time_frames(player: Player) -> float:
 
 
 def _get_reported_error(deformer: Deformer) -> float:
-    """Return the error [m] that a deformer reports; NaN without one."""
+    """Return the error [m] that a deformer reports; NaN if it reports no error."""
     if isinstance(deformer, Guarded):
         return float(np.fmin(deformer.model.bound, deformer.limit))
     return deformer.bound if isinstance(deformer, Learned) else MAX_LIVE_ERROR

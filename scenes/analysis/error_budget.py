@@ -1,4 +1,4 @@
-"""Error budget of an overlay on a tracked camera, by contributor: a Monte Carlo simulation."""
+"""Error budget of an overlay on a tracked camera, by source of error, from a Monte Carlo simulation."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -27,43 +27,43 @@ from .uncertainty import SurfaceMotions, compute_motion_errors
 CALIBRATION, MARKERS, LATENCY, SHUTTER = "calibration", "markers", "latency x motion", "rolling shutter"
 PARAMETERS = "tissue, skull, tool's place"  # Name of the contributor of unknown tissue, skull and tool position.
 TECHNICAL = (CALIBRATION, MARKERS, LATENCY, SHUTTER, SURROGATE, MESH)
-"""Contributors of the system itself."""
+"""Contributors to the error that belong to the technical system."""
 CLINICAL = (*TECHNICAL, REGISTRATION, SEGMENTATION, PARAMETERS)
-"""Contributors including unmeasured properties of the patient."""
+"""All contributors, including unmeasured properties of the patient."""
 CALIBRATION_COUNT = 100  # Number of sampled calibrations.
 
 
 @dataclass(frozen=True, eq=False)
 class FilmedScene:
-    """Scene at one time, seen by a tracked camera.
+    """Scene at one time, recorded by a tracked camera, with the sources of error.
 
     Parameters
     ----------
     site, viewpoint
-        Open cortex, and camera with its calibration and path.
+        Craniotomy, and camera with its calibration and path.
     duration
-        Duration of the scene [s], from which times of the camera's path are sampled.
+        Duration of the scene [s]; times on the camera's path are sampled from 0 to `duration`.
     T_scan_patient
-        Transform (4, 4) of the patient's reference.
+        Pose (4, 4) [m] of the patient's reference in the scan.
     covariance
-        Covariance (9, 9) of the calibration.
+        Covariance (9, 9) of the camera's calibration.
     time
-        Time of the moment [s].
+        Time of the scene [s] at which errors are computed.
     rest, field, normals
-        (n, 3) [m]: tumour surface in the scan, its displacement, and its outward normals after that.
+        Undeformed tumour surface, its displacement, and outward normals of the deformed surface, (n, 3) [m].
     velocity
         Velocity (n, 3) [m/s] of the surface.
     bodies
-        Displacements of the surface in the sampled bodies (b, n, 3) [m].
+        Displacements (b, n, 3) [m] of the surface for sampled parameters of tissue, skull and tool.
     meshes, own_mesh
-        Discretisation error relative to the motion (b,), of each body's mesh and of samples for the scene's mesh.
+        Discretisation errors (b,) relative to the motion: of each sampled body, and samples for the scene itself.
     surrogate
-        Bound [m] reported by a trained model; 0 for FEM.
+        Error bound [m] reported by a trained model; 0 for FEM.
     registration
-        Measured registration; None: the published shift is used.
+        Measured registration; None: registration shifts have the published standard deviation.
     corner, latency, clock
-        Standard deviations of corner positions [pixel], latency [s] and image times relative to poses [s]. The
-        displayed image is `latency` [s] later than the tracked one.
+        Standard deviation of corner positions [pixel]; time [s] from the tracked image to the displayed image; and
+        standard deviation of the times of images relative to poses [s].
     """
 
     site: CraniotomyFrame
@@ -92,7 +92,7 @@ class FilmedScene:
         Raises
         ------
         InputError
-            A viewpoint without one.
+            The viewpoint has no calibration.
         """
         if self.viewpoint.calibration is None:
             raise InputError("a camera that is tracked has a calibration: give the viewpoint one.")
@@ -100,7 +100,7 @@ class FilmedScene:
 
     @cached_property
     def sampled_calibrations(self) -> tuple[Calibration, ...]:
-        """Sampled calibrations, cached because building one takes long."""
+        """Sampled calibrations with errors, cached because building a calibration takes long."""
         scale = np.sqrt(np.diag(self.covariance))
         scale[scale == 0.0] = 1.0  # exact inputs
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
@@ -109,18 +109,18 @@ class FilmedScene:
 
     @cached_property
     def differences(self) -> np.ndarray:
-        """Difference (b, n, 3) [m] between the scene's field and those of the bodies, without their mesh errors."""
+        """Differences (b, n, 3) [m] between the displacements of the bodies and of the scene, without mesh errors."""
         return self.bodies - self.field
 
 
 @dataclass(frozen=True, eq=False)
 class OverlayErrors:
-    """Errors of an overlay in S samples: across the line of sight and along it [m], and in pixels.
+    """Errors of an overlay in S samples.
 
     Parameters
     ----------
     across, along, pixels
-        Errors (S,) of the tumour's centre [m], [m], [pixel].
+        Errors (S,) of the tumour's centre across and along the line of sight [m], and in the image [pixel].
     worst
         Maximum surface error (S,) [m], in all directions.
     """
@@ -132,19 +132,19 @@ class OverlayErrors:
 
     @property
     def middle(self) -> np.ndarray:
-        """Distance error (S,) [m] of the centre."""
+        """Total error (S,) [m] of the tumour's centre."""
         return np.hypot(self.across, self.along)
 
 
 def sample_errors(scene: FilmedScene, contributors: Sequence[str], count: int, seed: int = 0) -> OverlayErrors:
-    """Sample the overlay error caused by the contributors, all others being exact.
+    """Sample the overlay error that the `contributors` cause, with all other contributors exact.
 
-    The same seed gives the same random numbers for any set of contributors.
+    With the same seed, each contributor has the same random numbers in any set of contributors.
 
     Raises
     ------
     InputError
-        A reference that the camera does not see.
+        The camera does not see the patient's reference.
     """
     rows = [_compare_tumours(*sample) for sample in _generate_samples(scene, frozenset(contributors), count, seed)]
     return OverlayErrors(*np.array(rows).T)
@@ -153,7 +153,7 @@ def sample_errors(scene: FilmedScene, contributors: Sequence[str], count: int, s
 def _generate_samples(
     filmed: FilmedScene, contributors: frozenset[str], count: int, seed: int
 ) -> Iterator[tuple[Camera, Camera, np.ndarray, np.ndarray]]:
-    """Yield the true and the estimated camera, and the true and the drawn tumour surface (n, 3) [m]."""
+    """Yield for each sample the true and the estimated camera, and the true and the drawn tumour surface (n, 3) [m]."""
     target = build_patient_reference()
     corners = sum(len(face.corners) for face in target.faces)
 
@@ -190,7 +190,7 @@ def _generate_samples(
 
 
 def _sample_time_and_body(filmed: FilmedScene, seed: int, number: int) -> tuple[np.random.Generator, float, int]:
-    """Return the numbers of a sample, of which the first say its time [s] and its body."""
+    """Return a sample's random generator, and the time [s] and the body index that were drawn first from it."""
     random = np.random.default_rng([seed, number])
     return random, random.uniform(0.0, filmed.duration), int(random.integers(len(filmed.bodies)))
 
@@ -198,7 +198,7 @@ def _sample_time_and_body(filmed: FilmedScene, seed: int, number: int) -> tuple[
 def _build_cameras(
     filmed: FilmedScene, time: float, late: float, readout: float, middle: np.ndarray
 ) -> tuple[Camera, Camera]:
-    """Return the camera that sees the tumour's `middle` (3,) [m] in the image of a time [s], and the tracked camera."""
+    """Return the true camera of the image row that shows `middle` (3,) [m] at a time [s], and the tracked camera."""
     true = _build_delayed_camera(filmed, time, 0.0)
     then = _build_delayed_camera(filmed, time, -late) if late else true
     if readout:
@@ -208,12 +208,12 @@ def _build_cameras(
 
 
 def _build_delayed_camera(filmed: FilmedScene, time: float, seconds: float) -> Camera:
-    """Return the true camera at a delay after a time [s]."""
+    """Return the true camera `seconds` after a time [s]."""
     return filmed.viewpoint.build_camera(filmed.site, time + seconds)
 
 
 def _sample_registration_error(filmed: FilmedScene, numbers: np.ndarray) -> np.ndarray:
-    """Return an error of registration (6,): a shift [m] and a turn [rad] in the frame of the patient's reference."""
+    """Convert 6 normal random numbers to a registration error (6,): translation [m], rotation [rad], reference axes."""
     if filmed.registration is None:
         return np.append(REGISTRATION_PRIOR.range[1] * numbers[:3], np.zeros(3))
     scale = np.repeat([1.0, 0.1], 3)  # so that metres and radians are alike
@@ -222,7 +222,7 @@ def _sample_registration_error(filmed: FilmedScene, numbers: np.ndarray) -> np.n
 
 
 def _compute_registration_shift(filmed: FilmedScene, error: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the displacement (n, 3) [m] of scan points (n, 3) by a registration error (6,)."""
+    """Return the displacement (n, 3) [m] of scan points (n, 3) [m] by a registration error (6,)."""
     if filmed.registration is None:
         return np.broadcast_to(error[:3], points.shape)
     R = filmed.T_scan_patient[:3, :3]
@@ -234,7 +234,7 @@ def _compute_registration_shift(filmed: FilmedScene, error: np.ndarray, points: 
 def _compare_tumours(
     true: Camera, believed: Camera, surface: np.ndarray, shown: np.ndarray
 ) -> tuple[float, float, float, float]:
-    """Compare the drawn tumour with the true one: centre across and along the line of sight, in pixels; worst point."""
+    """Return errors of the drawn tumour: centre across [m], along [m], in the image [pixel]; maximum on surface [m]."""
     here, there = (np.vstack([points.mean(axis=0), points]) for points in (surface, shown))
     pixels, depth = true.project(here)
     drawn, farther = believed.project(there)
@@ -248,10 +248,10 @@ def _compare_tumours(
 
 @dataclass(frozen=True, eq=False)
 class ErrorBudget:
-    """Error budget of an overlay: each contributor alone, and all of `TECHNICAL` and `CLINICAL`.
+    """Error budget of an overlay: errors of each contributor alone, of all in `TECHNICAL`, and of all in `CLINICAL`.
 
-    `coverage`: of the band on synthetic test cases, and its standard deviation (None for one case). Samples of one
-    body are correlated.
+    `coverage` of the band on synthetic test cases, and its standard deviation (None for one body), in which the
+    correlation of samples of the same body is included.
     """
 
     alone: dict[str, OverlayErrors]
@@ -265,7 +265,7 @@ class ErrorBudget:
         return float(np.quantile(self.clinical.worst, LEVEL))
 
     def find_largest(self, error: Literal["middle", "worst"]) -> str:
-        """Return the contributor with the largest 95th percentile of the error of the centre, or of the worst point."""
+        """Return the contributor with the largest 95th percentile of the centre's or the maximum surface error."""
         return max(self.alone, key=lambda name: float(np.quantile(getattr(self.alone[name], error), LEVEL)))
 
 
@@ -276,7 +276,7 @@ def compute_budget(
     test_scene: FilmedScene | None = None,
     progress: Callable[[Sequence[str]], Iterable[str]] = iter,
 ) -> ErrorBudget:
-    """Compute the budget from `count` samples; `test_scene`, other bodies, test the band with other random numbers."""
+    """Compute the budget from `count` samples; the band's coverage is tested on the other bodies of `test_scene`."""
     alone = {name: sample_errors(scene, [name], count, seed) for name in progress(CLINICAL)}
     technical, clinical = (sample_errors(scene, names, count, seed) for names in (TECHNICAL, CLINICAL))
     budget = ErrorBudget(alone, technical, clinical)
@@ -290,9 +290,9 @@ def compute_budget(
 
 
 def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | None]:
-    """Return the share of samples (S,) bool, and its standard deviation with bodies (S,) as clusters (ratio estimator).
+    """Return the share of True samples (S,), and its standard deviation with `bodies` (S,) as clusters.
 
-    Cochran (1977), "Sampling techniques", equation 2.46.
+    Ratio estimator: Cochran (1977), "Sampling techniques", equation 2.46.
     """
     share, numbers = float(within.mean()), np.unique(bodies, return_inverse=True)[1]
     excess = np.bincount(numbers, weights=within - share)
@@ -305,7 +305,7 @@ def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | No
 def find_largest_spread(
     nominal: SurfaceMotions, solutions: Sequence[tuple[np.ndarray, ...]], mesh_errors: np.ndarray
 ) -> int:
-    """Return the time index at which a scene's bodies differ most; `mesh_errors` (b,): see `compute_motion_errors`."""
+    """Return the time index at which sampled bodies differ most; `mesh_errors` (b,): see `compute_motion_errors`."""
     sizes = []
     for number, here in enumerate(nominal.fields):
         off = compute_motion_errors(np.stack([result[number] for result in solutions]), here, mesh_errors)
@@ -314,7 +314,7 @@ def find_largest_spread(
 
 
 def compute_velocity(nominal: SurfaceMotions, time_index: int) -> np.ndarray:
-    """Return the velocity (n, 3) [m/s] of the tumour's surface before a time; 0 if tissue was cut meanwhile."""
+    """Return the tumour surface's velocity (n, 3) [m/s] just before a time; 0 if tissue was resected in between."""
     before, here = nominal.fields[max(time_index - 1, 0)], nominal.fields[time_index]
     if time_index == 0 or before.shape != here.shape:
         return np.zeros_like(here)

@@ -1,4 +1,4 @@
-"""Tumour motion under every combination of skull, tissue, craniotomy, depth and stiffness."""
+"""Full factorial study of the tumour's motion: skull, Poisson's ratio, craniotomy, depth and tumour stiffness."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ LEVELS: Levels = {
     "nu": (0.45, 0.49, 0.499),
     "tumour's stiffness": (1.0, 3.0),
 }
-"""Combined factors: depth of the tumour's top below the cortex, stiffness relative to the brain, and others."""
+"""Levels by factor; depth is that of the tumour's top below the cortex, stiffness is relative to the brain."""
 DEFAULT = {"skull": "bonded", "nu": 0.49, "tumour's stiffness": 1.0}  # Default values of a body's factors.
 FORCE = 0.2  # Force of the tool [N].
 FOOTPRINT = 7e-3  # Radius of the tool [m].
@@ -35,10 +35,10 @@ PLACES = ((0.0, 0.0), (6.0, 0.0), (0.0, 6.0))
 
 @dataclass(frozen=True)
 class FactorCombination:
-    """Combination of levels by factor, with the tumour's mean motion [mm] under prescribed force and prescribed motion.
+    """Combination of levels, with the tumour's mean motion [mm] under a prescribed tool force or tool motion.
 
-    The prescribed motion is that of the tool under the force in the default body of the same opening and depth. NaN if
-    a load did not converge.
+    The prescribed motion is the tool's motion under the force in the default body with the same craniotomy and depth.
+    A value is NaN if a load did not converge.
     """
 
     levels: Mapping[str, str | float]
@@ -47,7 +47,7 @@ class FactorCombination:
 
 
 def solve_levels(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto") -> Iterator[FactorCombination]:
-    """Solve every combination on template meshes of about `nodes` nodes; the tool presses at three places."""
+    """Yield the solved combinations, on template meshes of about `nodes` nodes, with the tool at three positions."""
     for opening, depth in product(levels["opening [mm]"], levels["depth [mm]"]):
         subject = build_template_subject(Tumour(cover=1e-3 * float(depth)))
         anatomy = make_anatomy(subject, MeshPlan(nodes, 1e-3 * float(opening)))
@@ -77,10 +77,10 @@ def _compute_mean_motion(fem: Fem, anatomy: Anatomy, loads: Loads) -> float:
 
 
 def compute_variance_shares(cells: Sequence[FactorCombination], response: str = "force") -> dict[str, float]:
-    """Return the share of variance of the logarithmic motion explained by each factor, and by each interaction of two.
+    """Return the shares of the variance of log(motion) that each factor and each interaction of two factors explain.
 
-    The sums of squares of a balanced analysis of variance, by size; cells that did not converge are left out. The
-    remainder to 1 is the interaction of three and more factors.
+    The shares are sums of squares of a balanced analysis of variance, the largest first. Combinations that did not
+    converge are excluded. The remainder to 1 is due to interactions of three and more factors.
     """
     values = np.log([getattr(cell, response) for cell in cells])
     good = np.isfinite(values)
@@ -99,7 +99,7 @@ def compute_variance_shares(cells: Sequence[FactorCombination], response: str = 
 
 
 def build_panels(combinations: Sequence[FactorCombination]) -> list[ChartPanel]:
-    """Plot the motion over the tumour's depth, one panel per craniotomy: skulls, Poisson's ratios of the default."""
+    """Build charts of motion against tumour depth, one per craniotomy, with a curve per skull and Poisson's ratio."""
     chosen = [{**DEFAULT, "nu": nu} for nu in _list_levels(combinations, "nu")]
     skulls = [skull for skull in _list_levels(combinations, "skull") if skull != DEFAULT["skull"]]
     chosen += [{**DEFAULT, "skull": skull} for skull in skulls]

@@ -1,4 +1,4 @@
-"""Charts with logarithmic axes, drawn by matplotlib as arrays of pixels."""
+"""Charts with logarithmic axes, drawn by matplotlib as images or SVG."""
 
 import io
 import re
@@ -32,7 +32,7 @@ HORIZONTAL_ALIGNMENT, VERTICAL_ALIGNMENT = {-1: "right", 0: "center", 1: "left"}
 
 @dataclass(frozen=True)
 class Curve:
-    """Points (x, y), both positive, under a name."""
+    """Named curve through points (x, y) with positive coordinates."""
 
     name: str
     points: tuple[tuple[float, float], ...]
@@ -40,9 +40,9 @@ class Curve:
 
 @dataclass(frozen=True)
 class Dot:
-    """Point (x, y), both positive, with a label, in the colour of its group; or pale.
+    """Dot at (x, y), both positive, with a label, in the colour of its group; pale if `is_pale`.
 
-    `y_range`: ends of a vertical bar; `hint`: text that appears where the pointer rests on the dot.
+    `y_range`: ends of a vertical bar; `hint`: text that appears if the mouse pointer is over the dot.
     """
 
     name: str
@@ -56,10 +56,10 @@ class Dot:
 
 @dataclass(frozen=True)
 class ChartPanel:
-    """One pair of axes: title, axis labels, curves, dots, and `marks`: labelled vertical lines.
+    """Chart with one pair of axes: title, axis labels, curves, dots, and labelled vertical lines (`marks`: x, label).
 
-    size: width and height [pixel]; y_range: limits of the axis (default: those of the data and a margin); front:
-    points that a stepped line joins.
+    `size`: width and height [pixel]; `y_range`: limits of the y axis (None: range of the data with a margin); `front`:
+    points that are joined by a stepped line.
     """
 
     title: str
@@ -74,12 +74,12 @@ class ChartPanel:
 
 
 def draw_panels(panels: Sequence[ChartPanel]) -> np.ndarray:
-    """Draw panels of equal height side by side: image (height, sum of widths, 3) uint8.
+    """Draw panels of equal height side by side; return an image (height, sum of widths, 3) uint8.
 
     Raises
     ------
     ValueError
-        No panel, or one without a point that is positive.
+        There is no panel, or a panel has no points or a point that is not positive.
     """
     if not panels:
         raise ValueError("a chart without panels shows nothing: give at least one.")
@@ -87,12 +87,12 @@ def draw_panels(panels: Sequence[ChartPanel]) -> np.ndarray:
 
 
 def draw_svg(panel: ChartPanel) -> str:
-    """Return a panel as an SVG element for HTML, whose dots show their `hint`.
+    """Draw a panel as an SVG element for HTML, in which dots show their `hint`.
 
     Raises
     ------
     ValueError
-        No point that is positive.
+        The panel has no points, or a point that is not positive.
     """
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "sulcus"}), io.StringIO() as file:
         canvas = _build_canvas(panel)
@@ -156,7 +156,7 @@ def _build_canvas(panel: ChartPanel) -> FigureCanvasAgg:
 
 
 def _write_names(axes: Axes, dots: Sequence[Dot]) -> None:
-    """Write the name of each dot where it overlaps least; that of a pale dot without free space is left out."""
+    """Write the name of each dot at the side with the fewest overlaps; omit names of pale dots that would overlap."""
     reach = 0.5 * DOT_DIAMETER * DPI / 72.0
     centres = axes.transData.transform([(dot.x, dot.y) for dot in dots])
     taken = [Bbox([centre - reach, centre + reach]) for centre in centres]
@@ -192,7 +192,7 @@ def _is_within(box: Bbox, frame: Bbox) -> bool:
 
 
 def _compute_axis_limits(values: np.ndarray) -> tuple[float, float]:
-    """Compute the limits of an axis: a margin around the values, and at least a factor of ten apart."""
+    """Compute the limits of a logarithmic axis: the range of the values with a margin, at least one decade."""
     low, high = float(values.min()) / 1.4, float(values.max()) * 1.4
     spare = max(10.0 * low / high, 1.0) ** 0.5
     return low / spare, high * spare

@@ -1,4 +1,4 @@
-"""Measurement of wall time and memory, with a description of the machine; tables of results as CSV."""
+"""Measurement of wall time and memory, description of the machine, and CSV tables of results."""
 
 import csv
 import os
@@ -19,12 +19,12 @@ from sim.runtime.versions import get_version
 
 
 def describe_machine(device: str) -> str:
-    """Describe hardware, versions and date in one line.
+    """Describe the machine's hardware, software versions and the date in one line.
 
     Raises
     ------
     InputError
-        A device that this machine does not have.
+        This machine does not have the device.
     """
     names = [wp.get_device(find_device(device, "float32").name).name]
     try:
@@ -39,7 +39,7 @@ def describe_machine(device: str) -> str:
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a CSV table, atomically: a line for each row, and a column for each name that occurs in a row."""
+    """Write a CSV table atomically, with a line for each row and a column for each name that occurs in any row."""
     names = dict.fromkeys(name for row in rows for name in row)
     with write_atomically(path, ".csv") as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(names))
@@ -48,7 +48,7 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def measure_peak_memory() -> float | None:
-    """Return the peak resident size of this process [GiB], as Linux reports it."""
+    """Return the peak resident memory of this process [GiB]; None on systems other than Linux."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
@@ -58,7 +58,7 @@ def measure_peak_memory() -> float | None:
 
 @contextmanager
 def watch_gpu_memory(device: str) -> Iterator[list[int]]:
-    """Yield the additional GPU memory [bytes] that is used while the block runs. Zero without a GPU."""
+    """Yield a list that collects the additionally used GPU memory [bytes] during the block; only 0 without a GPU."""
     where = wp.get_device(None if device == "auto" else device)
     taken = [0]
     if not where.is_cuda:
@@ -84,7 +84,7 @@ T = TypeVar("T")  # Result of the timed function.
 
 
 def time_work(work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> tuple[T, float]:
-    """Return the result of `work` and its wall time [s]; the device is synchronised at both readings."""
+    """Return the result of `work` and its wall time [s]; the GPU is synchronised before and after the work."""
     wp.synchronize()
     begun = time.perf_counter()
     found = work(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""Sensitivity of the tumour's motion to tissue, skull, tool and element, one change at a time."""
+"""Sensitivity of the tumour's motion to tissue, skull, tool and element type, with one change at a time."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,10 +20,10 @@ from surrogate.data.tool_loads import find_perpendiculars
 
 @dataclass(frozen=True)
 class BodyVariant:
-    """Variant of the body: tissue, relative stiffness of the tumour, skull model, element.
+    """Variant of the FEM model: tissue, stiffness of the tumour relative to the brain, skull model, element type.
 
-    `skull` is one of `sim.effects.SKULLS`. Linear tetrahedra lock near nu = 0.5, which would look like an influence of
-    nu: hence smoothed ones.
+    `skull` is a key of `sim.effects.SKULLS`. The default element type is "smoothed", because locking of linear
+    tetrahedra near nu = 0.5 would look like an influence of nu.
     """
 
     tissue: Material = BRAIN
@@ -34,9 +34,9 @@ class BodyVariant:
 
 @dataclass(frozen=True)
 class LoadPerturbation:
-    """Perturbation of a load: force or motion scaled by `share` and turned by `turn` [rad], point moved by `shift` [m].
+    """Perturbation of a load: force or motion changed by a share, turned by `turn` [rad], or moved by `shift` [m].
 
-    Each perturbation has several directions: more and less, about two axes, to four sides.
+    Directions of a perturbation: `share` is added and subtracted, `turn` is about two axes, `shift` to four sides.
     """
 
     share: float = 0.0
@@ -46,7 +46,7 @@ class LoadPerturbation:
 
 @dataclass(frozen=True)
 class Variant:
-    """Variant with one changed factor: its name, default and changed value, and the resulting body and aim."""
+    """Variant with one changed factor: name of the factor, default and changed value, resulting model and load."""
 
     factor: str
     default: str
@@ -56,7 +56,7 @@ class Variant:
 
 
 def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] = ()) -> list[Variant]:
-    """List the variants of tool, tissue and skull, and of other `elements`."""
+    """List the variants of tool, tissue and skull, and of the element types `elements`, that differ from `body`."""
     tissue = body.tissue
     text, poisson, tumour = f"{tissue.young:g} Pa", f"{tissue.poisson:g}", f"{body.tumour:g} x brain"
     changed = [
@@ -83,9 +83,9 @@ def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] =
 
 
 def perturb_loads(loads: Loads, perturbation: LoadPerturbation, patch: Patch) -> Loads:
-    """Perturb the loads of one tool by `perturbation`: one block of loads for each direction.
+    """Return the loads of a tool with a perturbation, as one block of loads for each direction of the perturbation.
 
-    Points are shifted along the open cortex.
+    Points are shifted in the tangent plane of the open cortex.
     """
     (cause,) = loads.causes
     if not isinstance(cause, Pushed | Displaced):
@@ -109,18 +109,18 @@ def perturb_loads(loads: Loads, perturbation: LoadPerturbation, patch: Patch) ->
 
 @dataclass(frozen=True)
 class Change:
-    """Difference of the tumour's displacement from the default, over the converged `solves`; `failed` did not converge.
+    """Difference of the tumour's displacement from the default model, over `solves` converged loads; `failed` failed.
 
     Parameters
     ----------
     mean_mm, p95_mm, largest_mm
-        Mean, 95th percentile and maximum of the difference, over every load x vertex [mm].
+        Mean, 95th percentile and maximum of the difference over all loads x vertices [mm].
     worst95_mm
-        95th percentile over loads of the largest vertex distance [mm], comparable with a surrogate's bound.
+        95th percentile over loads of the maximum vertex difference [mm], comparable with a surrogate's bound.
     percent
-        Mean of the distances, each divided by its load's mean motion under the default [%].
+        Mean difference of a load relative to the load's mean motion in the default model [%], averaged over loads.
     motion
-        Mean motion over that under the default.
+        Ratio of the mean motion to the mean motion in the default model.
     """
 
     solves: int
@@ -135,7 +135,7 @@ class Change:
 
 @dataclass(frozen=True)
 class SensitivityRow:
-    """Variant with its changes under tools of prescribed force, and of prescribed motion."""
+    """Variant with its changes under prescribed tool forces, and under prescribed tool motions."""
 
     variant: Variant
     force: Change
@@ -144,7 +144,7 @@ class SensitivityRow:
 
 @dataclass(frozen=True, eq=False)
 class SensitivityStudy:
-    """Study of fixed `Pushed` loads on variants of a body."""
+    """Study of the same `Pushed` loads on variants of the FEM model `body`."""
 
     anatomy: Anatomy
     loads: Loads
@@ -153,7 +153,7 @@ class SensitivityStudy:
     device: str = "auto"
 
     def build_fem(self, body: BodyVariant) -> Fem:
-        """Build FEM of a body, for tools of prescribed force or motion."""
+        """Build the FEM solver of a variant, for prescribed tool forces and motions."""
         tissue = body.tissue
         _, *others = build_push_effects(self.anatomy, tissue, body.skull)
         elasticity = Elasticity(tissue, {TUMOUR_LABEL: replace(tissue, young=body.tumour * tissue.young)})
@@ -162,15 +162,15 @@ class SensitivityStudy:
 
 
 def measure_variants(study: SensitivityStudy, variants: Sequence[Variant]) -> Iterator[SensitivityRow]:
-    """Yield the default, whose change is the whole motion, then the change of each variant from the default.
+    """Yield a row for the default model, whose change is its whole motion, then the change of each variant.
 
-    Prescribed motions are those of the default under its forces: the mean motion of each footprint. Every solve starts
-    at the default's solution, so that the same equilibrium is followed if a load has several.
+    Prescribed motions are the mean motions of the footprints in the default model under the forces. Every solve starts
+    from the default model's solution, so that solutions stay on the same equilibrium if a load has several.
 
     Raises
     ------
     InputError
-        An anatomy without tumour or open cortex; loads of another kind than `Pushed`; input rejected by `Fem`.
+        The anatomy has no tumour or open cortex, loads are not `Pushed`, or `Fem` rejects its input.
     """
     nodes, patch = study.anatomy.tumour_nodes, open_patch(study.anatomy)
     if not len(nodes):
@@ -197,9 +197,9 @@ def measure_variants(study: SensitivityStudy, variants: Sequence[Variant]) -> It
 
 
 def compute_change(result: Deformation, default: Deformation, reference: np.ndarray) -> Change:
-    """Compare `result`, k blocks of the loads of `default`, with `reference` (B, n, 3) [m].
+    """Compute the change of `result`, k blocks of the loads of `default`, from displacements `reference` (B, n, 3) [m].
 
-    A load counts where it and its default converged.
+    Only loads that converged in `result` and in `default` count.
     """
     ways = len(result) // len(default)
     sound, good = (np.array([outcome.good for outcome in one.outcome]) for one in (default, result))
@@ -225,9 +225,9 @@ def compute_change(result: Deformation, default: Deformation, reference: np.ndar
 
 
 def match_motion(anatomy: Anatomy, loads: Loads, result: Deformation) -> Loads:
-    """Build tools with the tissue motion that the forces of `loads` have in `result`.
+    """Build loads that prescribe the mean footprint motions that the forces of `loads` cause in `result`.
 
-    The mean motion of each footprint is computed from corner vertices: approximate for quadratic elements.
+    Mean motions are computed from corner vertices, which is an approximation for quadratic elements.
     """
     cause = loads.get_only(Pushed)
     if cause is None:

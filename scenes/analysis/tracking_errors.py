@@ -1,4 +1,4 @@
-"""Errors of a camera calibration and of detected target corners, for a Monte Carlo simulation without images."""
+"""Simulated errors of a camera calibration and of detected target corners, for Monte Carlo without images."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,16 +13,16 @@ from ar.tracking.intrinsics import BoardView, compute_intrinsics_covariance
 from ar.tracking.targets import DetectedCorners, Target, build_calibration_board, is_seen_from_front
 
 CORNER_NOISE = 0.1
-"""Standard deviation of a corner per axis [pixel]: by default twice that of sharp images (`benchmarks track`)."""
+"""Standard deviation of a corner per axis [pixel]: twice the value of sharp images (`benchmarks track`)."""
 VIEW_COUNT = 24  # Number of views of a typical calibration.
 MAX_TILT = np.radians(35.0)  # Largest tilt of the board in its views [rad].
 BOARD_WIDTHS = (0.45, 0.8)  # Range of the board's width relative to the image width.
 
 
 def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarray:
-    """Return the covariance (9, 9) of the intrinsics of a good calibration, ordered as `intrinsics.PARAMETERS`.
+    """Compute the covariance (9, 9) of a good calibration's intrinsics, ordered as `intrinsics.PARAMETERS`.
 
-    It has 24 views of the printed board, tilted by up to 35 degrees to all sides, near and far, all over the image.
+    Simulated are 24 views of the printed board at varied distances and positions, with tilts of up to 35 degrees.
     """
     random, board = np.random.default_rng(seed), build_calibration_board().faces[0]
     points = board.corners - np.array([*(0.5 * board.size), 0.0])
@@ -43,7 +43,7 @@ def sample_usual_covariance(calibration: Calibration, seed: int = 0) -> np.ndarr
 
 
 def change_calibration(calibration: Calibration, change: np.ndarray) -> Calibration:
-    """Return a calibration whose nine parameters differ by `change` (9,); further lens coefficients are unchanged."""
+    """Return a calibration with `change` (9,) added to its nine parameters; other lens coefficients stay unchanged."""
     fx, fy, cx, cy = (np.array([*calibration.focal, *calibration.principal]) + change[:4]).tolist()
     coefficients = calibration.lens.coefficients.copy()
     coefficients[:5] += change[4:]
@@ -51,7 +51,7 @@ def change_calibration(calibration: Calibration, change: np.ndarray) -> Calibrat
 
 
 def project_corners(camera: Camera, target: Target, T_world_target: np.ndarray, noise: np.ndarray) -> DetectedCorners:
-    """Project the corners of a target's visible faces, each with an error from a row of `noise` (n, 2) [pixel]."""
+    """Project the corners of a target's visible faces, and add the rows of `noise` (n, 2) [pixel] as errors."""
     points, faces, T = [], [], camera.T_camera_world @ T_world_target
     for number, face in enumerate(target.faces):
         if is_seen_from_front(T @ face.T_target_face):
@@ -66,9 +66,9 @@ def project_corners(camera: Camera, target: Target, T_world_target: np.ndarray, 
 def project_with_shutter(
     corners: DetectedCorners, get_camera: Callable[[float], Camera], readout_time: float, T_world_target: np.ndarray
 ) -> DetectedCorners:
-    """Project corners with a rolling shutter that reads the image rows within `readout_time` [s].
+    """Return detected corners with the shift by a rolling shutter that reads all image rows in `readout_time` [s].
 
-    `get_camera` returns the camera at a delay [s] after the middle row is read. The noise of `corners` corners stays.
+    `get_camera` returns the camera at a delay [s] after the readout of the middle row. Noise in `corners` is kept.
     """
     at = corners.points @ T_world_target[:3, :3].T + T_world_target[:3, 3]
     middle = get_camera(0.0)
@@ -81,5 +81,5 @@ def project_with_shutter(
 
 
 def compute_row_delay(camera: Camera, row: float) -> float:
-    """Compute the delay of a row [pixel] after the middle row, as a share of the readout time."""
+    """Compute the delay of an image row [pixel] relative to the middle row, as a share of the readout time."""
     return (row + 0.5) / camera.height - 0.5

@@ -1,4 +1,4 @@
-"""Ensemble of a scene: bodies and tools sampled from priors, solved by FEM, and their differences."""
+"""Ensemble of a scene: FEM solutions for parameters sampled from priors, and the resulting position error."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -59,28 +59,28 @@ SKULL_EFFECTS = Bonded | Slide | SkullContact  # Effects of the skull on the bra
 
 @dataclass(frozen=True, eq=False)
 class SolvedMotions:
-    """Motions (n, 3) [m] of the tumour's surface at each moment, and maximum number of inverted tetrahedra."""
+    """Motions (n, 3) [m] of the tumour's surface at each solved time, and maximum number of inverted tetrahedra."""
 
     motions: tuple[np.ndarray, ...]
     inverted: int = 0
 
 
 Answer = SolvedMotions | None
-"""Motions of a draw; None if some moment has no equilibrium."""
+"""Motions of a sample; None if any solved time has no equilibrium."""
 SoundDraws = list[tuple[PatientSample, tuple[np.ndarray, ...]]]
-"""Draws with an equilibrium at each moment, and their motions [m]."""
+"""Samples with an equilibrium at each solved time, and their motions [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMotions:
-    """Motions and normals of the tumour's surface at each moment.
+    """Motions and normals of the tumour's surface at each solved time.
 
     Parameters
     ----------
     fields
-        Displacements of the scene at each moment (n, 3) [m]. The vertices differ if tissue was cut.
+        Displacements (n, 3) [m] at each time. The vertices differ between times if tissue is resected.
     normals
-        Outward normals at each moment (n, 3).
+        Outward normals (n, 3) of the undeformed surface at each time.
     """
 
     times: tuple[float, ...]
@@ -89,12 +89,12 @@ class SurfaceMotions:
 
 
 def apply_sample(scene: Scene, sample: PatientSample) -> Scene:
-    """Return the scene with another tissue, tumour, skull and place of the tool.
+    """Return the scene with the sample's tissue, tumour stiffness, skull model and tool position.
 
     Raises
     ------
     InputError
-        A tissue that is not described by Young's modulus and Poisson's ratio.
+        A tissue of the scene is not described by Young's modulus and Poisson's ratio.
     """
     tissue = get_tissue(scene)
 
@@ -112,31 +112,31 @@ def apply_sample(scene: Scene, sample: PatientSample) -> Scene:
 
 
 def list_skulls(scene: Scene) -> tuple[str, ...]:
-    """List the possible skull models of a scene: if the brain may separate, fluid is in between and no bond remains."""
+    """List the possible skull models of a scene; "bonded" is excluded if the brain can separate from the skull."""
     lets_go = any(isinstance(effect, SkullContact) for effect in scene.effects)
     return tuple(name for name in SKULLS if not (lets_go and name == "bonded"))
 
 
 def get_skull_model(scene: Scene) -> str | None:
-    """Return the skull model of a scene; None if it is not simulated."""
+    """Return the name of a scene's skull model; None if the scene has no skull effect."""
     own = next((type(effect) for effect in scene.effects if isinstance(effect, SKULL_EFFECTS)), None)
     return next((name for name, skull in SKULLS.items() if type(skull) is own), None)
 
 
 def find_mesh_prior(scene: Scene, skull: str | None) -> ParameterPrior:
-    """Return the prior of a scene's mesh error for a skull model."""
+    """Return the prior of a scene's mesh error for a skull model (None: no skull effect)."""
     if skull in (None, "bonded"):
         return MESH_PRIOR
     return SINKING_MESH_PRIOR if any(isinstance(effect, Gravity) for effect in scene.effects) else SLIDING_MESH_PRIOR
 
 
 def sample_mesh_errors(scene: Scene, samples: Sequence[PatientSample]) -> np.ndarray:
-    """Sample the mesh error (draws,) of each draw, relative to its motion."""
+    """Return the mesh error (draws,) of each sample, relative to the sample's motion."""
     return estimate_mesh_deviations(scene, samples) * np.array([draw.mesh for draw in samples])
 
 
 def estimate_mesh_deviations(scene: Scene, samples: Sequence[PatientSample]) -> np.ndarray:
-    """Return the standard deviation (draws,) of each draw's mesh error, relative to its motion."""
+    """Return the standard deviation (draws,) of each sample's mesh error, relative to the sample's motion."""
     if get_skull_model(scene) is None:
         return np.full(len(samples), find_mesh_prior(scene, None).range[1])
     skulls = list_skulls(scene)
@@ -144,12 +144,12 @@ def estimate_mesh_deviations(scene: Scene, samples: Sequence[PatientSample]) -> 
 
 
 def get_tissue(scene: Scene) -> Material:
-    """Return the brain's tissue in a scene; regions may have other tissues.
+    """Return the brain's default tissue in a scene; regions may have other tissues.
 
     Raises
     ------
     InputError
-        A tissue without Young's modulus and Poisson's ratio, in the scene or in a region.
+        The tissue of the scene or of a region has no Young's modulus and Poisson's ratio.
     """
     elasticity = scene.elasticity
     strange = [one for one in elasticity.regions.values() if not isinstance(one, Material)]
@@ -163,7 +163,7 @@ def get_tissue(scene: Scene) -> Material:
 
 
 def get_tumour_tissue(scene: Scene) -> Material:
-    """Return the tumour's tissue in a scene, or the brain's if the tumour has none.
+    """Return the tumour's tissue in a scene, or the brain's tissue if the tumour has no tissue of its own.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def get_tumour_tissue(scene: Scene) -> Material:
 
 
 def _shift_path(path: Path, tip: Sequence[float]) -> Path:
-    """Return a path shifted by (3,) [m]: right, up, inwards."""
+    """Return a tool path shifted by `tip` (3,) [m]: to the right, upwards and inwards."""
 
     def aside(time: float) -> Touch:
         touch = path(time)
@@ -185,17 +185,17 @@ def _shift_path(path: Path, tip: Sequence[float]) -> Path:
 
 
 def list_solved_times(scene: Scene) -> tuple[float, ...]:
-    """Return the times [s] of a scene that are solved."""
+    """Return the times [s] of a scene at which ensembles are solved."""
     return tuple(np.linspace(0.0, scene.duration, ENSEMBLE.solved_times).tolist())
 
 
 def solve_nominal(patient: PatientSetup, scene: Scene) -> SurfaceMotions:
-    """Solve the scene without changes.
+    """Solve the scene with its own parameters, at the times of `list_solved_times`.
 
     Raises
     ------
     InputError
-        An anatomy without tumour; a time without equilibrium.
+        The anatomy has no tumour, or a time has no equilibrium.
     """
     if not len(patient.anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour to be uncertain of: make one with `sulcus anatomy`.")
@@ -210,9 +210,9 @@ def solve_nominal(patient: PatientSetup, scene: Scene) -> SurfaceMotions:
 
 
 def solve_scene(patient: PatientSetup, scene: Scene) -> Answer:
-    """Compute the tumour's motions at each moment; None if one of them has no equilibrium.
+    """Compute the tumour's motions at each time of `list_solved_times`; None if any time has no equilibrium.
 
-    If the step from the previous moment does not converge, intermediate times are solved.
+    If the step from the previous time does not converge, intermediate times are solved.
     """
     fem, stage = patient.build_fem(scene, ACCURACY, batch=1), Stage(scene, patient.site)
     last, found, before, inverted = None, [], 0.0, 0
@@ -237,23 +237,23 @@ def solve_scene(patient: PatientSetup, scene: Scene) -> Answer:
 
 
 def solve_ensemble(patient: PatientSetup, scene: Scene, samples: Sequence[PatientSample]) -> Iterator[Answer]:
-    """Yield the motions of every draw."""
+    """Yield the motions of each sample; None for a sample without equilibrium."""
     for draw in samples:
         yield solve_scene(patient, apply_sample(scene, draw))
 
 
 def select_solved_samples(samples: Sequence[PatientSample], solutions: Iterable[Answer]) -> SoundDraws:
-    """Return the draws that have an equilibrium at each moment, with their motions."""
+    """Return the samples that have an equilibrium at each solved time, with their motions."""
     return [(draw, result.motions) for draw, result in zip(samples, solutions, strict=True) if result is not None]
 
 
 def filter_solved_samples(scene: Scene, samples: Sequence[PatientSample], solutions: Iterable[Answer]) -> SoundDraws:
-    """Return the sound draws, see `select_solved_samples`, of a scene; check that there are enough.
+    """Return the samples of `select_solved_samples`, after a check that the share of solved samples is large enough.
 
     Raises
     ------
     InputError
-        Too few draws with an equilibrium.
+        Too few samples have an equilibrium.
     """
     sound = select_solved_samples(samples, solutions)
     if len(sound) < ENSEMBLE.min_solved_share * len(samples):
@@ -275,7 +275,7 @@ def estimate_uncertainty(
     Raises
     ------
     InputError
-        Too few draws with an equilibrium.
+        Too few samples have an equilibrium.
     """
     solutions = tuple(solutions)
     sound = filter_solved_samples(scene, samples, solutions)
@@ -307,17 +307,17 @@ def estimate_uncertainty(
 
 
 def compute_motion_errors(motion: np.ndarray, field: np.ndarray, mesh_errors: np.ndarray) -> np.ndarray:
-    """Return the error of a scene's field (n, 3) [m] relative to motions (draws, n, 3) with mesh errors (draws,)."""
+    """Return errors (draws, n, 3) [m]: motions of samples with mesh errors (draws,), minus the scene's motion."""
     return (1.0 + mesh_errors)[:, None, None] * motion - field
 
 
 def compute_worst_distances(
     errors: np.ndarray, normals: np.ndarray, shifts: np.ndarray, offsets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors of the worst point and of the centre (draws, shifts) [m], for every draw with every rigid error.
+    """Return maximum surface errors and centroid errors (draws, shifts) [m], for each sample with each rigid error.
 
-    off (draws, n, 3): errors of the model; normals (n, 3); shift (shifts, 3) and wide (shifts,): registration and
-    segmentation [m].
+    `errors` (draws, n, 3) [m]: model errors; `normals` (n, 3); `shifts` (shifts, 3) [m]: registration errors;
+    `offsets` (shifts,) [m]: segmentation errors.
     """
     aside = shifts[:, None] + offsets[:, None, None] * normals
     worst = np.stack([np.linalg.norm(one + aside, axis=2).max(axis=1) for one in errors])
@@ -328,9 +328,9 @@ def compute_worst_distances(
 def split_contributions(
     motion: np.ndarray, field: np.ndarray, samples: Sequence[PatientSample], scene: Scene
 ) -> dict[str, float]:
-    """Return each contributor's own error [m]: root mean square over the draws, at the worst surface point of each.
+    """Return by contributor the root mean square over samples of the maximum surface error [m] of this contributor.
 
-    A linear fit of the draws (draws, n, 3) separates the causes; its residual is their interaction.
+    A linear fit to the samples' motions (draws, n, 3) separates contributors; the residual is their interaction.
     """
     off, columns = motion - field, collect_contributor_values(samples, scene)
     design = np.concatenate(list(columns.values()), axis=1)
@@ -346,7 +346,7 @@ def split_contributions(
 
 
 def collect_contributor_values(samples: Sequence[PatientSample], scene: Scene) -> dict[str, np.ndarray]:
-    """Return, by contributor, the difference of each draw from the scene (draws, columns); zero without difference."""
+    """Return, by contributor, parameters (draws, columns) of the samples minus those of the scene."""
     poisson = get_tissue(scene).poisson
     table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in samples])
     found = {STIFFNESS.name: table[:, :1], POISSON.name: table[:, 1:2], RATIO.name: table[:, 2:3]}
@@ -359,7 +359,7 @@ def collect_contributor_values(samples: Sequence[PatientSample], scene: Scene) -
 
 
 def compute_rms_of_largest(field: np.ndarray) -> float:
-    """Compute the root mean square over draws of the largest vector length in each draw; vectors (draws, n, 3)."""
+    """Compute the root mean square over samples of the maximum length of the vectors (draws, n, 3)."""
     return float(np.sqrt((field**2).sum(axis=2).max(axis=1).mean()))
 
 
@@ -371,12 +371,12 @@ def measure_coverage(
     solutions: Iterable[Answer],
     seed: int,
 ) -> Uncertainty:
-    """Return the uncertainty with the coverage on synthetic patients: new draws, with new registration errors.
+    """Return the uncertainty with its coverage on synthetic patients: new samples with new registration errors.
 
     Raises
     ------
     InputError
-        Fewer than two of them have an equilibrium.
+        Fewer than two synthetic patients have an equilibrium.
     """
     sound = select_solved_samples(samples, solutions)
     if len(sound) < 2:

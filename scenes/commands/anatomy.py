@@ -56,7 +56,7 @@ MIN_REPORTED_LOSS = 3.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("--out", required=True, type=Path, metavar="MESH.vtu", help="output mesh [m, RAS]")
     parser.add_argument(
         "--preset", choices=tuple(PRESETS), default="default", help="values of the options that are not given"

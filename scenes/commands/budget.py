@@ -44,7 +44,7 @@ NOTE = """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "scene",
         help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py; palpate and retract take over 4 minutes on two "

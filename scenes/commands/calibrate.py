@@ -27,7 +27,7 @@ MIN_MOTION = 1e-3  # Motion along each axis below which positions may be in metr
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "pictures", nargs="?", type=Path, metavar="VIDEO|FOLDER",
         help="images of the board that `sulcus markers` prints: a video, or a folder of PNG or JPEG images",

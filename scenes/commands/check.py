@@ -28,7 +28,7 @@ TRACKING = "tracking"  # Name of the check without a scene: a synthetic video wh
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "scenes", nargs="*",
         help="built-in scenes, or MY_SCENE.py; tracking: a synthetic video with markers that disappear (default: all)",

@@ -17,7 +17,7 @@ FORMATS = ("lerobot", "robomimic", "folder", "xdmf", "card")  # Names of the for
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("episodes", nargs="+", type=Path, help="folder of episodes, or episode files (.h5)")
     parser.add_argument(
         "--to",

@@ -24,7 +24,7 @@ VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "scene", nargs="?",
         help="a built-in scene or MY_SCENE.py (default: the first scene that a trained model supports, spatula on the "

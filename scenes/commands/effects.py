@@ -19,7 +19,7 @@ COLUMN_TITLES = "effect", "ms a frame", "MB on the device", "tumour mm", "cortex
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
     parser.add_argument("--every", type=int, default=5, help="solve every Nth frame")
     parser.add_argument(

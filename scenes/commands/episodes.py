@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("plan", metavar="PLAN", help="a plan that ships with sulcus, or your own .toml")
     parser.add_argument("--count", required=True, type=_parse_positive, help="number of episodes")
     add_seed(parser, "all draws", _parse_natural)

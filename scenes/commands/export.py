@@ -12,7 +12,7 @@ MODEL_SUFFIX = ".model.npz"  # Ending of a model file.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "model",
         type=Path,

@@ -34,7 +34,7 @@ WRITTEN_FILES = ("camera.yaml", "camera.json", "registration.json", "tool.json",
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("scene", help="a built-in scene with a tool, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument(
         "--out", required=True, type=Path, metavar="DIR",

@@ -13,7 +13,7 @@ from ..options.shared_options import add_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("model", metavar="MODEL.npz", help="models from `sulcus train`")
     parser.add_argument(
         "data", metavar="FRESH.h5", help="test loads from `sulcus simulate` on the same mesh, with another --seed"

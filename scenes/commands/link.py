@@ -36,7 +36,7 @@ CLOSING_TIME = 0.25  # Time for notifying clients before the server stops [s].
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "anatomy", type=Path, metavar="PATIENT.vtu", help="anatomy from `sulcus patient` or `sulcus anatomy`"
     )

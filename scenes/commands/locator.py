@@ -28,7 +28,7 @@ REGIONS = f"{AS_LEARNED}. A locator knows how many times a region is as stiff as
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "anatomy", metavar="ANATOMY.vtu", type=Path, help="anatomy from `sulcus anatomy` or `sulcus patient`"
     )

@@ -8,7 +8,7 @@ from ..options.outputs import add_force, check_output_path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR",
         help="folder for markers.pdf, a PNG of each page, and targets.json with all corners [mm]",

@@ -50,7 +50,7 @@ NO_COVARIANCE_WARNING = (  # Warning about a calibration without a covariance.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "pictures", metavar="FILM|CAMERA", help="a video, a folder of PNG or JPEG images, or a camera number"
     )

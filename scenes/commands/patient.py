@@ -42,7 +42,7 @@ from ..script.shipped_files import get_template_path
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("labels", nargs="?", type=Path, metavar="LABELS.nii.gz", help="label volume")
     parser.add_argument(
         "--sample", action="store_true",

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "pairs", type=Path, metavar="PAIRS.csv",
         help="columns x,y,z,px,py,pz [mm]: a place in the scan, RAS, and where the tool's tip touched it, in the frame "

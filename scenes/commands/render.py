@@ -18,7 +18,7 @@ from ..options.shared_options import add_json, add_style
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
     parser.add_argument("--out", required=True, type=Path, help="folder of frame_0000.png, frame_0001.png, ...")
     parser.add_argument("--every", type=int, default=1, help="render every Nth frame")

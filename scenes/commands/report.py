@@ -31,7 +31,7 @@ NO_SERIES = "Models of the power series: not measured with --quick on a CPU, whe
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
+    """Add the arguments of the command to its parser."""
     size = parser.add_mutually_exclusive_group()
     size.add_argument(
         "--quick",

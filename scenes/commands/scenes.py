@@ -14,7 +14,7 @@ from ..options.shared_options import add_anatomy, add_device, add_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
     parser.add_argument(
         "--out", type=Path, help="draw and time each scene: folder for SCENE.png, and for all in sheet.png"

@@ -47,7 +47,7 @@ LOCKING_NOTES = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
+    """Add the arguments of the command to its parser."""
     add_model_options(parser)
     parser.add_argument(
         "--element", choices=ELEMENTS,

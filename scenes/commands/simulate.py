@@ -50,7 +50,7 @@ MAX_TOOL_MM = 200.0  # Largest size of a tool that presses on a brain [mm].
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "anatomy",
         nargs="?",

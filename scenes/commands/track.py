@@ -17,7 +17,7 @@ FRAMES = ("camera", "patient", "board")  # Coordinate systems of written poses.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "pictures",
         type=Path,

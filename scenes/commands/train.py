@@ -28,7 +28,7 @@ from ..options.shared_options import add_devices, add_json
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("data", metavar="DATA.h5", help="data set from `sulcus simulate`")
     parser.add_argument("--out", required=True, metavar="MODEL.npz", help="output file of all models")
     parser.add_argument(

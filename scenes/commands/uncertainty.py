@@ -37,7 +37,7 @@ registration, segmentation. Force, fluid level and resection are assumed to be a
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("scenes", nargs="*", help="built-in scenes, or MY_SCENE.py (default: all built-in scenes)")
     add_model_options(parser)
     add_model_tissue(parser)

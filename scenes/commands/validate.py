@@ -18,7 +18,7 @@ MAX_LISTED_FILES = 50  # Maximum number of files that are listed one by one.
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument("episodes", nargs="+", type=Path, help="folders of episodes, or episode files (.h5)")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="number of processes")
     parser.add_argument(

@@ -28,7 +28,7 @@ MAX_DISTANCE = 20.0  # Largest accepted distance from the open cortex [mm]: more
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments."""
+    """Add the arguments of the command to its parser."""
     parser.add_argument(
         "anatomy", nargs="?", type=Path, metavar="PATIENT.vtu",
         help="anatomy from `sulcus anatomy` or `sulcus patient` (default: the template that ships)",

@@ -1,1 +1,1 @@
-"""Options that several commands declare, and construction of the requested objects."""
+"""Command-line options that several commands share, and construction of the requested objects."""

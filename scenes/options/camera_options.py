@@ -1,4 +1,4 @@
-"""Command-line options for the camera of a scene and its motion."""
+"""Command-line options of a scene's camera and its motion."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_TILT = 75.0  # Largest tilt of the line of sight [deg].
 
 
 def add_camera_options(parser: argparse.ArgumentParser, default: str | None = None) -> None:
-    """Declare the camera's options: shared by every command that draws a scene; `default` is the usual one."""
+    """Add the camera options of commands that draw a scene to a parser; `default` is the default camera path."""
     group = parser.add_argument_group("camera options; see docs/camera.md")
     group.add_argument(
         "--camera", type=Path, metavar="FILE.yaml",
@@ -45,7 +45,7 @@ def add_camera_options(parser: argparse.ArgumentParser, default: str | None = No
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Parse WxH into two numbers, for argparse."""
+    """Parse the text WxH into width and height [pixel], for argparse."""
     found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 640x480 [pixel]")
@@ -53,13 +53,13 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def apply_camera_options(args: argparse.Namespace, scene: Scene) -> Scene:
-    """Return the scene with the requested camera; unchanged if the options of `add_camera_options` are not given.
+    """Return the scene with the camera requested by `add_camera_options`; unchanged if no option is given.
 
     Raises
     ------
     InputError
-        See `read_calibration`; a size without a calibration, or of another shape; a tilt outside -75 to 75 degrees; a
-        distance outside 50 to 1000 mm; see also `HandHeld`.
+        See `read_calibration` and `HandHeld`; a size without a calibration, or with another aspect ratio; a tilt
+        outside -75 to 75 degrees; a distance outside 50 to 1000 mm.
     """
     from ..script.camera_paths import PATHS as MADE
     from ..tracked.calibration_file import read_calibration
@@ -96,7 +96,7 @@ def use_tracked_camera(args: argparse.Namespace, scene: Scene) -> Scene:
     Raises
     ------
     InputError
-        See `apply_camera_options`; a camera that zooms.
+        See `apply_camera_options`; also if the camera zooms.
     """
     from ..tracked.filming import VIEW, scale_distance
 

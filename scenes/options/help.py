@@ -1,4 +1,4 @@
-"""Help of commands: options in sections, `(default: X)` for each default, metavars of type or unit."""
+"""Format of the commands' help: options in sections, default values, and metavars by type or unit."""
 
 import argparse
 import re
@@ -14,11 +14,11 @@ SECTIONS = {
     "camera": "--camera --intrinsics --size --path --path-seed --eye",
     "output": "--out --json --force --style --host --port --address",
 }
-"""Options in a section of the help of each command that has them; others stay under "options"."""
+"""Options of each section of a command's help; other options stay in the section "options"."""
 UNITS = {"mm": "MM", "ms": "MS", "s": "SECONDS", "Pa": "PA", "pixel": "PX", "ml": "ML", "1/s": "HZ"}
 """Metavars by unit."""
 KINDS: dict[Any, str] = {float: "X", Path: "FILE", None: "NAME"}
-"""Metavars by type; others are numbers."""
+"""Metavars by type; an option of another type has the metavar N."""
 
 FORMER = {
     "": "guard-mm:guard within-mm:within-error within-ms:within-time",
@@ -33,11 +33,11 @@ FORMER = {
     "track": "frame:reference-frame",
     "warp": "frame:frame-number labels:label-maps",
 }
-"""Former and present names of options of all commands ("") and of one: accepted for one release."""
+"""Former and present names of options, by command ("" for all commands); former names work for one release."""
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Formatter that completes each option's help."""
+    """Formatter that adds the default value and the metavar to each option's help."""
 
     def _get_help_string(self, action: argparse.Action) -> str:
         text, default = action.help or "", action.default
@@ -51,7 +51,7 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 
 class CommandParser(argparse.ArgumentParser):
-    """Parser of a command, with `SECTIONS`."""
+    """Parser of a command, whose help has the sections of `SECTIONS`."""
 
     def __init__(self, **settings: Any) -> None:
         self._sections: dict[str, argparse._ArgumentGroup] = {}
@@ -60,13 +60,13 @@ class CommandParser(argparse.ArgumentParser):
             self._sections |= dict.fromkeys(names.split(), self.add_argument_group(f"{title} options"))
 
     def add_argument(self, *names: Any, **settings: Any) -> argparse.Action:
-        """Declare an argument, in its section if it has one."""
+        """Add an argument, in its section of `SECTIONS` if there is one."""
         section = self._sections.get(names[0]) if names else None
         return (super() if section is None else section).add_argument(*names, **settings)
 
 
 def replace_former_options(arguments: Sequence[str]) -> list[str]:
-    """Replace former names of options, with a notice for each."""
+    """Return the arguments with present instead of former option names; print a notice for each replacement."""
     command = arguments[0] if arguments else ""
     pairs = [pair.partition(":") for key in {"", command} for pair in FORMER.get(key, "").split()]
     names = {f"--{former}": f"--{present}" for former, _, present in pairs}

@@ -1,4 +1,4 @@
-"""Checks of output files before the work, for all commands; files derived from a mesh are next to the mesh.
+"""Checks of output files before the computation, for all commands.
 
 An existing file is replaced only with --force. Commands that resume or extend their own output need no --force.
 """
@@ -19,21 +19,21 @@ FRAME_PATTERN = re.compile(r"frame_\d{4,}\.png")  # Pattern of a frame's file na
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:
-    """Declare --force: shared by every command that writes."""
+    """Add the option --force of commands that write files to a parser."""
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
 def check_output_path(
     path: str | Path, suffix: str, force: bool = False, inputs: Sequence[str | Path | None] = (), resumed: bool = False
 ) -> Path:
-    """Check that a file can be written and, unless `force`, does not exist; return its path without creating files.
+    """Check that a file can be written, and does not exist unless `force`; return its path without creating files.
 
-    The command's `inputs` are never replaced. A file that the command resumes, `resumed`, may exist.
+    If `resumed`, the command resumes the file, which may then exist. The command's `inputs` are never replaced.
 
     Raises
     ------
     InputError
-        See `check_output`; an input of the command; without `force`, an existing file.
+        See `check_output`; the file is an input of the command; the file exists, and neither `force` nor `resumed`.
     """
     with remove_empty_parents(Path(path)):
         path = check_output(path, suffix)
@@ -47,12 +47,12 @@ def check_output_path(
 
 
 def check_output_folder(folder: Path, content: str) -> Path:
-    """Check that images can be written into a folder; return it and leave nothing behind. `content`: their plural name.
+    """Check that files can be written into a folder, and return it; `content` is the files' plural name in messages.
 
     Raises
     ------
     InputError
-        A file of that name, or a place where nothing can be written.
+        The path is a file, or the folder is not writable.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: is a file, but the {content} need a folder. Choose another name.")
@@ -65,12 +65,12 @@ def check_output_folder(folder: Path, content: str) -> Path:
 
 
 def check_output_frames(folder: Path, force: bool) -> list[Path]:
-    """List the frames in a folder, which `force` allows to remove; other files are kept.
+    """List the frame images in a folder, which the caller may remove only if `force`.
 
     Raises
     ------
     InputError
-        Existing frames, without `force`.
+        The folder contains frames, and `force` is False.
     """
     frames = sorted(path for path in folder.glob("frame_*.png") if FRAME_PATTERN.fullmatch(path.name))
     if frames and not force:
@@ -85,7 +85,7 @@ UNCHANGED_ATTRIBUTES = ("anatomy", "effects", "tissue", "element", "accuracy", "
 
 
 def read_attributes(path: Path) -> dict[str, str]:
-    """Read the attributes of a data set, an unfinished one, or a model file as texts; empty if unreadable."""
+    """Read the attributes of a complete or unfinished data set, or of a model file, as texts; empty if unreadable."""
     import h5py
 
     from surrogate.model.npz_archive import Archive
@@ -103,7 +103,7 @@ def read_attributes(path: Path) -> dict[str, str]:
 
 
 def find_foreign_files(mesh_path: Path, digest: str) -> list[Path]:
-    """List data and models next to a mesh file that were made with an anatomy of another `digest`."""
+    """List the data sets and models next to a mesh file that belong to an anatomy with another digest."""
     from ..play.deformers import to_model_path  # takes seconds, and is not needed for simulation alone
 
     data = mesh_path.with_suffix(".h5")
@@ -112,12 +112,12 @@ def find_foreign_files(mesh_path: Path, digest: str) -> list[Path]:
 
 
 def check_no_foreign_files(mesh_path: Path, digest: str, force: bool) -> list[Path]:
-    """Return the files of `find_foreign_files`, which only `force` accepts.
+    """Return the files of `find_foreign_files`; there may be such files only if `force`.
 
     Raises
     ------
     InputError
-        An existing file, without `force`.
+        There is such a file, and `force` is False.
     """
     found = find_foreign_files(mesh_path, digest)
     if found and not force:
@@ -129,7 +129,7 @@ def check_no_foreign_files(mesh_path: Path, digest: str, force: bool) -> list[Pa
 
 
 def remove_outdated_data(path: Path, expected: Mapping[str, str]) -> None:
-    """Remove a data set, complete or unfinished, whose attributes differ from `expected`; keep others."""
+    """Remove a complete or unfinished data set if its attributes differ from `expected`."""
     for each in (path, to_unfinished_path(path)):
         found = read_attributes(each)
         if any(found.get(name) != expected.get(name) for name in UNCHANGED_ATTRIBUTES):
@@ -137,7 +137,7 @@ def remove_outdated_data(path: Path, expected: Mapping[str, str]) -> None:
 
 
 def read_batch_size(path: Path) -> int | None:
-    """Return the batch size of an existing or unfinished data set, which it keeps; None if unreadable."""
+    """Return the batch size of a complete or unfinished data set; None if it is not available."""
     for each in (path, to_unfinished_path(path)):
         found = read_attributes(each).get("batch", "")
         if found.isdigit():

@@ -1,4 +1,4 @@
-"""Options of commands that play a scene: anatomy, models, solver, tissue and trajectory."""
+"""Command-line options of commands that play a scene: anatomy, models, solver, tissue and trajectory."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of anatomy and models."""
+    """Add the options of anatomy, models and trajectory to a parser."""
     add_anatomy(parser)
     parser.add_argument(
         "--model", type=Path,
@@ -32,7 +32,7 @@ def add_model_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_trajectory(parser: argparse.ArgumentParser) -> None:
-    """Declare --trajectory."""
+    """Add the option --trajectory to a parser."""
     parser.add_argument(
         "--trajectory", type=Path, metavar="LINE.mrk.json",
         help="line from 3D Slicer along which the tool enters the open cortex, or a point, where it enters straight "
@@ -41,7 +41,7 @@ def add_trajectory(parser: argparse.ArgumentParser) -> None:
 
 
 def add_patient(parser: argparse.ArgumentParser) -> None:
-    """Declare deformer, anatomy and models: shared by every command that plays a scene."""
+    """Add the options of anatomy, deformer, registration, tissue and device to the parser of a command with scenes."""
     add_model_options(parser)
     parser.add_argument(
         "--deformer",
@@ -72,12 +72,12 @@ def add_patient(parser: argparse.ArgumentParser) -> None:
 
 
 def open_patient(args: argparse.Namespace, *scenes: str) -> PatientSetup:
-    """Open the anatomy and models requested by `add_patient`'s arguments, for scenes of these names.
+    """Open the anatomy and the models that the options of `add_patient` request; `scenes` are names of scenes.
 
     Raises
     ------
     InputError
-        See `open_theatre`; a limit of guarded models <= 0.
+        See `open_theatre`; also if --guard is not positive.
     """
     from ..play.deformers import open_theatre
 
@@ -90,7 +90,7 @@ def open_patient(args: argparse.Namespace, *scenes: str) -> PatientSetup:
 
 
 def build_requested_scene(args: argparse.Namespace, name: str, patient: PatientSetup) -> Scene:
-    """Return a scene by name, with the registration, tissue and element of `add_patient`'s arguments if given.
+    """Return a scene by name, with registration, tissue, element type and trajectory from the options if given.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def build_requested_scene(args: argparse.Namespace, name: str, patient: PatientS
 
 
 def _follow_trajectory(args: argparse.Namespace, scene: Scene, site: CraniotomyFrame) -> Scene:
-    """Let the scene's tool follow the trajectory; a notice reports if the bone's edge stops the tool."""
+    """Return the scene with its tool on the trajectory; print a notice if the bone's edge stops the tool."""
     from sim.bodies.markups import read_markup
 
     from ..script.approach import parse_approach
@@ -124,7 +124,7 @@ def _follow_trajectory(args: argparse.Namespace, scene: Scene, site: CraniotomyF
 
 
 def list_playable(args: argparse.Namespace, patient: PatientSetup, scenes: Sequence[Scene]) -> list[Scene]:
-    """Return the named scenes; by default all except those without a required locator, with a notice."""
+    """Return the requested scenes; by default all scenes except those that need a missing locator (with a notice)."""
     left = [] if args.scenes else [scene for scene in scenes if patient.is_without_locator(scene)]
     if left:
         names = ", ".join(scene.name for scene in left)
@@ -134,14 +134,14 @@ def list_playable(args: argparse.Namespace, patient: PatientSetup, scenes: Seque
 
 
 def choose_deformer(args: argparse.Namespace, patient: PatientSetup, scene: Scene, default: str | None = None) -> str:
-    """Return the requested deformation model; one that a budget selected is reported, with the reason.
+    """Return the name of the requested deformation model; a choice by a budget is printed with its reason.
 
-    `default`: the one without any request; None: that of the scene.
+    `default`: name without a request; None: the default of the scene.
 
     Raises
     ------
     InputError
-        A deformer and a budget, or a budget that none here meets.
+        Both a deformer and a budget are given, or no model meets the budget.
     """
     budget = args.within_error, args.within_time
     if args.deformer != "auto" and budget == (None, None):

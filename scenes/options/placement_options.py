@@ -1,4 +1,4 @@
-"""Command-line options for the craniotomy, shared by `anatomy` and `patient`."""
+"""Command-line options of the craniotomy, shared by the commands `anatomy` and `patient`."""
 
 import argparse
 from dataclasses import replace
@@ -16,7 +16,7 @@ LINE_POINTS = 2000  # Number of points of a trajectory that are compared with th
 
 
 def add_craniotomy_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare --nodes, --craniotomy, --fine-opening, and --opening-at and --opening-over, of which one may be given."""
+    """Add --nodes, --craniotomy, --fine-opening, and the exclusive --opening-at and --opening-over to a parser."""
     parser.add_argument("--nodes", type=int, default=5300, metavar="N", help="number of mesh nodes, 2000 to 250000")
     parser.add_argument(
         "--craniotomy", type=float, metavar="MM",
@@ -40,7 +40,7 @@ def add_craniotomy_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def point(text: str) -> Point:
-    """Parse X,Y,Z into three numbers, for argparse."""
+    """Parse the text X,Y,Z into three numbers, for argparse."""
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
@@ -49,17 +49,17 @@ def point(text: str) -> Point:
 
 
 def point_or_file(text: str) -> Point | Path:
-    """Parse X,Y,Z or the name of a markups file, for argparse."""
+    """Parse the text X,Y,Z into three numbers, or the name of a markups file into a path, for argparse."""
     return Path(text) if text.lower().endswith((".json", ".fcsv")) else point(text)
 
 
 def parse_opening(text: str) -> int | Point | Path:
-    """Parse a piece's number, X,Y,Z or the name of a markups file, for argparse."""
+    """Parse the number of a tumour piece, a point X,Y,Z or the name of a markups file, for argparse."""
     return int(text) if text.isdecimal() else point_or_file(text)
 
 
 def to_craniotomy_args(args: argparse.Namespace) -> list[str]:
-    """Return the options as arguments of another command."""
+    """Return the given craniotomy options as command-line arguments for another command."""
     given = {name: getattr(args, name) for name in ("nodes", "craniotomy", "opening_at", "opening_over")}
     texts = {
         name.replace("_", "-"): ",".join(map(repr, value)) if isinstance(value, tuple) else str(value)
@@ -70,18 +70,18 @@ def to_craniotomy_args(args: argparse.Namespace) -> list[str]:
 
 
 def get_trajectory_path(args: argparse.Namespace) -> Path | None:
-    """Return the file of the requested trajectory; None without a request."""
+    """Return the markups file of the craniotomy options if it contains a line; else None."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     return given if isinstance(given, Path) and read_markup(given).kind == "Line" else None
 
 
 def to_metres(millimetres: float | None) -> float | None:
-    """Return a length [m] given in millimetres; None stays None."""
+    """Convert a length from millimetres to metres; None stays None."""
     return None if millimetres is None else 1e-3 * millimetres
 
 
 def describe_craniotomy(args: argparse.Namespace) -> str:
-    """Describe the target of the craniotomy."""
+    """Describe the target of the craniotomy: a markups file, a given point, or a piece of the tumour."""
     given = args.opening_over if args.opening_at is None else args.opening_at
     if isinstance(given, Path):
         return f"what {given} marks"
@@ -89,13 +89,13 @@ def describe_craniotomy(args: argparse.Namespace) -> str:
 
 
 def place_craniotomy(subject: Subject, args: argparse.Namespace) -> Subject:
-    """Return the subject with the craniotomy placed by the options.
+    """Return the subject with the craniotomy at the position that the options request.
 
     Raises
     ------
     InputError
-        A piece that the tumour does not have; a point where nothing can be opened; a file that `read_markup` rejects,
-        or whose markup is of another kind.
+        The tumour has no piece with this number; the skull cannot be opened at the point; `read_markup` rejects the
+        file, or the markup is of another kind.
     """
     if isinstance(args.opening_at, Path):
         return _place_opening(subject, read_markup(args.opening_at))
@@ -126,7 +126,7 @@ def _compute_depth(subject: Subject, place: np.ndarray) -> float:
 
 
 def _place_opening(subject: Subject, markup: Markup) -> Subject:
-    """Return the subject opened at a point, where a trajectory enters the brain, or within an outline."""
+    """Return the subject with the craniotomy at a point, at a trajectory's entry into the brain, or in an outline."""
     _check_kind(markup, "--opening-at", Fiducial=1, Line=2, ClosedCurve=None)
     if markup.kind == "ClosedCurve":
         outline = markup.fit_curve()
@@ -139,7 +139,7 @@ def _place_opening(subject: Subject, markup: Markup) -> Subject:
 
 
 def _check_kind(markup: Markup, option: str, **kinds: int | None) -> None:
-    """Reject markups of other kinds, or with another number of points than they declare."""
+    """Raise InputError unless the markup is of one of the `kinds` with the given number of points (None: any)."""
     if markup.kind in kinds and kinds[markup.kind] in (None, len(markup.points)):
         return
     words = {"Fiducial": "one point", "Line": "a line of two points", "ClosedCurve": "a closed curve"}
@@ -150,7 +150,7 @@ def _check_kind(markup: Markup, option: str, **kinds: int | None) -> None:
 
 
 def _describe_markup(markup: Markup) -> str:
-    """Describe the content of a file."""
+    """Describe the content of a markups file for a message."""
     count = "1 point" if len(markup.points) == 1 else f"{len(markup.points)} points"
     descriptions = {
         "Fiducial": f"a list of {count}",

@@ -1,4 +1,4 @@
-"""Command-line options for an external tracker: pose files, clock, and pose of the camera."""
+"""Command-line options of an external tracker: pose files, time offset, and mounting of the camera."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ AUTO = "auto"  # Value of --clock that estimates the time offset.
 
 
 def add_pose_options(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+    """Add the options of an external tracker to a parser."""
     group = parser.add_argument_group("poses of an external tracker with its own clock; see docs/external_tracker.md")
     group.add_argument(
         "--poses", type=Path, nargs=2, metavar=("TOOL.csv", "PATIENT.csv"),
@@ -44,12 +44,12 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_pose_options(args: argparse.Namespace) -> None:
-    """Reject options that conflict, before anything is read.
+    """Check the options of an external tracker for conflicts, before files are read.
 
     Raises
     ------
     InputError
-        Options without --poses, poses without a tool, or an invalid clock.
+        An option is given without --poses, poses are given without a tool, or the clock is invalid.
     """
     if args.poses is None:
         if args.clock != ["0"] or args.hand_eye is not None or args.camera_poses is not None:
@@ -64,7 +64,7 @@ def check_pose_options(args: argparse.Namespace) -> None:
 
 
 def _parse_clock(words: list[str]) -> tuple[float, float]:
-    """Return a clock offset and its error [s]."""
+    """Parse the time offset [s] and its standard deviation [s] from the words of --clock."""
     try:
         offset, error = float(words[0]), float(words[1]) if len(words) > 1 else 0.0
     except ValueError:
@@ -75,12 +75,12 @@ def _parse_clock(words: list[str]) -> tuple[float, float]:
 
 
 def open_external_tracker(args: argparse.Namespace, calibration: Calibration) -> ExternalTracker | None:
-    """Return the external tracker's poses; None without a request.
+    """Read the requested external tracker with its poses; None without a request.
 
     Raises
     ------
     InputError
-        Files that cannot be read; clocks that cannot be compared.
+        A file cannot be read, or the time offset cannot be estimated.
     """
     from ..tracked.calibration_file import read_hand_eye
     from ..tracked.external_tracker import CameraMount, ExternalTracker
@@ -99,7 +99,7 @@ def open_external_tracker(args: argparse.Namespace, calibration: Calibration) ->
 
 
 def _report_mismatch(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
-    """Report the times of poses and images, if the video begins outside the poses."""
+    """Print the times of poses and video if the video begins outside the time range of the poses."""
     from ar.tracking.image_sequences import read_video
 
     from ..tracked.run import read_timed_images
@@ -118,7 +118,7 @@ def _report_mismatch(args: argparse.Namespace, elsewhere: ExternalTracker) -> No
 
 
 def _choose_clock(args: argparse.Namespace, calibration: Calibration, tool: PoseStream, patient: PoseStream) -> Clock:
-    """Return the given clock offset, or the one estimated from the video's own markers."""
+    """Return the time offset of --clock, or estimate it from the markers that the video shows."""
     from ar.tracking.image_sequences import read_video
     from ar.tracking.pose_stream import Clock
 

@@ -1,4 +1,4 @@
-"""Options that most commands have, from `--anatomy` to `--style` and `--address`, and their output as JSON."""
+"""Command-line options that many commands share, such as --anatomy, --device and --json, and JSON output."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 
 def add_anatomy(parser: argparse.ArgumentParser) -> None:
-    """Declare `--anatomy`; None stands for the template."""
+    """Add the option --anatomy to a parser; the default None means the template."""
     parser.add_argument(
         "--anatomy", type=Path, help="anatomy from `sulcus anatomy`, .vtu (default: the template that ships)"
     )
 
 
 def add_device(parser: argparse.ArgumentParser, purpose: str = "") -> None:
-    """Declare `--device` of one device; `purpose` describes the work on it, if that is not all of the command."""
+    """Add --device for one device to a parser; `purpose` names its work in the help, if it is a part of the command."""
     parser.add_argument(
         "--device", default="auto", help=f"compute device{purpose and f' for {purpose}'}: auto, cpu, cuda or cuda:1"
     )
 
 
 def add_devices(parser: argparse.ArgumentParser, purpose: str = "") -> None:
-    """Declare `--device` of several devices; `purpose` describes how they share the work."""
+    """Add --device for several devices to a parser; `purpose` is a text about their work at the end of the help."""
     parser.add_argument(
         "--device", default="auto", metavar="DEVICES",
         help=f"compute devices: auto, cpu, cuda, all, or a list such as cuda:0,cuda:1 with one process each{purpose}",
@@ -41,17 +41,17 @@ def add_devices(parser: argparse.ArgumentParser, purpose: str = "") -> None:
 def add_seed(
     parser: argparse.ArgumentParser, purpose: str = "the random draw", parse: Callable[[str], int] = int
 ) -> None:
-    """Declare `--seed` of a `purpose`, read as `parse`."""
+    """Add the option --seed to a parser; `purpose` completes its help, and `parse` converts its text."""
     parser.add_argument("--seed", type=parse, default=0, help=f"seed of {purpose}")
 
 
 def add_json(parser: argparse.ArgumentParser, purpose: str = "print one JSON line instead of text") -> None:
-    """Declare `--json`."""
+    """Add the option --json to a parser; `purpose` is its help."""
     parser.add_argument("--json", action="store_true", help=purpose)
 
 
 def to_json_line(value: Any) -> str:
-    """Format one line of JSON; null stands for numbers that are not finite, which JSON does not have."""
+    """Format a value as one line of JSON; numbers that are not finite become null."""
     return json.dumps(_replace_non_finite(value), allow_nan=False)
 
 
@@ -64,7 +64,7 @@ def _replace_non_finite(value: Any) -> Any:
 
 
 def add_style(parser: argparse.ArgumentParser, excluded: tuple[Style, ...] = ()) -> None:
-    """Declare the overlay's style: shared by every command that draws a scene; `excluded` excludes styles."""
+    """Add the option --style of the overlay to a parser, without the styles `excluded`."""
     from ar.overlay.styles import STYLES
 
     styles: list[Style] = [style for style in STYLES if style not in excluded]
@@ -73,7 +73,7 @@ def add_style(parser: argparse.ArgumentParser, excluded: tuple[Style, ...] = ())
 
 
 def add_address(parser: argparse.ArgumentParser) -> None:
-    """Declare --address."""
+    """Add the option --address to a parser."""
     parser.add_argument(
         "--address", action="append", default=[], metavar="https://NAME[:PORT]",
         help="public address of the page behind a proxy, a tunnel or a forwarded port, which requires a token; "
@@ -82,12 +82,12 @@ def add_address(parser: argparse.ArgumentParser) -> None:
 
 
 def list_addresses(args: argparse.Namespace) -> tuple[str, ...]:
-    """Return the addresses of --address in the form that browsers send.
+    """Return the addresses of --address in the form of a browser's Origin header.
 
     Raises
     ------
     InputError
-        Text that is not an address.
+        A text is not an address.
     """
     from ar.page.access_guard import format_origin
 
@@ -98,7 +98,7 @@ def list_addresses(args: argparse.Namespace) -> tuple[str, ...]:
 
 
 def print_addresses(browser: Browser) -> None:
-    """Print further addresses of the page, and the use of its token."""
+    """Print the additional addresses of the page, or a hint on the use of its token."""
     for address in browser.addresses:
         print(f"sulcus: behind the proxy or the forwarded port, open {address}", flush=True)
     if browser.token is not None and not browser.addresses:

@@ -1,4 +1,4 @@
-"""Brain and tumour on the command line: labels of a volume, or a tumour that is drawn in a healthy head."""
+"""Command-line options of brain and tumour: labels of a volume, or a synthetic tumour in a healthy head."""
 
 import argparse
 from dataclasses import replace
@@ -19,7 +19,7 @@ from .placement_options import point
 
 
 def add_label_options(parser: argparse._ActionsContainer, *names: str) -> None:
-    """Declare --brain, --tumour, --mask, --tumour-in, and the option `names` for the label convention."""
+    """Add the options of labels and masks to a parser; `names` are the names of the option of the label convention."""
     parser.add_argument("--brain", type=parse_labels, metavar="1,2", help="labels of brain, by number or segment name")
     parser.add_argument(
         "--tumour", type=parse_labels, metavar="3,4", help="labels of tumour, by number or segment name"
@@ -53,7 +53,7 @@ def add_label_options(parser: argparse._ActionsContainer, *names: str) -> None:
 
 
 def add_axes(parser: argparse._ActionsContainer) -> None:
-    """Declare --axes, of NIfTI files that do not state their orientation."""
+    """Add the option --axes to a parser, for NIfTI files that do not report their orientation."""
     parser.add_argument(
         "--axes", default="", metavar="RAS",
         help="directions of the axes of NIfTI files with neither sform nor qform, such as RAS or LPS",
@@ -61,7 +61,7 @@ def add_axes(parser: argparse._ActionsContainer) -> None:
 
 
 def parse_labels(text: str) -> tuple[Label, ...]:
-    """Parse numbers and names between commas, for argparse."""
+    """Parse label numbers and segment names that are separated by commas, for argparse."""
     found = tuple(int(part) if part.strip().isdecimal() else part.strip() for part in text.split(","))
     if "" in found:
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of labels such as 1,2 or Brain,Tumour")
@@ -69,7 +69,7 @@ def parse_labels(text: str) -> tuple[Label, ...]:
 
 
 def parse_sources(args: argparse.Namespace) -> MaskSources:
-    """Return the files and labels named by the options."""
+    """Build the sources of the masks, files and labels, from the options."""
     return MaskSources(
         args.labels,
         args.brain or (),
@@ -83,7 +83,7 @@ def parse_sources(args: argparse.Namespace) -> MaskSources:
 
 
 def parse_regions(args: argparse.Namespace) -> tuple[str, ...]:
-    """Return the parts of brain and tumour that become regions of their own."""
+    """Return the names of the parts of brain and tumour that become regions of the mesh."""
     return tuple(dict.fromkeys((*(name for name in _get_parts(args) if name in PART_LABELS), *args.regions)))
 
 
@@ -92,13 +92,13 @@ def _get_parts(args: argparse.Namespace) -> dict[str, tuple[Label, ...]]:
 
 
 def list_label_options(args: argparse.Namespace) -> list[str]:
-    """Return the given options that belong to a label volume."""
+    """List the names of the given options that require a label volume."""
     names = ("brain", "tumour", "convention", "tumour_in", "axes", *PART_LABELS, *SEPTA, "regions")
     return [f"--{name.replace('_', '-')}" for name in names if getattr(args, name)]
 
 
 def to_label_args(args: argparse.Namespace) -> list[str]:
-    """Return the options as arguments of `sulcus anatomy`."""
+    """Return the given label options as command-line arguments of `sulcus anatomy`."""
     given = {
         "--labels": args.labels,
         "--brain": args.brain and ",".join(map(str, args.brain)),
@@ -120,7 +120,7 @@ MAX_BRAIN_ML = 5000.0  # Largest accepted volume of a brain [ml].
 
 
 def add_synthetic_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of a healthy head and of the synthetic tumour in it."""
+    """Add the options of a healthy head and of a synthetic tumour in this head to a parser."""
     drawn = parser.add_argument_group("synthetic tumour in a healthy head, without --labels")
     drawn.add_argument(
         "--head", choices=("template", "fsaverage"),
@@ -151,26 +151,26 @@ def add_synthetic_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def describe_source(args: argparse.Namespace) -> str:
-    """Describe the source of the brain."""
+    """Return the name of the source of the brain: a file, a head, or the template."""
     return str(args.labels or args.mask or (args.head if args.head == "fsaverage" else "the template"))
 
 
 def check_no_synthetic_options(args: argparse.Namespace) -> None:
-    """Reject options of a synthetic tumour together with a label map, by an `InputError`."""
+    """Raise InputError if an option of the synthetic tumour is given, which a label map excludes."""
     for name in PLACING_OPTIONS:
         if getattr(args, name) is not None:
             raise InputError(f"--{name.replace('_', '-')} draws in a healthy head: leave it out with --labels.")
 
 
 def build_drawn_subject(args: argparse.Namespace, chosen: dict[str, Any]) -> Subject:
-    """Return the synthetic subject of the options.
+    """Build the subject with a synthetic tumour that the options request.
 
-    `chosen` has lengths [mm], shape and site after presets and defaults.
+    `chosen` contains lengths [mm], shape and site after application of presets and defaults.
 
     Raises
     ------
     InputError
-        Options that contradict each other, a volume out of bounds; what the head and the tumour reject.
+        Options contradict each other, a volume is out of range, or the head or the tumour is invalid.
     """
     if args.t1 is not None and args.mask is None:
         raise InputError("--t1 colours your own brain: give --labels or --mask too, or leave it out.")

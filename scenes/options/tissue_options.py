@@ -1,4 +1,4 @@
-"""Tissue and elements on the command line: one set of options for every command that solves."""
+"""Command-line options of tissue, skull and element type, shared by all commands that solve."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..script.scene import Scene
 
 NON_BRAIN_REGIONS = tuple(name for name in REGION_NAMES if name != "brain")
-"""Names of regions that may have a stiffness of their own."""
+"""Names of the regions that can have their own stiffness."""
 PLAUSIBLE_YOUNG = 100.0, 1e6
 """Young's moduli [Pa] below and above which no tissue in a skull was measured, by far.
 
@@ -35,9 +35,9 @@ AS_LEARNED = f"as in the models' training data, or {AS_BRAIN}"  # Default tissue
 def add_tissue_arguments(
     parser: argparse.ArgumentParser, full_help: bool = False, default_regions: str = AS_BRAIN
 ) -> None:
-    """Declare --material, the constants of its laws, and --region, whose `default_regions` are reported.
+    """Add --material, the constants of its laws, and --region to a parser.
 
-    The help describes each tissue if `full_help`, else names it.
+    `default_regions` describes the default of --region. If `full_help`, the help describes each named tissue.
     """
     sets = f"{', '.join(MATERIALS)}; see docs/concepts/physics.md"
     if full_help:
@@ -68,7 +68,7 @@ def add_tissue_arguments(
 
 
 def add_model_tissue(parser: argparse.ArgumentParser, skull: bool = False) -> None:
-    """Declare tissue, --skull if `skull`, and --element of a command that uses trained models."""
+    """Add the options of tissue, --skull if `skull`, and --element to the parser of a command with trained models."""
     add_tissue_arguments(parser, default_regions=AS_LEARNED)
     if skull:
         add_skull_argument(parser)
@@ -76,7 +76,7 @@ def add_model_tissue(parser: argparse.ArgumentParser, skull: bool = False) -> No
 
 
 def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN) -> None:
-    """Declare --region; `default` describes the default."""
+    """Add the option --region to a parser; `default` describes its default in the help."""
     parser.add_argument(
         "--region", action="append", default=[], metavar="REGION:YOUNG[,POISSON]",
         help=f"Young's modulus [Pa] and, optionally, Poisson's ratio of a region, by number or name "
@@ -86,7 +86,7 @@ def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN
 
 
 def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] = tuple(SKULLS)) -> None:
-    """Declare --skull, one of `choices`, the first of which is the default."""
+    """Add the option --skull with these `choices` to a parser; the first choice is the default."""
     words = {
         "bonded": "fixed by the meninges",
         "slide": "frictionless sliding without separation",
@@ -97,7 +97,7 @@ def add_skull_argument(parser: argparse.ArgumentParser, choices: Sequence[str] =
 
 
 def add_element_argument(parser: argparse.ArgumentParser, default_element: str = RECOMMENDED) -> None:
-    """Declare --element; None means `default_element`, or p2 if the mesh has mid-edge nodes."""
+    """Add the option --element to a parser; its default None means `default_element`, or p2 with mid-edge nodes."""
     parser.add_argument(
         "--element", choices=ELEMENTS,
         help=". ".join(f"{name}, {text}" for name, text in ELEMENTS.items())
@@ -106,12 +106,12 @@ def add_element_argument(parser: argparse.ArgumentParser, default_element: str =
 
 
 def parse_tissue(args: argparse.Namespace) -> Tissue:
-    """Return the requested tissue.
+    """Return the tissue that the options request.
 
     Raises
     ------
     InputError
-        Missing or unknown constants of the law, text with another format, or invalid constants.
+        Constants of the law are missing, unknown or invalid, or a text has another format.
     """
     tissue = _parse_tissue(args)
     if args.young is not None:
@@ -128,7 +128,7 @@ def parse_tissue(args: argparse.Namespace) -> Tissue:
 
 
 def _parse_tissue(args: argparse.Namespace) -> Material | Ogden:
-    """Return the requested elastic tissue, with the Prony series of its preset."""
+    """Return the requested tissue without --prony; a named tissue keeps its own Prony series."""
     preset = MATERIALS[args.material].tissue if args.material in MATERIALS else None
     ours = {"--ogden": args.ogden, "--bulk": args.bulk}
     if args.material == Ogden.law or isinstance(preset, Ogden):
@@ -156,7 +156,7 @@ def _parse_tissue(args: argparse.Namespace) -> Material | Ogden:
 
 
 def parse_elasticity(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
-    """Return the requested tissue of a mesh and its regions.
+    """Return the requested tissue of a mesh, with the tissues of its regions.
 
     Raises
     ------
@@ -168,14 +168,14 @@ def parse_elasticity(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
 
 
 def parse_optional_tissue(args: argparse.Namespace) -> Tissue | None:
-    """Return the requested tissue; None without a request."""
+    """Return the requested tissue; None if no option of the tissue is given."""
     constants = (args.young, args.poisson, args.ogden, args.bulk, args.prony)
     given = args.material != "default" or any(value is not None for value in constants)
     return parse_tissue(args) if given else None
 
 
 def reject_option(given_values: Mapping[str, object], material: str, owner: str) -> None:
-    """Raise InputError if an option is given that only `owner` supports."""
+    """Raise InputError if one of `given_values` is not None: only `owner`, not `material`, has these options."""
     for name, value in given_values.items():
         if value is not None:
             raise InputError(
@@ -184,9 +184,9 @@ def reject_option(given_values: Mapping[str, object], material: str, owner: str)
 
 
 def apply_tissue_options(args: argparse.Namespace, scene: Scene, patient: PatientSetup) -> Scene:
-    """Return a scene with the requested tissue and element.
+    """Return a scene with the requested tissue and element type.
 
-    Regions not set by --region have the tissue of the scene, or of `find_trained_regions`; the latter are reported.
+    Regions that --region does not set have the tissue of the scene, or that of `find_trained_regions` (see there).
 
     Raises
     ------
@@ -207,12 +207,12 @@ def apply_tissue_options(args: argparse.Namespace, scene: Scene, patient: Patien
 
 
 def parse_region_tissues(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | None = None) -> dict[int, Tissue]:
-    """Return tissues by region label, with the law of `tissue`.
+    """Parse texts of --region; return tissues by region label, with the law of `tissue`.
 
     Raises
     ------
     InputError
-        See `parse_region`; a region that is given twice, or is missing in `mesh`.
+        See `parse_region`; also if a region is given twice, or is missing in `mesh`.
     """
     pairs = [parse_region(text, tissue) for text in texts]
     labels = [label for label, _ in pairs]
@@ -228,7 +228,7 @@ def parse_region_tissues(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | N
 
 
 def check_stiffness(tissue: Tissue) -> str:
-    """Return the reason why a tissue's small-strain stiffness is implausible, as a predicate; empty if plausible."""
+    """Describe why the Young's modulus of a tissue at small strain is implausible; empty if plausible."""
     mu, lame = tissue.lame
     young, (least, most) = mu * (3.0 * lame + 2.0 * mu) / (lame + mu), PLAUSIBLE_YOUNG
     if least <= young <= most:
@@ -250,23 +250,23 @@ def _warn(option: str, tissue: Tissue) -> None:
 
 
 def parse_region_label(text: str) -> int:
-    """Return a region's label, by its number or its name.
+    """Return the label of a region that is given by number or name.
 
     Raises
     ------
     ValueError
-        Neither a label nor the name of a region.
+        The text is neither a number nor the name of a region.
     """
     return REGION_NAMES[text] if text in NON_BRAIN_REGIONS else int(text)
 
 
 def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
-    """Read "REGION:YOUNG[,POISSON]", or "REGION:C1,M1;C2,M2;K" where `tissue` obeys Ogden's law.
+    """Parse "REGION:YOUNG[,POISSON]", or "REGION:C1,M1;C2,M2;K" for Ogden's law; return label and tissue.
 
     Raises
     ------
     InputError
-        Text of another form, or invalid constants.
+        The text has another format, or constants are invalid.
     """
     ogden = isinstance(tissue, Ogden)
     try:
@@ -289,12 +289,12 @@ def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
 
 
 def parse_terms(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
-    """Parse pairs of numbers from texts "A,B", as Ogden's (c [Pa], m).
+    """Parse texts "A,B" into pairs of numbers, for example Ogden's (c [Pa], m).
 
     Raises
     ------
     ValueError
-        Text of another form.
+        A text has another format.
     """
     pairs = [text.split(",") for text in texts]
     return tuple((float(c), float(m)) for c, m in pairs)

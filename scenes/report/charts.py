@@ -1,4 +1,4 @@
-"""Charts of the report; each chart answers one question."""
+"""Charts of the report; the title of each chart is a question."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
