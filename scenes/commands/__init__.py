@@ -1,1 +1,1 @@
-"""Subcommands of `sulcus`, one file each: `add_arguments(parser)` and `run(args) -> exit code`."""
+"""Subcommands of `sulcus`: a module each, with `add_arguments(parser)` and `run(args)`, which returns the exit code."""

@@ -1,4 +1,4 @@
-"""`sulcus anatomy`: a tetrahedral brain with a tumour, from a label volume or drawn in a healthy head."""
+"""`sulcus anatomy`: build a tetrahedral brain with a tumour, from a label volume or synthetic in a healthy head."""
 
 import argparse
 import json
@@ -52,7 +52,7 @@ PRESETS = {  # Values of the options that differ from the default, by preset.
     "seed": {"cover": 8.0, "craniotomy": 110.0},
 }
 MIN_REPORTED_LOSS = 3.0
-"""Smallest share of the tumour's volume missing from the mesh that is reported [%]."""
+"""Smallest difference of the tumour's volume in the mesh from the labels that is reported [%]."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Build the anatomy, write it to a file, and print a summary."""
+    """Build the anatomy, write it to a file, and print a summary; return 0."""
     began = time.perf_counter()
     read = (args.labels, args.mask, args.tumour_in, args.t1)
     check_output_path(args.out, ".vtu", args.force, read)
@@ -171,7 +171,7 @@ def _summarise_anatomy(
 
 
 def _describe_position(subject: Subject, place: np.ndarray) -> dict[str, Any]:
-    """Describe the position of a point (3,) [m], in millimetres and in words."""
+    """Return the position of a point (3,) [m] for JSON, in millimetres and in words."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     return {"at_mm": [round(1e3 * value, 1) for value in place.tolist()], "side": describe_side(place, low, high)}
 
@@ -192,7 +192,7 @@ def _format_pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
 
 
 def _format_region(name: str, volume: float, figures: dict) -> str:
-    """Format the line of output about a region."""
+    """Format the output line of a region: name, volume [ml], volume error and region label."""
     missed = figures["regions_volume_error_percent"][name]
     off = "" if missed is None else f" ({missed:+} % of the label's)"
     return f"{name} {volume:g} ml{off}, region {PART_LABELS[name]}{' of the tumour' if name == 'necrosis' else ''}"

@@ -1,4 +1,4 @@
-"""`sulcus budget`: error budget of an overlay on a tracked camera, by contributor."""
+"""`sulcus budget`: estimate the error budget of an overlay on a tracked camera, by source of error."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve bodies, sample errors, and report the contribution of each source. Returns 0.
+    """Solve sampled bodies, sample errors, and report the contribution of each source; return 0.
 
     Raises
     ------
@@ -142,12 +142,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _build_filmed_scene(args: argparse.Namespace, patient: PatientSetup) -> Scene:
-    """Build the scene with a calibrated camera.
+    """Build the requested scene with a calibrated, tracked camera.
 
     Raises
     ------
     InputError
-        A scene with an estimated tumour, a tissue without priors, or a camera that zooms.
+        The scene has an observation model, the tissue has no priors, or the camera zooms.
     """
     from ..analysis.uncertainty import get_tissue
 
@@ -169,12 +169,12 @@ def _build_filmed_scene(args: argparse.Namespace, patient: PatientSetup) -> Scen
 
 
 def _read_intrinsic_covariance(args: argparse.Namespace, calibration: Calibration) -> np.ndarray:
-    """Return the covariance (9, 9) of the camera's intrinsics.
+    """Return the covariance (9, 9) of the camera's intrinsics, from --intrinsics or of a typical calibration.
 
     Raises
     ------
     InputError
-        A missing file, a file without a valid covariance, or one of another camera.
+        The file is missing, has no valid covariance, or belongs to another camera.
     """
     from ..analysis.tracking_errors import sample_usual_covariance
 
@@ -195,12 +195,12 @@ def _read_intrinsic_covariance(args: argparse.Namespace, calibration: Calibratio
 
 
 def _sample_bodies(args: argparse.Namespace, patient: PatientSetup, scene: Scene, count: int, seed: int) -> Bodies:
-    """Sample bodies from the priors and solve the tumour's surface motion; drop those without equilibrium.
+    """Sample bodies from the priors, and solve their tumour motions; bodies without equilibrium are dropped.
 
     Raises
     ------
     InputError
-        Too few bodies with an equilibrium.
+        Too few bodies have an equilibrium.
     """
     from ..analysis.uncertainty import filter_solved_samples, solve_ensemble
     from ..script.priors import sample_priors
@@ -213,7 +213,7 @@ def _sample_bodies(args: argparse.Namespace, patient: PatientSetup, scene: Scene
 
 
 def _extract_motions_at(scene: Scene, bodies: Bodies, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the tumour's surface motion in each body at one time, and the errors of their meshes."""
+    """Return motions (b, n, 3) [m] at time index `number`, mesh errors (b,) of the bodies, and of the scene (b,)."""
     from ..analysis.uncertainty import find_mesh_prior, get_skull_model, sample_mesh_errors
 
     draws = [draw for draw, _ in bodies]
@@ -256,7 +256,7 @@ def _collect_figures(
 
 
 def _compute_quantiles(errors: OverlayErrors) -> dict[str, dict[str, float]]:
-    """Medians and 95th percentiles of one row."""
+    """Compute the medians and 95th percentiles of errors [mm, pixel] for one row of the table."""
     columns = {
         "across_mm": 1e3 * errors.across, "along_mm": 1e3 * np.abs(errors.along), "pixels": errors.pixels,
         "middle_mm": 1e3 * errors.middle, "worst_mm": 1e3 * errors.worst,

@@ -1,4 +1,4 @@
-"""`sulcus calibrate`: camera by the board, tool tip by pivoting, or transform between two tracked bodies."""
+"""`sulcus calibrate`: calibrate a camera (board), a tool tip (pivoting), or two tracked bodies (hand-eye)."""
 
 import argparse
 import warnings
@@ -49,12 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Calibrate; return 0 when the calibration is determined.
+    """Calibrate a camera, a tool tip or a hand-eye transform, and report the result; return 0.
 
     Raises
     ------
     InputError
-        No input, or two kinds of input; files that cannot be read or written; data that do not determine the
+        There is not exactly one kind of input, files cannot be read or written, or the data do not determine the
         result.
     """
     asked = [each for each in (args.pictures, args.pivot, args.hand_eye) if each is not None]
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _calibrate_camera(args: argparse.Namespace) -> int:
-    """Calibrate a camera from images of the board."""
+    """Calibrate a camera from images of the board, and write its files; return 0."""
     from ar.tracking.intrinsics import calibrate_intrinsics, choose_views
     from ar.tracking.targets import build_calibration_board
 
@@ -127,7 +127,7 @@ def _write_json(path: Path, report: dict) -> None:
 
 
 def _parse_image_size(text: str) -> tuple[int, int]:
-    """Parse the width and height of an image, such as 1280x960."""
+    """Parse the width and height of an image [pixel] from a text such as 1280x960."""
     try:
         return parse_size(text)
     except argparse.ArgumentTypeError as error:
@@ -136,7 +136,7 @@ def _parse_image_size(text: str) -> tuple[int, int]:
 
 
 def _calibrate_tip(args: argparse.Namespace) -> int:
-    """Calibrate a tool's tip from poses while the tool pivots about the tip."""
+    """Calibrate a tool's tip from poses of the tool pivoting about its tip, and print the result; return 0."""
     from ar.tracking.tracker_calibration import calibrate_pivot
 
     from ..tracked.pose_file import read_poses
@@ -167,7 +167,7 @@ def _format_values(values: np.ndarray, deviations: np.ndarray) -> str:
 
 
 def _fit_poses(fit: Callable[..., Found], files: list[Path], poses: list[np.ndarray], rows: np.ndarray) -> Found:
-    """Fit a calibration to poses of files by `fit`; InputError if this fails, or if residuals exceed their limits."""
+    """Fit a calibration to the poses of files with `fit`; raise InputError if this fails or residuals are too large."""
     from ar.tracking.rigid import list_conventions
 
     names = " and ".join(map(str, files))
@@ -196,7 +196,7 @@ def _fit_poses(fit: Callable[..., Found], files: list[Path], poses: list[np.ndar
 
 
 def _calibrate_hand_eye(args: argparse.Namespace) -> int:
-    """Estimate the transform between two bodies from poses of both."""
+    """Estimate the transform between two bodies from poses of both, and print the result; return 0."""
     from ar.tracking.tracker_calibration import solve_hand_eye
 
     from ..tracked.pose_file import read_poses

@@ -1,4 +1,4 @@
-"""`sulcus check`: play the built-in scenes without a display, and compare their metrics with limits."""
+"""`sulcus check`: play the built-in scenes without display, and compare metrics of their images with limits."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check each scene; return 1 if a metric exceeds its limit."""
+    """Check each requested scene and the tracking; return 1 if a metric exceeds its limit, else 0."""
     from tqdm import tqdm
 
     from ..play.checks import list_warnings, measure_frames
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_tracking(args: argparse.Namespace, patient: PatientSetup, table: TextIO) -> dict[str, object]:
-    """Check the overlay on a synthetic video whose markers disappear and return."""
+    """Check the overlay on a synthetic video whose markers disappear and return; return metrics for JSON."""
     from ..tracked.rendered_video import render_synthetic_video
     from ..tracked.tracking_checks import build_default_pipeline, measure_tracking
 
@@ -132,17 +132,17 @@ def _to_millimetres(metres: float | None) -> float | None:
 
 
 def _describe_compared(scene: Scene, name: str) -> str:
-    """Describe what is compared with FEM: the tumour of a deformation model, or an estimated one."""
+    """Describe the compared tumour: that of a deformation model, or the tumour estimated from observations."""
     return f"{name}: the tumour" if scene.observation_model is None else f"{name} is the reference; tumour estimate"
 
 
 def _describe_bond(share: float) -> str:
-    """Describe how close the skull's bond is to its strength, if there is one."""
+    """Describe the largest traction of the bond to the skull as a share of its strength; empty without bond."""
     return f", bond at {share:.0%} of its strength" if math.isfinite(share) else ""
 
 
 def _summarise_estimates(figures: SceneFigures) -> str:
-    """Summarise the errors of the estimates in a scene with observations."""
+    """Describe coverage and accuracy of the estimates in a scene with observations; empty without estimates."""
     if not math.isfinite(figures.covered):
         return ""
     held = f"Its middle is in the ellipsoid in {figures.covered:.0%} of the frames"

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play the scene and write its episode."""
+    """Play the scene, and write its episode to a file; return 0."""
     from tqdm import tqdm
 
     from ..episodes.episode import collect

@@ -31,12 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the episodes, and write them in the requested format, atomically.
+    """Read the episodes, and write them in the requested format, atomically; return 0.
 
     Raises
     ------
     InputError
-        Missing or incomplete episodes, or episodes that cannot be in one set; an output that cannot be written.
+        Episodes are missing or incomplete, or cannot be in one data set; the output cannot be written.
     """
     from tqdm import tqdm
 
@@ -56,12 +56,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def build_episode_writer(args: argparse.Namespace) -> Callable[..., dict[str, Any]]:
-    """Return the function that writes episodes in the requested format, after a check of its output path.
+    """Check the output path, and return the function that writes episodes in the requested format.
 
     Raises
     ------
     InputError
-        A missing or existing output; a missing package.
+        The output is not given or exists, or a package is missing.
     """
     if args.to == "card":
         from ..episodes.exports.card import write_card
@@ -82,12 +82,12 @@ def build_episode_writer(args: argparse.Namespace) -> Callable[..., dict[str, An
 
 
 def find_folder_writer(name: str) -> Callable[..., dict[str, Any]]:
-    """Return the function that writes a folder of this format.
+    """Return the function that writes a folder of episodes in the format `name`.
 
     Raises
     ------
     InputError
-        LeRobot without the package that writes its tables.
+        The package that writes LeRobot's tables is missing.
     """
     if name == "lerobot":
         with require_extra("data", "--to lerobot needs"):

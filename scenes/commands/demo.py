@@ -1,4 +1,4 @@
-"""`sulcus demo`: a scene on a page in the browser."""
+"""`sulcus demo`: play a scene on a page in the browser."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve the page until the time is over, Ctrl-C (exit code 0) or SIGTERM (143)."""
+    """Serve the page until --seconds are over, Ctrl-C (exit code 0) or SIGTERM (exit code 143)."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def play_demo(args: argparse.Namespace, kernel_loader: ThreadPoolExecutor, exit_stack: ExitStack) -> int:
-    """Open the page, and play once `kernel_loader` has loaded the first kernels; `exit_stack` closes the page."""
+    """Open the page, wait for `kernel_loader` to load kernels, and play; return 0. `exit_stack` closes the page."""
     from ar.page.access_guard import ViserError
 
     from ..page.demo import Demo

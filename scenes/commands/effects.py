@@ -1,4 +1,4 @@
-"""`sulcus effects`: computing time and influence of each effect of a scene."""
+"""`sulcus effects`: measure the computing time and the influence of each effect of a scene."""
 
 import argparse
 import sys
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve each scene with and without each effect. Returns 1 if a scene is not solved."""
+    """Solve each scene with and without each effect, and report the differences; return 1 if a scene is not solved."""
     from tqdm import tqdm
 
     from ..play.deformers import open_theatre
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _describe_hardware(device: str, elements: int) -> str:
-    """Return the device, the processor and the number of threads of the solver's loops."""
+    """Describe the device, the processor, and the number of threads of the solver's loops."""
     from ..analysis.measurement import describe_machine
 
     names = describe_machine(device).partition(";")[0].rpartition(",")[0]  # without versions and all cores

@@ -1,4 +1,4 @@
-"""`sulcus episodes`: thousands of scripted episodes by many processes, one file per episode."""
+"""`sulcus episodes`: make thousands of scripted episodes with many processes, one file per episode."""
 
 from __future__ import annotations
 
@@ -82,12 +82,12 @@ def _parse_natural(text: str) -> int:
 
 
 def _get_plan_path(args: argparse.Namespace) -> str:
-    """Return the plan's name, or a path that is valid from any folder."""
+    """Return the plan's name, or the absolute path of the plan's file."""
     return str(Path(args.plan).absolute()) if args.plan.endswith(".toml") else args.plan
 
 
 def run(args: argparse.Namespace) -> int:
-    """Make the missing episodes; return 1 if one failed."""
+    """Make the missing episodes; return 1 if an episode failed, else 0."""
     out = check_output_folder(args.out, "episodes").absolute()
     if args.slurm:
         return _print_script(args, out)
@@ -139,7 +139,7 @@ def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_
 
 
 def _update_card(out: Path, numbers: Set[int], changed: bool) -> str | None:
-    """Update the card of the data set; return the reason if this fails."""
+    """Update the card of the data set; return the reason if this fails, else None."""
     from tqdm import tqdm
 
     from ..episodes.exports.card import update_card
@@ -168,7 +168,7 @@ def _start_workers(args: argparse.Namespace, device: str) -> AbstractContextMana
 def _show_progress(
     out: Path, there: RunStatistics, total: int, stop_if_asked: Callable[[], None]
 ) -> Iterator[ProgressListener]:
-    """Yield a listener that shows progress (frames per second, failures) and records task durations in the folder."""
+    """Yield a listener that shows the progress (frames/s, failures), and records task durations in the folder."""
     from tqdm import tqdm
 
     from ..episodes.engine import BODY

@@ -1,4 +1,4 @@
-"""`sulcus export`: a trained model as an ONNX file for other programs, or as a page that needs no server."""
+"""`sulcus export`: write a trained model as an ONNX file for other programs, or as a page that needs no server."""
 
 import argparse
 from pathlib import Path
@@ -48,13 +48,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export the model to a file; return 0.
+    """Export a trained model to a file; return 0.
 
     Raises
     ------
     InputError
-        A missing model or mesh, or a learner that is not in the file; input that `write_onnx` and `write_html`
-        reject.
+        The model or mesh is missing, the file has no model of this name, or `write_onnx` or `write_html` rejects the
+        input.
     """
     if (args.to or Path(args.out).suffix[1:]) == HTML:
         return _write_page(args)
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _find_mesh(args: argparse.Namespace) -> Path:
-    """Return the mesh of the model's anatomy."""
+    """Return the path of the mesh that belongs to the model file."""
     if not args.model.is_file():
         raise InputError(f"{args.model}: no such file. Give a model of `sulcus train`.")
     mesh = args.anatomy
@@ -91,7 +91,7 @@ def _find_mesh(args: argparse.Namespace) -> Path:
 
 
 def _write_page(args: argparse.Namespace) -> int:
-    """Write the page; return 0."""
+    """Write the model as an HTML page; return 0."""
     from ..html.document import write_html
     from ..play.deformers import open_theatre
     from ..script.scene import find_scene

@@ -1,4 +1,4 @@
-"""`sulcus film`: video of a scene by a tracked camera, with printed targets in view and ground truth."""
+"""`sulcus film`: render a video of a scene by a tracked camera, with printed targets and ground truth."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_disturbance(text: str) -> tuple[str, float, float]:
-    """Parse KIND:FROM-TO into a name and two times [s], for argparse."""
+    """Parse the text KIND:FROM-TO into the kind of a disturbance and two times [s], for argparse."""
     found = re.fullmatch(r"(\w+):([\d.]+)-([\d.]+)", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form KIND:FROM-TO, such as tool:1.0-1.5")
@@ -78,12 +78,12 @@ def parse_disturbance(text: str) -> tuple[str, float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Record the video and its ground truth; return 0.
+    """Render the video, and write it with its ground truth; return 0.
 
     Raises
     ------
     InputError
-        Input that cannot be read, output that cannot be written, numbers out of range.
+        Input cannot be read, output cannot be written, or a number is out of range.
     """
     from ..tracked.calibration_file import write_calibration, write_exact_intrinsics
     from ..tracked.filming import Artefacts, Disturbance, mount_targets, register_with_error, render_frames
@@ -135,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_disturbances(troubles: Sequence[Disturbance], times: np.ndarray) -> None:
-    """Reject a disturbance that contains none of the frame `times` (F,) [s]: it would have no effect."""
+    """Raise InputError if a disturbance contains none of the frame `times` (F,) [s], and so would have no effect."""
     for each in troubles:
         if not ((each.start <= times) & (times < each.end)).any():
             raise InputError(
@@ -145,7 +145,7 @@ def _check_disturbances(troubles: Sequence[Disturbance], times: np.ndarray) -> N
 
 
 def _build_scene(args: argparse.Namespace, patient: PatientSetup) -> Scene:
-    """Return the scene with its tracked camera, limited to the requested duration."""
+    """Return the requested scene with a tracked camera, limited to the requested duration."""
     scene = use_tracked_camera(args, build_requested_scene(args, args.scene, patient))
     if args.readout is not None:
         view = scene.viewpoint
@@ -159,7 +159,7 @@ def _build_scene(args: argparse.Namespace, patient: PatientSetup) -> Scene:
 
 
 def _write_film(args: argparse.Namespace, taken: Iterator[VideoFrame], shots: list[VideoFrame], player: Player) -> Path:
-    """Write the images, and append the ground truth of each to `shots`; return the path of the video or folder."""
+    """Write the images, and append each frame without its image to `shots`; return the path of the video or folder."""
     from tqdm import tqdm
 
     from ar.screen import FrameFolder, write_movie

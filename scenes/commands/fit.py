@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit the tissue; return 0."""
+    """Fit the tissue to the observed frames, write it to a file, and print a summary; return 0."""
     from tqdm import tqdm
 
     from sim.bodies.meshfile import read_anatomy
@@ -119,7 +119,7 @@ def _summarise_tissue(tissue: FittedTissue, out: Path) -> dict[str, object]:
 
 
 def format_fit(tissue: FittedTissue, out_path: Path) -> list[str]:
-    """Describe the fitted parameters, and those that are not determined."""
+    """Describe the fitted parameters, and the parameters that the frames do not determine, as lines of text."""
     low, middle, high = tissue.ratio
     lines = [
         f"The tumour is {middle:.2g} times as stiff as the brain (95 %: {low:.2g} to {high:.2g}).",
@@ -135,12 +135,12 @@ def format_fit(tissue: FittedTissue, out_path: Path) -> list[str]:
 
 
 def find_fitted_tissue(tissue_path: Path | None, anatomy_path: Path, digest: str) -> FittedTissue | None:
-    """Read the tissue from `tissue_path`, or from the file next to an anatomy; None if there is none.
+    """Read the fitted tissue from `tissue_path`, or from the file next to an anatomy; None if there is no file.
 
     Raises
     ------
     InputError
-        See `load_tissue`; a requested file that is missing.
+        See `load_tissue`; also if the requested file is missing.
     """
     from surrogate.fitting.tissue import load_tissue, to_tissue_path
 

@@ -1,9 +1,9 @@
-"""Text below each command's help: examples, the next step, and the scenes."""
+"""Text below the help of each command: examples, the next step, and the names of scenes."""
 
 # Names of the scenes. Repeated here, so that a command's help does not import scenes.
 NAMES = "spatula, press, slide, draw, palpate, retract, brain_shift, resection, pulsation, sag, lost_force, microscope"
 PLAYING_COMMANDS = ("demo", "render", "film", "collect", "check", "effects")
-"""Commands that take the scene to play."""
+"""Commands that have the name of a scene as an argument."""
 
 EXAMPLES = {  # Examples in the help of each command.
     "anatomy": """examples:
@@ -137,6 +137,6 @@ next: look at a scene that fails: sulcus render SCENE --out frames""",
 
 
 def format_guidance(command: str) -> str:
-    """Return the text below a command's help."""
+    """Return the text below the help of a command."""
     scenes = f"scenes: {NAMES};\n  `sulcus scenes` says what happens in each\n\n" if command in PLAYING_COMMANDS else ""
     return scenes + EXAMPLES[command]

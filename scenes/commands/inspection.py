@@ -1,4 +1,4 @@
-"""Preview of an anatomy from a patient's labels, in seconds: volumes, depth, craniotomy and warnings."""
+"""Preview of an anatomy from a patient's labels without meshing: volumes, depth, craniotomy and warnings."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -43,12 +43,12 @@ MAX_LISTED_PIECES = 4  # Maximum number of pieces that are listed.
 
 @dataclass(frozen=True)
 class Inspection:
-    """Result of an inspection; lengths in mm, volumes in ml.
+    """Result of an inspection of a label map; lengths are in mm, volumes in ml.
 
     Parameters
     ----------
     brain, tumour
-        Volumes.
+        Volumes of brain (with tumour) and tumour.
     pieces
         Pieces of the tumour: volume and position in words, the largest first.
     parts
@@ -58,17 +58,17 @@ class Inspection:
     depth
         Distance from the tumour to the nearest cortex.
     opening
-        Position of its centre (RAS).
-    place
-        Description of that position.
-    distance
-        Distance from the centre of the opening to the tumour.
-    voxel
-        Edge lengths; the longest bounds the error of the lengths here.
+        Position of the craniotomy's centre (RAS).
+        place
+            Description of the craniotomy's position in words.
+        distance
+            Distance from the centre of the craniotomy to the tumour.
+        voxel
+            Edge lengths of a voxel; the longest edge bounds the error of the other lengths.
     axes, mirrored
-        Directions of the file's axes, as three letters of R or L, A or P, S or I; True if they are left-handed.
+        Directions of the file's axes, as three letters (R or L, A or P, S or I); True if the axes are left-handed.
     warnings
-        Warnings, as sentences.
+        Warnings as sentences.
     """
 
     brain: float
@@ -86,7 +86,7 @@ class Inspection:
     warnings: tuple[str, ...]
 
     def format_lines(self) -> list[str]:
-        """Format the result as a few lines of text."""
+        """Format the result as lines of text."""
         error = max(self.voxel)
         pieces = [f"  piece {number}: {size:.2f} ml, {place}" for number, (size, place) in enumerate(self.pieces, 1)]
         shown, hidden = pieces[:MAX_LISTED_PIECES], len(pieces) - MAX_LISTED_PIECES
@@ -111,7 +111,7 @@ class Inspection:
         return f"a region of its own, {self.regions[part]}" if part in self.regions else f"{around} like the rest"
 
     def to_json(self) -> dict[str, Any]:
-        """Convert to JSON, with units in the names: volumes to a microlitre, lengths to 0.1 mm, voxels to 1 um."""
+        """Convert the result to a JSON object, with units in names; volumes to 1 ul, lengths to 0.1 mm, voxels to 1 um."""
         pieces = [{"ml": round(volume, 3), "side": place} for volume, place in self.pieces]
         return {
             "brain_ml": round(self.brain, 3),
@@ -132,7 +132,7 @@ class Inspection:
 def inspect_subject(
     masks: HeadMasks, subject: Subject, regions: Mapping[int, Tissue], limits: InspectionLimits = InspectionLimits()
 ) -> Inspection:
-    """Inspect `masks` and the `subject` in them, with tissues of regions by label."""
+    """Inspect the `masks` of a label map and the `subject` built from them, with tissues of regions by label."""
     affine = masks.affine
     edges, voxel = 1e3 * np.linalg.norm(affine[:3, :3], axis=0), 1e6 * abs(float(np.linalg.det(affine[:3, :3])))
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
@@ -160,14 +160,14 @@ def inspect_subject(
 
 
 def _describe_tissue(label: int, regions: Mapping[int, Tissue]) -> str:
-    """Describe the tissue of a region."""
+    """Describe the tissue of the region with this label."""
     tissue = Elasticity(None, regions).get_law(label)
     around = "tumour" if label == NECROSIS_LABEL else "brain"
     return f"as stiff as the {around}" if tissue is None else str(tissue)
 
 
 def describe_axes(affine: np.ndarray) -> str:
-    """Return three letters for the directions of a volume's axes, from its affine (4, 4) to RAS."""
+    """Return three letters for the directions of a volume's axes, from its affine matrix (4, 4) to RAS."""
     letters, taken = [], set()
     for column in affine[:3, :3].T / np.linalg.norm(affine[:3, :3], axis=0)[:, None]:
         axis = next(axis for axis in np.argsort(-np.abs(column)) if axis not in taken)

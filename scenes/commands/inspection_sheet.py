@@ -1,4 +1,4 @@
-"""Image sheet of an inspection: three slices, the craniotomy as a surgeon sees it, and the numbers."""
+"""Image sheet of an inspection: three slices, a view of the craniotomy from outside, and the numbers."""
 
 import textwrap
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ COLOURS: dict[str, Colour] = {
     "left out": (206, 92, 206),
     "opening": (70, 205, 110),
 }
-"""Colour of each part; later parts are drawn over earlier ones."""
+"""Colour (RGB) of each part; later parts are drawn over earlier parts."""
 CORTEX: Colour = (176, 168, 164)  # Colour of the covered cortex (RGB).
 VIEW_MARGIN = 6e-3  # Margin of a view round the brain [m].
 HALF_LINE_WIDTH = 2.2e-3  # Half the thickness of the craniotomy's line in a slice [m].
@@ -52,7 +52,7 @@ LIGHT = np.array([-0.4, 0.5, 0.77])  # Direction of the light on the cortex: fro
 
 @dataclass(frozen=True)
 class InspectionView:
-    """Square image of a plane in space.
+    """View of a plane in space, as a square image.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class InspectionView:
     middle
         Position (3,) [m] of the image's centre.
     reach
-        Half of its side length [m].
+        Half of the image's side length [m].
     """
 
     name: str
@@ -78,7 +78,7 @@ class InspectionView:
         return self.middle + steps[:, None, None] * self.down + steps[None, :, None] * self.right
 
     def find_orientation_letters(self) -> dict[str, str]:
-        """Return the letters of the patient's sides at the left, right, upper and lower edge of the image."""
+        """Return the orientation letters (R, L, A, P, S, I) at the edges "left", "right", "top" and "bottom"."""
         found = {}
         for edge, direction in (
             ("left", -self.right),
@@ -92,9 +92,9 @@ class InspectionView:
 
 
 def draw_sheet(inspection: Inspection, masks: HeadMasks, subject: Subject, open_mask: np.ndarray) -> np.ndarray:
-    """Draw the sheet as an image (H, W, 3) uint8.
+    """Draw the sheet of an inspection as an image (H, W, 3) uint8.
 
-    `open_mask` (n,) bool says which points of the subject's cortex are in the opening.
+    `open_mask` (n,) bool is True for points of the subject's cortex inside the craniotomy.
     """
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     centre = subject.pieces[0].centre
@@ -117,7 +117,7 @@ def draw_sheet(inspection: Inspection, masks: HeadMasks, subject: Subject, open_
 
 
 def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.ndarray) -> tuple[np.ndarray, set[str]]:
-    """Render a slice: coloured labels over the scan, if any, and the opened cortex. Also return the drawn labels."""
+    """Return the image of a slice with coloured labels over the scan and the opened cortex, and the drawn labels."""
     points = view.compute_points().reshape(-1, 3)
     inverse = np.linalg.inv(masks.affine)
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3]).astype(int)
@@ -158,12 +158,12 @@ def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.
 
 
 def _blend_colour(ground: np.ndarray, colour: Colour, share: float) -> np.ndarray:
-    """Blend colours (..., 3) with a share of another colour."""
+    """Blend colours (..., 3) with a share (0 to 1) of another colour."""
     return (1.0 - share) * ground + share * np.array(colour)
 
 
 def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
-    """Render the cortex seen along the normal of the opening, with the silhouette of the tumour below."""
+    """Render the cortex seen along the normal of the craniotomy, with the silhouette of the tumour below."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
     inward = 0.5 * (low + high) - subject.site
     if opened.sum() > 3:  # normal to the plane of the opening
@@ -193,7 +193,7 @@ def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.n
 
 
 def _rasterise_points(view: InspectionView, points: np.ndarray, inward: np.ndarray, cell: float) -> np.ndarray:
-    """Return the number (SIDE, SIDE) of the point (n, 3) in each pixel, or -1; points are squares of `cell` [m]."""
+    """Return the index (SIDE, SIDE) of the nearest point (n, 3) in each pixel, or -1; points are squares of `cell` [m]."""
     off, scale = points - view.middle, 0.5 * SIDE / view.reach
     half = int(np.ceil(0.5 * cell * scale))
     order = np.argsort(-(off @ inward), kind="stable")  # the nearest point is painted last
@@ -208,7 +208,7 @@ def _rasterise_points(view: InspectionView, points: np.ndarray, inward: np.ndarr
 
 
 def _draw_frame(colour: np.ndarray, view: InspectionView) -> np.ndarray:
-    """Return the panel with its name, the patient's sides and a scale."""
+    """Return the image of a view with its name, orientation letters and a scale bar."""
     picture = Image.fromarray(colour)
     ink = ImageDraw.Draw(picture)
     ink.rectangle([0, 0, SIDE - 1, SIDE - 1], outline=(60, 60, 64))
@@ -236,7 +236,7 @@ def _draw_frame(colour: np.ndarray, view: InspectionView) -> np.ndarray:
 
 
 def _write_text(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
-    """Draw numbers, warnings and colours in the right column."""
+    """Draw the numbers, the warnings and the colour legend into the right column of the sheet."""
     left, top = 2 * SIDE + PAD, PAD
     rows: list[tuple[str, Colour]] = [("Model to be built", TEXT_COLOUR)]
     for text in found.format_lines():

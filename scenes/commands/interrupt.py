@@ -21,7 +21,7 @@ POLL_INTERVAL = 0.1
 
 
 class EndedBySignal(BaseException):
-    """Exception that a signal raises in the main thread, with the exit code."""
+    """Exception that a signal raises in the main thread; `code` is the exit code."""
 
     def __init__(self, signal_number: int) -> None:
         super().__init__(signal_number)
@@ -31,13 +31,13 @@ class EndedBySignal(BaseException):
 def run_until_signal(work: Callable[[ExitStack], int]) -> int:
     """Run `work`, clean up and return its result; at a signal, clean up and exit the process immediately.
 
-    The work runs in its own thread, so that the main thread, which receives signals, is free during long calls.
-    Results computed during a signal are dropped: no file is open for writing here.
+    The work runs in its own thread, so that the main thread can receive signals during long calls. Results of a
+    computation that a signal interrupts are lost; no file must be open for writing.
 
     Parameters
     ----------
     work
-        Function that registers its cleanup on the given stack.
+        Function that registers its cleanup on the exit stack that it receives, and returns the exit code.
     """
     closing = ExitStack()
     if threading.current_thread() is not threading.main_thread():
@@ -69,10 +69,10 @@ def run_until_signal(work: Callable[[ExitStack], int]) -> int:
 
 @contextmanager
 def interrupt_on_termination() -> Iterator[Callable[[], None]]:
-    """Treat SIGTERM like Ctrl-C: clean up, and end started processes.
+    """Raise KeyboardInterrupt at SIGTERM as at Ctrl-C, so that the block is cleaned up; yield a function to poll.
 
-    Python drops errors of finalisers: a signal during a finaliser is repeated after it. Long work should also call the
-    yielded function regularly: it raises KeyboardInterrupt after a signal.
+    Python ignores exceptions in finalisers, so that a signal during a finaliser is repeated later. Long work should
+    also call the yielded function regularly, which raises KeyboardInterrupt after a signal.
     """
     came, over = threading.Event(), threading.Event()
 
@@ -102,7 +102,7 @@ def interrupt_on_termination() -> Iterator[Callable[[], None]]:
 
 
 def _is_finalising(frame: FrameType | None) -> bool:
-    """Return True if a frame runs within a finaliser, or within a callback of the garbage collector."""
+    """Return True if a stack frame runs inside a finaliser or a callback of the garbage collector."""
     while frame is not None:
         if frame.f_code.co_name in ("__del__", "_gc_callback") or frame.f_code.co_filename == weakref.__file__:
             return True

@@ -22,12 +22,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate the models; return 0 for any errors and coverage.
+    """Evaluate the models, and report errors and coverage; return 0 regardless of the results.
 
     Raises
     ------
     InputError
-        Loads at places that the models were trained on, or of another tissue or element.
+        The loads are at positions of the models' training, or have another tissue or element type.
     """
     from sim.bodies.tip_distance import build_tip_gauge
     from surrogate.data.dataset import read_dataset
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _get_physics(stated: Mapping[str, str]) -> dict[str, object]:
-    """Return the properties that two bodies must share to be compared: tissue, tissue of regions, and element."""
+    """Return the properties that must agree in a comparison of models and data: tissue of all regions, and element."""
     from surrogate.data.solution_rows import TISSUE_KEY, read_tissue_text
 
     return {"tissue": read_tissue_text(stated) if TISSUE_KEY in stated else None, "element": stated.get("element")}

@@ -96,12 +96,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until the time is over, Ctrl-C (exit code 0) or SIGTERM (143).
+    """Serve until --seconds are over, Ctrl-C (exit code 0) or SIGTERM (exit code 143).
 
     Raises
     ------
     InputError
-        Files that cannot be read or do not belong together, impossible options, an address that cannot be used.
+        Files cannot be read or do not belong together, an option is invalid, or an address cannot be used.
     """
     for name, value in {"--seconds": args.seconds, "--stale": args.stale, "--clients": args.clients}.items():
         if not value > 0:
@@ -129,7 +129,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def parse_names(args: argparse.Namespace) -> TransformNames:
-    """Parse the names of the received transforms."""
+    """Return the names of the received transforms from the options."""
     from ..link.received_transforms import TransformNames
 
     return TransformNames(args.tool_name, args.reference_name, args.camera_name, args.registration_name)
@@ -141,7 +141,7 @@ def parse_address(text: str) -> tuple[str, int]:
     Raises
     ------
     InputError
-        Text that is not an address.
+        The text is not an address.
     """
     whole = f"[{text}]" if is_ipv6(text) else text
     found = re.fullmatch(r"(\[[^\[\]]+\]|[^:\[\]]+)(?::([0-9]*))?", whole)
@@ -155,7 +155,7 @@ def parse_address(text: str) -> tuple[str, int]:
 
 
 def is_ipv6(text: str) -> bool:
-    """Return True if a text is an IPv6 address, with or without a %zone."""
+    """Return True if a text is an IPv6 address, with or without a zone (%zone)."""
     try:
         socket.inet_pton(socket.AF_INET6, text.partition("%")[0])
     except OSError:
@@ -164,7 +164,7 @@ def is_ipv6(text: str) -> bool:
 
 
 def is_local_host(host: str, server_address: str) -> bool:
-    """Return True if a host is this machine, or the server's own address."""
+    """Return True if a host name is an address of this machine, or equals the server's address."""
     if host == server_address:
         return True
     try:
@@ -175,7 +175,7 @@ def is_local_host(host: str, server_address: str) -> bool:
 
 
 def _is_own(family: int, address: tuple) -> bool:
-    """Return True if a socket of this machine can be bound to an address."""
+    """Return True if a socket on this machine can be bound to an address."""
     with socket.socket(family, socket.SOCK_DGRAM) as tried:
         try:
             tried.bind(address)
@@ -209,7 +209,7 @@ def _run_link(args: argparse.Namespace, source: tuple[str, int] | None, closing:
 
 
 def open_link(args: argparse.Namespace) -> LinkSession:
-    """Return the requested link; call it in an event loop.
+    """Build the requested link session; must be called in an event loop.
 
     Raises
     ------
@@ -272,7 +272,7 @@ def open_link(args: argparse.Namespace) -> LinkSession:
 
 
 def _choose_tool(patient: PatientSetup, path: Path) -> TrackedTool:
-    """Return the tool of the best pose model, with its origin at the tip as in PLUS: z points away from the shaft."""
+    """Return the tool of the best model for poses; its origin is the tip, z points away from the shaft as in PLUS."""
     from ..tracked.tracked_tool import TrackedTool
 
     posed = [(model.bound, model.tool) for model in patient.models.values() if model.tool is not None]

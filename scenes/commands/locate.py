@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Locate the tumour; return 0. Observations that no cause explains are invalid input."""
+    """Locate the tumour and report the result; return 0. Raise InputError for observations that no cause explains."""
     from sim.bodies.meshfile import read_anatomy, write_mesh
     from sim.runtime.device import find_device
     from surrogate.locating.observation import to_evidence
@@ -131,7 +131,7 @@ def _format_result(found: Location, out: Path | None) -> str:
 
 
 def _list_warnings(found: Location) -> list[str]:
-    """List remarks that a reader of the result needs, in sentences."""
+    """List the warnings of a result as sentences, including excluded points and tips."""
     warnings = list(found.warnings)
     if found.slipped:
         warnings.append("If it was checked, say so by --registration-checked.")
@@ -141,6 +141,6 @@ def _list_warnings(found: Location) -> list[str]:
 
 
 def describe_excluded_rows(indices: np.ndarray) -> str:
-    """Describe which rows of a file were excluded, by the numbers (k,) of their points from 0."""
+    """Describe the excluded rows of a file, given the indices (k,) of their points."""
     rows = ", ".join(str(number + 2) for number in indices[:20]) + (" ..." if len(indices) > 20 else "")
     return f"Left out, off the open cortex or without support by other points: rows {rows} of the file."

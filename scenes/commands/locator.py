@@ -1,4 +1,4 @@
-"""`sulcus locator`: precompute the ensemble of an anatomy, for any number of observations."""
+"""`sulcus locator`: precompute the ensemble of an anatomy, which is reused for all observations."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Build the locator; return 0."""
+    """Build the locator of an anatomy, and write it to a file; return 0."""
     from sim.bodies.meshfile import read_anatomy
     from sim.runtime.device import find_device
     from surrogate.locating.locator_store import save_locator, to_locator_path
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def build_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, regions: tuple[Region, ...]) -> Locator:
-    """Build a locator with a progress bar; parts that an interrupted run left next to `path` are reused."""
+    """Build a locator with a progress bar; parts of an interrupted run next to `path` are reused."""
     from tqdm import tqdm
 
     from surrogate.locating.causes import Causes
@@ -88,12 +88,12 @@ def build_with_progress(path: Path, anatomy: Anatomy, seed: int, device: str, re
 
 
 def find_locator(args: argparse.Namespace, anatomy: Anatomy, allow_small: bool = False) -> Locator:
-    """Load the locator next to the anatomy, or build one; a locator covers every vertex, unless `allow_small`.
+    """Load the requested locator or the locator next to the anatomy; build and save the locator if it does not exist.
 
     Raises
     ------
     InputError
-        See `load_locator`; a small locator; a locator of other regions than those requested.
+        See `load_locator`; the locator has other regions than requested, or is small and `allow_small` is False.
     """
     from surrogate.locating.locator_store import load_locator, save_locator, to_locator_path
     from surrogate.locating.regions import describe_regions
@@ -120,12 +120,12 @@ def find_locator(args: argparse.Namespace, anatomy: Anatomy, allow_small: bool =
 
 
 def list_regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Region, ...]:
-    """Return the regions of --region; without it, those with a tissue in the models next to the anatomy.
+    """Return the regions of --region, or else the regions with a tissue in the models next to the anatomy.
 
     Raises
     ------
     InputError
-        See `parse_region_tissues` and `list_known_regions`; a value that is not a tissue.
+        See `parse_region_tissues` and `list_known_regions`; also if a value is not a tissue.
     """
     from sim.effects import Elasticity
     from surrogate.locating.regions import list_known_regions
@@ -141,7 +141,7 @@ def list_regions_known(args: argparse.Namespace, anatomy: Anatomy) -> tuple[Regi
 
 
 def remove_temporary_files(path: Path) -> None:
-    """Remove temporary files next to a locator's path."""
+    """Remove the parts of an interrupted run next to a locator's path."""
     shutil.rmtree(_to_parts_path(path), ignore_errors=True)
 
 

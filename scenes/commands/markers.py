@@ -1,4 +1,4 @@
-"""`sulcus markers`: pages with tracking targets to print, and a list of the targets."""
+"""`sulcus markers`: write printable pages with tracking targets, and a list of the targets."""
 
 import argparse
 import json
@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        Files of those names that `sulcus markers` did not write, or a folder that cannot be written to.
+        Files of these names exist and are not to be replaced, or the folder is not writable.
     """
     from ar.tracking.pages import DPI, build_printed_pages, describe_targets, to_pdf, to_png
     from sim.runtime.atomic_files import write_atomically

@@ -1,4 +1,4 @@
-"""`sulcus overlay`: the tumour drawn into a video or a live camera image."""
+"""`sulcus overlay`: draw the tumour into a video or into live camera images."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """Inputs of a run."""
+    """Tracker, renderer and camera of a run, and description of the deformation model."""
 
     calibration: Calibration
     follower: Follower
@@ -106,12 +106,12 @@ class Pipeline:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw the overlay; return 0, or 1 if no frame has a reliable tumour position.
+    """Draw the overlay on all images; return 0, or 1 if no image has a reliable tumour position.
 
     Raises
     ------
     InputError
-        Files that cannot be read, written, or do not belong together; images of another size than the camera's.
+        Files cannot be read or written, or do not belong together; images do not have the size of the calibration.
     """
     from ..tracked.run import write_tracking_table
     from ..tracked.truth import compute_overlay_error, read_truth, summarise_errors
@@ -144,7 +144,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
-    """Show a video or a live camera on a page, until the time is over or a signal arrives."""
+    """Show a video or a live camera on a page until the time is over or a signal arrives; return 0 or 1 as `run`."""
     from ar.page.access_guard import ViserError, check_address
 
     from ..tracked.run import write_tracking_table
@@ -203,7 +203,7 @@ def _build_page(args: argparse.Namespace, parts: Pipeline, stack: ExitStack, nam
 def _print_summary(
     args: argparse.Namespace, report: dict[str, object], shown: list[Overlay], out: Path | None, table: Path | None
 ) -> int:
-    """Print the summary of a run; return 1 if no frame has a reliable tumour position."""
+    """Print the summary of a run; return 0, or 1 if no image has a reliable tumour position."""
     report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
     print(to_json_line(report) if args.json else _format_report(report))
     return 0 if any(each.result.is_reliable for each in shown) else 1
@@ -216,7 +216,7 @@ def _check_video_path(path: Path, force: bool, inputs: list[str | Path | None]) 
 
 
 def _read_parts(args: argparse.Namespace, film: bool) -> Pipeline:
-    """Read the inputs of a run, starting with those that take little time."""
+    """Read the inputs of a run, small files first, and build its tracker and renderer."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
     from sim.runtime.device import find_device
@@ -260,7 +260,7 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Pipeline:
 
 
 def _draw_video(args: argparse.Namespace, parts: Pipeline, out: Path | None) -> list[Overlay]:
-    """Draw the overlay on all frames, and write a video if requested; return the results without images."""
+    """Draw the overlay on all images, and write a video if requested; return the overlays without images."""
     from ar.screen import write_movie
     from ar.tracking.image_sequences import read_frame_rate, read_video
 
@@ -289,7 +289,7 @@ def _draw_video(args: argparse.Namespace, parts: Pipeline, out: Path | None) -> 
 
 
 def _report(shown: list[Overlay], who: str) -> dict[str, object]:
-    """Summarise a run for JSON."""
+    """Summarise a run for JSON: numbers of images, states, and latency; `who` describes the deformation model."""
     from ..tracked.run import summarise_latencies
 
     count = len(shown)

@@ -1,4 +1,4 @@
-"""`sulcus patient`: anatomy, training data and models from a label volume, by one command."""
+"""`sulcus patient`: build anatomy, training data and models from a label volume."""
 
 import argparse
 import json
@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run anatomy, simulate and train; the same command resumes an interrupted run."""
+    """Run the commands anatomy, simulate and train; return the exit code. The same call resumes an interrupted run."""
     # Report problems now, not after minutes of reading and meshing.
     _check_source(args)
     plan = MeshPlan(args.nodes, to_metres(args.craniotomy), fine_opening=args.fine_opening)
@@ -156,7 +156,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_source(args: argparse.Namespace) -> None:
-    """Check that there is one source of labels; set the files and labels of --sample."""
+    """Check that there is one source of labels; for --sample, set its files and labels in `args`."""
     if not args.sample:
         if args.labels is None:
             raise InputError("no label map: give LABELS.nii.gz, or --sample for a synthetic patient.")
@@ -168,7 +168,7 @@ def _check_source(args: argparse.Namespace) -> None:
 
 
 def _write_sample(args: argparse.Namespace) -> None:
-    """Write label map and T1 of --sample; equal files are kept, so that a run can resume."""
+    """Write label map and T1 scan of --sample; keep equal files, so that a run can be resumed."""
     volumes, new = build_sample_head(read_anatomy(get_template_path()).mesh), {}
     for path, data in zip((args.labels, args.t1), map(encode_intensity, volumes), strict=True):
         if not (path.is_file() and path.stat().st_size == len(data) and path.read_bytes() == data):
@@ -185,7 +185,7 @@ def _list_inputs(args: argparse.Namespace) -> list[Path]:
 
 
 def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tissue]) -> int:
-    """Print and draw the anatomy that would be made."""
+    """Print and draw a preview of the anatomy that would be built; return 0."""
     from ar.screen import write_png
 
     from .inspection import inspect_subject
@@ -213,7 +213,7 @@ def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tis
 
 
 def _format_scene_options(args: argparse.Namespace) -> str:
-    """Return the options that a scene needs to match these data: tissue, element and planned trajectory."""
+    """Return the options (text) with which a scene matches these data: tissue, element and planned trajectory."""
     tissue = "" if args.material == BRAIN.law else f" --material {args.material}"
     element = "" if args.element in (None, RECOMMENDED) else f" --element {args.element}"
     trajectory = get_trajectory_path(args)

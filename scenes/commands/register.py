@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     InputError
-        Files that cannot be read or written, a surface without anatomy, or points that determine no registration.
+        Files cannot be read or written, a surface is given without anatomy, or points determine no registration.
     """
     from ar.tracking.registration import compute_pair_residuals, refine_registration, register_points
     from sim import read_anatomy
@@ -97,7 +97,7 @@ def _summarise_residuals(fits: PairResiduals) -> dict[str, object]:
 
 
 def _format_table(fits: PairResiduals) -> list[str]:
-    """Format the residuals: a row for each pair, and a warning about the worst one."""
+    """Format the residuals as a row for each pair, and a warning if the worst pair may be an outlier."""
     if np.isnan(fits.p_value):
         rows = [f"{row + 1:4d} {1e3 * off:7.2f} mm" for row, off in enumerate(fits.residuals)]
         return ["pair    error", *rows, "three pairs cannot show an outlier: touch a fourth, better six"]
@@ -114,7 +114,7 @@ def _format_table(fits: PairResiduals) -> list[str]:
 
 
 def _build_nearest(anatomy: Anatomy) -> Nearest:
-    """Return the nearest place on the surface of the brain, and its normal."""
+    """Build a function from points (n, 3) [m] to the nearest points on the brain's surface, and the normals there."""
     from sim.geometry.closest_point import find_closest_points
 
     corners = anatomy.mesh.nodes[anatomy.mesh.surface]
@@ -129,7 +129,7 @@ def _build_nearest(anatomy: Anatomy) -> Nearest:
 
 
 def _compute_tumour_error(found: Registration, anatomy: Anatomy) -> tuple[np.ndarray, float]:
-    """Compute the error at the tumour's centre: deviations (3,) [mm] by axis of the reference, and 95 % radius [m]."""
+    """Compute the tumour centroid's error: deviations (3,) [mm] along the reference's axes, and 95 % radius [m]."""
     from surrogate.locating.locator import compute_confidence_radius
 
     if not len(anatomy.tumour_nodes):

@@ -1,4 +1,4 @@
-"""`sulcus render`: the frames of a scene as images, without display or browser."""
+"""`sulcus render`: write the frames of a scene as images, without display or browser."""
 
 import argparse
 import json
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Render all frames; return 1 if a frame is unreliable."""
+    """Render the frames of a scene to files; return 1 if the solution of a frame is unreliable, else 0."""
     from tqdm import tqdm
 
     from ..play.scene_costs import draw_cost_panel

@@ -1,4 +1,4 @@
-"""`sulcus report`: accuracy and computing time of every deformer, as a page, plots and tables."""
+"""`sulcus report`: measure accuracy and computing time of every deformer; write a page, plots and tables."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure all rows; return 1 if a row could not be measured."""
+    """Measure all rows and write the report; return 1 if a row could not be measured, else 0."""
     try:
         sections = _measure_seed_sections(args) if args.seed_protocol else _measure_sections(args)
     except KeyboardInterrupt:
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _measure_sections(args: argparse.Namespace) -> list[Section]:
-    """Measure the rows of each data set; rewrite the page after each."""
+    """Measure the rows of each data set; rewrite the report after each data set."""
     from ..analysis.measurement import describe_machine
     from ..play.effect_record import SUFFIX, read_effect_records
     from ..report.adaptation import build_debulked_study, simulate_debulked
@@ -157,7 +157,7 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
 
 
 def _check_options(args: argparse.Namespace) -> str:
-    """Check the output path and the number of loads; return the device of the measurements."""
+    """Check output path and number of loads; return the device on which rows are measured."""
     from sim.runtime.device import parse_device_names
 
     several = parse_device_names(args.device)
@@ -168,7 +168,7 @@ def _check_options(args: argparse.Namespace) -> str:
 
 
 def _measure_seed_sections(args: argparse.Namespace) -> list[Section]:
-    """Measure the protocol on the authors' mesh, if given, and on the template; rewrite the page after each."""
+    """Measure the published protocol on the authors' mesh (if given) and on the template; return their sections."""
     from ..analysis.measurement import describe_machine
     from ..report import seed_protocol
     from ..report.page import Section, write_report
@@ -204,7 +204,7 @@ def _tabulate(study: ReportStudy, bar: tqdm) -> None:
 
 
 def _simulate_data(path: Path, args: argparse.Namespace, count: int) -> None:
-    """Simulate a data set, or resume it."""
+    """Simulate a data set of `count` loads into a file, or resume an interrupted simulation."""
     from . import simulate
 
     parser = argparse.ArgumentParser()

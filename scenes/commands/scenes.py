@@ -1,4 +1,4 @@
-"""`sulcus scenes`: the built-in scenes, their effects, the deformers that support them, and images."""
+"""`sulcus scenes`: list the built-in scenes with their effects, deformers and images."""
 
 import argparse
 import json
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List the scenes."""
+    """List the scenes, and draw their images if requested; return 0."""
     from tqdm import tqdm
 
     from ar.screen import write_png

@@ -1,4 +1,4 @@
-"""`sulcus sensitivity`: influence of modelling choices on the tumour's motion, compared with the surrogate's error."""
+"""`sulcus sensitivity`: compare the influence of modelling choices on the tumour's motion with a surrogate's error."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 # Column titles of the table.
 COLUMN_TITLES = ("factor", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
 COLUMN_WIDTHS = (18, 11, 9, 6, 6, 6, 5, 6, 6, 6, 5)
-"""Widths of the table's columns [characters]: a line has at most 120."""
+"""Widths of the table's columns [characters]; a line has at most 120 characters."""
 # Explanation under the table.
 NOTE = """
 One factor is changed at a time. F: tools of prescribed force. M: the same tools with the motion of the default under
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve all variants; return 1 if one did not converge."""
+    """Solve all variants and print the table; return 1 if a solve did not converge, else 0."""
     from ..analysis.measurement import describe_machine, write_table
     from ..analysis.sensitivity import BodyVariant, SensitivityStudy, list_variants, measure_variants
     from ..play.deformers import open_theatre
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_factorial(args: argparse.Namespace) -> int:
-    """Solve every combination of factors, and print shares of variance; return 1 if a solve did not converge."""
+    """Solve all combinations of factors, and print shares of variance; return 1 if a solve did not converge, else 0."""
     from math import prod
 
     from ar.screen import write_png
@@ -165,7 +165,7 @@ def _describe_study(study: SensitivityStudy, preset: str) -> str:
 
 
 def _format_surrogate_row(model: Learned | None) -> list[str]:
-    """Format the table row of the surrogate's error bound; empty without a bound."""
+    """Format the table row of the surrogate's error bound, as a list of lines; empty without a bound."""
     if model is None or not np.isfinite(model.bound):
         return []
     bound = ("", f"{1e3 * model.bound:.3f}", "", "")
@@ -184,7 +184,7 @@ def _format_row(cells: Sequence[str]) -> str:
 
 
 def _list_remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned | None, failed: int) -> list[str]:
-    """List remarks that a reader of the table needs, in sentences."""
+    """List remarks on the table as sentences: failed solves, meaning of the surrogate's error, missing rows."""
     remarks = []
     if failed:
         remarks.append(f"{failed} solves did not converge: they and their comparisons are excluded.")
@@ -205,7 +205,7 @@ def _list_remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned
 
 
 def _get_reported_error(model: Learned) -> dict[str, Any]:
-    """Read the reported error of a model."""
+    """Return the reported error bound [mm] of a model, with its name, load preset and element type."""
     training = model.training
     about = {name: training.get(name, "unknown") for name in ("learner", "preset")}
     return {**about, "element": training.get("element", "p1"), "bound_mm": 1e3 * model.bound}

@@ -1,4 +1,4 @@
-"""`sulcus simulate`: sample loads of a tool, solve them by FEM, store every displacement."""
+"""`sulcus simulate`: sample loads of a tool, solve them by FEM, and store the displacements in a data set."""
 
 import argparse
 import json
@@ -102,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate the loads; return 0 even if a load did not converge: the data set records which did."""
+    """Simulate the loads; return 0 even if a load does not converge, because the data set records the outcomes."""
     out = check_output_path(args.out, ".h5", args.force, resumed="anatomy" in read_attributes(Path(args.out)))
     with time_stage("draw"):
         anatomy = read_anatomy(get_template_path() if args.anatomy is None else args.anatomy)
@@ -155,13 +155,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def show_progress(progress_bar: tqdm, done: int, total: int) -> None:
-    """Show that `done` of `total` rows are finished."""
+    """Update a progress bar: `done` of `total` rows are finished."""
     progress_bar.total = total
     progress_bar.update(done - progress_bar.n)
 
 
 def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
-    """Return the tool of pose control, or None, and sampled loads, with times for viscoelastic tissue."""
+    """Return the tool moved by poses (None for forces), and sampled loads, with times if the tissue relaxes."""
     asked = _build_requested_tool(args)
     if not args.pose_control:
         if asked is not None or args.scene is not None:
@@ -182,12 +182,12 @@ def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) ->
 
 
 def _build_requested_tool(args: argparse.Namespace) -> BuiltIn | None:
-    """Build the requested tool; None without a request.
+    """Build the tool of --ball, --capsule or --blade; None without such an option.
 
     Raises
     ------
     InputError
-        A size [mm] that is not possible for the tool.
+        A size [mm] of the tool is out of range.
     """
     for name, sizes in (("ball", [args.ball]), ("capsule", args.capsule), ("blade", args.blade)):
         if sizes and sizes[0] is not None and not all(MIN_TOOL_MM <= size <= MAX_TOOL_MM for size in sizes):

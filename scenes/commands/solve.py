@@ -1,4 +1,4 @@
-"""`sulcus solve`: static equilibrium of any tetrahedral mesh."""
+"""`sulcus solve`: compute the static equilibrium of any tetrahedral mesh."""
 
 import argparse
 import sys
@@ -55,9 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve, write the displacement, and print one JSON line; return 0 if converged, else 1.
+    """Solve the problem in a file, write the displacement, and print one JSON line; return 0 if converged, else 1.
 
-    Without convergence, the equilibrium under the largest solved share of the load is written, or else the last state.
+    Without convergence, the file gets the equilibrium under the largest solved share of the load, or the last state.
     """
     out = check_output_path(args.out, ".vtu", args.force, [args.mesh])
     accuracy = Accuracy(tolerance=args.tolerance, precision=args.precision, limit_strain=not args.any_strain)
@@ -124,12 +124,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def read_initial_guess(file: MeshFile, name: str, length_unit: float) -> Deformation | None:
-    """Return the initial guess in a file's point data `start`, if there is one. `length_unit` of the file [m].
+    """Return the initial guess in the point data `start` of a file; None without. `length_unit`: unit of the file [m].
 
     Raises
     ------
     InputError
-        A guess of the wrong shape, or not finite.
+        The guess has the wrong shape, or is not finite.
     """
     if "start" not in file.point_data:
         return None
@@ -139,12 +139,12 @@ def read_initial_guess(file: MeshFile, name: str, length_unit: float) -> Deforma
 
 
 def read_problem(file: MeshFile, name: str, length_unit: float) -> tuple[Anatomy, Loads, list[str]]:
-    """Read constraints and loads of a file's point data, with notes on changes. `length_unit` of the file [m].
+    """Read constraints and loads from a file's point data, with notes on corrections; `length_unit`: its unit [m].
 
     Raises
     ------
     InputError
-        Point data that are missing, of the wrong shape, or not finite.
+        Point data are missing, have the wrong shape, or are not finite.
     """
     mesh, data = file.mesh, file.point_data
     count, notes = len(mesh.nodes), []

@@ -1,4 +1,4 @@
-"""`sulcus track`: poses of the tool and the patient's reference in every frame of a calibrated camera."""
+"""`sulcus track`: write poses of the tool or the patient's reference in every frame of a calibrated camera."""
 
 import argparse
 import time
@@ -41,13 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Track every frame; return 0, or 1 if no frame has a reliable pose.
+    """Track the body in every frame, and write its poses; return 0, or 1 if no frame has a reliable pose.
 
     Raises
     ------
     InputError
-        Images or a camera that cannot be read; images of another size or focal length than the camera's. A rate
-        that is not above 0, a body in its own frame.
+        Images or the calibration cannot be read, images have another size or focal length than the calibration, the
+        rate is not > 0, or the body is its own reference.
     """
     from ar.tracking.targets import TIP_DISTANCE
 

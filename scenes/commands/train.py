@@ -1,4 +1,4 @@
-"""`sulcus train`: fit the learners to a data set, and compare their errors on held-out discs."""
+"""`sulcus train`: fit models to a data set, and compare their errors on held-out discs of the cortex."""
 
 import argparse
 import json
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train, compare and write the models; return 0."""
+    """Train the models, compare them on held-out loads, and write them to a file; return 0."""
     out = check_output_path(args.out, ".npz", args.force)
     device = parse_device_names(args.device)[0]
     if args.force:
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def parse_learners(text: str) -> list[str]:
-    """Parse the names in `--learners`; an empty name is an error."""
+    """Parse the names in --learners; raise InputError if a name is empty."""
     names = [name.strip() for name in text.split(",")]
     if not all(names):
         raise InputError(f"--learners {text!r}: name each learner, with one comma between two, or leave it out.")
@@ -83,7 +83,7 @@ def parse_learners(text: str) -> list[str]:
 
 
 def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
-    """List notes on slow parts and on results that need more loads, in sentences."""
+    """List notes as sentences on slow computations and on results that would need more loads."""
     notes, good = [], int(data.good.sum())
     expanded = [name for name in learners if name in SERIES_MODELS]
     if expanded:
@@ -132,7 +132,7 @@ def _describe_calibration(trained: Trained) -> str:
 
 
 def _describe_error(model: Learned) -> dict[str, object]:
-    """Describe the errors that the model reports, next to its score."""
+    """Return the errors that a model reports, for JSON."""
     reported = get_reported_errors(model)
     discs = None if reported.held_out is None else asdict(reported.held_out)
     return {"bound_mm": 1e3 * reported.bound, "discs": discs, "weak": reported.is_weak}

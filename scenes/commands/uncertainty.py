@@ -1,4 +1,4 @@
-"""`sulcus uncertainty`: tumour position error of a scene, and the contribution of each source."""
+"""`sulcus uncertainty`: estimate the tumour position error of a scene, and the contribution of each source."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve an ensemble of each scene, and store the results."""
+    """Solve an ensemble of each scene, store the results next to the anatomy or in --out, and print them; return 0."""
     from ..analysis.uncertainty import (
         estimate_uncertainty,
         get_tissue,
@@ -122,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _summarise_scene(patient: PatientSetup, scene: Scene, found: Uncertainty) -> dict[str, Any]:
-    """Summarise a scene at the time of the largest bound on the tumour's error [mm]."""
+    """Summarise the results of a scene for JSON, at the time of the largest bound on the tumour's error."""
     from ..play.frame_text import format_errors
 
     model = patient.models.get(patient.select_best(scene))

@@ -29,12 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Validate each file; return 1 if one has faults.
+    """Validate each episode file, and report the faults; return 1 if a file has faults, else 0.
 
     Raises
     ------
     InputError
-        No files to check.
+        There are no files to check.
     """
     from tqdm import tqdm
 
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def list_missing_episodes(folder: Path) -> list[Report]:
-    """List the missing episodes that a folder's card names."""
+    """Return a report for each episode that the card of a folder lists and that is missing."""
     from ..episodes.exports.card import TABLE, list_card_files
     from ..episodes.reading.validation import Report
 
@@ -85,7 +85,7 @@ def list_missing_episodes(folder: Path) -> list[Report]:
 
 
 def format_reports(reports: list[Report], unreadable: list[Report]) -> list[str]:
-    """Format the faults of each file, the files that could not be checked, and statistics of all complete ones."""
+    """Format as lines the faults of each file, checks that were skipped, and statistics of all complete episodes."""
     lines = [f"{report.path}: {problem}" for report in unreadable for problem in report.problems]
     lines = [
         *lines[:MAX_LISTED_FILES],

@@ -1,4 +1,4 @@
-"""`sulcus warp`: a deformed brain as fields, images, meshes and markups that other programs open."""
+"""`sulcus warp`: write a deformed brain as fields, images, meshes and markups for other programs."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_load(text: str) -> tuple[float, float, float, float]:
-    """Parse X,Y,Z,N into four numbers, for argparse."""
+    """Parse the text X,Y,Z,N into a point [mm] and a force [N], for argparse."""
     try:
         x, y, z, newton = (float(part) for part in text.split(","))
     except ValueError:
@@ -79,7 +79,7 @@ def parse_load(text: str) -> tuple[float, float, float, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve, write and report; return 1 if the solution did not converge, or if the field folds."""
+    """Solve the load, write the files, and report; return 1 if the solution did not converge or the field folds."""
     from tqdm import tqdm
 
     from sim.runtime.atomic_files import write_folder_atomically
@@ -123,12 +123,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def check_warp_options(args: argparse.Namespace) -> None:
-    """Reject conflicting options and values out of range.
+    """Check the options for conflicts and for values out of range.
 
     Raises
     ------
     InputError
-        A missing or unused option, or an invalid value; two images with the same output name.
+        An option is missing, unused or invalid, or two images have the same output name.
     """
     from ..warp.images import to_warped_name
     from ..warp.places import MAX_SPACING, MIN_SPACING
@@ -148,12 +148,12 @@ def check_warp_options(args: argparse.Namespace) -> None:
 
 
 def build_scene(args: argparse.Namespace, patient: PatientSetup) -> Scene:
-    """Return the requested scene; a load is a scene with a constantly pushing tool.
+    """Return the requested scene; for --load, a scene with a tool that pushes constantly.
 
     Raises
     ------
     InputError
-        An unknown scene or frame; a force that does not push, or is too large; a point away from the cortex.
+        The scene or frame is unknown, the force is not positive or too large, or the point is not on the cortex.
     """
     if args.load is not None:
         return apply_tissue_options(args, replace(build_pushing_scene(patient, args.load), name="load"), patient)
@@ -167,7 +167,7 @@ def build_scene(args: argparse.Namespace, patient: PatientSetup) -> Scene:
 
 
 def build_pushing_scene(patient: PatientSetup, load: tuple[float, float, float, float]) -> Scene:
-    """Return the scene of a round tool that pushes the open cortex at X, Y, Z [mm, RAS] with a force [N].
+    """Return a scene with a round tool that pushes the open cortex constantly; `load` is X, Y, Z [mm, RAS], force [N].
 
     Raises
     ------
@@ -197,7 +197,7 @@ def build_pushing_scene(patient: PatientSetup, load: tuple[float, float, float, 
 def select_deformed_anatomies(
     args: argparse.Namespace, patient: PatientSetup, scene: Scene | None
 ) -> tuple[DeformedAnatomy, list[tuple[float, DeformedAnatomy]]]:
-    """Return the requested moment, and those of a sequence with times [s]; without a scene, read it from a file.
+    """Return the requested deformed anatomy, and those of --sequence with times [s]; without a scene, read --located.
 
     Raises
     ------
@@ -220,7 +220,7 @@ def select_deformed_anatomies(
 
 
 def format_warp(report: dict, out_path: Path) -> str:
-    """Format the summary of a warp."""
+    """Format the report of `write_warp` as lines of text."""
     error, bound = report["grid_error_mm"], report["bound_mm"]
     lines = [
         f"Moved by: {report['moved_by']}. The largest displacement is {report['largest_displacement_mm']:.2f} mm.",
