@@ -111,7 +111,7 @@ class Inspection:
         return f"a region of its own, {self.regions[part]}" if part in self.regions else f"{around} like the rest"
 
     def to_json(self) -> dict[str, Any]:
-        """Convert the result to a JSON object, with units in names; volumes to 1 ul, lengths to 0.1 mm, voxels to 1 um."""
+        """Convert the result to a JSON object, with units in names; rounded to 1 ul, 0.1 mm, and 1 um for voxels."""
         pieces = [{"ml": round(volume, 3), "side": place} for volume, place in self.pieces]
         return {
             "brain_ml": round(self.brain, 3),

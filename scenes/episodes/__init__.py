@@ -1,1 +1,1 @@
-"""Data sets: plans, episodes sampled from them, and readers."""
+"""Data sets of simulated surgery: plans, episodes that are sampled from plans, exports and readers."""

@@ -1,4 +1,4 @@
-"""Bodies of the episodes: each is sampled, meshed, and gets a trained model, once."""
+"""Bodies of a data set: anatomy and tissue of episodes, sampled and meshed once, with a trained model."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -39,20 +39,20 @@ from .run_folder import BODIES, get_versions
 MAX_ATTEMPTS = 6  # Maximum number of sampled tumours: one may leave the brain, or its craniotomy have too few nodes.
 PRESET = "palpation"  # Preset of the training loads.
 BATCH_SIZE = 512
-"""Number of load cases that a GPU solves together while a model is trained: other processes need its memory, too."""
+"""Number of load cases in a batch on a GPU during training, limited because other processes need its memory too."""
 ANATOMY_FILE, BODY_FILE = "anatomy.vtu", "body.json"  # File names in a body's folder: mesh, sampled values.
 
 
 @dataclass(frozen=True)
 class EpisodeBody:
-    """Body of a data set: folder of its files, and its sampled parameters by name."""
+    """Body of a data set: folder of the body's files, and sampled parameters by name."""
 
     folder: Path
     parameters: Mapping[str, Any]
 
     @property
     def anatomy(self) -> Path:
-        """Path of the anatomy; scan and model are next to it."""
+        """Path of the anatomy; scan and model are in the same folder."""
         return self.folder / ANATOMY_FILE
 
     @property
@@ -61,15 +61,15 @@ class EpisodeBody:
         return get_tissue(self.parameters)
 
     def build_effects(self, *more: Effect, can_separate: bool = False) -> tuple[Effect, ...]:
-        """Return the effects: constraints, skull and others.
+        """Return the effects of a scene on the body: tissue, constraints, skull, and the effects `more`.
 
-        With `can_separate`, the brain may separate from the skull, regardless of the sampled skull model.
+        If `can_separate`, the brain can separate from the skull, regardless of the sampled skull model.
         """
         skull = "contact" if can_separate else self.parameters["bodies.tissue.skull"]
         return self.tissue, Held(), SKULLS[skull], *more
 
     def open_patient(self, device: str) -> PatientSetup:
-        """Open the body and the models in its files.
+        """Open the body's anatomy, scan and models, or the shipped models for the template without own models.
 
         Raises
         ------
@@ -81,7 +81,7 @@ class EpisodeBody:
 
 
 def get_tissue(values: Mapping[str, Any]) -> Elasticity:
-    """Return the tissue of sampled values."""
+    """Build the tissue with all regions from sampled values."""
     law, young, poisson = (values[f"bodies.tissue.{name}"] for name in ("law", "young_pa", "poisson"))
     ratio = {name: values.get(_to_ratio_name(name), 1.0) for name in ("tumour", *PART_LABELS)}
     times = {**ratio, "necrosis": ratio["necrosis"] * ratio["tumour"]}
@@ -92,7 +92,7 @@ def get_tissue(values: Mapping[str, Any]) -> Elasticity:
 
 
 def _to_ratio_name(region: str) -> str:
-    """Return the name under which a region's stiffness is sampled."""
+    """Return the name of a region's relative stiffness among the sampled values."""
     return f"bodies.tissue.{to_ratio_key(region)}"
 
 
@@ -103,7 +103,7 @@ def _drop_absent_regions(values: Mapping[str, Any], anatomy: Anatomy) -> dict[st
 
 
 def sample_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dict[str, Any]:
-    """Sample the values of a body by name; another `attempt` samples another tumour."""
+    """Sample the values of body `number`, by name; another `attempt` samples another tumour for the same body."""
     found: dict[str, Any] = {}
     for table, values, again in (
         ("bodies", bodies, 0), ("bodies.tissue", bodies.tissue, 0), ("bodies.tumour", bodies.tumour, attempt),
@@ -117,21 +117,20 @@ def sample_body(bodies: Bodies, seed: int, number: int, attempt: int = 0) -> dic
 def write_body(
     folder: Path, plan: EpisodePlan, seed: int, number: int, device: str, other_folders: Sequence[Path] = ()
 ) -> bool:
-    """Make a body in its own folder: anatomy, scan, trained model, and `body.json` last.
+    """Make a body in its own folder: anatomy, scan, trained model, and at last `body.json`.
 
-    Loads solved before, there or in `other_folders`, are not solved again; returns True if there were any. The
-    files have the same bytes in both cases.
+    Returns True if solved loads of an earlier run, in the folder or in `other_folders`, were reused. The files have
+    the same bytes in both cases.
 
     Parameters
     ----------
     other_folders
-        Folders in which the same body was partly made, or is being made.
+        Folders in which other processes have partly made the same body, or are making it.
 
     Raises
     ------
     InputError
-        No anatomy could be meshed in `MAX_ATTEMPTS` draws; an own anatomy that cannot be read; loads that train
-        nothing.
+        No anatomy could be meshed in `MAX_ATTEMPTS` attempts, a custom anatomy cannot be read, or training fails.
     """
     bodies = plan.contents.bodies
     anatomy, scan, values = _sample_anatomy(plan, seed, number)
@@ -147,12 +146,12 @@ def write_body(
 
 
 def read_body(folder: Path) -> EpisodeBody:
-    """Return a body that `write_body` made.
+    """Read a body that `write_body` has made.
 
     Raises
     ------
     InputError
-        A missing or invalid file.
+        The file `body.json` is missing or invalid.
     """
     path = folder / BODY_FILE
     try:
@@ -162,7 +161,7 @@ def read_body(folder: Path) -> EpisodeBody:
 
 
 def _sample_anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy, Intensity | None, dict[str, Any]]:
-    """Return an anatomy, its scan, and the sampled parameters."""
+    """Sample the anatomy of a body; return the anatomy, its scan (None: no scan) and the sampled values."""
     bodies = plan.contents.bodies
     values = sample_body(bodies, seed, number)
     kind = str(values["bodies.anatomies"])
@@ -191,7 +190,7 @@ def _sample_anatomy(plan: EpisodePlan, seed: int, number: int) -> tuple[Anatomy,
 
 
 def _can_use_shipped_model(body: EpisodeBody, anatomy: Anatomy) -> bool:
-    """Return True if the shipped model applies to this body."""
+    """Return True if a shipped model supports the tissue and skull of this body."""
     if body.parameters["bodies.anatomies"] != "template":
         return False
     models = load(to_model_path(get_template_path()), anatomy)
@@ -202,7 +201,7 @@ def _can_use_shipped_model(body: EpisodeBody, anatomy: Anatomy) -> bool:
 def _train(
     body: EpisodeBody, anatomy: Anatomy, plan: EpisodePlan, seed: int, number: int, device: str, others: Sequence[Path]
 ) -> bool:
-    """Train a model on simulated loads of a body, which are then removed; return True if earlier loads were reused."""
+    """Train a model on simulated loads, which are removed afterwards; return True if earlier loads were reused."""
     learner = plan.contents.bodies.learner
     effects = (*build_push_effects(anatomy, body.tissue, body.parameters["bodies.tissue.skull"]), NodalForce())
     fem = Fem(anatomy, effects, TRAIN, device, 64)
@@ -226,16 +225,16 @@ def _train(
 
 
 def _remove_training_dates(model: Learned) -> Learned:
-    """Return a model without the training metadata that differ from run to run."""
+    """Return a model without training metadata that differ between runs, such as dates."""
     return replace(model, training={key: text for key, text in model.training.items() if key not in CREATION_KEYS})
 
 
 MAX_LISTED_BODIES = 10
-"""Maximum number of bodies that are listed one by one."""
+"""Maximum number of bodies that a message lists individually."""
 
 
 def list_model_errors(folder: Path) -> dict[int, ReportedErrors]:
-    """Read the reported errors of the models of a folder's bodies, by number; bodies without a model are excluded."""
+    """Read the reported errors of the best model of each body in a folder, by body number, for bodies with a model."""
     found = {}
     for path in sorted((folder / BODIES).glob("[0-9]*")):
         with suppress(InputError, ValueError):  # bodies without a readable model are skipped
@@ -246,14 +245,14 @@ def list_model_errors(folder: Path) -> dict[int, ReportedErrors]:
 
 
 def select_weak(models: Mapping[int, ReportedErrors]) -> dict[int, ReportedErrors]:
-    """Select the weak models, the largest error bound first."""
+    """Select the bodies with a weak model, in order of decreasing error bound."""
     return dict(
         sorted(((number, one) for number, one in models.items() if one.is_weak), key=lambda each: -each[1].bound)
     )
 
 
 def describe_weak(models: Mapping[int, ReportedErrors]) -> list[str]:
-    """Describe the weak models and their errors, in sentences; empty if there is none."""
+    """Describe the weak models and their errors in sentences; empty if no model is weak."""
     weak = select_weak(models)
     if not weak:
         return []
@@ -266,7 +265,7 @@ def describe_weak(models: Mapping[int, ReportedErrors]) -> list[str]:
 
 
 def to_weak_json(models: Mapping[int, ReportedErrors]) -> list[dict[str, float | int | None]]:
-    """Convert the weak models to JSON."""
+    """Convert the weak models to a JSON list: body number, error bound [mm] and relative mean error."""
     return [
         {
             "body": number,

@@ -1,4 +1,4 @@
-"""Checksums of a file's data sets and attributes."""
+"""Checksums of the data sets and attributes of an HDF5 file."""
 
 from hashlib import sha256
 
@@ -8,11 +8,11 @@ import numpy as np
 CHECKSUM_ATTRIBUTE = "sha256"
 """Attribute that contains the checksum of a data set or of the file."""
 ARRAYS_ATTRIBUTE = "arrays"
-"""Attribute of the file that lists the data sets it was written with."""
+"""Attribute of the file that lists the names of all written data sets."""
 
 
 def compute_digest(data: h5py.Dataset) -> str:
-    """Compute the hexadecimal digest of a data set's kind, shape and content."""
+    """Compute the hexadecimal digest of a data set's type, shape and content."""
     found = sha256(f"{data.shape} {data.dtype.str if data.dtype.kind != 'O' else 'objects'}".encode())
     values = np.asarray(data[()])
     if values.dtype.kind != "O":
@@ -25,14 +25,14 @@ def compute_digest(data: h5py.Dataset) -> str:
 
 
 def list_datasets(file: h5py.File) -> list[h5py.Dataset]:
-    """List all data sets of a file, in the order of their names."""
+    """List all data sets of a file, sorted by name."""
     found: dict[str, h5py.Dataset] = {}
     file.visititems(lambda name, item: found.update({name: item}) if isinstance(item, h5py.Dataset) else None)
     return [found[name] for name in sorted(found)]
 
 
 def compute_file_digest(file: h5py.File) -> str:
-    """Return the hexadecimal digest of all attributes and of the data sets' recorded checksums."""
+    """Compute the hexadecimal digest of all attributes of a file, which include the data sets' checksums."""
     found = sha256()
     for item in (file, *list_datasets(file)):
         for name in sorted(item.attrs):
@@ -45,7 +45,7 @@ def compute_file_digest(file: h5py.File) -> str:
 
 
 def write_checksums(file: h5py.File) -> None:
-    """Write the names of all data sets, the checksum of each, and that of the file."""
+    """Write the names of all data sets, their checksums, and the checksum of the file as attributes."""
     for data in list_datasets(file):
         data.attrs[CHECKSUM_ATTRIBUTE] = compute_digest(data)
     file.attrs[ARRAYS_ATTRIBUTE] = " ".join(_list_names(file))
@@ -53,7 +53,7 @@ def write_checksums(file: h5py.File) -> None:
 
 
 def find_errors(file: h5py.File) -> list[str]:
-    """List the differences from the recorded checksums; empty for a file without checksums."""
+    """List the differences from the recorded checksums as sentences; empty for a file without checksums."""
     if CHECKSUM_ATTRIBUTE not in file.attrs:
         return []
     found = [

@@ -1,4 +1,4 @@
-"""Random numbers and words of a plan, and their sampling from a seed."""
+"""Distributions of the numbers and words of a plan, and sampling of values from a seed."""
 
 from dataclasses import dataclass
 from zlib import crc32
@@ -17,9 +17,9 @@ class Distribution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     uniform, log
         Limits of a uniform or log-uniform distribution.
     normal
-        Mean and standard deviation; cut off at three deviations.
+        Mean and standard deviation; values are clipped at three standard deviations.
     choice, weights
-        Values of which one is sampled, and their relative frequencies (default: equal).
+        Possible values, and their relative frequencies (default: equal).
     """
 
     uniform: tuple[float, float] | None = None
@@ -37,24 +37,24 @@ Word = str | list[str] | Distribution
 
 @dataclass(frozen=True)
 class ValueLimits:
-    """Least and greatest value that a number of a plan may take, and their unit."""
+    """Smallest and largest allowed value of a number in a plan, and their unit."""
 
     low: float
     high: float
     unit: str = "1"
 
     def __str__(self) -> str:
-        """Describe the limits."""
+        """Format the limits with their unit."""
         return f"{self.low:,g} to {self.high:,g}" + (f" {self.unit}" if self.unit != "1" else "")
 
 
 def build_generator(seed: int, number: int, name: str) -> np.random.Generator:
-    """Build the random generator of one name of one episode, independent of other names and episodes."""
+    """Build the random generator of a named quantity of episode `number`, independent of other names and episodes."""
     return np.random.default_rng([seed, number, crc32(name.encode())])
 
 
 def to_distribution(value: object) -> Distribution:
-    """Return a plan's value as a `Distribution`."""
+    """Convert a value of a plan (`Number` or `Word`) to a `Distribution`."""
     if isinstance(value, Distribution):
         return value
     if isinstance(value, tuple):
@@ -63,7 +63,7 @@ def to_distribution(value: object) -> Distribution:
 
 
 def sample_value(distribution: object, random: np.random.Generator) -> float | str | bool:
-    """Sample a value of a plan's `Number` or `Word`."""
+    """Sample a value from a `Number` or `Word` of a plan."""
     spread = to_distribution(distribution)
     if spread.uniform is not None:
         return float(random.uniform(*spread.uniform))
@@ -78,7 +78,7 @@ def sample_value(distribution: object, random: np.random.Generator) -> float | s
 
 
 def check_distribution(value: object, name: str, limits: ValueLimits | None, choices: tuple[str, ...] = ()) -> None:
-    """Check that every value that can be sampled is valid.
+    """Check that all values that can be sampled are valid.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def check_distribution(value: object, name: str, limits: ValueLimits | None, cho
     Raises
     ------
     InputError
-        A reversed or infinite range, invalid weights, a value outside the limits, or a word that is not in
+        A range is reversed or infinite, weights are invalid, a value is outside the limits, or a word is not in
         `choices`.
     """
     spread = to_distribution(value)

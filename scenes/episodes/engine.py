@@ -1,4 +1,4 @@
-"""Scheduling of episodes on many workers: missing ones are assigned in any order, until all exist or have failed."""
+"""Scheduling of episodes on many workers, until all episodes exist or have failed."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ from .workers import MAX_WORKER_DEATHS, Workers, describe_scheduler_end
 MAX_RETRIES = 3
 """Number of retries of a task that raises an error."""
 TASKS_PER_WORKER = 3
-"""Number of episodes assigned to each worker: one is made while others wait, so that no worker is idle."""
+"""Number of episodes that are assigned to each worker at a time, so that no worker is idle."""
 POLL_INTERVAL = 1.0
-"""Interval between counts of the workers [s]."""
+"""Interval at which the workers are counted [s]."""
 EPISODE, BODY = "episode", "body"
 """Kinds of tasks."""
 GRACE_TIME = 60
-"""Warning time before the end of a job [s]."""
+"""Time between the warning signal and the end of a job [s]."""
 
 
 class ProgressListener(Protocol):
-    """Callback for each finished task, with the number of workers; `outcome` is None if no task finished."""
+    """Protocol of a callback for finished tasks and for the number of workers; `outcome` is None without a task."""
 
     def __call__(self, kind: str, outcome: TaskOutcome | None, workers: int) -> object:
-        """Receive the outcome of a task."""
+        """Receive the outcome of a task of this kind, and the current number of workers."""
         ...
 
 
 @dataclass(frozen=True)
 class RunStatistics:
-    """Statistics of a run: episodes made now, present before, failed permanently, lost for now.
+    """Statistics of a run: numbers of episodes made now, present before, failed permanently, and failed temporarily.
 
-    `frames` and `bytes` are those of the episodes made now.
+    `frames` and `bytes` are the totals of the episodes made now.
     """
 
     made: int = 0
@@ -58,7 +58,7 @@ class RunStatistics:
     bytes: int = 0
 
     def add(self, outcome: TaskOutcome) -> RunStatistics:
-        """Return the statistics with one more episode."""
+        """Return the statistics with the outcome of one more episode."""
         if outcome.failed:
             return replace(self, lost=self.lost + 1) if outcome.lost else replace(self, failed=self.failed + 1)
         if outcome.skipped:
@@ -70,17 +70,17 @@ class RunStatistics:
 def list_missing_episodes(
     folder: Path, existing: Set[int], numbers: range, first_client: bool, retry: bool = False
 ) -> tuple[RunStatistics, list[int]]:
-    """Count episodes that exist or have failed permanently, and list the missing ones in their order of execution.
+    """Count the episodes that exist or have failed permanently, and list the missing episodes in order of execution.
 
-    The first client takes them in ascending order. Later clients use a random order, so that two in one folder seldom
-    make the same episode at the same time. If they do, one overwrites the other's file with the same bytes.
+    The order is ascending for the first client and random for later clients, so that two clients of a folder seldom
+    make the same episode at the same time. If they do, one client overwrites the file with the same bytes.
 
     Parameters
     ----------
     existing
-        Numbers of all existing episodes.
+        Numbers of all existing episodes in the folder.
     retry
-        True to retry permanently failed episodes.
+        True to retry episodes that have failed permanently.
     """
     there = existing & set(numbers)
     gone = set() if retry else {number for number, one in list_failures(folder).items() if not one.lost}
@@ -100,17 +100,17 @@ def make_episodes(
     listener: ProgressListener,
     statistics: RunStatistics,
 ) -> RunStatistics:
-    """Make the missing episodes, each after its body; failures are recorded in the folder. Returns the totals.
+    """Make the missing episodes, each after its body, and record failures in the folder; return the totals.
 
     Parameters
     ----------
     statistics
-        Totals of earlier work.
+        Initial totals, to which outcomes are added.
 
     Raises
     ------
     InputError
-        A worker without access to this folder, a full disk, or a scheduler that ended.
+        A worker has no access to the folder or other versions, the disk is full, or the scheduler ended.
     """
     ended: SimpleQueue[Future] = SimpleQueue()
     busy: dict[str, tuple[str, int, Future]] = {}
@@ -170,7 +170,7 @@ def make_episodes(
 
 
 def _collect_ended(ended: SimpleQueue[Future]) -> list[Future]:
-    """Return the ended futures, after at most `POLL_INTERVAL` without one."""
+    """Return all ended futures; wait for the first future for at most `POLL_INTERVAL`."""
     found = []
     try:
         found.append(ended.get(timeout=POLL_INTERVAL))
@@ -183,7 +183,7 @@ def _collect_ended(ended: SimpleQueue[Future]) -> list[Future]:
 def _collect_outcomes(
     futures: Sequence[Future], workers: Workers, ended: SimpleQueue[Future]
 ) -> Iterator[tuple[Future, TaskOutcome]]:
-    """Collect the results of finished tasks; those whose worker died with its result will finish again."""
+    """Yield finished tasks with their outcomes; a task whose result was lost with its worker will finish again."""
     for future in futures:
         if future.status == "error":
             yield future, TaskOutcome(0, failed=_describe_failure(future.exception()), lost=True)
@@ -205,14 +205,14 @@ def _describe_failure(error: object) -> str:
 
 
 def write_sbatch_script(command: Sequence[str], machines: int, device: str, name: str) -> str:
-    """Return a script for `sbatch`: an array of jobs that work in one folder without communication.
+    """Return the text of a script for `sbatch`: an array of jobs that work in one folder without communication.
 
-    A job that ends early is queued again and continues. No port is opened between machines.
+    A job that ends early is queued again and resumes. No network port is opened between machines.
 
     Parameters
     ----------
     command
-        Command that each machine runs, without --workers.
+        Command that each job runs, without --workers.
     machines
         Number of jobs in the array.
     device

@@ -1,4 +1,4 @@
-"""A scene as one episode in HDF5: camera images, tool poses and forces, and the tumour's motion.
+"""Recording of a scene as an episode in HDF5: camera images, tool poses and forces, and the tumour's motion.
 
 Patient space is RAS [m]; the camera frame is OpenCV's (x right, y down, z forward). Read an image with
 `cv2.imdecode(file["pictures/colour"][i], cv2.IMREAD_COLOR)`. Attributes describe each data set, its solver, and
@@ -39,10 +39,10 @@ from .png import encode_png
 
 FORMAT = "sulcus episode 2"  # Name and version of the file format.
 DEPTH_SCALE = 1e-5
-"""Resolution of the 16-bit depth [m]; depth is 0 where nothing is visible."""
+"""Resolution of the 16-bit depth images [m]; a depth of 0 means that nothing is visible."""
 JPEG_QUALITY = 95  # JPEG quality of the images, 0 to 100.
 PIXEL_BYTES = 1.5
-"""Compressed size of all images of a frame [bytes per pixel]: 0.9 to 1.0 in the scenes `press` and `draw`."""
+"""Estimate of the compressed size of a frame's images [bytes per pixel]; the scenes `press` and `draw`: 0.9 to 1.0."""
 # Meanings of the arrays of an episode, by path.
 MEANINGS = {
     "pictures/colour": "JPEG bytes: camera image, BGR when decoded by OpenCV",
@@ -105,24 +105,24 @@ UNITS = {
 
 @dataclass(frozen=True)
 class EpisodeRecording:
-    """Settings of the recording of a scene.
+    """Settings for the recording of a scene as an episode.
 
     Parameters
     ----------
     solved_every
-        FEM solves every Nth frame; None: FEM plays the scene, and its solutions are stored directly.
+        FEM solves every Nth frame as reference; None: FEM plays the scene, and its solutions are the reference.
     overlay
-        True to also store the image with the overlay.
+        True to store also the images with overlay.
     with_times
-        True to store date and wall times; without them the same scene gives the same bytes.
+        True to store date and computing times; if False, equal scenes give equal bytes.
     add_noise
-        Function from the number of a frame and its colour image (H, W, 3) uint8 to the image with camera noise.
+        Function that adds camera noise, given a number and a colour image (H, W, 3) uint8.
     read_sensors
-        Sensor readings (with noise) of the other columns, by name.
+        Function from the recorded columns to columns of noisy sensor readings, by name.
     attributes
-        Further attributes.
+        Further attributes of the file.
     fem
-        FEM solver to use, if it already exists.
+        Existing FEM solver for the reference; None: a new solver.
     """
 
     solved_every: int | None = 1
@@ -135,7 +135,7 @@ class EpisodeRecording:
 
 
 FULL_RECORDING = EpisodeRecording()
-"""Default recording: all contents, FEM in every frame."""
+"""Default settings: all contents are recorded, and FEM solves every frame."""
 
 
 def collect(
@@ -147,14 +147,14 @@ def collect(
     solved: Callable[[int], object] = lambda more: None,
     recording: EpisodeRecording = FULL_RECORDING,
 ) -> dict[str, object]:
-    """Play a scene and write its episode, atomically; return its contents.
+    """Play a scene and write its episode, atomically; return a summary for JSON.
 
-    `progress` passes the frames on as they are drawn; `solved` receives the number of newly solved frames.
+    `progress` wraps the iteration over the drawn frames; `solved` receives the number of newly solved frames.
 
     Raises
     ------
     InputError
-        A file that cannot be written, or a disk with less space than it needs.
+        The file cannot be written, or the disk has too little space.
     """
     total = len(player.scene.times)
     check_disk_space(path, int(total * PIXEL_BYTES * player.camera.width * player.camera.height))
@@ -185,7 +185,7 @@ def collect(
 def encode_frame(
     frame: Frame, player: Player, recording: EpisodeRecording, right: Stage | None
 ) -> dict[str, np.ndarray]:
-    """Encode the frame's images, by name; `right` renders the right eye, if there is one."""
+    """Encode the images of a frame, by name; `right` renders the image of the right eye (None: no stereo)."""
     picture = frame.picture
     tumour = player.stage.select_stage(frame.loads).build_tumour(player.estimate_positions(frame))
     mask = compute_silhouette(frame.camera, tumour.vertices, tumour.triangles, player.stage.device)
@@ -211,12 +211,12 @@ def _encode_jpeg(colour: np.ndarray) -> np.ndarray:
 
 
 def _build_right_camera(player: Player, frame: Frame) -> Camera:
-    """Return the camera of the right eye."""
+    """Return the camera of the right eye in a frame."""
     return replace(player.scene.viewpoint, eye="right").build_camera(player.site, frame.time)
 
 
 def collect_frame_values(frame: Frame, player: Player, with_times: bool = True) -> dict[str, np.ndarray | float | str]:
-    """Return all values except images, by name; with computing times if `with_times`."""
+    """Return all values of a frame except images, by name; computing times are included if `with_times`."""
     nodes, cortex = player.site.anatomy.tumour_nodes, find_cortex_vertices(player)
     right = player.scene.viewpoint.eye == "left"
     return {
@@ -245,7 +245,7 @@ def find_cortex_vertices(player: Player) -> np.ndarray:
 
 
 def collect_tool(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, np.ndarray | float]:
-    """Return the tool's pose and the printed distance to the tumour; NaN if none is printed."""
+    """Return the tool's pose and tip, and the displayed distance to the tumour with its error, NaN if not available."""
     return {
         "T_world_tool": pose,
         "tip": tip,
@@ -255,7 +255,7 @@ def collect_tool(frame: Frame, pose: np.ndarray, tip: np.ndarray) -> dict[str, n
 
 
 def collect_reactions(result: Deformation) -> dict[str, np.ndarray]:
-    """Return the force of a pose-controlled tool, if the deformation model provides it."""
+    """Return the predicted force of a tool with prescribed pose and its bounds; empty without a prediction."""
     if not result.reaction.shape[1]:
         return {}
     return {"reaction_predicted": result.reaction[0], "reaction_bound": result.reaction_bound[:, 0]}

@@ -1,4 +1,4 @@
-"""Estimate of a run: time, disk space and processes of many episodes, from measured ones."""
+"""Estimate of time, disk space and processes that many episodes need, from measured episodes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from .tasks import FIRST, FIRST_OF_BODY, FIRST_OF_PROCESS, NOT_FIRST
 
 DAY = 86400.0  # One day [s].
 UNITS = (DAY, "days"), (3600.0, "h"), (60.0, "min")
-"""Units of printed times [s], the longest first; a unit is used for times of at least twice its length."""
+"""Units of printed times [s], the longest unit first; a unit is used for times of at least 2 units."""
 PROCESS_COUNTS = (1, 8, 64, 512)
 """Numbers of processes for which the time is printed."""
 
 
 @dataclass(frozen=True)
 class Amount:
-    """Expected total and its standard error, which is NaN if only one value was measured."""
+    """Estimated mean or total with its standard error, which is NaN if only one value was measured."""
 
     mean: float
     error: float
@@ -33,16 +33,16 @@ class RunEstimate:
     Parameters
     ----------
     episodes, bodies
-        Requested numbers.
-    measured, measured_bodies
-        Numbers on which the estimate is based.
-    seconds, frames, bytes
-        Totals of all episodes and their bodies: time of one started process [s], number of frames, and size.
+        Requested numbers of episodes and bodies.
+        measured, measured_bodies
+            Numbers of measured episodes and bodies on which the estimate is based.
+        seconds, frames, bytes
+            Totals of all episodes and bodies: computing time of a single process [s], number of frames, and size.
     start, opening
-        Extra time of the first episode of a process, which loads and compiles; and of its first episode on each
-        further body [s]. NaN: not available.
+        Extra time [s] of a process's first episode, for loading and compiling, and of its first episode on each
+        further body. NaN: not available.
     apart
-        True if `seconds` exclude first episodes; False if they include them.
+        True if `seconds` exclude the extra time of first episodes; False if the time is included.
     """
 
     episodes: int
@@ -57,7 +57,7 @@ class RunEstimate:
     apart: bool
 
     def estimate_duration(self, processes: int) -> Amount:
-        """Return the duration [s] with a number of processes."""
+        """Return the estimated duration [s] of the run with a number of processes."""
         each = self.episodes / processes
         further = self.bodies * -np.expm1(-each / self.bodies) - 1.0  # bodies that the episodes of one process use
         parts = (self.start, 1.0), (self.opening, max(0.0, further)), (self.seconds, 1.0 / processes)
@@ -65,12 +65,12 @@ class RunEstimate:
 
 
 def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEstimate:
-    """Estimate the cost of a number of episodes on a number of bodies from measured ones.
+    """Estimate the cost of `episodes` episodes on `bodies` bodies from measured `rates`.
 
     Raises
     ------
     InputError
-        No measured episodes.
+        No episode was measured.
     """
     own = {kind: [rate for rate in rates if rate.kind == kind] for kind in (EPISODE, BODY)}
     if not own[EPISODE]:
@@ -98,7 +98,7 @@ def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEs
 
 
 def _compute_extra_time(first: Sequence[Rate], others: Sequence[Rate]) -> Amount:
-    """Return the mean extra time of first episodes [s]; the error of a single measurement is the whole time."""
+    """Return the mean extra time of first episodes [s]; with a single measurement, the error is the extra time."""
     if not (first and others):
         return Amount(np.nan, np.nan)
     one, other = (_compute_mean([rate.seconds for rate in those]) for those in (first, others))
@@ -107,24 +107,24 @@ def _compute_extra_time(first: Sequence[Rate], others: Sequence[Rate]) -> Amount
 
 
 def _compute_mean(values: Sequence[float]) -> Amount:
-    """Return a mean and its standard error."""
+    """Return the mean of values and its standard error."""
     error = float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return Amount(float(np.mean(values)), error)
 
 
 def _compute_total(values: Sequence[float], count: int) -> Amount:
-    """Return the total of `count` values with the standard error of their mean; exact if all were measured."""
+    """Return the estimated total of `count` values and its standard error, which is 0 if all were measured."""
     mean = _compute_mean(values)
     return Amount(count * mean.mean, 0.0 if len(values) >= count else count * mean.error)
 
 
 def _add_amounts(amounts: Sequence[Amount]) -> Amount:
-    """Return a sum of independent amounts."""
+    """Return the sum of independent amounts, with its standard error."""
     return Amount(sum(one.mean for one in amounts), float(np.hypot.reduce([one.error for one in amounts])))
 
 
 def format_estimate(estimate: RunEstimate) -> list[str]:
-    """Format the estimate as a table."""
+    """Format the estimate as the lines of a table."""
     found = estimate
     rows = [
         ("disk", _format_amount(found.bytes, 1e9, "GB")),

@@ -1,4 +1,4 @@
-"""Families of tool motions in the episodes of a data set, with random parameters."""
+"""Families of tool motions of episodes, with their random parameters."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,18 +18,18 @@ from ..script.tool_paths import Path, Touch, draw, keep_idle, lay, palpate, pres
 from .draws import Number, ValueLimits
 
 PRONY = RELAXING_BRAIN.prony
-"""Relaxation of tissue under a spatula."""
+"""Prony series of tissue that relaxes under a spatula."""
 REST_SHARE = 0.3  # Share of the time between two places in which the tool is lifted and moves on.
 
 
 class FamilyMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Weight of a family, relative to the others."""
+    """Base of the families of a plan, with the relative frequency (`weight`) of a family."""
 
     weight: Annotated[float, ValueLimits(0, 100_000)] = 1.0
 
 
 class Pushing(FamilyMotion, frozen=True):
-    """Push of a ball with a force; `spread`: distance from the craniotomy's centre, relative to the reach."""
+    """Base of families in which a ball pushes with a force; `spread`: distance from the craniotomy's centre (0 to 1)."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.35)
     radius_mm: Annotated[Number, ValueLimits(1, 15, "mm")] = (5.0, 7.5)
@@ -37,38 +37,38 @@ class Pushing(FamilyMotion, frozen=True):
 
 
 class Press(Pushing, frozen=True):
-    """Press one position obliquely, hold, and release."""
+    """Family in which a ball presses one position obliquely, stays, and releases."""
 
     tilt_deg: Annotated[Number, ValueLimits(0, 45, "°")] = (0.0, 25.0)
 
 
 class SlideMotion(Pushing, frozen=True):
-    """Press, slide along a straight line, and let go."""
+    """Family in which a ball presses, slides along a straight line, and releases."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.3)
 
 
 class DrawMotion(Pushing, frozen=True):
-    """Press, and draw the tissue aside."""
+    """Family in which a ball presses, and draws the tissue aside."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.25)
     tilt_deg: Annotated[Number, ValueLimits(0, 45, "°")] = (20.0, 40.0)
 
 
 class Reach(Pushing, frozen=True):
-    """Touch several places one after the other, with minimum jerk between them."""
+    """Family in which a ball touches several positions in sequence, with minimum-jerk motions in between."""
 
     places: Annotated[Number, ValueLimits(2, 12)] = (2.0, 5.0)
 
 
 class Walk(Pushing, frozen=True):
-    """Wander at random in place and force, always in contact."""
+    """Family in which a ball moves at random with a random force, always in contact."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.25)
 
 
 class Palpate(FamilyMotion, frozen=True):
-    """A ball is moved by its pose, and slides through the tissue; solved by FEM."""
+    """Family in which a ball with prescribed pose sinks into the cortex and slides along it; solved by FEM."""
 
     depth_mm: Annotated[Number, ValueLimits(0.5, 10, "mm")] = (1.0, 4.0)
     radius_mm: Annotated[Number, ValueLimits(3, 15, "mm")] = 7.0
@@ -76,7 +76,7 @@ class Palpate(FamilyMotion, frozen=True):
 
 
 class Retract(FamilyMotion, frozen=True):
-    """A spatula draws the cortex aside while the tissue relaxes; solved by FEM."""
+    """Family in which a spatula draws the cortex aside while the tissue relaxes; solved by FEM."""
 
     depth_mm: Annotated[Number, ValueLimits(0.5, 12, "mm")] = (3.0, 8.0)
     tilt_deg: Annotated[Number, ValueLimits(0, 40, "°")] = (10.0, 30.0)
@@ -84,21 +84,21 @@ class Retract(FamilyMotion, frozen=True):
 
 
 class Drain(FamilyMotion, frozen=True):
-    """Fluid drains to a share of its height and the head turns; the skull may separate; solved by FEM."""
+    """Family in which CSF drains to the level `fluid` and the head turns; the brain can separate; solved by FEM."""
 
     fluid: Annotated[Number, ValueLimits(0, 1)] = (0.0, 0.7)
     turn_deg: Annotated[Number, ValueLimits(-60, 60, "°")] = (-30.0, 30.0)
 
 
 class Debulk(FamilyMotion, frozen=True):
-    """Fluid has partly drained, and the tumour is cut out in shares; solved by FEM."""
+    """Family in which CSF drains to the level `fluid` and the tumour is resected in parts; solved by FEM."""
 
     fluid: Annotated[Number, ValueLimits(0, 1)] = (0.2, 0.7)
     steps: Annotated[Number, ValueLimits(2, 8)] = (3.0, 5.0)
 
 
 class FamilyMotions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Families of a plan; None: the family is not played."""
+    """Families of tool motions of a plan; None: the plan does not contain the family."""
 
     press: Press | None = None
     slide: SlideMotion | None = None
@@ -112,25 +112,25 @@ class FamilyMotions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def named(self) -> dict[str, FamilyMotion]:
-        """Families that the plan names."""
+        """Families that the plan contains, by name."""
         found = {name: getattr(self, name) for name in self.__struct_fields__}
         return {name: motion for name, motion in found.items() if motion is not None}
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Scenario of an episode.
+    """Scenario of an episode: tool motion, effects and head pose.
 
     Parameters
     ----------
     path, tool, lying, surgery
         See `Scene`.
     effects
-        Effects beyond tissue, constraints and skull.
+        Effects in addition to tissue, constraints and skull.
     is_viscoelastic
-        True if the tissue is viscoelastic.
+        True if the tissue relaxes.
     skull_separates
-        True if the brain may separate from the skull, regardless of the body's skull model.
+        True if the brain can separate from the skull, regardless of the body's skull model.
     """
 
     path: Path = keep_idle
@@ -144,9 +144,9 @@ class Scenario:
 
 @dataclass(frozen=True)
 class ScenarioInputs:
-    """Inputs of a scenario: sampled values, random numbers, duration [s], reach [m].
+    """Inputs for sampling a scenario: sampled values, random generator, and duration [s].
 
-    `reach` returns the largest distance of a tool of a radius [m] from the centre of the open cortex.
+    `reach` is a function from a tool's radius [m] to the tool's maximum distance [m] from the craniotomy's axis.
     """
 
     values: Mapping[str, Any]
@@ -275,7 +275,7 @@ FAMILIES: dict[str, Callable[[ScenarioInputs], Scenario]] = {
 
 
 def add_tremor(path: Path, seed: int, position_sigma: float, force_sigma: float) -> Path:
-    """Return a path with a hand's tremor and drift: standard deviations of place [m] and force [N]; none in the air."""
+    """Return a path with hand tremor: standard deviations of position [m], and of force [N] while the tool pushes."""
 
     def trembles(time: float) -> Touch:
         touch, way = path(time), sample_hand_motion(seed, time)

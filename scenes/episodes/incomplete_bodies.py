@@ -1,7 +1,7 @@
-"""Solved loads of an unfinished body: the next process that makes it resumes them.
+"""Solved loads of an unfinished body, which the next process that makes this body reuses.
 
-Each process makes a body in its own hidden folder, and copies results of others for the same body. No locks are
-needed: records of loads have checksums (`sim.runtime.journal`), also those of running processes.
+Each process makes a body in its own hidden folder, and copies solved loads of other processes for the same body. No
+locks are needed, because records of loads have checksums (`sim.runtime.journal`) even while they are written.
 """
 
 import json
@@ -14,25 +14,25 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.partial_files import to_unfinished_path
 
 DATA = "training.h5"
-"""File name of the loads that a body's model is trained on, until training ends."""
+"""File name of the training loads of a body's model, which exist until training ends."""
 NOTE, TABLE = ".json", ".series.npz"
-"""Endings of companion files: description of the loads; table of the series, if the learner has one."""
+"""Endings of companion files: description of the loads, and power-series table if the model type has a table."""
 
 
 def resume_data_set(path: Path, inputs: Mapping[str, str], other_folders: Sequence[Path]) -> bool:
-    """Resume a data set and its table from the most complete copy; return True if there is one.
+    """Resume a data set and its power-series table from the most complete copy; return True if there is a copy.
 
-    Copies are searched in its own folder and in `other_folders`.
+    Copies are searched in the data set's own folder and in `other_folders`.
 
     Parameters
     ----------
     inputs
-        All inputs that determine its bytes; files with other inputs are ignored.
+        All inputs that determine the bytes of the data set; copies with other inputs are ignored.
 
     Raises
     ------
     InputError
-        A file that cannot be written.
+        The file cannot be written.
     """
     said = json.dumps(dict(inputs), sort_keys=True)
     if not _is_of(path, said):
@@ -62,25 +62,25 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def has_solved_loads(folder: Path) -> bool:
-    """Return True if a folder contains solved loads of a body."""
+    """Return True if the folder of a body contains solved loads."""
     return any(path.exists() for path in _list_files(folder / DATA)[1:])
 
 
 def clear_folder(folder: Path) -> None:
-    """Create a folder, or remove all its files except solved loads of a body."""
+    """Create a folder, or remove all files of an existing folder except solved loads of a body."""
     folder.mkdir(parents=True, exist_ok=True)
     for path in set(folder.iterdir()) - set(_list_files(folder / DATA)):
         path.unlink()
 
 
 def remove_data_set(data: Path) -> None:
-    """Remove a data set, complete or unfinished, and its table."""
+    """Remove a complete or unfinished data set, with its description and its power-series table."""
     for path in _list_files(data):
         path.unlink(missing_ok=True)
 
 
 def _list_files(data: Path) -> tuple[Path, ...]:
-    """Return the paths of the description of the loads, the solved part, the complete data set, and the table."""
+    """Return the paths of description, unfinished data set, complete data set, and power-series table."""
     return data.with_suffix(NOTE), to_unfinished_path(data), data, data.with_suffix(TABLE)
 
 
@@ -91,7 +91,7 @@ def _is_of(data: Path, said: str) -> bool:
 
 
 def _find_kept_files(data: Path) -> Iterator[tuple[bool, int, Path]]:
-    """Return whether a file is the complete data set, its size, and its name."""
+    """Yield for each existing file of a data set: True if complete, size [bytes], path."""
     for path in (data, to_unfinished_path(data)):
         with suppress(OSError):
             yield path == data, path.stat().st_size, path

@@ -1,4 +1,4 @@
-"""Creation of one episode or one body of a data set in a folder, unless it exists."""
+"""Creation of missing episodes and bodies of a data set in a folder."""
 
 import json
 from collections.abc import Mapping
@@ -35,9 +35,9 @@ QUANTILES = ndtri((np.arange(256) + 0.5) / 256)
 
 
 def add_noise(image: np.ndarray, sigma: float, random: np.random.Generator) -> np.ndarray:
-    """Return an image (H, W, 3) uint8 with Gaussian noise [grey levels], independent of pixel and colour.
+    """Return an image (H, W, 3) uint8 with Gaussian noise of deviation `sigma` [grey levels], independent by pixel.
 
-    The noise has 256 values, equally probable: quantiles of the normal distribution. They are fast to sample, and fit
+    The noise has 256 equally probable values, quantiles of the normal distribution, which are fast to sample and fit
     into a byte up to a standard deviation of 40.
     """
     if sigma == 0.0:
@@ -49,7 +49,7 @@ def add_noise(image: np.ndarray, sigma: float, random: np.random.Generator) -> n
 
 
 def add_jitter(poses: np.ndarray, position_sigma: float, angle_sigma: float, random: np.random.Generator) -> np.ndarray:
-    """Add tracking errors to poses (n, 4, 4): Gaussian, along and about the axes of each pose's own frame."""
+    """Return poses (n, 4, 4) with Gaussian errors along [m] and about [rad] the axes of each pose's own system."""
     off = np.tile(np.eye(4), (len(poses), 1, 1))
     off[:, :3, 3] = position_sigma * random.standard_normal((len(poses), 3))
     off[:, :3, :3] = Rotation.from_rotvec(angle_sigma * random.standard_normal((len(poses), 3))).as_matrix()
@@ -59,7 +59,7 @@ def add_jitter(poses: np.ndarray, position_sigma: float, angle_sigma: float, ran
 def add_sensor_noise(
     columns: Mapping[str, Any], noise: Mapping[str, float], seed: int, number: int
 ) -> dict[str, np.ndarray]:
-    """Return the measured columns of an episode: `force_read`, and both tracked poses."""
+    """Return the simulated sensor readings of an episode: measured force, and tracked poses of tool and camera."""
     found: dict[str, np.ndarray] = {}
     if "force" in columns:
         force = np.asarray(columns["force"])
@@ -74,31 +74,31 @@ def add_sensor_noise(
 
 
 MAX_CACHE_SIZE = 2
-"""Number of bodies that a process keeps open, and number of FEM solvers that each of them keeps."""
+"""Maximum number of open bodies in a process, and of cached FEM solvers of each body."""
 TRANSIENT_ERRORS = OSError, MemoryError
-"""Errors of the disk, or of other processes on the same GPU: a retry may succeed."""
+"""Temporary errors, for example of the disk or due to other processes on a GPU, after which a retry may succeed."""
 
 
 def to_episode_path(folder: Path, number: int) -> Path:
-    """Return the file of an episode."""
+    """Return the path of an episode's file."""
     return folder / to_episode_name(number)
 
 
 def to_body_path(folder: Path, number: int) -> Path:
-    """Return the folder of a body."""
+    """Return the path of a body's folder."""
     return folder / BODIES / f"{number:04d}"
 
 
 def choose_body(plan: EpisodePlan, seed: int, number: int) -> int:
-    """Return the number of the body of an episode."""
+    """Return the number of the body of episode `number`."""
     return sample_body_number(plan.contents, seed, number)
 
 
 def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> MadeEpisode:
-    """Make a body, unless it exists; a failure is reported in `MadeEpisode.failed`.
+    """Make a body, unless the body exists; a failure is reported in `MadeEpisode.failed`.
 
-    It is made under another name, so that a folder of its name is whole. A second
-    process discards its own copy: both are equal. Loads that were solved before are not solved again.
+    The folder has a temporary name until it is complete. If another process finishes the same body first, the equal
+    copy of this process is discarded. Loads that were already solved are reused.
     """
     path = to_body_path(folder, number)
     if (path / BODY_FILE).is_file():
@@ -122,9 +122,9 @@ def make_body(folder: Path, plan: EpisodePlan, seed: int, number: int, device: s
 
 
 def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device: str = "auto") -> MadeEpisode:
-    """Make an episode, unless it exists; its body must exist. A failure is reported in `MadeEpisode.failed`.
+    """Make an episode, unless the episode exists; its body must exist. `MadeEpisode.failed` reports a failure.
 
-    Loads without equilibrium do not fail an episode: `outcome_predicted` and `outcome_fem` record them by frame.
+    A load without equilibrium is no failure: `outcome_predicted` and `outcome_fem` record the outcome of each frame.
     """
     path = to_episode_path(folder, number)
     if path.is_file():
@@ -142,14 +142,14 @@ def make_episode(folder: Path, plan: EpisodePlan, seed: int, number: int, device
 
 @dataclass(frozen=True, eq=False)
 class OpenedBody:
-    """Body whose files were read, and its FEM solvers by the effects that they solve."""
+    """Body whose files are loaded, and cached FEM solvers by effects."""
 
     body: EpisodeBody
     patient: PatientSetup
     solvers: dict[str, Fem | ResectedFem] = field(default_factory=dict)
 
     def get_fem(self, scene: Scene) -> Fem | ResectedFem:
-        """Return the FEM solver of a scene; a few are cached, because building one takes as long as some frames."""
+        """Return the FEM solver of a scene; a few solvers are cached, because building a solver takes long."""
         asked = repr(scene.get_effects_on(self.patient.anatomy))
         if asked not in self.solvers:
             if len(self.solvers) >= MAX_CACHE_SIZE:
@@ -160,7 +160,7 @@ class OpenedBody:
 
 @lru_cache(maxsize=MAX_CACHE_SIZE)
 def open_body(folder: Path, device: str) -> OpenedBody:
-    """Return an existing body, read once for many episodes; InputError as `read_body`."""
+    """Load an existing body; the result is cached for further episodes. Raises InputError, see `read_body`."""
     body = read_body(folder)
     return OpenedBody(body, body.open_patient(device))
 
@@ -168,7 +168,7 @@ def open_body(folder: Path, device: str) -> OpenedBody:
 def _collect_episode(
     path: Path, plan: EpisodePlan, seed: int, number: int, place: Path, device: str
 ) -> Mapping[str, Any]:
-    """Play an episode and write its file."""
+    """Play an episode on the body in folder `place`, write its file, and return a summary."""
     contents = plan.contents
     opened, asked = open_body(place, device), sample_episode(contents, seed, number)
     body, patient = opened.body, opened.patient

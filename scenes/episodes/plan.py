@@ -1,4 +1,4 @@
-"""Plan of a data set: distributions that episodes are sampled from."""
+"""Plan of a data set: distributions from which episodes and bodies are sampled."""
 
 import os
 import re
@@ -27,21 +27,21 @@ TYPE_NAMES = {
     "object": "a table", "array": "a list", "str": "text in quotation marks", "float": "a number",
     "int": "a whole number", "bool": "true or false", "null": "nothing",
 }  # fmt: skip
-"""Descriptions of types, by their names in msgspec."""
+"""Descriptions of types for users, by their names in msgspec."""
 SHIPPED_PLANS = Path(__file__).parent.parent / "data" / "plans"
-"""Folder of the shipped plans."""
+"""Folder of the plans in the package."""
 NO_LEARNER = "none"
-"""Learner of bodies without a model: FEM computes the deformation."""
+"""Name of the learner that trains no model, so that FEM computes the deformation."""
 MAX_PLAN_BYTES = 200_000
-"""Maximum size of a plan's text [bytes]: every episode contains it."""
+"""Maximum size of a plan's text [bytes], which every episode contains."""
 FIXED = "fixed"
-"""Path of a static camera."""
+"""Name of the camera path of a static camera."""
 
 
 def format_msgspec_error(error: str) -> str:
-    """Return an error of msgspec as a sentence that begins with the key in question.
+    """Format an error message of msgspec as a sentence that begins with the key in question.
 
-    The remaining text is unchanged.
+    A message of an unknown form is unchanged apart from this.
     """
     words, _, place = error.partition(" - at `$.")
     table = place.rstrip("`")
@@ -60,7 +60,7 @@ def _join_key(table: str, key: str) -> str:
 
 
 def _format_types(words: str) -> str:
-    """Format the expected types by their names."""
+    """Replace the names of types in a message of msgspec by descriptions for users."""
 
     def kinds(found: re.Match) -> str:
         names = [one.strip() for one in str(found[1]).split("|")]
@@ -71,7 +71,7 @@ def _format_types(words: str) -> str:
 
 
 class TumourPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Tumour and opening of synthetic anatomies, as the options of `sulcus anatomy`."""
+    """Distributions of tumour and craniotomy of synthetic anatomies, named like the options of `sulcus anatomy`."""
 
     radius_mm: Annotated[Number, ValueLimits(3, 35, "mm")] = (9.0, 16.0)
     cover_mm: Annotated[Number, ValueLimits(1, 60, "mm")] = (3.0, 12.0)
@@ -82,7 +82,7 @@ class TumourPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TissuePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Tissue and skull model of a body."""
+    """Distributions of tissue and skull model of a body; ratios are stiffnesses relative to the brain."""
 
     law: Annotated[Word, LAWS] = "neo-hookean"
     young_pa: Annotated[Number, ValueLimits(100, 50_000, "Pa")] = 3000.0
@@ -95,17 +95,17 @@ class TissuePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LearnerPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Training of a body's model: learner and number of loads. `name` "none": FEM is used."""
+    """Training of a body's model: model type `name` ("none": FEM is used), and number of training loads."""
 
     name: Annotated[str, (NO_LEARNER, *LEARNERS)] = "series-gp"
     loads: Annotated[int, ValueLimits(40, 100_000)] = 200
 
 
 class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Bodies of the episodes: their number; sampled once from the seed.
+    """Bodies on which episodes are played: number of bodies, and distributions of their properties.
 
-    `anatomies`: "drawn", the template's brain with a sampled tumour and opening; "template", the shipped anatomy;
-    or a custom .vtu next to the plan.
+    `anatomies`: "drawn" (the template's brain with a sampled tumour and craniotomy), "template" (the shipped anatomy),
+    or the name of a custom .vtu file next to the plan.
     """
 
     count: Annotated[int, ValueLimits(1, 100_000)] = 1
@@ -116,7 +116,7 @@ class Bodies(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AppearancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Camera, light and texture."""
+    """Distributions of camera, light, texture and occluders."""
 
     distance_mm: Annotated[Number, ValueLimits(80, 800, "mm")] = 200.0
     tilt_deg: Annotated[Number, ValueLimits(-75, 75, "°")] = -46.0
@@ -134,7 +134,7 @@ class AppearancePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Sensor noise; standard deviations of an episode."""
+    """Distributions of the standard deviations of sensor noise, one value for each episode."""
 
     grey_levels: Annotated[Number, ValueLimits(0, 40, "grey levels")] = 0.0
     force_n: Annotated[Number, ValueLimits(0, 1, "N")] = 0.0
@@ -145,14 +145,14 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class HandTremor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Tremor of the hand, added to the intended motion: standard deviations."""
+    """Distributions of the standard deviations of hand tremor, which is added to the intended motion."""
 
     tremor_mm: Annotated[Number, ValueLimits(0, 3, "mm")] = 0.0
     tremor_n: Annotated[Number, ValueLimits(0, 0.1, "N")] = 0.0
 
 
 class PlanContents(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Contents of a plan's file."""
+    """Parsed contents of the file of a plan."""
 
     title: str
     motion: FamilyMotions
@@ -169,20 +169,20 @@ class PlanContents(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class EpisodePlan:
-    """Episode plan as read from its file.
+    """Plan of episodes, as read from a file.
 
     Parameters
     ----------
     name
-        Name of the file, without its suffix.
+        Name of the file without its ending.
     text
         TOML text of the file.
     contents
         Parsed contents of the file.
     folder
-        Folder of custom anatomies.
+        Folder that contains custom anatomies.
     own
-        Digests of custom anatomies and their scans, by the anatomy's name.
+        Digests of the custom anatomies with their scans, by name of the anatomy.
     """
 
     name: str
@@ -193,7 +193,7 @@ class EpisodePlan:
 
     @property
     def digest(self) -> str:
-        """Sixteen hexadecimal digits of the text, and of the custom anatomies if there are any."""
+        """Digest (16 hexadecimal digits) of the plan's text and its custom anatomies."""
         return sha256("".join((self.text, *self.own.values())).encode()).hexdigest()[:16]
 
 
@@ -203,13 +203,13 @@ def list_shipped_plans() -> list[str]:
 
 
 def load_plan(name: str) -> EpisodePlan:
-    """Load a shipped plan by name, or a custom one by the path of its .toml file.
+    """Load a shipped plan by name, or a custom plan by the path of its .toml file.
 
     Raises
     ------
     InputError
-        An unknown plan; invalid TOML or unknown keys; an impossible range; a missing custom
-        anatomy.
+        The plan is unknown, its TOML is invalid or has unknown keys, a range is impossible, or a custom anatomy is
+        missing.
     """
     path = Path(name) if name.endswith(".toml") else SHIPPED_PLANS / f"{name}.toml"
     if not os.path.isfile(path):  # accepts any name
@@ -225,12 +225,12 @@ def load_plan(name: str) -> EpisodePlan:
 
 
 def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
-    """Compute sixteen hexadecimal digits from the current files of a custom anatomy and its scan.
+    """Compute the digest (16 hexadecimal digits) of the current files of a custom anatomy and its scan.
 
     Raises
     ------
     InputError
-        A missing or unreadable file.
+        The file is missing or unreadable.
     """
     found, path = sha256(), plan.folder / anatomy
     with wrap_errors(path, "an anatomy", "Put it next to the plan."):
@@ -240,7 +240,7 @@ def compute_anatomy_digest(plan: EpisodePlan, anatomy: str) -> str:
 
 
 def parse_plan(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
-    """Parse the plan in a TOML text.
+    """Parse a plan from TOML text.
 
     Raises
     ------
@@ -261,7 +261,7 @@ def parse_plan(text: str, name: str, folder: Path = Path()) -> EpisodePlan:
 
 
 def list_sampled_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueLimits | None, tuple[str, ...]]]:
-    """List every field that may be sampled: name, value, limits of a number, and allowed words."""
+    """List the sampled fields of a table: name, value, limits (None for words), and allowed words."""
     found = []
     for name, (kind, about) in _list_field_types(type(table)).items():
         if kind in (Number, Word):
@@ -271,7 +271,7 @@ def list_sampled_fields(table: msgspec.Struct) -> list[tuple[str, object, ValueL
 
 
 def list_fixed_numbers(table: msgspec.Struct) -> list[tuple[str, float, ValueLimits]]:
-    """List every fixed number: name, value and limits; one entry for each number of a pair."""
+    """List the fixed numbers of a table: name, value and limits, with one entry for each number of a pair."""
     found = []
     for name, (kind, about) in _list_field_types(type(table)).items():
         if kind != Number and isinstance(about, ValueLimits):
@@ -281,13 +281,13 @@ def list_fixed_numbers(table: msgspec.Struct) -> list[tuple[str, float, ValueLim
 
 
 def _list_field_types(table: type[msgspec.Struct]) -> dict[str, tuple[object, ValueLimits | tuple[str, ...] | None]]:
-    """List every field: its types, and its limits or known words."""
+    """Return the type and the limits or allowed words of each field of a table, by name."""
     hints = get_type_hints(table, include_extras=True)
     return {name: get_args(kind)[:2] if get_origin(kind) is Annotated else (kind, None) for name, kind in hints.items()}
 
 
 def list_tables(contents: PlanContents) -> dict[str, msgspec.Struct]:
-    """Return the tables of a plan by name: those sampled for each episode, and those of bodies."""
+    """Return all tables of a plan by name, for episodes and for bodies."""
     bodies, motion = contents.bodies, {f"motion.{name}": each for name, each in contents.motion.named.items()}
     of_bodies = {f"bodies.{name}": getattr(bodies, name) for name in ("tumour", "tissue", "learner")}
     seen = {"look": contents.look, "hand": contents.hand, "noise": contents.noise}
@@ -325,17 +325,17 @@ def _check(contents: PlanContents) -> None:
 
 
 def to_ratio_key(region: str) -> str:
-    """Return the key of a region's stiffness in `bodies.tissue`, by the region's name."""
+    """Return the key of a region's relative stiffness in `bodies.tissue`, given the name of the region."""
     return f"{region}_ratio"
 
 
 def _list_own_anatomies(contents: PlanContents) -> list[str]:
-    """List the named anatomies of bodies, except the built-in ones."""
+    """List the file names of custom anatomies in a plan."""
     return sorted(_list_anatomies(contents) - {"drawn", "template"})
 
 
 def _list_anatomies(contents: PlanContents) -> set[str]:
-    """List the named anatomies of bodies."""
+    """Return the names of all anatomies that bodies can have."""
     choices = contents.bodies.anatomies
     named = choices.choice if isinstance(choices, Distribution) else [choices] if isinstance(choices, str) else choices
     return {str(each) for each in named or ()}

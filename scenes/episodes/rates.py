@@ -1,4 +1,4 @@
-"""Durations of tasks, stored next to the episodes: the bytes of episodes do not depend on the machine."""
+"""Durations of tasks, stored next to the episodes, whose own bytes do not depend on the machine."""
 
 import os
 import platform
@@ -19,9 +19,9 @@ COLUMNS = "kind,number,frames,bytes,seconds,first"  # Column names of the table 
 
 @dataclass(frozen=True)
 class Rate:
-    """Measured task: kind ("episode" or "body"), number, frames, size [bytes], and duration in one worker [s].
+    """Measured task: kind ("episode" or "body"), number, frames, size [bytes], and duration [s] in one worker.
 
-    `first`: first task of its kind by that worker, one of `tasks.FIRST`.
+    `first`, one of `tasks.FIRST`, is the task's position in the worker: first of the process, first on a body, or not.
     """
 
     kind: str
@@ -34,12 +34,12 @@ class Rate:
 
 @contextmanager
 def write_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
-    """Yield a function that records each completed task, unless it was resumed, in a file of this process.
+    """Yield a function that records completed tasks in a file of this process; resumed tasks are not recorded.
 
     Raises
     ------
     InputError
-        A file that cannot be written.
+        The file cannot be written.
     """
     now = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
     path = folder / RATES / f"{now}-{platform.node()}-{os.getpid()}.csv"
@@ -60,7 +60,7 @@ def write_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
 
 
 def read_rates(folder: Path) -> list[Rate]:
-    """Read the recorded rates; a line left incomplete by a killed process is skipped."""
+    """Read the recorded rates of a folder; incomplete lines, which a killed process may leave, are skipped."""
     found = []
     for path in sorted((folder / RATES).glob("*.csv")):
         for line in path.read_text(errors="replace").splitlines(keepends=True):

@@ -1,1 +1,1 @@
-"""Episodes in other formats: LeRobot, robomimic, folders of images, XDMF; and the card of a data set."""
+"""Export of episodes to LeRobot, robomimic, folders of images and XDMF, and the card of a data set."""

@@ -1,4 +1,4 @@
-"""Card of a data set, written into its folder: table of episodes, Croissant, data sheet and licence."""
+"""Card of a data set, written into its folder: table of episodes, Croissant metadata, data sheet and licence."""
 
 import csv
 import io
@@ -24,9 +24,9 @@ from .datasheet import MARK, NAME, get_template_notice, has_template, write_data
 
 TABLE = "episodes.csv"  # File name of the table of episodes.
 NAMES = (TABLE, "croissant.json", SHEET, LICENCE_NAME)
-"""Files of a card."""
+"""File names of a card."""
 MAX_COMPARED_EPISODES = 5000
-"""Number of episodes above which a run does not write the card automatically: each takes 20 to 50 ms."""
+"""Maximum number of episodes for which a run writes the card automatically; an episode takes 20 to 50 ms."""
 # Text of the licence file.
 LICENCE = f"""# Licence of this data set
 
@@ -55,12 +55,12 @@ def write_card(
 ) -> dict[str, Any]:
     """Write `episodes.csv`, `croissant.json`, `DATASHEET.md` and `LICENSE.md` into a data set's folder.
 
-    Files are written atomically and replace an earlier card. `contents`: contents of its episodes, if already read.
+    Files are written atomically, and replace an earlier card. `contents`: contents of the episodes if already read.
 
     Raises
     ------
     InputError
-        A folder without episodes, a damaged episode, or a file of such a name that is not a card (unless `force`).
+        The folder has no episodes, an episode is damaged, or (unless `force`) a file of this name is not a card's.
     """
     for name in NAMES:
         if not force and (folder / name).exists() and not is_card(folder / name):
@@ -94,16 +94,16 @@ def write_card(
 def update_card(
     folder: Path, numbers: Set[int], changed: bool, progress: Callable[[Iterable], Iterable] = iter
 ) -> str | None:
-    """Rewrite the card of a run's folder if it does not match the episodes; return the reason if this failed.
+    """Rewrite the card of a run's folder if the card does not match the episodes; return the reason if this failed.
 
-    Nothing is written if no episode is complete. Files that do not belong to a card are kept.
+    Nothing is written if there are no episodes. Files that do not belong to a card are kept. None: no failure.
 
     Parameters
     ----------
     numbers
         Numbers of the existing episodes.
     changed
-        True if episodes were made, or failed, since the card was written.
+        True if episodes were made or failed since the card was written.
     """
     if not numbers or not (changed or _is_outdated(folder, {to_episode_name(number) for number in numbers})):
         return None
@@ -120,7 +120,7 @@ def update_card(
 
 
 def _is_outdated(folder: Path, names: set[str]) -> bool:
-    """Return True if a folder's card lists other episodes than these; for many, sizes are not compared."""
+    """Return True if the card of a folder does not list exactly the files `names`, with their sizes unless too many."""
     listed = list_card_files(folder) if all((folder / name).is_file() for name in NAMES) else {}
     if listed.keys() != names or len(names) > MAX_COMPARED_EPISODES:
         return listed.keys() != names
@@ -128,7 +128,7 @@ def _is_outdated(folder: Path, names: set[str]) -> bool:
 
 
 def list_card_files(folder: Path) -> dict[str, int]:
-    """Read names and sizes of the episodes that a folder's card lists; empty without such a table."""
+    """Read the names and sizes [bytes] of the episodes that the card of a folder lists; empty without a card."""
     try:
         with (folder / TABLE).open(newline="", encoding="utf-8") as file:
             return {row["file"]: int(row["bytes"]) for row in csv.DictReader(file)}
@@ -137,7 +137,7 @@ def list_card_files(folder: Path) -> dict[str, int]:
 
 
 def read_run_settings(folder: Path) -> RunSettings | None:
-    """Return the settings of the run in a folder; None without a run, or if its settings cannot be read."""
+    """Read the settings of the run in a folder; None if there is no run or its settings cannot be read."""
     try:
         return read_run(folder)
     except InputError:
@@ -145,13 +145,13 @@ def read_run_settings(folder: Path) -> RunSettings | None:
 
 
 def is_card(path: Path) -> bool:
-    """Return True if a file belongs to an earlier card."""
+    """Return True if a file was generated as part of a card."""
     head = path.read_text(encoding="utf-8", errors="replace")[:4096]
     return MARK in head or head.startswith(",".join(COLUMNS)) or ("mlcommons.org/croissant" in head and NAME in head)
 
 
 def build_row(contents: EpisodeContents, folder: Path) -> dict[str, object]:
-    """Return an episode as a row of the table."""
+    """Build the row of an episode in the table of episodes."""
     with open_episode(contents.path) as file:
         times = read_numbers(file, contents, "time")
         solved, _, error = count_solved_frames(file, contents)
@@ -176,7 +176,7 @@ def build_row(contents: EpisodeContents, folder: Path) -> dict[str, object]:
 
 
 def format_table(rows: Sequence[dict[str, object]]) -> str:
-    """Return the table as CSV."""
+    """Format the table of episodes as CSV."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(COLUMNS), lineterminator="\n")
     writer.writeheader()

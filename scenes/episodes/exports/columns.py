@@ -1,4 +1,4 @@
-"""Columns of exports: task, held-out flag, images, frame rate and numbers of an episode."""
+"""Columns of exported episodes: task, held-out flag, images, frame rate, states, actions and other numbers."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
@@ -29,14 +29,14 @@ HELD_OUT_STRIDE = 10  # One in this many bodies (or episodes, if there are fewer
 
 
 def describe_task(contents: EpisodeContents) -> str:
-    """Return the sentence for an episode's family; without a family, the name of its scene."""
+    """Return a sentence that describes the task of an episode's family, or names its scene."""
     return TASKS.get(contents.family, f"Play the scene {contents.family}.")
 
 
 def mark_held_out(episodes: Sequence[EpisodeContents]) -> list[bool]:
-    """Return which episodes are held out: every tenth body, or every tenth episode of fewer than ten bodies.
+    """Return a held-out flag for each episode: every tenth body, or every tenth episode of fewer than ten bodies.
 
-    Of two to nine episodes, the last one is held out.
+    If there are two to nine episodes, the last episode is held out.
     """
     bodies = list(dict.fromkeys(str(one.attributes.get("anatomy")) for one in episodes))
     if len(bodies) < HELD_OUT_STRIDE:
@@ -52,9 +52,9 @@ NUMBERS = (
     "force", "force_read", "tip", "contact", "distance", "K", "T_camera_world", "T_camera_world_tracked",
     "T_world_tool_tracked", "tumour_predicted",
 )  # fmt: skip
-"""Arrays that are exported unchanged, one row per frame, next to the tool's pose."""
+"""Names of arrays that are exported unchanged, with one row per frame."""
 SPACE = "world: RAS [m]; camera: x right, y down, z forward [m]"
-"""Coordinate system of all positions."""
+"""Description of the coordinate systems of exported positions."""
 # Names of the components of a state: position and unit quaternion of the tool.
 STATE = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 # Names of the components of an action: translation and rotation vector of the tool.
@@ -64,12 +64,12 @@ SHEET, LICENCE = "DATASHEET.md", "LICENSE.md"
 
 
 def list_shared_images(episodes: Sequence[EpisodeContents], names: Sequence[str] = tuple(PICTURES)) -> tuple[str, ...]:
-    """List the requested images that every episode has.
+    """List those of the image names `names` that every episode has.
 
     Raises
     ------
     InputError
-        Episodes whose images differ in size.
+        The episodes' images differ in size.
     """
     for one in episodes:
         if one.size != episodes[0].size:
@@ -79,7 +79,7 @@ def list_shared_images(episodes: Sequence[EpisodeContents], names: Sequence[str]
 
 
 def list_shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
-    """List the `NUMBERS` that every episode has in the same shape; tumours of two bodies differ in shape."""
+    """List those of `NUMBERS` that every episode has with equal row shapes (tumours of two bodies differ)."""
     first = episodes[0].shapes
     return tuple(
         name
@@ -90,12 +90,12 @@ def list_shared_numbers(episodes: Sequence[EpisodeContents]) -> tuple[str, ...]:
 
 
 def compute_frame_rate(contents: EpisodeContents, time: np.ndarray) -> float:
-    """Compute the frame rate [1/s].
+    """Compute the frame rate [1/s] of an episode with frame times `time` (T,) [s].
 
     Raises
     ------
     InputError
-        Frames that are not evenly spaced, or fewer than two.
+        Frames are not evenly spaced, or there are fewer than two frames.
     """
     steps = np.diff(time)
     if not len(steps) or not steps.mean() > 0.0 or np.abs(steps - steps.mean()).max() > TIME_STEP_TOLERANCE:
@@ -104,12 +104,12 @@ def compute_frame_rate(contents: EpisodeContents, time: np.ndarray) -> float:
 
 
 def collect_numbers(file: h5py.File, contents: EpisodeContents, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Collect `state` (T, 7), `action` (T, 6) and the named arrays as float32; `time` keeps its stored type.
+    """Collect `state` (T, 7), `action` (T, 6) and the arrays `names` as float32; `time` keeps its stored type.
 
     Raises
     ------
     InputError
-        An episode without a tool.
+        The episode has no tool.
     """
     if "T_world_tool" not in contents.shapes:
         raise InputError(f"{contents.path}: has no tool, and so no actions: leave it out.")
@@ -120,7 +120,7 @@ def collect_numbers(file: h5py.File, contents: EpisodeContents, names: Sequence[
 
 
 def read_per_frame(file: h5py.File, contents: EpisodeContents, name: str) -> np.ndarray:
-    """Read the rows (T, ...) of a named array; `K` (T, 3, 3) has a row per frame, because a camera may zoom."""
+    """Read an array with a row per frame (T, ...); `K` is expanded to (T, 3, 3), because a camera may zoom."""
     if name != "K":
         return read_numbers(file, contents, name)
     if "K_of_frame" in contents.shapes:
@@ -129,24 +129,24 @@ def read_per_frame(file: h5py.File, contents: EpisodeContents, name: str) -> np.
 
 
 def split_into_blocks(frames: int) -> Iterator[range]:
-    """Split the frames into blocks of `BLOCK_FRAMES`."""
+    """Yield ranges of at most `BLOCK_FRAMES` frames that cover all frames."""
     return (range(start, min(start + BLOCK_FRAMES, frames)) for start in range(0, frames, BLOCK_FRAMES))
 
 
 def name_axes(name: str) -> list[str] | None:
-    """Return the names of a vector's components; None if they have no names."""
+    """Return the component names of the vector `name`; None if its components have no names."""
     return {"state": list(STATE), "action": list(ACTION), "distance": ["m"]}.get(
         name, list("xyz") if name in ("force", "force_read", "tip", "contact") else None
     )
 
 
 def measure_stored_size(episodes: Sequence[EpisodeContents]) -> int:
-    """Return the total size of the episodes' files [bytes]."""
+    """Return the total file size of the episodes [bytes]."""
     return sum(one.path.stat().st_size for one in episodes)
 
 
 def name_files(episodes: Sequence[EpisodeContents]) -> Mapping[EpisodeContents, str]:
-    """Return a unique name of each episode: its file's name, numbered if two files have the same name."""
+    """Return a unique name by episode: the file name, with a number if several files have the same name."""
     taken: set[str] = set()
     found = {}
     for one in episodes:
@@ -157,7 +157,7 @@ def name_files(episodes: Sequence[EpisodeContents]) -> Mapping[EpisodeContents, 
 
 
 def build_states(poses: np.ndarray) -> np.ndarray:
-    """Build (T, 7) float32 from `T_world_tool` (T, 4, 4): origin [m], and quaternion x, y, z, w without sign jumps."""
+    """Build states (T, 7) float32 from `T_world_tool` (T, 4, 4): origin [m], and x, y, z, w without sign jumps."""
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     flips = np.sign(np.einsum("ij,ij->i", turns[1:], turns[:-1]))
     turns[1:] *= np.cumprod(np.where(flips < 0.0, -1.0, 1.0))[:, None]
@@ -165,9 +165,9 @@ def build_states(poses: np.ndarray) -> np.ndarray:
 
 
 def build_twists(poses: np.ndarray) -> np.ndarray:
-    """Build (T, 6) float32: the tool's translation [m] and rotation [rad] to the next frame, in world axes.
+    """Build actions (T, 6) float32 from poses (T, 4, 4): translation [m] and rotation [rad] to the next frame.
 
-    The last row is zero.
+    Axes are those of the world. The last row is zero.
     """
     shifts = np.diff(poses[:, :3, 3], axis=0)
     turns = Rotation.from_matrix(poses[1:, :3, :3]) * Rotation.from_matrix(poses[:-1, :3, :3]).inv()
@@ -176,9 +176,9 @@ def build_twists(poses: np.ndarray) -> np.ndarray:
 
 
 def collect_texts(episodes: Sequence[EpisodeContents]) -> Mapping[str, str]:
-    """Return data sheets and licences by file name; names are numbered if there are several folders.
+    """Read the data sheets and licences of the episodes' folders, by file name; empty without such files.
 
-    Empty if there are no such files.
+    File names are numbered if there are several folders.
     """
     homes = dict.fromkeys(find_dataset_folder(one.path.resolve().parent) for one in episodes)
     found = {}
@@ -197,5 +197,5 @@ def write_notices(episodes: Sequence[EpisodeContents], folder: Path) -> None:
 
 
 def find_dataset_folder(folder: Path) -> Path:
-    """Return the data set's folder, given the folder of its episodes."""
+    """Return the folder of a data set, given the folder of its episodes."""
     return folder.parent if folder.name == "episodes" and not (folder / LICENCE).exists() else folder

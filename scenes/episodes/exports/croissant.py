@@ -1,4 +1,4 @@
-"""Croissant 1.1 metadata of a data set: JSON-LD that catalogues of data sets read.
+"""Croissant 1.1 metadata of a data set, as JSON-LD for catalogues of data sets.
 
 Akhtar et al. (2024), "Croissant: A Metadata Format for ML-Ready Datasets", DEEM; version 1.1 of the specification.
 """
@@ -31,7 +31,7 @@ CONTEXT: Mapping[str, Any] = {
     "name": {"@container": "@language"},
     **{name: f"cr:{name}" for name in UNTYPED_TERMS},
 }
-"""JSON-LD context of the specification."""
+"""JSON-LD context of the Croissant specification."""
 COLUMNS: Mapping[str, tuple[str, str]] = {
     "file": ("sc:Text", "The episode's HDF5 file."),
     "family": ("sc:Text", "Scenario of the episode."),
@@ -51,20 +51,20 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
     "bytes": ("sc:Integer", "Size of the file."),
     "sha256": ("sc:Text", "Checksum in the file of its arrays; empty if there is none."),
 }
-"""Columns of the table of episodes: type and meaning."""
+"""Type and meaning of each column of the table of episodes."""
 
 
 def build_croissant_metadata(
     name: str, description: str, date: str, table: str, sha256: str, folder: str
 ) -> dict[str, Any]:
-    """Return the metadata, as JSON.
+    """Build the metadata as a JSON object.
 
     Parameters
     ----------
     table, sha256
-        The file with a row for each episode, and its checksum.
+        Name and checksum of the file with a row for each episode.
     folder
-        Pattern of the episodes' files.
+        Pattern of the paths of the episodes' files.
     """
     return {
         "@context": dict(CONTEXT),

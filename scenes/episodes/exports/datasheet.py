@@ -15,9 +15,9 @@ MAX_LISTED_VALUES = 100  # Maximum length of each list of sampled values.
 
 
 def read_parameters(contents: EpisodeContents) -> dict[str, Any]:
-    """Return the sampled parameters of an episode by dotted names; empty if not recorded as JSON.
+    """Read the sampled parameters of an episode, by dotted name; empty if they are not recorded as JSON.
 
-    Tumours are sampled for synthetic anatomies only; those of others have no effect and are excluded.
+    Parameters of the tumour are excluded unless the anatomy is synthetic, because they have no effect otherwise.
     """
     try:
         found = dict(list_leaves(json.loads(contents.attributes.get("parameters", "{}"))))
@@ -28,7 +28,7 @@ def read_parameters(contents: EpisodeContents) -> dict[str, Any]:
 
 
 def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
-    """Yield lines of two tables: varied parameters (ranges, or counts of texts), and constant parameters."""
+    """Yield the lines of two tables: varied parameters with ranges or frequent values, and constant parameters."""
     values: dict[str, list[Any]] = {}
     for one in episodes:
         for key, value in read_parameters(one).items():
@@ -50,7 +50,7 @@ def format_variation_tables(episodes: Sequence[EpisodeContents]) -> Iterator[str
 
 
 def format_range_row(key: str, values: Sequence[Any]) -> str:
-    """Format the table row of a varied parameter."""
+    """Format the table row of a varied parameter: range of numbers, or frequencies of texts."""
     if all(is_number(one) for one in values):
         return f"| `{key}` | {format_cell(min(values))} | {format_cell(max(values))} | {len(values)} |"
     often = ", ".join(f"{text} ({count})" for text, count in Counter(map(str, values)).most_common(8))
@@ -58,17 +58,17 @@ def format_range_row(key: str, values: Sequence[Any]) -> str:
 
 
 def is_number(value: Any) -> bool:
-    """Return True if a value is a number; booleans are not."""
+    """Return True if a value is a number; a boolean is not a number."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def format_cell(value: Any) -> str:
-    """Format a value for a table: whole numbers in full, others to four digits."""
+    """Format a value for a table cell; floating-point numbers have four significant digits."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def list_leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """List numbers and texts of nested JSON by their dotted names; items of lists are numbered."""
+    """Yield the dotted names and values of numbers and texts in nested JSON; items of lists are numbered."""
     match value:
         case dict():
             for key, inner in value.items():
@@ -81,14 +81,14 @@ def list_leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 
 
 TEMPLATE, DRAWN, UNSTATED = "template", "drawn", ""
-"""Origin of an anatomy: the shipped one, the same brain with another tumour, or unknown.
+"""Origins of an anatomy: shipped template, template with another tumour, or unknown.
 
 Other values: the name of a custom anatomy.
 """
 
 
 def find_origin(contents: EpisodeContents) -> str:
-    """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, the name of a custom one, or `UNSTATED`."""
+    """Return the origin of an episode's anatomy: `TEMPLATE`, `DRAWN`, name of a custom anatomy, or `UNSTATED`."""
     stated = read_parameters(contents).get("bodies.anatomies")
     if stated is not None:
         return str(stated)
@@ -108,7 +108,7 @@ def has_template(episodes: Sequence[EpisodeContents]) -> bool:
 
 
 def format_origins(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
-    """Yield lines on the source of the anatomies."""
+    """Yield lines that describe the sources of the episodes' anatomies."""
     for origin, count in Counter(find_origin(one) for one in episodes).most_common():
         if origin in (TEMPLATE, DRAWN):
             tumour = "the same in all" if origin == TEMPLATE else "sampled"
@@ -135,9 +135,9 @@ def write_datasheet(
     notes: Sequence[str] = (),
     run: RunSettings | None = None,
 ) -> str:
-    """Return the data sheet as Markdown, from the files' attributes; `rows` are those of the table of episodes.
+    """Build the data sheet as Markdown from the attributes of the files and the `rows` of the table of episodes.
 
-    `notes` are sentences on missing or weak parts; `run` is the run of the folder.
+    `notes` are sentences on missing or weak parts; `run` contains the settings of the folder's run.
     """
     parts = (
         f"# Data sheet: {name}\n\n{MARK}\n",
@@ -160,7 +160,7 @@ def write_datasheet(
 
 
 def describe_motivation() -> str:
-    """Describe the motivation."""
+    """Return the section on the motivation of the data set."""
     return (
         "## Motivation\n\nA tool that presses moves the brain, and the tumour in it. Where the tumour is at each "
         "moment is not known of real surgery. Here it is, because the surgery is simulated.\n"
@@ -170,7 +170,7 @@ def describe_motivation() -> str:
 def describe_composition(
     episodes: Sequence[EpisodeContents], rows: Sequence[Mapping[str, Any]], notes: Sequence[str]
 ) -> str:
-    """Describe the composition: counts, sizes, arrays."""
+    """Build the section on the composition of the data set: numbers, sizes and arrays."""
     lines = ["## Composition\n", "| family | episodes | frames | solved | seconds | GB |", "|---|---|---|---|---|---|"]
     for family in [*sorted({row["family"] for row in rows}), None]:
         those = [row for row in rows if family in (None, row["family"])]
@@ -199,7 +199,7 @@ def describe_composition(
 
 
 def describe_bodies(episodes: Sequence[EpisodeContents]) -> str:
-    """Describe the numbers of anatomies and image sizes."""
+    """Describe the number and sources of anatomies, and the image sizes."""
     bodies = len({one.attributes.get("anatomy") for one in episodes})
     sizes = sorted({one.size for one in episodes})
     said_sizes = ", ".join(f"{width} x {height}" for width, height in sizes)
@@ -207,7 +207,7 @@ def describe_bodies(episodes: Sequence[EpisodeContents]) -> str:
 
 
 def describe_collection(episodes: Sequence[EpisodeContents], run: RunSettings | None) -> str:
-    """Describe the collection process, and the random variation."""
+    """Build the section on the collection process: models, tools, versions and random variation."""
     lines = ["## Collection\n", "A scripted tool moved on a simulated brain, and a camera view was rendered.\n"]
     tools = [str(tool).partition("(")[0] for tool in format_value(episodes, "tool")]  # sizes are sampled parameters
     lines += [*format_counts("deformation model", format_value(episodes, "answered_by"))]
@@ -228,7 +228,7 @@ def describe_collection(episodes: Sequence[EpisodeContents], run: RunSettings | 
 
 
 def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
-    """Yield lines with the number of occurrences of each text; at most the `MAX_LISTED_NAMES` most frequent."""
+    """Yield lines with the frequencies of the texts, for the `MAX_LISTED_NAMES` most frequent texts and the others."""
     often = Counter(map(str, texts)).most_common()
     yield from (f"- {title}: {text} (in {count})" for text, count in often[:MAX_LISTED_NAMES])
     if often[MAX_LISTED_NAMES:]:
@@ -237,12 +237,12 @@ def format_counts(title: str, texts: Sequence[Any]) -> Iterator[str]:
 
 
 def format_value(episodes: Sequence[EpisodeContents], key: str) -> list[Any]:
-    """Format the values of an attribute over all episodes that have it."""
+    """List the values of the attribute `key` in all episodes that have this attribute."""
     return [one.attributes[key] for one in episodes if key in one.attributes]
 
 
 def format_plans(episodes: Sequence[EpisodeContents]) -> Iterator[str]:
-    """Yield the plans that the files contain."""
+    """Yield a section with the text of each plan that the files contain."""
     for text in dict.fromkeys(map(str, format_value(episodes, "plan"))):
         yield f"## Plan\n\n```toml\n{text.strip()}\n```\n"
 

@@ -1,6 +1,6 @@
 """Episodes as a LeRobot data set, v3.0: Parquet tables with the encoded images, and JSON.
 
-Images are features of the kind `image`, as they are stored: JPEG, and PNG of 8 or 16 bits. Depth is exact.
+Images are features of the type `image` with unchanged bytes: JPEG, and PNG of 8 or 16 bits, so that depth is exact.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .columns import (
 
 @dataclass(frozen=True, eq=False)
 class RowStatistics:
-    """Statistics of `count` rows: each a float64 array of one row's shape. NaN values are excluded."""
+    """Statistics of `count` rows, as float64 arrays with the shape of one row; NaN values are excluded."""
 
     minimum: np.ndarray
     maximum: np.ndarray
@@ -63,7 +63,7 @@ class RowStatistics:
         )
 
     def __add__(self, other: RowStatistics) -> RowStatistics:
-        """Return the statistics of both sets."""
+        """Return the statistics of both sets of rows together."""
         return RowStatistics(
             np.minimum(self.minimum, other.minimum),
             np.maximum(self.maximum, other.maximum),
@@ -74,7 +74,7 @@ class RowStatistics:
         )
 
     def to_lists(self) -> dict[str, list]:
-        """Return lists of min, max, mean, std and count; zeros without data."""
+        """Convert to lists "min", "max", "mean", "std" and "count"; zeros if there are no values."""
         known = np.maximum(self.counted, 1)
         mean = self.total / known
         deviation = np.sqrt(np.maximum(self.squares / known - np.square(mean), 0.0))
@@ -85,7 +85,7 @@ class RowStatistics:
 
 VERSION = "v3.0"  # Version of the LeRobot format.
 DEPTH_RANGE = (0.1, 0.6)
-"""Depth range for readers that scale depth [m]: contains tools, cortex and drape of all scenes."""
+"""Depth range [m] for readers that scale depth; tools, cortex and drape of all scenes are within this range."""
 EXPORTED = ("colour", "colour_right", "depth", "segmentation", "tumour_mask")  # Exported images.
 FILE_MEGABYTES = 100  # Maximum size of a table [MB], as in LeRobot.
 FOLDER_FILES = 1000  # Maximum number of tables in a folder, as in LeRobot.
@@ -101,12 +101,12 @@ REQUIRED_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_
 def write_lerobot(
     episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write a data set, atomically; return its summary. `progress` wraps the episodes.
+    """Write episodes as a LeRobot data set, atomically; return a summary. `progress` wraps the iteration.
 
     Raises
     ------
     InputError
-        Episodes without a tool, of different sizes or rates, or damaged; a folder that cannot be written.
+        Episodes have no tool, different image sizes or frame rates, or are damaged; the folder cannot be written.
     """
     pictures = list_shared_images(episodes, EXPORTED)
     names = list_shared_numbers(episodes)
@@ -171,12 +171,12 @@ def write_lerobot(
 
 
 def to_key(name: str) -> str:
-    """Return LeRobot's name of an array."""
+    """Return LeRobot's name for an array."""
     return "action" if name == "action" else f"observation.{name}"
 
 
 def build_columns(frames: int, episode: int, first: int, task: int, rate: float) -> dict[str, np.ndarray]:
-    """Return the columns that each LeRobot data set has."""
+    """Build the columns that every LeRobot data set requires, for one episode; `first` is its first row."""
     every = np.arange(frames)
     same = np.ones(frames, np.int64)
     numbers = ((every / rate).astype(np.float32), every, episode * same, first + every, task * same)
@@ -185,7 +185,7 @@ def build_columns(frames: int, episode: int, first: int, task: int, rate: float)
 
 @dataclass
 class TableWriter:
-    """Writer of data tables of limited size; frames are written in blocks."""
+    """Writer of frames into tables (Parquet files) of limited size."""
 
     folder: Path
     number: int = -1
@@ -195,7 +195,7 @@ class TableWriter:
     def write(
         self, file: h5py.File, contents: EpisodeContents, columns: Mapping[str, np.ndarray], pictures: Sequence[str]
     ) -> tuple[int, int]:
-        """Write an episode; return the numbers of its folder and its file."""
+        """Write the frames of an episode; return the numbers of the folder and of the file."""
         if self.writer is not None and self.path.stat().st_size > 1e6 * FILE_MEGABYTES:
             self.close()
         for block in split_into_blocks(len(columns["index"])):
@@ -220,7 +220,7 @@ class TableWriter:
 
 
 def encode_images(file: h5py.File, contents: EpisodeContents, name: str, frames: range) -> Iterator[dict[str, Any]]:
-    """Yield images as LeRobot stores them."""
+    """Yield the encoded images of some frames as LeRobot stores images: bytes and path."""
     suffix = get_suffix(name)
     return (
         {"bytes": read_image_bytes(file, contents, name, frame), "path": f"{name}_{frame:06d}.{suffix}"}
@@ -229,7 +229,7 @@ def encode_images(file: h5py.File, contents: EpisodeContents, name: str, frames:
 
 
 def to_arrow_column(array: np.ndarray) -> pa.Array:
-    """Convert rows (T, ...) to a column: numbers, vectors, or lists of lists."""
+    """Convert rows (T, ...) to an Arrow column of numbers, vectors, or nested lists."""
     if array.ndim == 1:
         return pa.array(array)
     if array.ndim == 2:
@@ -242,7 +242,7 @@ def to_arrow_column(array: np.ndarray) -> pa.Array:
 
 
 def measure_image_statistics(file: h5py.File, contents: EpisodeContents, name: str) -> RowStatistics:
-    """Compute statistics of a few images: colour and labels relative to 255, depth in its own steps."""
+    """Compute statistics of a few images of an episode; colour and labels relative to 255, depth in its steps."""
     found = []
     for frame in np.unique(np.linspace(0, contents.frames - 1, STATISTICS_IMAGES).round().astype(int)).tolist():
         picture = read_one_image(file, contents, name, frame)[::STATISTICS_STRIDE, ::STATISTICS_STRIDE]
@@ -252,7 +252,7 @@ def measure_image_statistics(file: h5py.File, contents: EpisodeContents, name: s
 
 
 def to_lerobot_statistics(name: str, statistics: RowStatistics) -> dict[str, list]:
-    """Convert statistics to LeRobot's form; those of an image have shape (channels, 1, 1)."""
+    """Convert statistics to LeRobot's format, in which statistics of images have the shape (channels, 1, 1)."""
     said = statistics.to_lists()
     if not name.startswith("observation.images."):
         return said
@@ -260,7 +260,7 @@ def to_lerobot_statistics(name: str, statistics: RowStatistics) -> dict[str, lis
 
 
 def build_task_table(tasks: Sequence[str]) -> pa.Table:
-    """Build the table of tasks and their numbers; pandas restores the sentence as index."""
+    """Build the table of tasks and task numbers, in which pandas uses the sentence as index."""
     index = "__index_level_0__"
     table = pa.table({"task_index": np.arange(len(tasks)), index: list(tasks)})
     kinds = (("task_index", "int64", "int64"), (index, "unicode", "object"))
@@ -279,7 +279,7 @@ def build_task_table(tasks: Sequence[str]) -> pa.Table:
 
 
 def describe_features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
-    """Describe the numbers for `info.json`."""
+    """Describe the numeric columns for `info.json`, given the shapes of their rows."""
     kinds = {name: "float32" if name not in REQUIRED_COLUMNS or name == "timestamp" else "int64" for name in shapes}
     return {
         name: {"dtype": kinds[name], "shape": list(shape) or [1], "names": name_axes(name.rpartition(".")[2])}
@@ -288,7 +288,7 @@ def describe_features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
 
 
 def describe_image_features(contents: EpisodeContents, pictures: Sequence[str]) -> dict[str, Any]:
-    """Describe images for `info.json`; for depth its step, and its range [m]."""
+    """Describe the images for `info.json`; depth images with the step and the range of depth [m]."""
     width, height = contents.size
     found = {}
     for name in pictures:
@@ -309,7 +309,7 @@ def describe_image_features(contents: EpisodeContents, pictures: Sequence[str]) 
 
 
 def build_info(episodes: int, frames: int, tasks: int, rate: float, features: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the contents of `info.json`."""
+    """Build the content of `info.json`."""
     return {
         "codebase_version": VERSION,
         "robot_type": "simulated hand-held tool",
@@ -328,5 +328,5 @@ def build_info(episodes: int, frames: int, tasks: int, rate: float, features: Ma
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON with indents."""
+    """Write a value as indented JSON."""
     path.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")

@@ -1,4 +1,4 @@
-"""Episodes as folders: images as JPEG and PNG files, numbers as CSV, and their description as JSON."""
+"""Export of episodes as folders: images as JPEG and PNG files, numbers as CSV, and a description as JSON."""
 
 import csv
 import json
@@ -17,13 +17,13 @@ from ..reading.windows import read_image_bytes, read_numbers, read_rows
 from .columns import measure_stored_size, name_files, write_notices
 
 SEPARATE_TABLES = ("tumour_predicted", "tumour_fem", "tumour_left", "cortex_predicted", "cortex_fem")
-"""Arrays with many numbers per frame, each in its own table."""
+"""Names of arrays with many numbers per frame, each of which has its own table."""
 
 
 def write_folder(
     episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write a folder for each episode, atomically; return a summary.
+    """Write a folder for each episode, atomically; return a summary. `progress` wraps the iteration.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def write_folder(
 
 
 def write_images(folder: Path, file: h5py.File, contents: EpisodeContents) -> None:
-    """Write the encoded images, one file each: `colour/000000.jpg`."""
+    """Write the encoded images to files such as `colour/000000.jpg`."""
     for name in PICTURES:
         if name in contents.shapes:
             (folder / name).mkdir()
@@ -54,7 +54,7 @@ def write_images(folder: Path, file: h5py.File, contents: EpisodeContents) -> No
 
 
 def write_tables(folder: Path, file: h5py.File, contents: EpisodeContents) -> None:
-    """Write `frames.csv`, a row for each frame, and a table for each array with many columns. NaN is an empty field."""
+    """Write `frames.csv` with a row per frame, and a table for each of `SEPARATE_TABLES`; NaN is an empty field."""
     columns: dict[str, Sequence[object] | np.ndarray] = {"frame": range(contents.frames)}
     for name in contents.shapes:
         described = ARRAYS.get(name)
@@ -77,7 +77,7 @@ def write_tables(folder: Path, file: h5py.File, contents: EpisodeContents) -> No
 
 
 def write_table(path: Path, columns: dict[str, Any]) -> None:
-    """Write columns of equal length."""
+    """Write columns of equal length as CSV, by title; NaN is an empty field."""
     with path.open("w", newline="") as out:
         writer = csv.writer(out)
         writer.writerow(columns)
@@ -85,7 +85,7 @@ def write_table(path: Path, columns: dict[str, Any]) -> None:
 
 
 def write_description(path: Path, file: h5py.File, contents: EpisodeContents) -> None:
-    """Write the attributes, the meaning of each array, and the arrays without frames."""
+    """Write the episode's attributes, the meaning and unit of each array, and arrays without frame axis as JSON."""
     arrays = {}
     for name in contents.shapes:
         item = file[f"pictures/{name}" if name in PICTURES else name]

@@ -1,4 +1,4 @@
-"""Episodes as one robomimic file: HDF5 with `data/demo_0`, ... and masks of those to train on and to hold out."""
+"""Export of episodes as one robomimic file: HDF5 with `data/demo_0`, ..., and masks for training and validation."""
 
 import json
 from collections.abc import Callable, Iterable, Sequence
@@ -30,18 +30,18 @@ from .columns import (
 EXPORTED = ("colour", "colour_right", "depth", "segmentation")  # Exported images.
 IMAGE_SIZE_FACTOR = 4  # Size of decoded images compressed by gzip, relative to the episodes' JPEG and PNG.
 GYM = 2
-"""robomimic's number for environments of Gymnasium's kind."""
+"""robomimic's number for Gymnasium environments."""
 
 
 def write_robomimic(
     episodes: Sequence[EpisodeContents], path: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write the file, atomically; return a summary. `progress` wraps the episodes.
+    """Write episodes as a robomimic file, atomically; return a summary. `progress` wraps the iteration.
 
     Raises
     ------
     InputError
-        Episodes without a tool, of different image sizes, or damaged; a file that cannot be written.
+        Episodes have no tool, different image sizes, or are damaged; the file cannot be written.
     """
     pictures, names = list_shared_images(episodes, EXPORTED), list_shared_numbers(episodes)
     check_disk_space(path, IMAGE_SIZE_FACTOR * measure_stored_size(episodes))
@@ -70,7 +70,7 @@ def write_robomimic(
 
 
 def write_demo(demo: h5py.Group, obs: h5py.Group, contents: EpisodeContents, values: dict[str, np.ndarray]) -> None:
-    """Write one episode without images: a state is that of the tool, then of the tumour if exported."""
+    """Write one episode without images; a state is the tool's state, followed by the tumour's positions if exported."""
     actions, state = values.pop("action"), values.pop("state")
     tumour = [values[name].reshape(contents.frames, -1) for name in ("tumour_predicted",) if name in values]
     dones = np.zeros(contents.frames, np.int64)
@@ -87,7 +87,7 @@ def write_demo(demo: h5py.Group, obs: h5py.Group, contents: EpisodeContents, val
 def write_images(
     obs: h5py.Group, file: h5py.File, contents: EpisodeContents, names: Sequence[str], stream: Stream
 ) -> None:
-    """Write decoded images, (T, H, W, channels): uint8, and depth as float32 [m]."""
+    """Write decoded images (T, H, W, channels): uint8, or float32 [m] for depth."""
     width, height = contents.size
     for name in names:
         kind = np.float32 if name == "depth" else np.uint8
@@ -105,7 +105,7 @@ def write_images(
 
 
 def describe_environment(episodes: Sequence[EpisodeContents], rates: Sequence[float]) -> dict[str, Any]:
-    """Return the environment metadata of robomimic: no environment replays the actions, so the scenes are named."""
+    """Build robomimic's environment metadata, which name the scenes because no environment replays the actions."""
     families = sorted({one.family for one in episodes})
     return {
         "env_name": "sulcus",

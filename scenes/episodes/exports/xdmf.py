@@ -1,4 +1,4 @@
-"""Tumour and, if recorded, cortex over time: XDMF with arrays in HDF5, for ParaView."""
+"""Export of the tumour's and, if recorded, the cortex's motion as XDMF with arrays in HDF5, for ParaView."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,16 +17,16 @@ from ..reading.windows import read_numbers
 from .columns import SPACE, measure_stored_size, name_files, write_notices
 
 SURFACES = {"tumour": "tumour_surface", "cortex": "open_surface"}
-"""Exported surfaces, and the attribute of the anatomy with the triangles of each."""
+"""Attribute of the anatomy with the triangles of each exported surface, by name."""
 
 
 def write_xdmf(
     episodes: Sequence[EpisodeContents], folder: Path, progress: Callable[[Iterable], Iterable] = iter
 ) -> dict[str, Any]:
-    """Write two files per episode, atomically: `.xdmf` to open, and `.h5` with its arrays.
+    """Write two files per episode, atomically: `.xdmf`, which ParaView opens, and `.h5` with the arrays.
 
-    Positions are metres. Further arrays are the displacement from the scan, and the distance to the FEM solution where
-    FEM solved the frame. Without the anatomy there are points alone: `points_only` counts such episodes.
+    Arrays are positions [m], displacements from the scan [m], and distances from the FEM solution [m] in solved frames.
+    Episodes whose anatomy is not found contain points without triangles; `points_only` in the summary counts them.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def write_xdmf(
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[h5py.File]:
-    """Yield a new HDF5 file; a full disk is reported in a sentence."""
+    """Create an HDF5 file, atomically, and yield it; a full disk raises an InputError."""
     with write_stream_atomically(path, ".h5") as stream, h5py.File(stream, "w") as file:
         yield file
 
@@ -67,7 +67,7 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
 def write_arrays(
     group: h5py.Group, file: h5py.File, contents: EpisodeContents, name: str, triangles: np.ndarray | None
 ) -> None:
-    """Write positions, displacement and difference of each frame, single precision."""
+    """Write positions, displacements and distances from FEM of surface `name`, by frame, in single precision."""
     at = read_numbers(file, contents, f"{name}_predicted")
     arrays = {"positions": at, "displacement": at - read_numbers(file, contents, f"{name}_rest")}
     if f"{name}_fem" in contents.shapes:
@@ -82,7 +82,7 @@ def write_arrays(
 
 
 def add_surface_series(domain: Element, group: h5py.Group, name: str, times: np.ndarray) -> None:
-    """Describe the frames of one surface, a grid per frame."""
+    """Add the grids of a surface, one for each frame, to the XDMF tree."""
     item = SubElement(domain, "Grid", Name=str(group.name).strip("/"), GridType="Collection", CollectionType="Temporal")
     cells = get_array(group, "cells")
     kind = (
@@ -100,7 +100,7 @@ def add_surface_series(domain: Element, group: h5py.Group, name: str, times: np.
 
 
 def add_data_item(parent: Element, array: h5py.Dataset, name: str) -> None:
-    """Refer to an array of the HDF5 file."""
+    """Add a reference to an array of the HDF5 file `name` to an XDMF element."""
     kind, size = ("Int", "4") if array.dtype.kind == "i" else ("Float", "4")
     shape = " ".join(map(str, array.shape))
     item = SubElement(parent, "DataItem", Dimensions=shape, NumberType=kind, Precision=size, Format="HDF")
