@@ -59,12 +59,12 @@ class Inspection:
         Distance from the tumour to the nearest cortex.
     opening
         Position of the craniotomy's centre (RAS).
-        place
-            Description of the craniotomy's position in words.
-        distance
-            Distance from the centre of the craniotomy to the tumour.
-        voxel
-            Edge lengths of a voxel; the longest edge bounds the error of the other lengths.
+    place
+        Description of the craniotomy's position in words.
+    distance
+        Distance from the centre of the craniotomy to the tumour.
+    voxel
+        Edge lengths of a voxel; the longest edge bounds the error of the other lengths.
     axes, mirrored
         Directions of the file's axes, as three letters (R or L, A or P, S or I); True if the axes are left-handed.
     warnings

@@ -193,7 +193,7 @@ def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.n
 
 
 def _rasterise_points(view: InspectionView, points: np.ndarray, inward: np.ndarray, cell: float) -> np.ndarray:
-    """Return the index (SIDE, SIDE) of the nearest of `points` in each pixel, or -1; points are squares of `cell` [m]."""
+    """Return the index (SIDE, SIDE) of the nearest point (n, 3) in each pixel, or -1; a point is `cell` [m] wide."""
     off, scale = points - view.middle, 0.5 * SIDE / view.reach
     half = int(np.ceil(0.5 * cell * scale))
     order = np.argsort(-(off @ inward), kind="stable")  # the nearest point is painted last

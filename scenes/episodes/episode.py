@@ -267,7 +267,7 @@ def to_nan(value: float | None) -> float:
 
 
 def collect_causes(loads: Loads) -> dict[str, np.ndarray]:
-    """Return the values of each cause of one load case, by name."""
+    """Return the values of all loads of one load case, by name."""
     found: dict[str, np.ndarray] = {}
     for cause in loads.causes:
         match cause:

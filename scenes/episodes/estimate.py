@@ -34,10 +34,10 @@ class RunEstimate:
     ----------
     episodes, bodies
         Requested numbers of episodes and bodies.
-        measured, measured_bodies
-            Numbers of measured episodes and bodies on which the estimate is based.
-        seconds, frames, bytes
-            Totals of all episodes and bodies: computing time of a single process [s], number of frames, and size.
+    measured, measured_bodies
+        Numbers of measured episodes and bodies on which the estimate is based.
+    seconds, frames, bytes
+        Totals of all episodes and bodies: computing time of a single process [s], number of frames, and size.
     start, opening
         Extra time [s] of a process's first episode, for loading and compiling, and of its first episode on each
         further body. NaN: not available.

@@ -29,7 +29,7 @@ class FamilyMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pushing(FamilyMotion, frozen=True):
-    """Base of families in which a ball pushes with a force; `spread`: distance from the craniotomy's centre (0 to 1)."""
+    """Base of families in which a ball pushes with a force; `spread` (0 to 1): distance from the centre."""
 
     force_n: Annotated[Number, ValueLimits(0.01, 2, "N")] = (0.05, 0.35)
     radius_mm: Annotated[Number, ValueLimits(1, 15, "mm")] = (5.0, 7.5)

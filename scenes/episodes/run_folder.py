@@ -1,7 +1,7 @@
-"""State of a run on disk: its settings, finished and failed episodes.
+"""State of a run on disk: settings, finished and failed episodes.
 
 The folder is the only state: an episode is complete if its file exists, because files are written atomically.
-Processes that work in the folder do not communicate. Two that make the same episode write the same bytes.
+Processes that work in the folder do not communicate. Processes that make the same episode write the same bytes.
 """
 
 import json
@@ -20,22 +20,22 @@ from sim.runtime.versions import get_version
 
 FORMAT = "sulcus run 1"  # Name and version of the folder format.
 PLAN, RUN, FAILED, BODIES, RATES = "plan.toml", "run.json", "failed", "bodies", "rates"
-"""Names of files and folders other than the episodes."""
+"""Names of the files and folders of a run other than the episodes."""
 EPISODE = re.compile(r"episode_(\d{6,})\.(?:h5|json)")  # Pattern of an episode's file name.
 PACKAGES = ("h5py", "numpy", "scipy", "sulcus", "warp-lang")
-"""Packages whose version is part of an episode's bytes."""
+"""Packages whose versions influence the bytes of an episode."""
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """Settings of a run: everything that determines the bytes of an episode, except its number.
+    """Settings of a run, which together with an episode's number determine the episode's bytes.
 
     Parameters
     ----------
     plan, digest
-        Name of the plan, and the digest of its text.
+        Name of the plan, and digest of its text and custom anatomies.
     device
-        "cpu" or "cuda": solutions of the two differ in the last digits.
+        "cpu" or "cuda", whose solutions differ in the last digits.
     versions
         Versions of the packages in `PACKAGES`.
     """
@@ -49,7 +49,7 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class Failure:
-    """Failed episode and the reason; `lost` if the next run tries again."""
+    """Failed episode with the reason; `lost` is True if the next run makes another attempt."""
 
     number: int
     reason: str
@@ -58,31 +58,31 @@ class Failure:
 
 @cache
 def get_versions() -> Mapping[str, str]:
-    """Return the versions of this process's packages."""
+    """Return the versions of the `PACKAGES` in this process, by name."""
     return {name: get_version(name) for name in PACKAGES}
 
 
 def to_episode_name(number: int) -> str:
-    """Return the name of an episode's file."""
+    """Return the file name of episode `number`."""
     return f"episode_{number:06d}.h5"
 
 
 def begin_run(folder: Path, run: RunSettings, plan_text: str, force: bool = False) -> bool:
-    """Initialise the folder of a run, or open it; return True if it is new.
+    """Initialise the folder of a run, or check an existing folder; return True if the folder is new.
 
-    Unfinished files of dead processes are removed; those of an unfinished body stay, to be resumed.
+    Partial files of ended processes are removed, except those of unfinished bodies, which can be resumed.
 
     Parameters
     ----------
     plan_text
-        Text of the plan, as stored next to the episodes.
+        Text of the plan, which is stored next to the episodes.
     force
-        True to accept a folder with other files, or of other versions.
+        True to accept a folder with other files, or with episodes of other package versions.
 
     Raises
     ------
     InputError
-        A folder of another plan, seed or device; without `force`, of other versions, or with files but no run.
+        The folder has another plan, seed or device; or, unless `force`, other versions, or files but no run.
     """
     for inner in (folder, folder / FAILED, folder / RATES):
         remove_partial_files(inner)
@@ -107,12 +107,12 @@ def begin_run(folder: Path, run: RunSettings, plan_text: str, force: bool = Fals
 
 
 def read_run(folder: Path) -> RunSettings | None:
-    """Read the settings of the run of a folder, if it has one.
+    """Read the settings of the run in a folder; None if there is no run.
 
     Raises
     ------
     InputError
-        A file of this name that no run wrote.
+        A file of this name was not written by a run, or cannot be read.
     """
     path = folder / RUN
     try:
@@ -129,34 +129,34 @@ def read_run(folder: Path) -> RunSettings | None:
 
 
 def list_finished(folder: Path) -> set[int]:
-    """List the numbers of the finished episodes."""
+    """Return the numbers of the finished episodes in a folder."""
     return {number for number, ending in _find_episodes(folder) if ending == ".h5"}
 
 
 def list_failures(folder: Path) -> dict[int, Failure]:
-    """Return the failed episodes, by number."""
+    """Read the failures in a folder, by episode number."""
     return {number: one for number in list_failed(folder) if (one := read_failure(folder, number)) is not None}
 
 
 def list_failed(folder: Path) -> set[int]:
-    """List the numbers of the failed episodes; no file is read."""
+    """Return the numbers of the failed episodes in a folder, from file names only."""
     return {number for number, _ in _find_episodes(folder / FAILED)}
 
 
 def read_failure(folder: Path, number: int) -> Failure | None:
-    """Read the reason why an episode failed; None if the episode exists, or if the reason cannot be read."""
+    """Read the recorded failure of episode `number`; None if no failure is recorded or readable."""
     with suppress(OSError, ValueError, TypeError):  # another client is removing it
         return Failure(**json.loads(_to_failed_path(folder, number).read_text()))
     return None
 
 
 def mark_failed(folder: Path, failure: Failure) -> None:
-    """Record the failure of an episode."""
+    """Record the failure of an episode in the folder of the run."""
     _write_json(_to_failed_path(folder, failure.number), asdict(failure))
 
 
 def remove_failure(folder: Path, number: int) -> None:
-    """Remove the failure of an episode that was completed later."""
+    """Remove the recorded failure of an episode that was completed later."""
     _to_failed_path(folder, number).unlink(missing_ok=True)
 
 
@@ -165,7 +165,7 @@ def _to_failed_path(folder: Path, number: int) -> Path:
 
 
 def _find_episodes(folder: Path) -> Iterator[tuple[int, str]]:
-    """Find numbers and endings of a folder's episodes, from file names alone: there may be a million."""
+    """Yield numbers and file endings of the episodes in a folder, from file names only, as there may be a million."""
     with suppress(FileNotFoundError), os.scandir(folder) as entries:
         for entry in entries:
             found = EPISODE.fullmatch(entry.name)
@@ -211,6 +211,6 @@ def _check_same_run(folder: Path, found: RunSettings, run: RunSettings, force: b
 
 
 def describe_other_versions(others: Mapping[str, str], own: Mapping[str, str]) -> str:
-    """Describe the packages of other versions; empty if there are none."""
+    """Describe the packages whose versions differ; empty if all versions agree."""
     names = [name for name in sorted({*others, *own}) if others.get(name) != own.get(name)]
     return ", ".join(f"{name} {others.get(name, 'none')} and not {own.get(name, 'none')}" for name in names)

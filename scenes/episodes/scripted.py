@@ -1,4 +1,4 @@
-"""Episodes of a plan: sampled from the seed and the episode's number alone, and converted to scenes."""
+"""Sampling of a plan's episodes from the seed and the episode number only, and conversion to scenes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -32,11 +32,11 @@ class EpisodeSample:
     Parameters
     ----------
     body
-        Number of its body.
+        Number of the body on which the episode is played.
     family
-        Family of its motion, by name.
+        Name of the family of the tool motion.
     values
-        All numbers and words by their names in the plan.
+        All sampled numbers and words, by their names in the plan.
     """
 
     body: int
@@ -44,18 +44,18 @@ class EpisodeSample:
     values: Mapping[str, Any]
 
     def group(self, table: str) -> dict[str, Any]:
-        """Return the values of one table of the plan."""
+        """Return the values of one table of the plan, by name within the table."""
         head = f"{table}."
         return {name.removeprefix(head): value for name, value in self.values.items() if name.startswith(head)}
 
 
 def sample_body_number(contents: PlanContents, seed: int, number: int) -> int:
-    """Return the number of the body that an episode is played on."""
+    """Sample the number of the body on which episode `number` is played."""
     return int(build_generator(seed, number, "body").integers(contents.bodies.count))
 
 
 def sample_episode(contents: PlanContents, seed: int, number: int) -> EpisodeSample:
-    """Sample the values of an episode from seed and episode number alone; each name has its own random numbers."""
+    """Sample the values of episode `number` from the seed; each name has its own independent random generator."""
     named = contents.motion.named
     weights = np.array([motion.weight for motion in named.values()])
     family = list(named)[int(build_generator(seed, number, "family").choice(len(named), p=weights / weights.sum()))]
@@ -77,7 +77,7 @@ def build_scene(
     Raises
     ------
     InputError
-        An impossible scene: a tumour of too few tetrahedra for its shares, a lens that folds the image.
+        The scene is impossible, for example due to too few tetrahedra in the tumour, or a lens that folds the image.
     """
     contents, seconds = plan.contents, sample.values["seconds"]
     chance = ScenarioInputs(
@@ -101,7 +101,7 @@ def build_scene(
 
 
 def make_relaxing(tissue: Elasticity) -> Elasticity:
-    """Return the tissues with viscoelastic relaxation."""
+    """Return the tissue with all regions relaxing by the Prony series `PRONY`."""
 
     def relaxed(each: object) -> Any:
         return replace(cast(Any, each), prony=PRONY)
@@ -111,7 +111,7 @@ def make_relaxing(tissue: Elasticity) -> Elasticity:
 
 
 def _build_viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
-    """Return the camera of an episode."""
+    """Build the viewpoint of an episode from the sampled values of the table `look`."""
     random = build_generator(seed, number, "look.camera")
     width, height = contents.size
     path = None if look["path"] == FIXED else PATHS[look["path"]](int(random.integers(2**31)))
@@ -135,7 +135,7 @@ def _build_viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int,
 
 
 def _build_appearance(look: Mapping[str, Any], site: CraniotomyFrame, seed: int, number: int) -> Appearance:
-    """Return light, colour and occluders of an episode."""
+    """Build light, colour and occluders of an episode from the sampled values of the table `look`."""
     random = build_generator(seed, number, "look.covers")
     vessels = int(random.integers(2**31)) if random.random() < look["vessels"] else None
     tint = 1.0 - look["tint"] * MAX_TINTS * random.random(3)

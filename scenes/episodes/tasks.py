@@ -1,4 +1,4 @@
-"""Tasks of a worker: one body or one episode, and their outcome."""
+"""Tasks of a worker, which make one body or one episode, and their outcomes."""
 
 import errno
 import os
@@ -15,19 +15,19 @@ from sim.runtime.threads import limit_to_one_thread
 from .run_folder import RunSettings, describe_other_versions, get_versions, read_run
 
 DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
-"""Errors that would occur in every other episode, too."""
+"""Error numbers of a full or read-only disk, which would occur in all other episodes too."""
 FIRST = FIRST_OF_PROCESS, FIRST_OF_BODY, NOT_FIRST = "process", "body", "no"
-"""Values of `first`: first task of its kind by a process; first on its body by a process; neither."""
+"""Values of `first`: first task of its kind in a process, first task on a body in a process, or neither."""
 
 
 @dataclass(frozen=True)
 class MadeEpisode:
-    """Outcome of making an episode or a body.
+    """Result of making an episode or a body.
 
     Parameters
     ----------
     path
-        Path of the file or folder.
+        Path of the episode's file or the body's folder.
     frames, bytes
         Number of frames, and size [bytes].
     failed
@@ -35,7 +35,7 @@ class MadeEpisode:
     skipped
         True if the result existed before.
     resumed
-        True if a part of it existed before.
+        True if a part of the result existed before.
     """
 
     path: Path
@@ -48,14 +48,14 @@ class MadeEpisode:
 
 @dataclass(frozen=True)
 class RunWork:
-    """Functions that make bodies and episodes: module-level (or partials), so that workers can import them.
+    """Functions that make bodies and episodes; workers must be able to import them (module-level or partial).
 
     Parameters
     ----------
     body_of
-        Function from an episode's number to that of its body.
+        Function from an episode's number to the number of its body.
     make_body, make_episode
-        Functions that make the item of a number, or find the existing one.
+        Functions that make the body or the episode of a number, unless it exists.
     """
 
     body_of: Callable[[int], int]
@@ -98,7 +98,7 @@ class TaskOutcome:
 
 
 class _Process:
-    """State of this process: what it has made, and whether its GPU has failed, so that its results are unreliable."""
+    """State of this process: tasks made here, and True in `spoilt` after a GPU error, which may spoil results."""
 
     made: ClassVar[set[object]] = set()
     spoilt = False
@@ -107,13 +107,13 @@ class _Process:
 def try_task(
     make: Callable[[int], MadeEpisode], number: int, folder: Path, run: RunSettings, body: TaskOutcome | None = None
 ) -> TaskOutcome:
-    """Make item `number`, if the worker can access the run's folder and has the run's versions.
+    """Make item `number` with `make`, if the worker has access to the run's folder and the run's versions.
 
     Raises
     ------
     Exception
-        See `make`; another attempt may succeed. On a GPU, errors not caused by the input make the process
-        unusable: it ends itself at its next task.
+        Any exception of `make`; another attempt may succeed. After an exception on a GPU other than InputError and
+        OSError, the process is unusable, and ends at its next task.
     """
     if _Process.spoilt:
         os._exit(1)
@@ -142,7 +142,7 @@ def try_task(
 
 
 def _explain_unfit_worker(folder: Path, run: RunSettings) -> str:
-    """Return the reason why this worker cannot take part in the run; empty if it can."""
+    """Return the reason why this worker cannot work for the run; empty if it can."""
     here = platform.node()
     other = describe_other_versions(get_versions(), run.versions)
     if other:

@@ -1,6 +1,6 @@
-"""Workers that make episodes: processes of this machine, or those of a running scheduler.
+"""Workers that make episodes: processes of this machine, or workers of a running Dask scheduler.
 
-Dask's own nanny gives up on a worker that is killed while it starts.
+Processes are started here because Dask's nanny does not restart a worker that is killed during its start.
 """
 
 import asyncio
@@ -21,20 +21,20 @@ from sim.errors import InputError
 from sim.runtime.processes import build_gpu_environment, start_process
 
 LOCAL_HOST = "127.0.0.1"
-"""Address of the scheduler and workers: not reachable from outside this machine."""
+"""Address of local scheduler and workers, which is not reachable from other machines."""
 GPU_RESOURCE = "GPU"
-"""Resource of a worker with its own GPU, by Dask's convention."""
+"""Name of the resource of a worker with its own GPU, by Dask's convention."""
 ONE_THREAD_VARIABLES = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""One thread per process: as many processes as cores, and reproducible sums."""
+"""Environment variables that limit a process to one thread, because there are as many processes as cores."""
 MAX_WORKER_DEATHS = 20
-"""Number of lost workers after which a task is given up: machines may be taken back at any time."""
+"""Number of lost workers after which a task fails; it is large because machines may be withdrawn at any time."""
 SETTINGS = {  # Settings of Dask.
     "distributed.scheduler.allowed-failures": MAX_WORKER_DEATHS,
     "distributed.scheduler.worker-ttl": None,  # clocks jump, as after sleep; ended processes are detected
     "distributed.scheduler.http.routes": [],  # HTTP services need no keys
 }
 SCHEDULER_TIMEOUT = 10.0
-"""Time-out of a scheduler [s]."""
+"""Time-out of the connection to a scheduler [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +48,14 @@ class _Started:
 def start_processes(
     address: str, security: Security, devices: Sequence[str], max_starts: int
 ) -> Iterator[Callable[[], None]]:
-    """Start workers of the scheduler at an address, one for each device, killed at the end; yield a restart function.
+    """Start a worker of the scheduler at `address` for each device; yield a function that restarts ended workers.
 
-    Call it regularly: it restarts workers that ended.
+    The function must be called regularly. The workers are killed at the end of the block.
 
     Raises
     ------
     InputError
-        In the restart function: a process ended `max_starts` times in a row without a connection.
+        From the yielded function, if a process ended `max_starts` times in a row before it was connected.
     """
     crew = [_start(address, security, device, 1) for device in devices]
 
@@ -83,7 +83,7 @@ def start_processes(
 
 
 def silence_dask() -> None:
-    """Silence Dask's own notes: relevant ones are reported in our messages."""
+    """Suppress log messages of Dask, because relevant events are reported in messages of sulcus."""
     for name in ("distributed", "tornado"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
@@ -128,7 +128,7 @@ async def _work(address: str, security: Security, resources: dict[str, float] | 
 
 @dataclass(frozen=True, eq=False)
 class Workers:
-    """Processes that make episodes.
+    """Workers that make episodes, with the connection to their scheduler.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class Workers:
     device
         "cpu" or "cuda".
     description
-        Description of the machines.
+        Description of the workers for messages.
     restart
         Function that restarts ended processes.
     """
@@ -149,7 +149,7 @@ class Workers:
 
     @property
     def needs(self) -> dict[str, int] | None:
-        """Resources that a task requires of a worker."""
+        """Dask resources that a task requires of a worker; None on the CPU."""
         return {GPU_RESOURCE: 1} if self.device == "cuda" else None
 
     def count(self) -> int:
@@ -158,7 +158,7 @@ class Workers:
         Raises
         ------
         InputError
-            A scheduler that ended; processes that end as soon as they are started.
+            The scheduler ended, or a process ends repeatedly right after its start.
         """
         self.restart()
         if self.client.status != "running":
@@ -174,18 +174,18 @@ class Workers:
 def start_local_workers(
     devices: Sequence[str], settings: Mapping[str, object] | None = None, max_starts: int = 10
 ) -> Iterator[Workers]:
-    """Yield processes of this machine, one for each name in `devices`, each with the GPU in its name.
+    """Yield workers in processes of this machine, one for each name in `devices`; a process uses only its own GPU.
 
-    They are spawned, restarted if they end, and killed when the block or this process ends. A scheduler and its
-    workers execute the code of any client: TLS keys that exist only in the memory of these processes exclude other
-    users of the machine.
+    Processes are spawned, restarted if they end, and killed at the end of the block or of this process. Since a
+    scheduler and its workers execute code of any client, TLS keys, which exist only in the memory of these processes,
+    exclude other users of the machine.
 
     Parameters
     ----------
     devices
-        Devices, such as "cpu" or "cuda:1"; all of one kind.
+        Names of devices of one kind, such as "cpu" or "cuda:1".
     settings
-        Settings of Dask, in addition to `SETTINGS`.
+        Dask settings in addition to `SETTINGS`.
     max_starts
         Maximum number of consecutive crashes of a process before its first task is done.
     """
@@ -206,19 +206,19 @@ def start_local_workers(
 
 @contextmanager
 def connect_workers(address: str, device: str, timeout: float = SCHEDULER_TIMEOUT) -> Iterator[Workers]:
-    """Yield the workers of a running scheduler; their number may change.
+    """Yield the workers of a running Dask scheduler; the number of workers may change.
 
     Parameters
     ----------
     device
-        "cpu", "cuda", or "auto": cuda if one of the workers has a GPU.
+        "cpu", "cuda", or "auto" ("cuda" if any worker has a GPU).
     timeout
         Time-out of the scheduler [s].
 
     Raises
     ------
     InputError
-        A scheduler that cannot be reached.
+        The scheduler cannot be reached.
     """
     silence_dask()
     try:
@@ -237,7 +237,7 @@ def connect_workers(address: str, device: str, timeout: float = SCHEDULER_TIMEOU
 
 @contextmanager
 def _restore_environment() -> Iterator[None]:
-    """Restore the environment variables that Dask sets, at the end of the block."""
+    """Restore all environment variables at the end of the block, because Dask changes some variables."""
     before = dict(os.environ)
     try:
         yield
@@ -247,5 +247,5 @@ def _restore_environment() -> Iterator[None]:
 
 
 def describe_scheduler_end(workers: str) -> InputError:
-    """Return the error of a lost scheduler."""
+    """Build the error for a scheduler that ended; `workers` describes its workers."""
     return InputError(f"{workers}: their scheduler ended. Results are kept; run the same command again to resume.")

@@ -1,4 +1,4 @@
-"""Surgical tasks as Gymnasium environments, registered by the import of this package; needs the extra `gym`."""
+"""Surgical tasks as Gymnasium environments, which the import of this package registers; needs the extra `gym`."""
 
 from .registration import register_environments
 

@@ -1,4 +1,4 @@
-"""Environments of a task for Gymnasium: single and vectorised."""
+"""Gymnasium environments of the tasks: a single and a vectorised environment."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,18 +24,18 @@ from .tissue_requests import TissueRequest
 
 RENDER_MODES = ("rgb_array",)  # Supported render modes.
 METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": round(1.0 / STEP_SECONDS)}
-"""Render modes, as Gymnasium requires."""
+"""Metadata that Gymnasium requires: render modes and frame rate."""
 
 
 def open_environment_setting(
     task: str, observation: str, render_mode: str | None, settings: Mapping[str, Any], together: bool | None = None
 ) -> TaskSetting:
-    """Open the setting of environments; anatomy, physics, device, size and model are `settings`, see `open_setting`.
+    """Open the shared setting of environments; `settings` contains the arguments `ARGUMENTS` of `open_setting`.
 
     Raises
     ------
     InputError
-        See `open_setting`; an unknown task, observation or render mode.
+        See `open_setting`; also if the task, the observation or the render mode is unknown.
     """
     if observation not in KINDS:
         raise InputError(f"observation is {observation!r:.80}: choose one of {', '.join(KINDS)}.")
@@ -54,7 +54,7 @@ class Operation(gymnasium.Env):
     anatomy, physics, device, size, model
         See `open_setting`.
     observation
-        "states", or "rgbd": with images.
+        "states", or "rgbd" (states and images).
     render_mode
         "rgb_array", or None.
 
@@ -85,12 +85,12 @@ class Operation(gymnasium.Env):
         self.episode, self.pictures = Episode(self.setting), ObservationCamera(self.setting)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode: return observation and ground truth; no `options` are supported.
+        """Begin an episode; return observation and ground truth. There are no `options`.
 
         Raises
         ------
         InputError
-            Options.
+            `options` are given.
         """
         super().reset(seed=seed)
         if options:
@@ -100,12 +100,12 @@ class Operation(gymnasium.Env):
         return self._build_observation(step), step.info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Move the tool: return observation, reward, True if the goal or a limit was reached, False, and ground truth.
+        """Move the tool; return observation, reward, True at a goal or limit, False (never truncated), ground truth.
 
         Raises
         ------
         InputError
-            See `Episode.ask`.
+            See `Episode.request_step`.
         """
         (touched,) = self.setting.tissue_model.compute_responses([self.episode.request_step(action)])
         step = self.episode.end_step(touched)
@@ -131,7 +131,7 @@ class Operation(gymnasium.Env):
 class Operations(VectorEnv):
     """Vectorised environments: `gymnasium.make_vec("sulcus/Palpate-v0", num_envs=64)`.
 
-    After the end of an episode, the environment's next step ignores the action, begins an episode and has reward 0.
+    The first step after the end of an episode ignores the action, begins an episode, and has the reward 0.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class Operations(VectorEnv):
     Raises
     ------
     InputError
-        See `Operation`; a number of environments or steps below 1.
+        See `Operation`; also if the number of environments or of steps is < 1.
     """
 
     metadata = METADATA | {"autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -182,12 +182,12 @@ class Operations(VectorEnv):
     def reset(
         self, *, seed: int | np.integer | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin all episodes; environment i has seed s + i for a seed s. No `options` are supported.
+        """Begin the episodes of all environments; for a single seed s, environment i has the seed s + i.
 
         Raises
         ------
         InputError
-            Options; another number of seeds than environments.
+            `options` are given, or the number of seeds is not the number of environments.
         """
         if options:
             raise InputError(f"options are {options!r:.80}: there are none; give them to gymnasium.make_vec.")
@@ -202,12 +202,12 @@ class Operations(VectorEnv):
         return self._build_observation(steps), self._stack_infos(steps)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Move all tools: as `Operation.step`, a row for each environment.
+        """Move the tools of all environments; return the results of `Operation.step` with a row per environment.
 
         Raises
         ------
         InputError
-            Actions of another shape than (num_envs, 6), or not finite; no call of `reset` before.
+            Actions do not have the shape (num_envs, 6) or are not finite, or `reset` was not called.
         """
         twists = np.array(actions, np.float64)
         if twists.shape != (self.num_envs, 6):
@@ -227,7 +227,7 @@ class Operations(VectorEnv):
         return self._build_observation(steps), rewards, terminated, truncated, self._stack_infos(steps)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Return the image (H, W, 3) uint8 of each camera; None without a render mode."""
+        """Return the camera image (H, W, 3) uint8 of each environment; None without a render mode."""
         if self.render_mode is None:
             return None
         return tuple(self.pictures.render([episode.view for episode in self.episodes])[0])
@@ -244,19 +244,19 @@ class Operations(VectorEnv):
         return {"rgb": colour, "depth": depth, "states": states}
 
     def _stack_infos(self, steps: Sequence[EpisodeStep]) -> dict[str, Any]:
-        """Return the ground truth as arrays, a row per environment, with Gymnasium's masks: True for all."""
+        """Return the ground truth as arrays with a row per environment, and Gymnasium's masks, which are all True."""
         infos = {name: np.stack([step.info[name] for step in steps]) for name in steps[0].info}
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 
 
 def make_many(task: str, count: int, processes: bool = False, **given: Any) -> VectorEnv:
-    """Make `count` environments of a task, like `gymnasium.make_vec`.
+    """Make `count` environments of a task by `gymnasium.make_vec`.
 
     Parameters
     ----------
     processes
-        True for one process per environment. Processes are spawned, because a process that uses a GPU cannot be
-        forked: a script that uses them needs `if __name__ == "__main__":`.
+        True for one process per environment. Since processes are spawned (a process that uses a GPU cannot be forked),
+        the script needs `if __name__ == "__main__":`.
     given
         Other arguments of `Operation`.
 

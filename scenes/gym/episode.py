@@ -1,4 +1,4 @@
-"""Episode of one environment: goal, tool, reached amount and reward."""
+"""Episodes of one environment: goal, tool motion, score and reward."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -39,18 +39,18 @@ DRAIN_STEPS = 60  # Number of steps in which the fluid level falls.
 
 @dataclass(frozen=True)
 class EpisodeScore:
-    """Distance of an episode from its goal.
+    """Score of a state of an episode: distances from the goal, and load.
 
     Parameters
     ----------
     distance
-        Distance of the tool from its place [m].
+        Distance of the tool from its target position [m].
     amount_error
-        Difference between the reached and the requested amount, relative to the latter.
+        Difference between reached and requested amount, relative to the requested amount.
     cut_shares
-        Shares of the tumour that are cut.
+        Number of resected parts of the tumour.
     load_ratio
-        The force, or the pressure, as a share of its limit: the greater of both.
+        Maximum of force and pressure, each relative to its limit.
     """
 
     distance: float
@@ -60,13 +60,13 @@ class EpisodeScore:
 
     @property
     def potential(self) -> float:
-        """Potential whose differences are rewarded."""
+        """Potential of the state; its increase in a step is a part of the reward."""
         away = min(self.distance, REWARD.max_potential_distance) / REWARD.potential_length
         return REWARD.share_reward * self.cut_shares - away - min(self.amount_error, 1.0)
 
 
 def compute_reward(previous: EpisodeScore, current: EpisodeScore, success: bool, is_aborted: bool) -> float:
-    """Return the reward of a step from one state to the next; `is_aborted`: True if the episode ends at a limit."""
+    """Return the reward of a step between two scores; `is_aborted` is True if the episode ends at a limit."""
     reward = current.potential - previous.potential - REWARD.step_penalty
     if current.load_ratio > 1.0:
         reward -= REWARD.limit_penalty
@@ -75,7 +75,7 @@ def compute_reward(previous: EpisodeScore, current: EpisodeScore, success: bool,
 
 @dataclass(frozen=True, eq=False)
 class EpisodeStep:
-    """Result of a step: state (24,), reward, end of the episode, and ground truth."""
+    """Result of a step: state (24,), reward, True at the end of the episode, and ground truth by name."""
 
     states: np.ndarray
     reward: float
@@ -85,7 +85,7 @@ class EpisodeStep:
 
 @dataclass(frozen=True, eq=False)
 class ResetSample:
-    """Random values of an episode: goal, initial pose, seed and size of the tremor [m]."""
+    """Random values of an episode: goal, initial pose of the tool, seed and standard deviation [m] of the tremor."""
 
     goal: Goal
     hand: RobotTool
@@ -106,12 +106,12 @@ def sample_reset(setting: TaskSetting, random: np.random.Generator) -> ResetSamp
 
 
 class Episode:
-    """Successive episodes of an environment: call `begin` first, then `ask` for each step, and `take` after each call.
+    """Successive episodes of an environment. Call `begin` or `request_step`, and then `end_step` with the response.
 
     Parameters
     ----------
     setting
-        Task and body.
+        Task on a body.
     """
 
     def __init__(self, setting: TaskSetting):
@@ -121,7 +121,7 @@ class Episode:
         self.over = True
 
     def begin(self, random: np.random.Generator) -> TissueRequest:
-        """Sample an episode and return its first request to the tissue model."""
+        """Sample a new episode, and return its first request to the tissue model."""
         self.random, self.drawn = random, sample_reset(self.setting, random)
         self.hand, self.touched, self.judged = self.drawn.hand, None, None
         self.step, self.held, self.violations, self.cut, self.over = 0, 0, 0, 0, False
@@ -129,12 +129,12 @@ class Episode:
         return self._build_request(self.drawn)
 
     def request_step(self, action: np.ndarray) -> TissueRequest:
-        """Move the tool; return the next request to the tissue model.
+        """Move the tool by an action (6,), and return the next request to the tissue model.
 
         Raises
         ------
         InputError
-            An action that is not six finite numbers; an episode that is over, or did not begin.
+            The action is not six finite numbers, or the episode is over or has not begun.
         """
         if self.over or self.drawn is None:
             raise InputError("this episode is over, or did not begin: call reset().")
@@ -156,12 +156,12 @@ class Episode:
 
     @property
     def completed_steps(self) -> int:
-        """Number of completed resection steps: the corridor is cut before an episode begins."""
+        """Number of completed resection steps; the corridor is already resected when an episode begins."""
         return self.cut + 1 if self.setting.task.resects else 0
 
     @property
     def view(self) -> Seen:
-        """View of the episode for images.
+        """State of the episode for rendering.
 
         Raises
         ------
@@ -173,7 +173,7 @@ class Episode:
         return self.touched, self.actual.compute_pose(self.setting.task.tool), self.shown
 
     def end_step(self, response: Response) -> EpisodeStep:
-        """Return the result of a step from the tissue's response."""
+        """Complete a step with the response of the tissue model, and return the result."""
         assert self.drawn is not None
         task, goal, self.shown = self.setting.task, self.drawn.goal, self.completed_steps
         target = self._compute_target(response)
@@ -195,18 +195,18 @@ class Episode:
         )
 
     def _compute_target(self, touched: Response) -> np.ndarray:
-        """Compute the target position of the tool (3,) [m]: the goal, or the deformed position of the next share."""
+        """Compute the target (3,) [m] of the tool: the goal, or the deformed position of the next part to resect."""
         planned = self._compute_planned_target()
         return planned if self.next_share is None else planned + touched.motion[self.next_share].mean(axis=0)
 
     @property
     def next_share(self) -> np.ndarray | None:
-        """Vertices of the next share of the tumour to be cut, or of the last share; None if the task cuts nothing."""
+        """Vertices of the next part of the tumour to resect, or of the last part; None if the task resects nothing."""
         shares = self.setting.resection_shares
         return shares[min(self.cut, len(shares) - 1)] if shares else None
 
     def _compute_planned_target(self) -> np.ndarray:
-        """Compute the target position of the tool in the scan (3,) [m]."""
+        """Compute the target position (3,) [m] of the tool in the undeformed scan."""
         assert self.drawn is not None
         nodes = self.setting.site.anatomy.mesh.nodes
         return self.drawn.goal.position if self.next_share is None else nodes[self.next_share].mean(axis=0)
@@ -225,7 +225,7 @@ class Episode:
         return EpisodeScore(away, abs(self._compute_reached(touched) - goal.amount) / goal.amount, 0, load)
 
     def _compute_reached(self, touched: Response) -> float:
-        """Return the force [N], the shift [m], or the shares cut, which are compared with the goal's amount."""
+        """Return the reached amount, which the goal prescribes: force [N], shift [m], or number of resected parts."""
         assert self.drawn is not None
         if self.setting.task.resects:
             return float(self.cut)
@@ -247,7 +247,7 @@ class Episode:
         return compute_states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
 
     def _collect_truth(self, touched: Response, target: np.ndarray, success: bool) -> dict[str, Any]:
-        """Return ground truth that is not observed (see the docs). Arrays are new in each step."""
+        """Return the ground truth, which is not observed, by name (see docs/gym.md). Arrays are new in each step."""
         assert self.judged is not None and self.drawn is not None
         setting = self.setting
         tumour = setting.site.anatomy.tumour_nodes

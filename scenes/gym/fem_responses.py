@@ -1,4 +1,4 @@
-"""FEM response to a moved tool, and to drainage and resection of the brain."""
+"""FEM response of the tissue to a tool with prescribed pose, and to drainage and resection."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -23,16 +23,16 @@ from .tissue_requests import Response, TissueRequest
 
 @dataclass(frozen=True, eq=False)
 class PosedFem:
-    """FEM in contact with a rigid tool.
+    """FEM model of the contact with a rigid tool.
 
-    The pressure under a ball is Hertz's at its force; under a blade it is the maximum of `sim.compute_pressure`.
+    The pressure under a ball follows from its force by `Hertz`; under a blade it is the maximum of `compute_pressure`.
 
     Parameters
     ----------
     fem
         FEM with `ToolContact` of the tool.
     ball
-        Hertz model of the tool, if the tool is a ball.
+        Hertz model of the tool; None if the tool is not a ball.
     batched
         True if all environments are solved in one batch.
     """
@@ -42,7 +42,7 @@ class PosedFem:
     batched: bool = False
 
     def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
-        """Solve as `TissueModel.compute_responses`; environments at the start of an episode form a separate batch."""
+        """Solve requests, see `TissueModel.compute_responses`; requests at an episode's start form a separate batch."""
         found: dict[int, Response] = {}
         begin = [row for row, each in enumerate(requests) if each.previous is None]
         going = [row for row, each in enumerate(requests) if each.previous is not None]
@@ -77,7 +77,7 @@ MAX_SURFACE_DISTANCE = 0.03  # Distance from the corridor and the tumour within 
 
 
 class RemainingSurface(NamedTuple):
-    """Surface (S, 3) of the remaining healthy tissue near the tumour; undeformed outward normals (V, 3)."""
+    """Surface triangles (S, 3) of the remaining healthy tissue near the tumour, and outward normals (V, 3)."""
 
     triangles: np.ndarray
     normals: np.ndarray
@@ -85,14 +85,14 @@ class RemainingSurface(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ResectionFem:
-    """FEM under gravity, by fluid level and resection step; each state is solved once.
+    """FEM model under gravity, by CSF level and number of resection steps; each state is solved once.
 
-    Contact of the tool, a ball, with healthy tissue follows `Hertz`. The ball enters the tumour and moves no tissue.
+    The force of the ball on healthy tissue follows `Hertz`. The ball can enter the tumour, and moves no tissue.
 
     Parameters
     ----------
     site
-        The open cortex.
+        Craniotomy of the anatomy.
     fem
         FEM of the resection.
     ball
@@ -106,7 +106,7 @@ class ResectionFem:
     _surfaces: dict[int, RemainingSurface] = field(default_factory=dict)
 
     def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
-        """Solve as `TissueModel.compute_responses`; independent of earlier requests: levels have a fixed order."""
+        """Solve requests, see `TissueModel.compute_responses`; results do not depend on earlier requests."""
         return [self._solve_touch(each) for each in requests]
 
     def _solve_touch(self, asked: TissueRequest) -> Response:
@@ -123,9 +123,9 @@ class ResectionFem:
         return Response(motion, np.arange(len(motion)), force, self.ball.compute_pressure(size), good)
 
     def _solve_level(self, level: int, done: int) -> Deformation:
-        """Return the solution at a fluid level, started from the level above.
+        """Return the solution at a CSF level, whose solve starts from the solution at the level above.
 
-        After several resection steps, it starts from the solution with one step less.
+        After several resection steps, the solve starts from the solution with one step less.
         """
         key = level, done
         if key not in self._solved:
@@ -139,7 +139,7 @@ class ResectionFem:
         return self._solved[key]
 
     def _compute_force(self, pose: np.ndarray, done: int, motion: np.ndarray) -> np.ndarray:
-        """Compute the force (3,) [N] of the ball on healthy tissue."""
+        """Compute the force (3,) [N] of the ball at a pose (4, 4) on healthy tissue."""
         healthy, nodes = self._get_healthy(done), self.site.anatomy.mesh.nodes
         radius = self.ball.radius
         middle = pose[:3, 3] + radius * pose[:3, 2]
@@ -152,7 +152,7 @@ class ResectionFem:
         return -float(self.ball.compute_force(np.array(radius - distance))) * outward
 
     def _get_healthy(self, done: int) -> RemainingSurface:
-        """Return the remaining body after a number of steps."""
+        """Return the surface of the remaining healthy tissue after `done` resection steps."""
         if done not in self._surfaces:
             self._surfaces[done] = self._build_healthy(done)
         return self._surfaces[done]

@@ -1,4 +1,4 @@
-"""Predicted response to a moved tool, by models trained on forces or on tool poses."""
+"""Tissue response to a tool with prescribed pose, predicted by models trained on forces or on tool poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,14 +26,14 @@ MAX_FORCE_RATIO = 1.5  # Largest force in the search, relative to the strongest 
 
 @dataclass(frozen=True)
 class Hertz:
-    """Forces, depths and pressures of a ball without friction.
+    """Hertz contact model of a frictionless ball: forces, depths and pressures.
 
     Parameters
     ----------
     radius
         Radius of the ball [m].
     tissue
-        Tissue of the half space; only its stiffness at small strains is used.
+        Tissue of the half-space, of which only the stiffness at small strain is used.
     """
 
     radius: float
@@ -41,26 +41,26 @@ class Hertz:
 
     @cached_property
     def modulus(self) -> float:
-        """E / (1 - nu^2) [Pa], which is 2 mu / (1 - nu)."""
+        """Plane-strain modulus E' = E / (1 - nu^2) = 2 mu / (1 - nu) [Pa]."""
         mu, lame = self.tissue.lame
         return 2.0 * mu / (1.0 - 0.5 * lame / (lame + mu))
 
     def compute_force(self, depth: np.ndarray) -> np.ndarray:
-        """Return forces [N] at depths [m]: F = 4/3 E' sqrt(r) d^1.5; none above the surface."""
+        """Return forces [N] at depths [m]: F = 4/3 E' sqrt(r) d^1.5; 0 above the surface."""
         return 4.0 / 3.0 * self.modulus * np.sqrt(self.radius) * np.maximum(depth, 0.0) ** 1.5
 
     def compute_contact_radius(self, force: np.ndarray) -> np.ndarray:
-        """Return the radii of contact [m] under forces [N]: a^3 = 3 F r / (4 E')."""
+        """Return the contact radii [m] under forces [N]: a^3 = 3 F r / (4 E')."""
         return np.cbrt(0.75 * force * self.radius / self.modulus)
 
     def compute_pressure(self, force: float) -> float:
-        """Return the pressure [Pa] in the middle of the contact under a force [N]: 3 F / (2 pi a^2)."""
+        """Return the maximum contact pressure [Pa], which is at the centre, under a force [N]: 3 F / (2 pi a^2)."""
         return 1.5 * force / (np.pi * float(self.compute_contact_radius(np.array(force))) ** 2) if force > 0.0 else 0.0
 
     def compute_extra_depth(self, force: np.ndarray, footprint: np.ndarray) -> np.ndarray:
-        """Return the extra depth [m] of the ball's centre compared with a wider footprint (k,) [m] at equal forces.
+        """Return how much deeper (k,) [m] the ball sinks than a wider footprint (k,) [m] under equal forces (k,) [N].
 
-        The middle of a footprint sqrt(1 - (s/a)^2) sinks by 3 F / (4 E' a).
+        The centre of a footprint with pressure proportional to sqrt(1 - (s/a)^2) sinks by 3 F / (4 E' a).
         """
         own = np.where(force > 0.0, self.compute_contact_radius(force), 1.0)
         return 0.75 * force / self.modulus * (1.0 / own - 1.0 / footprint)
@@ -68,16 +68,16 @@ class Hertz:
 
 @dataclass(frozen=True, eq=False)
 class PressedModel:
-    """Search for the force under which the predicted cortex touches the ball.
+    """Model trained on forces, with a search for the force under which the predicted cortex touches the ball.
 
-    The force acts at the point of the undeformed cortex nearest to the ball's centre, away from the centre. The
+    The force acts at the point of the undeformed cortex that is nearest to the ball's centre, away from the centre. The
     footprint has the contact radius of `Hertz`. If the model was trained only on wider footprints, the depth is
-    corrected by the difference of Hertz's formula.
+    corrected by `Hertz.compute_extra_depth`.
 
     Parameters
     ----------
     site
-        The open cortex.
+        Craniotomy of the anatomy.
     model
         Model trained on pushes.
     ball
@@ -96,13 +96,13 @@ class PressedModel:
         return open_patch(self.site.anatomy)
 
     def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
-        """Predict as `TissueModel.compute_responses`."""
+        """Predict responses, see `TissueModel.compute_responses`."""
         poses = np.stack([each.pose for each in requests])
         parts = [poses] if self.batched else np.split(poses, len(poses))
         return [touched for part in parts for touched in self._predict_poses(part)]
 
     def _predict_poses(self, poses: np.ndarray) -> list[Response]:
-        """Predict tools at poses (B, 4, 4) together."""
+        """Predict the responses to tools at poses (B, 4, 4) in one batch."""
         near = to_indentation(Loads((Touching(poses[:, None]),)), Ball(self.ball.radius), self._patch)
         depth = np.linalg.norm(near.force, axis=1)
         inward = np.divide(near.force, depth[:, None], out=np.zeros_like(near.force), where=depth[:, None] > 0.0)
@@ -122,14 +122,14 @@ class PressedModel:
         return answers
 
     def _build_loads(self, point: np.ndarray, inward: np.ndarray, size: np.ndarray) -> Loads:
-        """Build pushes of sizes (k,) [N], each on a footprint of its contact radius, clipped to the training range."""
+        """Build pushes of sizes (k,) [N]; footprints have the contact radius, clipped to the training range."""
         return Loads((Pushed(point, size[:, None] * inward, self._compute_footprint(size)),))
 
     def _compute_footprint(self, size: np.ndarray) -> np.ndarray:
         return np.clip(self.ball.compute_contact_radius(size), *self.model.envelope.footprint)
 
     def _find_forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find forces (k,) [N] at points (k, 3) by the secant method, and whether each reaches its depth (k,) [m]."""
+        """Find forces (k,) [N] at points (k, 3) by the secant method; also return True (k,) if the depth is reached."""
         patch, rows = self._patch, np.arange(len(depth))
         place = find_closest_points(point, patch.points[patch.triangles])
         corners, most = patch.triangles[place.triangle], MAX_FORCE_RATIO * self.model.envelope.force[1]
@@ -155,9 +155,9 @@ class PressedModel:
 
 @dataclass(frozen=True, eq=False)
 class PosedModel:
-    """Prediction of motion, force and bound by a model of tool poses; a blade continues from its last state.
+    """Model trained on tool poses, which predicts motion, force and error bound; a solution starts from the last.
 
-    The pressure under a ball is that of Hertz under its force; under a blade it is the highest of
+    The pressure under a ball follows from its force by `Hertz`; under a blade it is the maximum of
     `compute_tool_pressure`.
 
     Parameters
@@ -165,16 +165,16 @@ class PosedModel:
     model
         Model trained on poses of the tool.
     ball
-        Hertz model of the tool, if the tool is a ball.
+        Hertz model of the tool; None if the tool is not a ball.
     """
 
     model: Learned
     ball: Hertz | None
 
     def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
-        """Predict as `TissueModel.compute_responses`, one by one.
+        """Predict responses one by one, see `TissueModel.compute_responses`.
 
-        If the model rejects a pose, the tissue stays and is marked unreliable.
+        If the model rejects a pose, the response is the previous response, marked as unreliable.
         """
         return [self._predict_pose(each.pose, each.previous) for each in requests]
 

@@ -1,4 +1,4 @@
-"""Observations of a robot: tracked poses, measured forces, the planned goal, and images."""
+"""Observations of the environments: tracked pose, measured force, planned goal, and images."""
 
 import numpy as np
 from gymnasium import spaces
@@ -24,12 +24,12 @@ MAX_DEPTH = 2.0
 
 
 def build_action_space() -> spaces.Box:
-    """Return the space of actions: twists (6,) of a tool."""
+    """Return the space of actions: twists (6,) of a tool in [-1, 1]."""
     return spaces.Box(-1.0, 1.0, (6,), np.float32)
 
 
 def build_observation_space(observation_kind: str, size: tuple[int, int]) -> spaces.Space:
-    """Return the observation space of one of `KINDS`, with images of a width and height [pixel]."""
+    """Return the observation space of a kind in `KINDS`; `size` is the width and height of images [pixel]."""
     states = spaces.Box(-STATE_BOUND, STATE_BOUND, (STATE_SIZE,), np.float32)
     if observation_kind == "states":
         return states
@@ -47,7 +47,7 @@ def compute_states(
     task: GymTask, goal: Goal, robot_tool: RobotTool, readings: np.ndarray, time: float, progress: float,
     axes: np.ndarray, origin: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Compute the state (24,) float32, in the axes (3, 3) of twists, relative to the open cortex's centre (3,) [m].
+    """Compute the state (24,) float32 in the `axes` (3, 3) of twists, relative to the `origin` (3,) [m].
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def compute_states(
     time
         Time since the start of the episode [s].
     progress
-        Completed share of the steps to hold, or of the tissue to cut.
+        Completed share of the steps for which the goal must be kept, or of the parts to resect.
     """
     parts = (
         (robot_tool.position - origin) @ axes / LENGTH_UNIT,

@@ -1,4 +1,4 @@
-"""Images of environments: colour and depth; those of one cavity are rendered together."""
+"""Colour and depth images of environments; images with the same resection cavity are rendered in one batch."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -12,11 +12,11 @@ from .setting import TaskSetting
 from .tissue_requests import Response
 
 Seen = tuple[Response, np.ndarray, int]
-"""Rendered state: the tissue's response, T_world_tool (4, 4), and the number of resection steps done."""
+"""Rendered state: response of the tissue, T_world_tool (4, 4), and number of completed resection steps."""
 
 
 class ObservationCamera:
-    """Renderer of camera images of a setting."""
+    """Renderer of the camera images of a task on a body."""
 
     def __init__(self, setting: TaskSetting):
         self.setting = setting
@@ -28,7 +28,7 @@ class ObservationCamera:
         return self.setting.scene.viewpoint.build_camera(self.setting.site)
 
     def render(self, views: Sequence[Seen]) -> tuple[np.ndarray, np.ndarray]:
-        """Render colours (B, H, W, 3) uint8 and depths (B, H, W) float32 [m], 0 in the background."""
+        """Render states; return colours (B, H, W, 3) uint8 and depths (B, H, W) float32 [m], 0 in the background."""
         shape = len(views), self.camera.height, self.camera.width
         colour, depth = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32)
         for done in sorted({each[2] for each in views}):

@@ -1,4 +1,4 @@
-"""Scripted policy of each task, based on the robot's observations."""
+"""Scripted policies of the tasks, based on observed states."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class PolicySettings:
 
 
 def compute_scripted_actions(task: str, states: np.ndarray, settings: PolicySettings = PolicySettings()) -> np.ndarray:
-    """Return actions (..., 6) float32 for states (..., 24) of a task by name.
+    """Compute the actions (..., 6) float32 of the scripted policy for states (..., 24) of a task, given by name.
 
     Raises
     ------

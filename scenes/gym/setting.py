@@ -1,4 +1,4 @@
-"""Shared data of the environments of one task on one body: the body, its tissue, and possible goals."""
+"""Shared data of all environments of one task on one body: anatomy, tissue model and possible goals."""
 
 import warnings
 from collections.abc import Mapping
@@ -44,12 +44,12 @@ PATCH_RADIUS = 8e-3  # Radius of the patch of cortex whose shift is rewarded [m]
 
 @dataclass(frozen=True, eq=False)
 class TaskSetting:
-    """Task on a body.
+    """Setting of environments: a task on a body, with the model of its tissue.
 
     Parameters
     ----------
     task, scene, patient
-        Task, scene and body. Regions have the tissue that the body's models were trained with.
+        Task, scene and body. Regions have the tissue with which the body's models were trained.
     tissue_model
         Model of the tissue's response to the tool.
     """
@@ -61,16 +61,16 @@ class TaskSetting:
 
     @property
     def site(self) -> CraniotomyFrame:
-        """The open cortex."""
+        """Coordinate system of the craniotomy of the body."""
         return self.patient.site
 
     @cached_property
     def stage(self) -> Stage:
-        """Renderer of the body."""
+        """Rendered parts of the body."""
         return self.patient.build_stage(self.scene)
 
     def get_stage(self, step: int) -> Stage:
-        """Return the rendered body after a number of resection steps."""
+        """Return the rendered parts of the body after `step` resection steps."""
         cut = Loads((Resected(np.array([float(step)])),))
         return self.stage.select_stage(cut) if self.task.resects else self.stage
 
@@ -81,12 +81,12 @@ class TaskSetting:
 
     @cached_property
     def tumour_centre(self) -> np.ndarray:
-        """Mean position of the tumour's vertices in the scan (3,) [m]."""
+        """Mean position (3,) [m] of the tumour's vertices in the scan."""
         return self.site.anatomy.mesh.nodes[self.site.anatomy.tumour_nodes].mean(axis=0)
 
     @cached_property
     def resection_shares(self) -> tuple[np.ndarray, ...]:
-        """Mesh vertices of the tetrahedra of each share that is cut, in order."""
+        """Mesh vertices of the tetrahedra of each part of the tumour to resect, in order."""
         surgery = self.task.surgery
         if surgery is None:
             return ()
@@ -94,12 +94,12 @@ class TaskSetting:
         return tuple(mesh.tets[list(step)].ravel() for step in surgery.build_resection(self.site.anatomy).steps[1:])
 
     def find_vertices_near(self, position: np.ndarray) -> np.ndarray:
-        """Find the vertices (n,) of the open cortex within `PATCH_RADIUS` of a place (3,) [m], or the nearest one."""
+        """Find the open cortex's vertices (n,) within `PATCH_RADIUS` of a position (3,) [m], or the nearest vertex."""
         away = np.linalg.norm(self.site.anatomy.mesh.nodes[self.cortex] - position, axis=1)
         return self.cortex[away <= max(PATCH_RADIUS, away.min())]
 
     def sample_goal(self, random: np.random.Generator) -> Goal:
-        """Sample a goal; every task takes the same number of random values."""
+        """Sample a goal; all tasks use the same number of random values."""
         far, angle, turn, amount, more = random.random(5)
         task, site = self.task, self.site
         arm = self.tumour_centre - site.origin
@@ -124,32 +124,32 @@ def open_setting(
     model: str | None = None,
     batched: bool | None = None,
 ) -> TaskSetting:
-    """Return a task on an anatomy, which is read once for all environments of a process.
+    """Open a task on an anatomy; the result is cached for all environments of a process.
 
     Parameters
     ----------
     anatomy
         "template", or the path of a .vtu file.
     physics
-        "model": the best trained model of tool poses, or of pushes if the tool is a ball. "fem": FEM. "auto": the
-        model if one is applicable, otherwise FEM; if models exist that are not applicable, a warning gives the
+        "model": the best trained model of tool poses, or of pushes if the tool is a ball. "fem": FEM. "auto": an
+        applicable model, or else FEM; if there are only models that are not applicable, a warning gives the
         reason.
     device
         See `Fem`.
     size
         Width and height of images [pixel].
     model
-        File of trained models. None: the file next to the anatomy, or the shipped one for template and spatula.
-        Regions have the tissue that the models were trained with.
+        File of trained models. None: the file next to the anatomy, or the shipped file for template and spatula.
+        Regions have the tissue with which the models were trained.
     batched
-        True to solve all environments in one batch; None: on a GPU only. On the CPU one batch is several times as
-        fast, but the last digits depend on the other environments.
+        True to solve all environments in one batch; None: only on a GPU. On the CPU a batch is several times as fast,
+        but the last digits of results depend on the other environments.
 
     Raises
     ------
     InputError
-        Unreadable files; an anatomy without tumour or open cortex; an unavailable device; a missing model, or a given
-        model that is not applicable.
+        A file is unreadable, the anatomy has no tumour or open cortex, the device is unavailable, or a required model
+        is missing or not applicable.
     """
     patient = _open_setup(anatomy, _get_shipped_model(task) if model is None and anatomy == TEMPLATE else model, device)
     if not patient.anatomy.in_tumour.any():
@@ -177,9 +177,9 @@ def open_setting(
 
 
 def _find_touched_tissue(task: GymTask, scene: Scene, site: CraniotomyFrame) -> Tissue:
-    """Return the tissue that a ball presses: the one with the largest volume within its radius of the goals' centre.
+    """Return the tissue under a ball, which has the largest volume within the ball's radius around the goals' centre.
 
-    For a task that cuts tissue, it is the tissue of the brain.
+    For a task with resection, this is the tissue of the brain.
     """
     mesh, elasticity = site.anatomy.mesh, scene.elasticity
     arm = mesh.nodes[site.anatomy.tumour_nodes].mean(axis=0) - site.origin
@@ -193,7 +193,7 @@ def _find_touched_tissue(task: GymTask, scene: Scene, site: CraniotomyFrame) -> 
 
 
 def _list_rejections(task: GymTask, scene: Scene, patient: PatientSetup) -> dict[str, str | None]:
-    """Return, by name, why a trained model is not applicable; None if it is. For a ball, models of pushes apply too."""
+    """Return by name why a trained model is not applicable (None: it is); for a ball, models of pushes apply too."""
     if task.resects:
         return dict.fromkeys(patient.models, "tissue is resected, which no model supports")
     ball = isinstance(task.tool, Probe)
@@ -212,12 +212,12 @@ def _list_rejections(task: GymTask, scene: Scene, patient: PatientSetup) -> dict
 
 
 def _report_no_model(task: GymTask, anatomy: str, physics: str, model: str | None, why: str | None) -> None:
-    """Report that no trained model is applicable, and why.
+    """Warn that FEM is used, because no trained model is applicable, unless the task resects tissue.
 
     Raises
     ------
     InputError
-        A model is required.
+        `physics` or `model` requires a trained model.
     """
     remedy = "Give physics='fem', or train one: docs/gym.md has the commands."
     if model is not None:
@@ -243,12 +243,12 @@ def _get_shipped_model(task: GymTask) -> str | None:
 
 
 def check_arguments(arguments: Mapping[str, object]) -> tuple[str, str, str, tuple[int, int], str | None]:
-    """Validate `anatomy`, `physics`, `device`, `size` and `model`, see `open_setting`.
+    """Check and return the values of `ARGUMENTS`, as arguments of `open_setting`.
 
     Raises
     ------
     InputError
-        An invalid value.
+        A value is invalid.
     """
     anatomy, physics, device, size, model = (arguments[name] for name in ARGUMENTS)
     if not isinstance(anatomy, str | Path):

@@ -1,4 +1,4 @@
-"""Tasks: tool, step sizes, limits of force and pressure, and tissue."""
+"""Definition of the tasks: tool, goal, step sizes, and limits of force and pressure."""
 
 from dataclasses import dataclass, replace
 
@@ -16,23 +16,23 @@ from ..script.viewpoint import OBLIQUE_VIEWPOINT, PLAIN_APPEARANCE
 STEP_SECONDS = 0.05
 """Duration of a step [s]."""
 MAX_LOAD_RATIO = 1.25
-"""Ratio of a load to its limit at which an episode ends."""
+"""Ratio of a load to its limit above which an episode ends."""
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Goal of an episode, from the plan of the operation.
+    """Goal of an episode, which the plan of the operation prescribes.
 
     Parameters
     ----------
     position
         Goal position (3,) [m] in the scan.
     direction
-        (3,) unit vector in which tissue is pressed or drawn.
+        Unit vector (3,) of the direction in which tissue is pressed or drawn.
     amount
-        Requested force [N], distance [m], or number of shares.
+        Requested force [N], distance [m], or number of parts to resect.
     fluid
-        Final fluid level as a share of its height.
+        Final CSF level, from 0 (drained) to 1 (full).
     """
 
     position: np.ndarray
@@ -48,27 +48,27 @@ class GymTask:
     Parameters
     ----------
     name, title
-        Name in lower case; description.
+        Name in lower case, and description.
     tool
         Tool of the robot.
     max_force, max_pressure
         Limits of the force on the tissue [N], and of the pressure under the tool [Pa].
     amount
-        Range of the goal's amount, in its own unit; `unit` is the amount with the observation 1.
+        Range of the goal's amount; and amount for which the observed value is 1.
     tolerance
-        Tolerance relative to the requested amount.
+        Tolerance of the amount, relative to the requested amount.
     max_distance
         Maximum distance of the tool from its goal position [m].
     hold_steps
-        Number of consecutive steps for which the goal must be held.
+        Number of consecutive steps for which the goal must be kept.
     max_push_angle
-        Maximum angle of a push to the inward axis [rad].
+        Maximum angle between the goal's direction and the inward axis [rad].
     step, turn
-        Translation [m] and rotation [rad] of an action of 1.
+        Translation [m] and rotation [rad] in a step for an action of 1.
     max_tilt
-        Maximum tilt of the tool from its first orientation [rad].
+        Maximum tilt of the tool relative to its initial orientation [rad].
     max_depth
-        Maximum depth below the centre of the open cortex [m].
+        Maximum depth of the tool below the centre of the open cortex [m].
     resects
         True if tissue is resected.
     """
@@ -92,11 +92,11 @@ class GymTask:
 
     @property
     def surgery(self) -> Debulking | None:
-        """Return the resection: the corridor, then share after share; the last share remains."""
+        """Schedule of the resection (corridor, then parts of the tumour except the last); None without resection."""
         return Debulking(tuple(float(each) for each in range(int(self.amount[1]) + 1))) if self.resects else None
 
     def build_scene(self, size: tuple[int, int]) -> Scene:
-        """Return the scene of the task, with images of a width and height [pixel]."""
+        """Build the scene of the task; `size` is the width and height of images [pixel]."""
         view = replace(OBLIQUE_VIEWPOINT, width=size[0], height=size[1])
         if self.resects:
             effects = Elasticity(MATERIALS["drained"].tissue), Held(), SkullContact(), Gravity()

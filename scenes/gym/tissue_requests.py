@@ -1,4 +1,4 @@
-"""Request to a tissue model in a step, and its response."""
+"""Requests to a tissue model in a step, and responses of the model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,15 +18,15 @@ class Response:
     motion, nodes
         Displacements (n, 3) [m] of mesh vertices (n,).
     force
-        Force of the tool on the tissue (3,) [N].
+        Force (3,) [N] of the tool on the tissue.
     pressure
         Maximum pressure under the tool [Pa].
     reliable
         True if the solution is reliable.
     error
-        95 % bound of the tumour vertex error relative to the model's FEM [m]; 0 for FEM itself.
+        95 % bound on the tumour vertex error relative to the model's FEM [m]; 0 for FEM.
     memory
-        State from which the next solution starts.
+        Solution from which the next solve starts; None: no such solution.
     """
 
     motion: np.ndarray
@@ -40,16 +40,16 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class TissueRequest:
-    """Load on the tissue of one environment.
+    """Request for the response of the tissue in one environment.
 
     Parameters
     ----------
     pose
-        T_world_tool (4, 4).
+        Pose T_world_tool (4, 4) [m] of the tool.
     previous
         Previous response; None at the start of an episode.
     fluid
-        Fluid level relative to its full height.
+        CSF level, from 0 (drained) to 1 (full).
     completed_steps
         Number of completed resection steps.
     """
@@ -61,12 +61,12 @@ class TissueRequest:
 
 
 class TissueModel(Protocol):
-    """Model of the tissue's response to tools: trained, or FEM.
+    """Protocol of a model of the tissue's response to tools: a trained model, or FEM.
 
-    On a GPU all requests are solved in one batch. On the CPU each is solved alone, so that results are the same byte
-    for byte for any number of requests.
+    By default, all requests are solved in one batch on a GPU. On the CPU each request is solved alone, so that results
+    do not depend on the number of requests.
     """
 
     def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
-        """Compute the responses to requests, in their order."""
+        """Compute the responses to requests, in the order of the requests."""
         ...

@@ -1,4 +1,4 @@
-"""HTML file of a scene: the user drags the tool over the cortex, and a fast model moves the tumour in the browser."""
+"""HTML file of a scene, in which a fast model moves the tumour while the user drags the tool over the cortex."""
 
 import base64
 import hashlib
@@ -38,12 +38,12 @@ MAX_BYTES = 2_000_000  # Largest size of the file [bytes].
 MAX_MODEL_BYTES = 32_000_000  # Size of a model's arrays above which they do not fit, compressed [bytes].
 FORCE_RANGE = 1.5  # Largest force of the page, relative to that of the training.
 SCRIPTS = ("graph.js", "contact.js", "model.js", "outline.js", "draw.js", "page.js")
-"""Scripts of the page, in the order in which they depend on each other."""
+"""Scripts of the page; a script uses only earlier scripts."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
-    """Fast model that a page evaluates: its name, the model, its graph, and True if the model also moves the cortex."""
+    """Fast model of a page: name, model, computation graph, and True in `cortex` if the graph also moves the cortex."""
 
     name: str
     model: Learned
@@ -52,18 +52,18 @@ class ExportedModel:
 
 
 def write_html(path: str | Path, patient: PatientSetup, scene: Scene, learner: str | None = None) -> ExportedModel:
-    """Write the page of a scene atomically, without the motion of the cortex if that is too large; return its model.
+    """Write the page of a scene atomically; return its model. The cortex does not move if the page would be too large.
 
     Parameters
     ----------
     learner
-        Name of the model; None: the one with the fewest numbers.
+        Name of the model; None: the model with the fewest parameters.
 
     Raises
     ------
     InputError
-        No model of that name, or none that a page evaluates; a scene without a palpation ball; a mesh of too many
-        points, or a page of more than `MAX_BYTES`; a path that does not end in .html, or a folder that cannot be
+        There is no model of this name, or a page cannot evaluate it; the scene has no palpation ball; the mesh has too
+        many points, or the page has more than `MAX_BYTES`; the path does not end in .html, or the folder cannot be
         written.
     """
     if not isinstance(scene.tool, Probe):
@@ -84,7 +84,7 @@ def write_html(path: str | Path, patient: PatientSetup, scene: Scene, learner: s
 
 
 def choose_model(patient: PatientSetup, learner: str | None = None) -> ExportedModel:
-    """Trace the named model, or the model with the fewest parameters.
+    """Build the computation graph of the model `learner`, or of the model with the fewest parameters if None.
 
     Raises
     ------
@@ -105,12 +105,12 @@ def choose_model(patient: PatientSetup, learner: str | None = None) -> ExportedM
 
 
 def build_exported_model(name: str, model: Learned, with_cortex: bool) -> ExportedModel:
-    """Trace a model of the tumour, or of the cortex too.
+    """Build the computation graph of a model for the tumour, and for the cortex if `with_cortex`.
 
     Raises
     ------
     InputError
-        A model of poses, a model that is far too large, and what `build_graph` rejects.
+        The model is for tool poses or is far too large, or `build_graph` rejects the model.
     """
     if model.tool is not None:
         raise InputError(f"{name} is a model of poses, but the page pushes by a force: export another learner.")
@@ -127,7 +127,7 @@ def _count_bytes(sheet: GraphBuilder) -> int:
 
 
 def build_html(patient: PatientSetup, scene: Scene, exported: ExportedModel) -> str:
-    """Build the text of the page with model, surfaces, scripts and style."""
+    """Build the HTML text of the page with model, surfaces, scripts and style."""
     stage, model = patient.build_stage(scene).without_fine_cortex, exported.model
     nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
     table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})
@@ -158,7 +158,7 @@ def build_html(patient: PatientSetup, scene: Scene, exported: ExportedModel) -> 
 
 
 def _describe_errors(patient: PatientSetup, scene: Scene) -> dict[str, Any]:
-    """Return the error of the tumour position in proportion to its motion, and its description for the page."""
+    """Return the tumour position error in proportion to the motion, and texts of the page, for JSON."""
     error, registration = patient.estimate_motion_error(scene), scene.registration
     known = None if error is None else {"rest": error.rest[registration], "surface": error.surface}
     words = {
@@ -173,7 +173,7 @@ def _describe_errors(patient: PatientSetup, scene: Scene) -> dict[str, Any]:
 
 
 def _list_facts(patient: PatientSetup, exported: ExportedModel) -> list[str]:
-    """Return sentences about model, error bound, anatomy and program."""
+    """List sentences about the model, its error bound, the anatomy and the program."""
     model = exported.model
     bound = f"at most {1e3 * model.bound:.2f} mm" if np.isfinite(model.bound) else "not known"
     return [
@@ -209,10 +209,10 @@ def _read(name: str) -> str:
 
 
 def _digest(text: str) -> str:
-    """Compute the digest by which the page's security policy allows one inline script or style."""
+    """Compute the digest by which the page's security policy allows an inline script or style."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
 def _to_script_json(content: dict[str, Any]) -> str:
-    """Convert to JSON that ends no script element."""
+    """Convert to JSON without "<", so that the text cannot end a script element."""
     return json.dumps(content, allow_nan=False).replace("<", "\\u003c")

@@ -1,4 +1,4 @@
-"""Arrays as text for a page: shuffled bytes, deflated, base64."""
+"""Encoding of arrays as text for a page: byte shuffle, deflate compression and base64."""
 
 import base64
 import zlib
@@ -11,9 +11,9 @@ STORED = {"f4": "f4", "f8": "f8", "i8": "i4", "i4": "i4", "i2": "i4", "u1": "u1"
 
 
 def pack_arrays(arrays: Mapping[str, np.ndarray]) -> tuple[dict[str, tuple[str, tuple[int, ...]]], str]:
-    """Pack arrays; return their type and shape by name, in order, and all their bytes as text.
+    """Pack arrays; return their types and shapes by name, in order, and their bytes as text.
 
-    The first bytes of an array's numbers come first, then the second, and so on: they compress better.
+    All first bytes of an array's numbers come first, then all second bytes, and so on, which improves compression.
     """
     table, parts = {}, []
     for name, array in arrays.items():

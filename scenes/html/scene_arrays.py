@@ -1,4 +1,4 @@
-"""Surfaces, colours, light and camera of a scene, as arrays for its page."""
+"""Surfaces, colours, light and camera of a scene, as arrays and JSON for its page."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -27,12 +27,12 @@ NEAR, FAR = 0.2, 2.0  # Smallest and largest drawn depth, relative to the distan
 
 
 def build_arrays(stage: Stage, nodes: np.ndarray) -> dict[str, np.ndarray]:
-    """Build the arrays of the page, by name, for a model that predicts the vertices `nodes` (n,).
+    """Build the arrays of a page, by name, for a model that predicts displacements of the vertices `nodes` (n,).
 
     Raises
     ------
     InputError
-        A mesh of more points than 16 bits can number.
+        The mesh has more points than 16-bit numbers can index.
     """
     anatomy, rest, tool = stage.anatomy, stage.anatomy.mesh.nodes, stage.scene.tool
     assert isinstance(tool, Probe)
@@ -56,7 +56,7 @@ def build_arrays(stage: Stage, nodes: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def find_row_indices(vertices: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Return the position (n,) uint16 of each of the `vertices` (n,) in sorted `nodes`, or `NO_ROW`."""
+    """Return the index (n,) uint16 of each of the `vertices` (n,) in sorted `nodes`, or `NO_ROW` if absent."""
     row = np.searchsorted(nodes, vertices).clip(max=len(nodes) - 1)
     return np.where(nodes[row] == vertices, row, NO_ROW).astype(np.uint16)
 
@@ -66,7 +66,7 @@ def _build_surface(name: str, points: np.ndarray, triangles: np.ndarray, kind: t
 
 
 def _build_texture(stage: Stage, cortex: Layer) -> dict[str, np.ndarray]:
-    """Build the scan on the cortex as an image over the tangent plane, and the place of each vertex in it."""
+    """Build the texture of the scan over the tangent plane, and the texture coordinates of the cortex vertices."""
     if cortex.solid is None or cortex.rest is None:
         return {}
     site, half = stage.site, stage.site.radius + RIM_DISTANCE
@@ -87,7 +87,7 @@ def _build_texture(stage: Stage, cortex: Layer) -> dict[str, np.ndarray]:
 
 
 def describe_camera_and_tool(stage: Stage, camera: Camera) -> dict[str, Any]:
-    """Return coordinate system, camera, light, colours and tool, for JSON; lengths [m], colours scene-linear."""
+    """Describe coordinate system, camera, light, colours and tool for JSON; lengths [m], linear colours."""
     site, tool, lamp, scene = stage.site, stage.scene.tool, stage.lamp, stage.scene
     assert isinstance(tool, Probe)
     axis, pose = lamp.target - lamp.position, tool.pose(np.zeros(3), site.axis, site.right)
@@ -121,7 +121,7 @@ def describe_camera_and_tool(stage: Stage, camera: Camera) -> dict[str, Any]:
 
 
 def _describe_layers(stage: Stage, pose: np.ndarray) -> Mapping[str, Any]:
-    """Describe colour, highlight and relief of the layers that the page draws, with the tool at a pose (4, 4)."""
+    """Describe colour, highlight and relief of the drawn layers, by name, with the tool at a pose (4, 4)."""
     looks = {}
     for layer in stage.build_layers(stage.anatomy.mesh.nodes, pose):
         looks[layer.name] = {

@@ -42,7 +42,7 @@ class SceneFigures:
     error_mm, motion_mm
         Largest mean error and largest mean displacement (by FEM) of the tumour's nodes over the frames [mm].
     pixels
-    Distance between the tumour's projections by the drawing camera and by OpenCV with the scene's camera [pixel].
+        Distance between the tumour's projections by the drawing camera and by OpenCV with the scene's camera [pixel].
     drawn
         95th percentile of the distance between the outline in the image, which is detected by its colour, and the
         outline that another renderer computes [pixel].

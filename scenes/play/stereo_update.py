@@ -100,8 +100,8 @@ class FirstView:
         Rectified view of the pair.
     pixels, rest_positions
         Pixels (n, 2) of cortex points, and their positions (n, 3) [m] in the scan; n <= `requested_count`.
-        static_pixels, static_positions
-            Pixels (m, 2) of static points around the craniotomy, and their positions (m, 3) [m].
+    static_pixels, static_positions
+        Pixels (m, 2) of static points around the craniotomy, and their positions (m, 3) [m].
     """
 
     stereo_view: StereoView

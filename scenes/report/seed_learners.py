@@ -36,10 +36,10 @@ class VertexModels:
     ----------
     sites
         Undeformed positions (k, 3) [m] of the vertices.
-        centroid
-            Mean (3,) [m] of all mesh vertices.
-        regressors
-            Regressor of each vertex.
+    centroid
+        Mean (3,) [m] of all mesh vertices.
+    regressors
+        Regressor of each vertex.
     """
 
     sites: np.ndarray

@@ -38,8 +38,8 @@ class ParameterPrior:
         Lower and upper limit; for "normal", both entries are the standard deviation.
     meaning
         Meaning of the parameter, with its unit.
-        source
-            Literature source of the values.
+    source
+        Literature source of the values.
     """
 
     name: str

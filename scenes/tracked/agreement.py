@@ -36,8 +36,8 @@ class Agreement:
     ----------
     positions
         Positions (n, 3) [m] of a target in the coordinate system of its body, by target name.
-        inconsistencies
-            Inconsistency between the poses and the last image of a target, by target name; empty text: consistent.
+    inconsistencies
+        Inconsistency between the poses and the last image of a target, by target name; empty text: consistent.
     settings
         Limits of the warnings.
     """

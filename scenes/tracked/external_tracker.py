@@ -117,8 +117,8 @@ class ExternalTracker:
         Poses of the tool and of the patient's reference.
     clock
         Time offset between the clocks of the tracker and the images.
-        mount
-            Mounting of the camera; None: the images determine the camera's pose relative to the printed reference.
+    mount
+        Mounting of the camera; None: the images determine the camera's pose relative to the printed reference.
     """
 
     tool_poses: PoseStream

@@ -112,12 +112,12 @@ class VideoFrame:
     ----------
     time
         Time of the image [s].
-        image
+    image
         Image (H, W, 3) uint8.
     T_camera_scan, T_scan_tool
         True poses (4, 4) [m].
-        displacement
-            True displacements (n, 3) [m] of the tumour's surface vertices, in the order of `Stage.tumour_vertices`.
+    displacement
+        True displacements (n, 3) [m] of the tumour's surface vertices, in the order of `Stage.tumour_vertices`.
     """
 
     time: float

@@ -89,10 +89,10 @@ class TrackingResult:
         Times [s] of the last pose of the reference, and of the last pose of the tool relative to it; None: never.
     interval
         Shortest interval between two previous images [s].
-        was_near
-            True if the tool has been near the head; before that, the registration may be that of another patient.
-        image_speed
-            Recent maximum speed of the brain across the image [m/s]; None: not known.
+    was_near
+        True if the tool has been near the head; before that, the registration may be that of another patient.
+    image_speed
+        Recent maximum speed of the brain across the image [m/s]; None: not known.
     agreement
         Consistency of an external tracker's poses with printed targets in the images.
     """

@@ -43,8 +43,8 @@ class Painter:
     ----------
     stage
         Rendered parts of the brain.
-        tool
-            Tracked tool, which may occlude the tumour; None: no tool.
+    tool
+        Tracked tool, which may occlude the tumour; None: no tool.
     style
         Overlay style, see `ar.overlay.composite.composite`.
     device

@@ -42,7 +42,7 @@ class Overlay:
         Tracking result that is drawn.
     image
         Image (H, W, 3) uint8 with the overlay.
-        seconds
+    seconds
         Processing time from the image's arrival [s].
     centroid
         Centroid (3,) [m] of the drawn tumour, in the scan.

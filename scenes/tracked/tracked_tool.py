@@ -41,8 +41,8 @@ class TrackedTool:
         Contact shape of the tool.
     T_cube_tool
         Transform (4, 4) [m] from tool coordinates, whose origin is the tool's lowest point, to cube coordinates.
-        tip_covariance
-            Calibration covariance (3, 3) [m^2] of this lowest point in cube coordinates.
+    tip_covariance
+        Calibration covariance (3, 3) [m^2] of this lowest point in cube coordinates.
     """
 
     shape: BuiltIn

@@ -122,8 +122,8 @@ class OverlayError:
     ----------
     outline, overlap
         Mean distance between the drawn and the true outline [pixel]; intersection over union of the silhouettes.
-        centroid, maximum
-            Error of the tumour's centroid and maximum error on its surface, across the true line of sight [m].
+    centroid, maximum
+        Error of the tumour's centroid and maximum error on its surface, across the true line of sight [m].
     is_covered
         True if `maximum` is within the error band of the overlay.
     """

@@ -26,8 +26,8 @@ def check_video(path: Path, frame_rate: float, calibration: Calibration, camera:
     ----------
     path, frame_rate
         Video, or folder of images with this frame rate [1/s].
-        camera
-            Name of the calibration file, for messages.
+    camera
+        Name of the calibration file, for messages.
 
     Raises
     ------

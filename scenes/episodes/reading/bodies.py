@@ -1,4 +1,4 @@
-"""Anatomies of episodes: the template, or files next to the episodes."""
+"""Anatomies of episodes, found by digest: the template, or files next to the episodes."""
 
 from functools import cache
 from pathlib import Path
@@ -14,21 +14,21 @@ from .contents import EpisodeContents
 
 
 def find_anatomy(contents: EpisodeContents) -> Anatomy | None:
-    """Find the anatomy with an episode's digest; None if it is neither the template nor in a nearby folder.
+    """Find the anatomy with the digest of an episode; None if it is neither the template nor in a nearby folder.
 
-    It is searched in `bodies/*/anatomy.vtu` of the episode's folder, and of the folder above.
+    Files `bodies/*/anatomy.vtu` in the episode's folder and in its parent folder are searched.
     """
     return _find_anatomy(str(contents.attributes.get("anatomy")), contents.path.resolve().parent)
 
 
 def is_template(digest: str) -> bool:
-    """Return True if an anatomy's digest is that of the template."""
+    """Return True if a digest is that of the template anatomy."""
     template = _read_anatomy(get_template_path())
     return template is not None and template.digest == digest
 
 
 def find_surface_rows(surface: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Select the triangles (S, 3) whose corners are all in sorted `nodes` (n,), as indices into `nodes`."""
+    """Select the triangles (S, 3) with all corners in sorted `nodes` (n,); return them as indices into `nodes`."""
     places = np.searchsorted(nodes, surface).clip(max=len(nodes) - 1)
     return places[(nodes[places] == surface).all(axis=1)]
 
@@ -45,7 +45,7 @@ def _find_anatomy(digest: str, folder: Path) -> Anatomy | None:
 
 @cache
 def _read_anatomy(path: Path) -> Anatomy | None:
-    """Read an anatomy; None if it cannot be read."""
+    """Read an anatomy; None if the file cannot be read."""
     try:
         return read_anatomy(path)
     except InputError:

@@ -1,4 +1,4 @@
-"""Contents of an episode file, checked before use; the number of open files is bounded."""
+"""Contents of episode files, which are checked before use, and a cache with a limited number of open files."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ REMEDY = f"{HINT}make it again, or leave it out."  # Remedy in error messages.
 
 
 def open_episode(path: Path) -> h5py.File:
-    """Open an episode's file; InputError if it is missing or not HDF5."""
+    """Open the file of an episode; raise InputError if the file is missing or not HDF5."""
     with wrap_errors(path, "an episode", REMEDY):
         return h5py.File(path, "r")
 
 
 def format_finding(error: InputError, path: Path) -> str:
-    """Return the fault of an episode, without its path, and without the hint to the command that reports it."""
+    """Format an error about an episode as a finding, without the path and without the hint to `sulcus validate`."""
     return str(error).removeprefix(f"{path}: ").replace(f"{HINT}make", "Make")
 
 
 class FileCache:
-    """Cache of open files: each is opened at its first use, and the least recently used one is closed.
+    """Cache of open files. A file is opened at its first use; at the limit, the least recently used file is closed.
 
-    Forked processes, and processes that unpickle this object, open their own files.
+    Forked processes and processes that unpickle this object open their own files.
     """
 
     def __init__(self, max_files: int = 16) -> None:
@@ -53,12 +53,12 @@ class FileCache:
         return len(self._open)
 
     def get_file(self, path: Path) -> h5py.File:
-        """Return the open file.
+        """Return the open file of a path.
 
         Raises
         ------
         InputError
-            A missing file, or one that is not HDF5.
+            The file is missing or not HDF5.
         """
         if self._process != os.getpid():
             self.close()
@@ -90,16 +90,16 @@ ALLOWED_FILTERS = {
 
 @dataclass(frozen=True, eq=False)
 class EpisodeContents:
-    """Contents of one episode, as its file describes them.
+    """Contents of one episode, as described by its file.
 
     Parameters
     ----------
     path
-        The file.
+        Path of the file.
     attributes
-        Attributes of the file: texts, numbers.
+        Attributes of the file, as texts, numbers and lists.
     shapes
-        Shapes of all known arrays, by name; images without the group's name.
+        Shapes of all known arrays, by name; names of images are without the name of their group.
     fem_frames
         Sorted numbers (F,) of the frames that FEM solved.
     """
@@ -116,28 +116,28 @@ class EpisodeContents:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of its images [pixel]."""
+        """Width and height of the images [pixel]."""
         return int(self.attributes["width"]), int(self.attributes["height"])
 
     @property
     def family(self) -> str:
-        """Family of the episode; in the former format its scene."""
+        """Name of the episode's family; without a family, name of its scene."""
         return str(self.attributes.get("family", self.attributes.get("scene", "episode")))
 
     @property
     def depth_scale(self) -> float:
-        """Length of one step of the depth images [m]."""
+        """Resolution of the depth images [m]; NaN if not recorded."""
         return float(self.attributes.get("depth_scale_m", np.nan))
 
 
 def read_contents(path: str | Path) -> EpisodeContents:
-    """Read the contents of an episode file.
+    """Read and check the contents of an episode file.
 
     Raises
     ------
     InputError
-        A missing file, or not an episode. Links to other files; arrays of unexpected shapes or kinds, or larger
-        than the file.
+        The file is missing or not an episode, contains links to other files, or has arrays of unexpected shape or type
+        or larger than the file.
     """
     path = to_path(path)
     with wrap_errors(path, "an episode", REMEDY), h5py.File(path, "r") as file:
@@ -145,7 +145,7 @@ def read_contents(path: str | Path) -> EpisodeContents:
 
 
 def inspect_contents(file: h5py.File, path: Path) -> EpisodeContents:
-    """Read the contents of an open file.
+    """Read and check the contents of an open file.
 
     Raises
     ------
@@ -167,12 +167,12 @@ def inspect_contents(file: h5py.File, path: Path) -> EpisodeContents:
 
 
 def read_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
-    """Read attributes as texts, numbers, and lists of Python.
+    """Read attributes as Python texts, numbers and lists, by name.
 
     Raises
     ------
     InputError
-        An array that is larger than the limit.
+        An attribute is larger than `MAX_TEXT_BYTES`.
     """
     found = {}
     for name in item.attrs:
@@ -186,7 +186,7 @@ def read_attributes(item: h5py.Group | h5py.Dataset) -> dict[str, Any]:
 
 
 def get_array(group: h5py.Group, name: str) -> h5py.Dataset:
-    """Return an array by its name; raise InputError if it is not an array."""
+    """Return an array by name; raise InputError if the item is not an array."""
     found = group[name]
     if not isinstance(found, h5py.Dataset):
         raise InputError(f"{name!r} is no array. {REMEDY}")
@@ -194,7 +194,7 @@ def get_array(group: h5py.Group, name: str) -> h5py.Dataset:
 
 
 def _find_arrays(file: h5py.Group, inside: str = "", depth: int = 0) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Yield the arrays by name; InputError if one is not in the file itself."""
+    """Yield the names and arrays of a file; raise InputError for links and for data in other files."""
     if len(file) > MAX_NAMES or depth > MAX_DEPTH:
         raise InputError(f"it holds more groups or names than an episode has. {REMEDY}")
     for name in file:
@@ -210,7 +210,7 @@ def _find_arrays(file: h5py.Group, inside: str = "", depth: int = 0) -> Iterator
 
 
 def _check_stored_inside(name: str, array: h5py.Dataset) -> None:
-    """Reject an array whose data are in another file, or are declared but missing."""
+    """Raise InputError if the data of an array are in another file, are missing, or use an unsupported filter."""
     if array.external or array.is_virtual:
         raise InputError(f"{name!r} lies in another file: episodes that refer to others are not read. {REMEDY}")
     pipeline = array.id.get_create_plist()
@@ -224,7 +224,7 @@ def _check_stored_inside(name: str, array: h5py.Dataset) -> None:
 
 
 def _check_shapes(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the known arrays; raise InputError if they are inconsistent."""
+    """Return the shapes of the known arrays, by name; raise InputError if shapes or types are inconsistent."""
     sizes: dict[str, int] = {}
     if "fem_frames" not in arrays:
         sizes[SOLVED] = arrays["time"].shape[0] if arrays["time"].ndim else 0
@@ -248,7 +248,7 @@ def _check_shapes(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ..
 
 
 def _check_shape(name: str, shape: tuple[int, ...], wanted: ArraySpec, sizes: dict[str, int]) -> None:
-    """Reject a shape that contradicts known lengths; record new ones."""
+    """Raise InputError if a shape contradicts known axis lengths in `sizes`; add new axis lengths to `sizes`."""
     axes = wanted.axes
     if axes[-1] is None:
         axes = (*axes[:-1], *shape[len(axes) - 1 :])

@@ -1,4 +1,4 @@
-"""Repeated FEM solution of some frames of an episode, from its plan and its body alone."""
+"""Repeated FEM solution of frames of an episode, from its plan and body only, for validation."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -29,9 +29,9 @@ MAX_MEMORY = 8 * 1024**3  # Maximum memory for the examination of one file [byte
 
 
 def solve_frames_again(report: Report, count: int, device: str = "auto") -> Report:
-    """Return a report extended by solving `count` of its frames again: differences of the tumour position.
+    """Solve `count` frames of an episode again; return the report extended by differences of the tumour position.
 
-    Frames are spread evenly. For history-dependent solutions, all solved frames before them are solved too, in order.
+    Frames are evenly spaced. If solutions depend on the history, all earlier solved frames are solved too, in order.
     """
     try:
         with wrap_errors(report.path, "an episode", REMEDY), h5py.File(report.path, "r") as file:
@@ -62,7 +62,7 @@ def _add_skipped(report: Report, words: str) -> Report:
 def _solve_again(
     said: Mapping[str, Any], opened: OpenedBody, solved: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Solve frames again: numbers of the frames (k,), and the tumour's displacement (k, n, 3) [m] in each."""
+    """Solve frames again; return frame numbers (k,), and displacements (k, n, 3) [m] of the tumour's vertices."""
     plan = parse_plan(str(said["plan"]), str(said.get("plan_name", "plan")), Path())
     seed, number = int(said["seed"]), int(said["episode"])
     body, patient = opened.body, opened.patient
@@ -78,9 +78,9 @@ def _solve_again(
 def validate_files(
     paths: Sequence[Path], workers: int, validate: Callable[[Path], Report] = validate_episode
 ) -> Iterator[Report]:
-    """Yield a report of each file, in order of completion; `workers` processes at a time.
+    """Yield a report for each file, in order of completion, with `workers` parallel processes.
 
-    Files of a crashed process are checked again, each in its own process.
+    After a crash of a process, each remaining file is checked in its own process.
     """
     left = list(dict.fromkeys(paths))
     look_at = partial(_run_limited, validate)

@@ -1,4 +1,4 @@
-"""Arrays of an episode: axes, kinds and units, in the current and in the former format."""
+"""Specification of the arrays of an episode: axes, types and units, in the current and in the former format."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ class ArraySpec:
     Parameters
     ----------
     axes
-        Lengths, or names of lengths that arrays share; `None` at the end: any number of further axes.
+        Lengths of the axes, or names of lengths that arrays share; None at the end: any number of further axes.
     kind
         Allowed letters of NumPy's `dtype.kind`; "O" for texts or images.
     unit
-        Unit in the array's attribute; None: no unit is required.
+        Required unit in the array's attribute; None: no unit is required.
     known
         True if NaN (not available) is not allowed.
     limited
@@ -34,7 +34,7 @@ class ArraySpec:
 
     @property
     def has_frame_axis(self) -> bool:
-        """True if there is a row for each frame."""
+        """True if the array has a row for each frame."""
         return bool(self.axes) and self.axes[0] == FRAMES
 
 
@@ -46,11 +46,11 @@ PICTURES: Mapping[str, str] = {
     "segmentation": LABELS,
     "tumour_mask": LABELS,
 }
-"""Images, one per frame in the group `pictures`, and the decoder of each."""
+"""Decoder of each kind of image by name; an episode has one image per frame in the group `pictures`."""
 
 
 def get_suffix(name: str) -> str:
-    """Return the file ending of an image's bytes: colour is JPEG, all else PNG."""
+    """Return the file ending of an encoded image: jpg for colour, else png."""
     return "jpg" if PICTURES[name] == COLOUR else "png"
 
 
@@ -102,6 +102,6 @@ ARRAYS: Mapping[str, ArraySpec] = {
     "cortex_nodes": ArraySpec(("cortex",), "iu", "1"),
     "cortex_rest": ArraySpec(("cortex", 3)),
 }
-"""Arrays other than images, by name. Only `time` is required."""
+"""Specifications of arrays other than images, by name; only `time` is required."""
 
 REQUIRED_ARRAYS = ("time",)  # Required arrays.

@@ -12,9 +12,9 @@ from .windows import Episodes, read_episodes
 
 
 class EpisodeDataset(Dataset[dict[str, Any]]):
-    """Windows of `read_episodes` as tensors, in the order of `read_episodes`; texts stay lists.
+    """PyTorch data set of the windows of `read_episodes`, in the same order, as tensors; texts stay lists.
 
-    Open files are not pickled: forked and spawned workers open their own.
+    Open files are not pickled: forked and spawned workers open their own files.
     """
 
     def __init__(
@@ -26,18 +26,18 @@ class EpisodeDataset(Dataset[dict[str, Any]]):
         stride: int = 1,
         most_open: int = 16,
     ) -> None:
-        """Read the contents of the files; raises InputError, see `read_episodes`."""
+        """Read the contents of the files; for the arguments and the InputError see `read_episodes`."""
         self.episodes: Episodes = read_episodes(paths, keys, window, step, stride, most_open)
 
     def __len__(self) -> int:
         return len(self.episodes)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        """Return the window of a number, counted over all episodes."""
+        """Return window `index`, counted over all episodes."""
         return {name: _to_tensor(value) for name, value in self.episodes[index].items()}
 
     def get_window(self, episode: int, first: int) -> dict[str, Any]:
-        """Return the window of an episode that begins at a frame; InputError as `Episodes.get_window`."""
+        """Return the window that begins at frame `first` of an episode; for errors see `Episodes.get_window`."""
         return {name: _to_tensor(value) for name, value in self.episodes.get_window(episode, first).items()}
 
     at = get_window  # Former names, for one release.

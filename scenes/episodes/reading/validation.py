@@ -1,4 +1,4 @@
-"""Faults of an untrusted episode: each finding is a sentence."""
+"""Validation of an untrusted episode; each finding is a sentence."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -30,7 +30,7 @@ POSES = ("T_camera_world", "T_camera_world_right", "T_camera_world_tracked", "T_
 
 
 def check_mask(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy | None) -> tuple[list[str], list[str]]:
-    """List the faults of `tumour_mask`, and what could not be checked, as sentences."""
+    """Compare `tumour_mask` with rendered silhouettes; return faults and skipped checks as sentences."""
     shapes = contents.shapes
     missing = [
         name
@@ -67,7 +67,7 @@ def check_mask(file: h5py.File, contents: EpisodeContents, anatomy: Anatomy | No
 
 
 def read_episode_camera(file: h5py.File, contents: EpisodeContents, frame: int) -> Camera:
-    """Return the camera of a frame; ValueError if its parameters are invalid."""
+    """Build the camera of a frame; raise ValueError if its parameters are invalid."""
     moves = "K_of_frame" in contents.shapes
     K = (
         read_numbers(file, contents, "K_of_frame", range(frame, frame + 1))[0]
@@ -81,25 +81,25 @@ def read_episode_camera(file: h5py.File, contents: EpisodeContents, frame: int) 
 
 @dataclass(frozen=True)
 class Report:
-    """Findings of one file.
+    """Findings of the validation of one file.
 
     Parameters
     ----------
     path
         Path of the file.
     problems
-        Faults; none if the file is complete.
+        Faults, as sentences; empty if the file is complete and correct.
     skipped
-        Skipped checks, and the reasons.
+        Skipped checks, with their reasons.
     frames, solved
-        Number of frames, and of those that FEM solved.
+        Number of frames, and number of frames that FEM solved.
     unsolved
         Number of FEM solutions that did not converge.
     error_mm
-        Mean and maximum error of predicted tumour vertices relative to FEM in solved frames [mm]; None if there
-        are none, or if FEM was used directly.
+        Mean and maximum error of predicted tumour vertices relative to FEM over solved frames [mm]; None without
+        solved frames, or if FEM played the scene.
     again, again_mm
-        Number of frames solved again here, and maximum difference of tumour positions from the file [mm].
+        Number of frames that were solved again, and maximum difference of tumour positions from the file [mm].
     """
 
     path: Path
@@ -114,7 +114,7 @@ class Report:
 
 
 def validate_episode(path: Path) -> Report:
-    """Check the arrays, images and attributes of one episode."""
+    """Check the arrays, images and attributes of one episode; return the findings."""
     problems: list[str] = []
     skipped: list[str] = []
     try:
@@ -138,7 +138,7 @@ def validate_episode(path: Path) -> Report:
 
 
 def check_units(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
-    """Yield findings on missing or unexpected units, and on unknown arrays."""
+    """Yield findings on missing or unexpected units of arrays."""
     for name in contents.shapes:
         if name in PICTURES:
             continue
@@ -148,7 +148,7 @@ def check_units(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
 
 
 def check_numbers(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
-    """Yield findings on forbidden NaN, infinite values, and times that do not increase."""
+    """Yield findings on forbidden NaN and infinite values, and on times that do not increase."""
     for name in contents.shapes:
         if name in PICTURES or ARRAYS[name].kind != "f":
             continue
@@ -167,7 +167,7 @@ def check_numbers(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
 
 
 def check_poses(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
-    """Yield findings on poses that are not rigid motions, and on an invalid camera matrix."""
+    """Yield findings on poses that are not rigid motions, and on invalid camera matrices."""
     for name in POSES:
         if name not in contents.shapes:
             continue
@@ -192,7 +192,7 @@ def check_poses(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
 
 
 def check_images(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
-    """Yield findings on images that cannot be decoded, have another size than declared, or have undeclared labels."""
+    """Yield findings on images that cannot be decoded, have a wrong size, or contain labels without a name."""
     stored = str(contents.attributes.get("segmentation", ""))
     labels = {int(word.split()[0]) for word in stored.split(",") if word.strip()}
     for name, kind in PICTURES.items():
@@ -211,9 +211,9 @@ def check_images(file: h5py.File, contents: EpisodeContents) -> Iterator[str]:
 
 
 def count_solved_frames(file: h5py.File, contents: EpisodeContents) -> tuple[int, int, tuple[float, float] | None]:
-    """Return the numbers of solved and of unconverged frames, and the errors of the prediction [mm].
+    """Return the numbers of solved and of unconverged frames, and mean and maximum error of the prediction [mm].
 
-    The errors are None if FEM played the scene.
+    The errors are None if FEM played the scene, or if errors cannot be computed.
     """
     solved = len(contents.fem_frames)
     unsolved = 0

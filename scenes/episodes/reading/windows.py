@@ -1,4 +1,4 @@
-"""Rows of one episode's arrays, decoded, and windows of frames of many episodes in one order."""
+"""Reading of decoded array rows of one episode, and of windows of frames from many episodes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -31,7 +31,7 @@ def read_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: ran
     Raises
     ------
     InputError
-        An image that cannot be decoded, or whose size differs from the file's attributes; a damaged file.
+        An image cannot be decoded or has a wrong size, or the file is damaged.
     """
     frames = range(contents.frames) if frames is None else frames
     if name in PICTURES:
@@ -44,12 +44,12 @@ def read_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: ran
 
 
 def read_numbers(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> np.ndarray:
-    """Read rows as `read_rows`, from an array without texts."""
+    """Read the rows of an array without texts as a NumPy array; see `read_rows`."""
     return np.asarray(read_rows(file, contents, name, frames))
 
 
 def read_one_image(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> np.ndarray:
-    """Read and decode one image.
+    """Read and decode the image `name` of one frame.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def read_one_image(file: h5py.File, contents: EpisodeContents, name: str, frame:
 
 
 def read_image_bytes(file: h5py.File, contents: EpisodeContents, name: str, frame: int) -> bytes:
-    """Read the stored bytes of one image; InputError if the file is damaged."""
+    """Read the encoded bytes of one image; raise InputError if the file is damaged."""
     with wrap_errors(contents.path, "an episode", REMEDY):
         return np.asarray(get_array(file, f"pictures/{name}")[frame], np.uint8).tobytes()
 
@@ -84,7 +84,7 @@ def _read(array: h5py.Dataset, frames: range) -> Rows:
 
 
 def _read_solved_rows(array: h5py.Dataset, contents: EpisodeContents, frames: range) -> Rows:
-    """Read rows of an array with one row for each solved frame."""
+    """Read the rows of `frames` from an array with a row per solved frame; other rows are NaN or an empty text."""
     if len(contents.fem_frames) == contents.frames:
         return _read(array, frames)
     wanted = np.arange(frames.start, frames.stop, frames.step)
@@ -102,16 +102,16 @@ def _read_solved_rows(array: h5py.Dataset, contents: EpisodeContents, frames: ra
 
 
 FEM_KNOWN = "fem_known"
-"""(T,) bool for arrays of FEM: solved frames."""
+"""Key of the mask (T,) bool of frames that FEM solved, which accompanies FEM arrays."""
 
 
 def list_episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
-    """List files of episodes, sorted by name: given files, and those in a folder or its subfolder `episodes`.
+    """List the files of episodes: given files, and sorted files in given folders or their subfolders `episodes`.
 
     Raises
     ------
     InputError
-        A missing path, or a folder without episodes.
+        A path is missing, or a folder has no episodes.
     """
     paths: list[Path] = []
     for one in [given] if isinstance(given, str | Path) else given:
@@ -134,11 +134,11 @@ def list_episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
 
 @dataclass(frozen=True, eq=False)
 class Episodes(Sequence[dict[str, Any]]):
-    """Windows of frames, each a dictionary by key: (T, ...) arrays, or per-episode values.
+    """Sequence of windows of T frames; a window is a dict of arrays (T, ...) or values of the episode, by key.
 
     Images are decoded: colour (T, H, W, 3) uint8, depth (T, H, W) float32 [m], segmentation (T, H, W) uint8. Rows of
-    FEM are NaN if not solved, as given by `fem_known` (T,). `episode` and `frame` (T,) are
-    always present. Each process opens its files on first use.
+    FEM arrays are NaN for frames that FEM did not solve; `fem_known` (T,) marks solved frames. The keys `episode` and
+    `frame` (T,) are always present. Each process opens its own files at their first use.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class Episodes(Sequence[dict[str, Any]]):
     keys
         Arrays and images to read.
     window, step, stride
-        Frames of a window, distance between its frames, and distance between the starts of windows [frames].
+        Number of frames of a window, step between its frames, and step between starts of windows [frames].
     files
         Cache of open files.
     """
@@ -170,7 +170,7 @@ class Episodes(Sequence[dict[str, Any]]):
 
     @property
     def span(self) -> int:
-        """Frames from a window's first to its last."""
+        """Number of frames from the first to the last frame of a window, including both."""
         return (self.window - 1) * self.step + 1
 
     @cached_property
@@ -185,7 +185,7 @@ class Episodes(Sequence[dict[str, Any]]):
         return self.ends[-1]
 
     def __getitem__(self, index: int) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the window of a number, counted over all episodes; IndexError beyond the last."""
+        """Return window `index`, counted over all episodes; raise IndexError beyond the last window."""
         episode, first = self.place(index)
         return self.get_window(episode, first)
 
@@ -193,7 +193,7 @@ class Episodes(Sequence[dict[str, Any]]):
         return (self[index] for index in range(len(self)))
 
     def place(self, index: int) -> tuple[int, int]:
-        """Return the number of the episode of a window, and of its first frame; IndexError beyond the last."""
+        """Return the episode number and the first frame of window `index`; raise IndexError beyond the last window."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
         index %= len(self)
@@ -201,12 +201,12 @@ class Episodes(Sequence[dict[str, Any]]):
         return episode, (index - (self.ends[episode - 1] if episode else 0)) * self.stride
 
     def get_window(self, episode: int, first: int) -> dict[str, Any]:
-        """Return the window of an episode that begins at a frame.
+        """Return the window that begins at frame `first` of an episode.
 
         Raises
         ------
         InputError
-            A window that the episode does not have, a damaged file, or an image that cannot be decoded.
+            The episode has no such window, the file is damaged, or an image cannot be decoded.
         """
         contents = self.contents[episode]
         if not 0 <= first <= contents.frames - self.span:
@@ -224,7 +224,7 @@ class Episodes(Sequence[dict[str, Any]]):
         Raises
         ------
         InputError
-            See `get_window`; a size below 1, or rows of different sizes (for example tumours of two bodies).
+            See `get_window`; the size is < 1, or rows have different shapes (for example tumours of two bodies).
         """
         if size < 1:
             raise InputError(f"batches of {size}: give a whole number of windows, 1 or more.")
@@ -244,16 +244,16 @@ def read_episodes(
     stride: int = 1,
     most_open: int = 16,
 ) -> Episodes:
-    """Read windows of frames of episodes, from a folder or from files.
+    """Read windows of frames from the episodes in a folder or in files.
 
     Parameters
     ----------
     keys
-        Arrays and images by name; None: all numbers and images that every episode has.
+        Names of arrays and images; None: all numbers and images that every episode has.
     window, step, stride
         See `Episodes`.
     most_open
-        Maximum number of open files of a process.
+        Maximum number of open files in a process.
 
     Raises
     ------
