@@ -1,4 +1,4 @@
-"""Connections of many OpenIGTLink clients: input is checked, and no client blocks another."""
+"""Connections of several OpenIGTLink clients; received data are checked, and no client blocks another client."""
 
 import asyncio
 import socket
@@ -20,7 +20,7 @@ from .frame import (
 from .messages import Status, encode_status
 
 REJECTED_DEVICE = "SulcusRefused"
-"""Device name of each STATUS that is sent to one client."""
+"""Device name of STATUS messages about rejected data, which are sent only to the client concerned."""
 MAX_BODY_BYTES = 1 << 28  # Maximum size of a message body [bytes]; a longer one ends the connection.
 
 
@@ -42,14 +42,14 @@ CLIENT_LIMITS = ClientLimits()
 REQUESTS, QUERIES = ("GET_", "STT_", "STP_"), ("GET_", "STP_")
 
 Receive = Callable[[int, Header, bytes], None]
-"""Function of a client's number, a message's header and its content; raises `BadMessageError`."""
+"""Callback that receives a client's number, a message's header and its content; raises `BadMessageError`."""
 Longest = Callable[[str], int]
-"""Function that returns the maximum size [bytes] of messages of a type; 0: not wanted."""
+"""Function that returns the maximum size [bytes] of messages of a type; 0 if the type is not used."""
 
 
 @dataclass(eq=False)
 class Client:
-    """Connected client: pending messages by kind, and True if it polls each message."""
+    """Connected client, its unsent messages (`pending`) by key, and True in `polls` if it requests each message."""
 
     number: int
     writer: asyncio.StreamWriter
@@ -60,31 +60,31 @@ class Client:
     leaving: bool = False
 
     def offer(self, key: str, messages: tuple[bytes, ...]) -> None:
-        """Queue messages for sending; older ones of the same key are dropped."""
+        """Queue messages for sending; they replace unsent messages with the same key."""
         self.pending[key] = messages
         self.news.set()
 
     def leave(self) -> None:
-        """End the connection once the queued messages are sent."""
+        """Request the end of the connection after all queued messages are sent."""
         self.leaving = True
         self.news.set()
 
 
 class LinkClients:
-    """The clients of a server, or the one connection of a client.
+    """Clients of a server, or the connection of this program to a server.
 
-    All methods belong to the event loop's thread.
+    All methods must be called in the thread of the event loop.
 
     Parameters
     ----------
     receive
-        Callback for each wanted message with a valid checksum.
+        Callback for each message of a used type with a valid checksum.
     max_size
-        Maximum size of a message by type; 0: not wanted.
+        Function that returns the maximum size [bytes] of messages of a type; 0 if the type is not used.
     max_clients
-        Maximum number of clients; further ones are rejected.
+        Maximum number of clients; further clients are rejected.
     log
-        Callback for a line when a client connects or leaves, and when a message is rejected for a new reason.
+        Callback for a line of text when a client connects or leaves, and when a message is rejected for a new reason.
     """
 
     def __init__(
@@ -99,25 +99,25 @@ class LinkClients:
         self._attending: set[asyncio.Task] = set()
 
     def __len__(self) -> int:
-        """Return the number of clients."""
+        """Return the number of connected clients."""
         return len(self._clients)
 
     def publish(self, key: str, messages: Iterable[bytes]) -> None:
-        """Send messages to all clients, together; they replace queued messages of the same key."""
+        """Queue messages for all clients that do not poll; they replace unsent messages with the same key."""
         self._newest[key] = tuple(messages)
         for client in self._clients.values():
             if not client.polls:
                 client.offer(key, self._newest[key])
 
     def reject(self, client_number: int, code: Status, reason: str, text: str) -> None:
-        """Count a rejected message, and send a STATUS to one client; a newer STATUS replaces a queued one."""
+        """Count a rejected message, and send a STATUS to its client; this STATUS replaces an unsent one."""
         self._count_rejection(reason, text)
         client = self._clients.get(client_number)
         if client is not None and not client.polls:
             client.offer(REJECTED_DEVICE, (pack_message("STATUS", REJECTED_DEVICE, encode_status(code, text), 0),))
 
     async def serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve one connection until it ends."""
+        """Serve a new client until its connection ends; reject it with a STATUS if there are too many clients."""
         task = asyncio.current_task()
         assert task is not None
         self._attending.add(task)
@@ -132,7 +132,7 @@ class LinkClients:
         await _close(writer)
 
     async def close(self) -> None:
-        """Send the queued messages within a time limit, and end all connections."""
+        """Send all queued messages within a time limit, then end all connections."""
         for client in self._clients.values():
             client.leave()
         for patience in (CLIENT_LIMITS.last_message_time, CLIENT_LIMITS.farewell_time):
@@ -142,7 +142,7 @@ class LinkClients:
                 client.writer.transport.abort()
 
     async def listen(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Receive the messages of a server until the connection ends, and send nothing."""
+        """Receive the messages of a server until the connection ends; no results are published to this server."""
         await self._attend(Client(next(self._numbers), writer, polls=True), reader)
 
     async def _serve_client(self, client: Client, reader: asyncio.StreamReader) -> None:
@@ -171,7 +171,7 @@ class LinkClients:
             await _close(client.writer)
 
     async def _send(self, client: Client) -> None:
-        """Send the queued messages, as fast as the client reads them."""
+        """Send queued messages to a client, as fast as the client reads, until it leaves."""
         try:
             async with asyncio.timeout(CLIENT_LIMITS.greeting_time):
                 await client.spoke.wait()
@@ -196,7 +196,7 @@ class LinkClients:
             self._count_rejection("client that vanished")
 
     async def _read(self, client: Client, reader: asyncio.StreamReader) -> None:
-        """Receive messages of a client until it closes, or sends an invalid message."""
+        """Receive messages of a client until the client closes the connection or sends an invalid header."""
         try:
             while True:
                 raw = await reader.readexactly(HEADER.size)
@@ -219,7 +219,7 @@ class LinkClients:
             self._count_rejection("client that vanished")
 
     async def _receive_body(self, client: Client, reader: asyncio.StreamReader, header: Header) -> None:
-        """Receive one message's body, and reply."""
+        """Receive and process the body of one message; reject it if its type is not used or its content is invalid."""
         if header.kind[:4] in REQUESTS:
             await _skip_bytes(reader, header.size)
             self._handle_request(client, header)
@@ -241,7 +241,7 @@ class LinkClients:
             self.reject(client.number, code, why, f"{_format_name(header)} is rejected: {error}")
 
     def _handle_request(self, client: Client, header: Header) -> None:
-        """Handle a request: send one message (GET), or stop (STP) or start the stream of messages."""
+        """Process a request: queue one message (GET_), stop all messages (STP_), or start sending messages (STT_)."""
         client.polls = header.kind.startswith(QUERIES)
         client.spoke.set()
         if header.kind.startswith("STP_"):
@@ -257,14 +257,14 @@ class LinkClients:
             client.news.set()
 
     def _count_rejection(self, why: str, text: str = "") -> None:
-        """Count a rejected message, and report the first one of each reason."""
+        """Count a rejected message, and log the first message that is rejected for this reason."""
         self.refused[why] += 1
         if self.refused[why] == 1:
             self._note(f"rejected: {text or why}")
 
 
 def _find_message(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
-    """Return the message of a type with a name if there is one, else the message with the latest time stamp."""
+    """Return the message with a type and name, else the newest message of the type; None if there is no such type."""
     every = [(read_header(each[: HEADER.size]), each) for messages in newest.values() for each in messages]
     alike = [(header, each) for header, each in every if header.kind == kind]
     named = (each for header, each in alike if header.name == name)
@@ -276,13 +276,13 @@ def _format_name(header: Header) -> str:
 
 
 async def _skip_bytes(reader: asyncio.StreamReader, size: int) -> None:
-    """Read `size` bytes, and discard them."""
+    """Read and discard `size` bytes."""
     while size:
         size -= len(await reader.readexactly(min(size, CLIENT_LIMITS.chunk_bytes)))
 
 
 def _limit_send_buffer(writer: asyncio.StreamWriter) -> None:
-    """Limit the system's send buffer for unread bytes, and enable keep-alive to detect lost clients."""
+    """Limit the system's send buffer, and enable TCP keep-alive, which detects lost clients."""
     writer.transport.set_write_buffer_limits(high=0)
     own = writer.get_extra_info("socket")
     own.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, CLIENT_LIMITS.buffer_bytes)

@@ -1,4 +1,4 @@
-"""Console output with a limited rate of lines, and the number of suppressed lines."""
+"""Console output with a limited number of lines per time."""
 
 import sys
 import time
@@ -11,14 +11,14 @@ PREFIX = "sulcus link: "  # Start of each line.
 
 
 def print_safely(line: str) -> None:
-    """Print a line to standard error, without control characters; ignored if standard error is closed."""
+    """Print a line to standard error, without control characters; do nothing if standard error is closed."""
     plain = "".join(each if each.isprintable() else "?" for each in line)
     with suppress(OSError):
         print(f"{PREFIX}{plain}", file=sys.stderr, flush=True)
 
 
 def limit_rate(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Callable[[str], None]:
-    """Return a function that writes lines, no more than 10 in 5 s; the next line reports how many were suppressed."""
+    """Return a function that writes at most 10 lines in 5 s; the next line reports the number of suppressed lines."""
     begun, count, skipped = -LINE_INTERVAL, 0, 0
 
     def note(line: str) -> None:
@@ -36,5 +36,5 @@ def limit_rate(write: Callable[[str], None], clock: Callable[[], float] = time.m
 
 
 def format_address(host: str, port: int) -> str:
-    """Format HOST:PORT, with an IPv6 address in brackets."""
+    """Return HOST:PORT; an IPv6 address is written in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -1,4 +1,4 @@
-"""Frame of an OpenIGTLink message: header of 58 bytes, checksum and time stamp."""
+"""Header, checksum and metadata of OpenIGTLink messages."""
 
 import struct
 from collections.abc import Mapping
@@ -10,11 +10,11 @@ with require_extra("slicer", "OpenIGTLink's checksums need"):
     from fastcrc import crc64
 
 HEADER = struct.Struct(">H12s20sQQQ")
-"""Version, type, device name, time stamp, size of the body, checksum: 58 bytes, all numbers big-endian."""
+"""Layout of a header (58 bytes, big-endian): version, type, device name, time stamp, size of the body, checksum."""
 # Extended header of version 2: its size, the sizes of the metadata's index and of the metadata, message number.
 EXTENDED = struct.Struct(">HHII")
 INDEXED = struct.Struct(">HHI")
-"""Layout of a metadata index entry: size of its key, encoding and size of its value."""
+"""Layout of an entry of the metadata index: size of the key, encoding of the value, size of the value."""
 VERSIONS = (1, 2)  # Supported versions of the protocol.
 TICKS = 1 << 32  # Units of a time stamp per second; a stamp of 0 is 1970.
 NAME_BYTES = 20  # Maximum length of a device name [bytes].
@@ -22,17 +22,17 @@ WRONG_CHECKSUM = "wrong checksum"  # Error message.
 
 
 class BadMessageError(ValueError):
-    """Bytes that are no message, or invalid content; the text gives the sender the reason."""
+    """Invalid message; the text states the reason, and is sent to the sender of the message."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """A message's header.
+    """Header of a message.
 
     Parameters
     ----------
     version
-        1; or 2 for an extended header and metadata around the content.
+        Version 1; or version 2, whose body also contains an extended header and metadata.
     kind, name
         Type and device name.
     stamp
@@ -42,7 +42,7 @@ class Header:
     checksum
         CRC-64 of the body (ECMA-182, initial value 0).
     metadata
-        Metadata by key, available after the body was read.
+        Metadata by key; empty until the body is read.
     """
 
     version: int
@@ -55,12 +55,12 @@ class Header:
 
 
 def read_header(raw_bytes: bytes) -> Header:
-    """Decode the header in 58 bytes.
+    """Decode a header of 58 bytes.
 
     Raises
     ------
     BadMessageError
-        An unknown version, or a type or name with characters other than printable ASCII: not OpenIGTLink.
+        The version is unknown, or type or name contain characters other than printable ASCII.
     """
     version, kind, name, stamp, size, checksum = HEADER.unpack(raw_bytes)
     words = [text.split(b"\0", 1)[0] for text in (kind, name)]
@@ -70,12 +70,12 @@ def read_header(raw_bytes: bytes) -> Header:
 
 
 def read_content(header: Header, body: bytes) -> bytes:
-    """Extract the content between extended header and metadata, after the checksum test; of version 1 the whole body.
+    """Check the checksum, and return the content of a body; in version 1, the content is the whole body.
 
     Raises
     ------
     BadMessageError
-        A wrong checksum, or sizes that do not match the body.
+        The checksum is wrong, or sizes in the extended header do not match the body.
     """
     if crc64.ecma_182(body) != header.checksum:
         raise BadMessageError(WRONG_CHECKSUM)
@@ -91,12 +91,12 @@ def read_content(header: Header, body: bytes) -> bytes:
 
 
 def read_metadata(header: Header, body: bytes) -> dict[str, str]:
-    """Read the metadata of a message by key, after its content; empty for version 1.
+    """Return the metadata of a message by key; empty for version 1.
 
     Raises
     ------
     BadMessageError
-        Metadata of other sizes than its index names.
+        Sizes of the metadata do not match their index.
     """
     _, index, size, _ = EXTENDED.unpack_from(body) if header.version > 1 else (0, 0, 0, 0)
     if not index:
@@ -116,16 +116,16 @@ def read_metadata(header: Header, body: bytes) -> dict[str, str]:
 
 
 def pack_message(message_type: str, device_name: str, content: bytes, stamp: int) -> bytes:
-    """Return a whole message of version 1, which every client reads; a name longer than 20 bytes is cut."""
+    """Return a message of version 1 with its header, which all clients support; names are cut after 20 bytes."""
     text = device_name.encode("ascii", "replace")[:NAME_BYTES]
     return HEADER.pack(1, message_type.encode(), text, stamp, len(content), crc64.ecma_182(content)) + content
 
 
 def to_stamp(time: float) -> int:
-    """Return the time stamp of a moment [s since 1970]."""
+    """Convert a time [s since 1970] to a time stamp [2^-32 s since 1970]."""
     return int(time * TICKS)
 
 
 def to_time(stamp: int) -> float:
-    """Return the moment of a time stamp [s since 1970]."""
+    """Convert a time stamp [2^-32 s since 1970] to a time [s since 1970]."""
     return stamp / TICKS

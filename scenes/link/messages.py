@@ -27,7 +27,7 @@ MAX_TEXT_BYTES = (1 << 16) - 1  # Maximum length of a text [bytes].
 
 
 class Status(IntEnum):
-    """Codes of a STATUS."""
+    """Codes of STATUS messages."""
 
     OK = 1
     NOT_FOUND = 4
@@ -43,41 +43,41 @@ class Status(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class EncodedMesh:
-    """Encoded triangles (m, 3) of a moving surface. The triangles are encoded once."""
+    """Encoded triangles (m, 3) of a moving surface, which are the same in all messages."""
 
     count: int
     cells: bytes
 
     @staticmethod
     def from_triangles(triangles: np.ndarray) -> EncodedMesh:
-        """Encode triangles, given as vertex numbers (m, 3)."""
+        """Encode triangles (m, 3), which are vertex numbers."""
         rows = np.full((len(triangles), 4), 3, INTEGER_TYPE)
         rows[:, 1:] = triangles
         return EncodedMesh(len(triangles), rows.tobytes())
 
 
 EMPTY_MESH = EncodedMesh(0, b"")
-"""Surface that is not available."""
+"""Surface without triangles, for a surface that is not available."""
 
 
 def encode_polydata(points: np.ndarray, mesh: EncodedMesh) -> bytes:
-    """Encode points (n, 3) [mm] and the triangles between them as POLYDATA."""
+    """Encode a surface with vertices (n, 3) [mm] as POLYDATA."""
     head = struct.pack(">10I", len(points), 0, 0, 0, 0, mesh.count, len(mesh.cells), 0, 0, 0)
     return head + np.ascontiguousarray(points, FLOAT_TYPE).tobytes() + mesh.cells
 
 
 def encode_transform(T: np.ndarray) -> bytes:
-    """Encode a rigid motion (4, 4) [mm] as TRANSFORM, column by column."""
+    """Encode a rigid transform (4, 4) [mm] as TRANSFORM, column by column."""
     return np.ascontiguousarray(T[:3].T, FLOAT_TYPE).tobytes()
 
 
 def read_transform(content: bytes) -> np.ndarray:
-    """Return the matrix (4, 4) [mm] of a TRANSFORM, without checking it.
+    """Decode the matrix (4, 4) [mm] of a TRANSFORM; the matrix may not be rigid.
 
     Raises
     ------
     BadMessageError
-        A content of another size.
+        The content has the wrong size.
     """
     T = np.eye(4)
     T[:3] = _read_floats(content, 12).reshape(4, 3).T
@@ -85,12 +85,12 @@ def read_transform(content: bytes) -> np.ndarray:
 
 
 def read_position(content: bytes) -> np.ndarray:
-    """Return the matrix (4, 4) [mm] of a POSITION: a translation, and a unit quaternion with the real part last.
+    """Decode a POSITION, a translation and a unit quaternion with the real part last, as matrix (4, 4) [mm].
 
     Raises
     ------
     BadMessageError
-        A content of another size, such as a position without orientation; an invalid quaternion.
+        The content has the wrong size, for example a position without orientation; or the quaternion is invalid.
     """
     numbers = _read_floats(content, 7)
     if not abs(np.linalg.norm(numbers[3:]) - 1.0) < 1e-2:
@@ -121,7 +121,7 @@ def read_points(content: bytes) -> tuple[list[str], np.ndarray]:
     Raises
     ------
     BadMessageError
-        A content of another size; positions that are not finite.
+        The content has the wrong size, or positions are not finite.
     """
     if len(content) % POINT.size:
         raise BadMessageError(f"wrong size: {len(content)} bytes, no multiple of {POINT.size}")
@@ -141,12 +141,12 @@ def encode_image(image: np.ndarray) -> bytes:
 
 
 def read_image(content: bytes) -> np.ndarray:
-    """Decode the image (H, W, 3) uint8 of an IMAGE; grey ones have three equal channels.
+    """Decode the image (H, W, 3) uint8 of an IMAGE; a grey image has three equal channels.
 
     Raises
     ------
     BadMessageError
-        Content that is not one complete 8-bit image in grey, RGB or RGBA.
+        The content is not a complete 8-bit image in grey, RGB or RGBA.
     """
     if len(content) < IMAGE.size:
         raise BadMessageError("is too short for an image")
@@ -162,12 +162,12 @@ def read_image(content: bytes) -> np.ndarray:
 
 
 def encode_string(text: str) -> bytes:
-    """Encode a text of ASCII characters as STRING."""
+    """Encode an ASCII text as STRING."""
     raw = text.encode("ascii", "replace")[:MAX_TEXT_BYTES]
     return struct.pack(">HH", ASCII, len(raw)) + raw
 
 
 def encode_status(code: Status, text: str) -> bytes:
-    """Encode a code, its name, and a sentence as STATUS."""
+    """Encode a code, its name and a text as STATUS."""
     name = "" if code is Status.OK else code.name
     return STATUS.pack(code, 0, name.encode()) + text.encode("ascii", "replace") + b"\0"

@@ -1,4 +1,4 @@
-"""Messages of a result: surfaces, the tumour's pose, distances with bounds, and requested points."""
+"""Messages with a result: surfaces, pose of the tumour, distances with error bounds, and requested points."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,16 +29,16 @@ from .pose_responder import PoseResult
 MAX_POINT_DISTANCE = 2e-3
 MAX_NAMED_POINTS = 5  # Maximum number of points outside the tracked surfaces that are named.
 MAX_PLACES = 1000
-"""Maximum number of points in one request."""
+"""Maximum number of points in a request."""
 UNTRACKED_POINTS = "places that are not in or on the tumour, nor on open cortex, so that their motion is not known"
-"""Reason why points are not tracked."""
+"""Reason in a STATUS about points that are not tracked."""
 # Largest distance of a point from its position by barycentric coordinates, to be inside the tetrahedron [m].
 INSIDE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class SentPoints:
-    """Points in or on the tumour, or on the open cortex.
+    """Requested points in or on the tumour, or on the open cortex.
 
     Parameters
     ----------
@@ -47,9 +47,9 @@ class SentPoints:
     rest
         Positions in the scan (n, 3) [m].
     vertices, weights
-        (n, 4): mesh vertices that determine their motion, and interpolation weights.
+        Mesh vertices (n, 4) that determine the motion of each point, and their interpolation weights (n, 4).
     unattached
-        Description of points that cannot be followed, with their distances; empty: none.
+        Description of the points that cannot be tracked, with their distances; empty if all points are tracked.
     """
 
     names: tuple[str, ...]
@@ -61,9 +61,9 @@ class SentPoints:
 
 @dataclass(frozen=True, eq=False)
 class ResultEncoder:
-    """Encoder of results on a stage. All positions are in the scan's RAS, in millimetres.
+    """Encoder of results as messages. All encoded positions are in scan coordinates (RAS), in millimetres.
 
-    `registered` is true if the registration's error is known.
+    `registered` is True if the error of the registration is known.
     """
 
     stage: Stage
@@ -71,7 +71,7 @@ class ResultEncoder:
 
     @cached_property
     def _surfaces(self) -> tuple[tuple[str, np.ndarray, EncodedMesh], ...]:
-        """Name, vertices and triangles of the tumour, and of the open cortex."""
+        """Name, vertices and encoded triangles of the surfaces of the tumour and of the open cortex."""
         cortex, faces = np.unique(self.stage.anatomy.open_surface, return_inverse=True)
         tumour = EncodedMesh.from_triangles(self.stage.tumour_at_rest.triangles)
         return ("Tumour", self.stage.tumour_vertices, tumour), (
@@ -81,13 +81,13 @@ class ResultEncoder:
         )
 
     def build_scan(self, stamp: int) -> bytes:
-        """Return the tumour at its position in the scan."""
+        """Return the message with the tumour's surface in the scan."""
         _, vertices, mesh = self._surfaces[0]
         at = self.stage.anatomy.mesh.nodes[vertices]
         return pack_message("POLYDATA", "TumourInScan", encode_polydata(1e3 * at, mesh), stamp)
 
     def build_messages(self, result: PoseResult, points: SentPoints | None = None) -> tuple[bytes, ...]:
-        """Build all messages of a result, with the result's stamp; unknown surfaces are sent without points."""
+        """Build all messages of a result, with its time stamp; a surface that is not known is sent without vertices."""
         known, stamp = result.tracking, result.stamp
         none = encode_polydata(np.empty((0, 3)), EMPTY_MESH)
         out = []
@@ -109,19 +109,19 @@ class ResultEncoder:
         return tuple(out)
 
     def build_status(self, result: PoseResult, rejected: str) -> bytes:
-        """Build the STATUS of a result, with the number of rejected messages by reason."""
+        """Build the STATUS message of a result; `rejected` describes rejected messages."""
         known = result.tracking
         code = Status.OK if known.is_reliable else Status.NOT_READY
         words = known.warning or f"the tumour is known, {known.state.value}"
         return pack_message("STATUS", "Sulcus", encode_status(code, f"{words}{rejected}"), result.stamp)
 
     def attach_points(self, names: list[str], positions: np.ndarray) -> SentPoints:
-        """Attach points of the scan (n, 3) [m]: to the tumour's volume if inside, else to the nearest surface.
+        """Attach points (n, 3) [m] in the scan to tetrahedra of the tumour, or outside it to the nearest surface.
 
         Raises
         ------
         BadMessageError
-            No point or too many; none in or on the tumour or on open cortex, so that their motion is unknown.
+            There are no points or too many, or no point is in or on the tumour or on the open cortex.
         """
         if not 0 < len(positions) <= MAX_PLACES:
             raise BadMessageError(f"no place, or more than are followed: 1 to {MAX_PLACES}")
@@ -145,7 +145,7 @@ class ResultEncoder:
         return SentPoints(tuple(names[row] for row in good), positions[good], vertices[good], weights[good], strange)
 
     def _is_in_tumour(self, held: LocatedPoints, at: np.ndarray) -> np.ndarray:
-        """Return True for each point (n, 3) [m] in tetrahedra of the tumour."""
+        """Return a mask (n,) that is True for points (n, 3) [m] in tetrahedra of the tumour."""
         there = np.linalg.norm(np.einsum("nk,nkd->nd", held.weights, self._rest[held.vertices]) - at, axis=1)
         known = np.isin(held.vertices, self.stage.anatomy.tumour_nodes) | (held.weights <= 0.0)
         return known.all(axis=1) & (there <= INSIDE_TOLERANCE)
@@ -155,7 +155,7 @@ class ResultEncoder:
         return self.stage.anatomy.mesh.nodes
 
     def _build_point_message(self, known: TrackingResult, places: SentPoints) -> bytes:
-        """Build the POINT message of the positions of those points that the result covers."""
+        """Build the POINT message with the positions of all points whose motion is known."""
         moved = (known.motion.positions - self._rest)[places.vertices]
         at = 1e3 * (places.rest + np.einsum("nk,nkd->nd", places.weights, moved))
         nodes = () if known.motion.solution is None else known.motion.solution.nodes
@@ -163,7 +163,7 @@ class ResultEncoder:
         return encode_points([places.names[row] for row in here], at[here])
 
     def _format_distance(self, result: PoseResult) -> str:
-        """Describe the distance from tip to tumour with its error and source, or the reason why it is not available."""
+        """Describe the distance from tip to tumour with its error and its sources, or state why it is not available."""
         known, gauge = result.tracking, result.gauge
         if gauge is None:
             return f"not known: {known.warning}"
@@ -171,7 +171,7 @@ class ResultEncoder:
         return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._source}){_format_doubt(known)}"
 
     def _format_motion(self, known: TrackingResult) -> str:
-        """Describe the tumour's displacement, with its error and sources; or why it is unknown."""
+        """Describe the tumour's displacement with its error and its sources, or state why it is not available."""
         if known.bound is None:
             return f"not known: {known.warning}"
         moved = format_millimetres(known.motion.distance, known.motion.error)
@@ -180,31 +180,31 @@ class ResultEncoder:
 
     @property
     def _source(self) -> str:
-        """Description of the sources included in an error, and of the unknown ones."""
+        """Description of the sources of error that a bound includes, and of the unknown sources."""
         if self.registered:
             return "of tracking, registration and model; not known of tissue and segmentation"
         return "of tracking and model; not known of registration, tissue and segmentation"
 
 
 def _format_doubt(known: TrackingResult) -> str:
-    """Describe why numbers are unreliable; empty if they are reliable."""
+    """Describe why a result is unreliable; empty if the result is reliable."""
     return "" if known.is_reliable else f"; doubtful: {known.warning}"
 
 
 def _format_names(names: list[str]) -> str:
-    """Format the first names, and the number of the others."""
+    """Return the first names, and the number of further names, as text."""
     others = len(names) - MAX_NAMED_POINTS
     return ", ".join(names[:MAX_NAMED_POINTS]) + (f" and {others} others" if others > 0 else "")
 
 
 def _is_motion_known(known: TrackingResult, vertices: np.ndarray) -> bool:
-    """Return True if the motion of these vertices is known."""
+    """Return True if the motion of all given vertices is known."""
     result = known.motion.solution
     return result is not None and bool(np.isin(vertices, result.nodes).all())
 
 
 def fit_rigid(rest: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """Fit the rigid motion (4, 4) that maps points (n, 3) to their current positions (n, 3), in their unit."""
+    """Fit the rigid transform (4, 4) that maps points `rest` (n, 3) to `current` positions (n, 3), in the same unit."""
     middle, there = rest.mean(axis=0), current.mean(axis=0)
     T = np.eye(4)
     T[:3, :3] = Rotation.align_vectors(current - there, rest - middle)[0].as_matrix()
