@@ -1,4 +1,4 @@
-"""Tracking result of a tool's pose: positions of tumour and open cortex, with their errors."""
+"""Solver that computes positions of tumour and open cortex, and their errors, from received poses of a tool."""
 
 import time as clock
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ TIMED_DEPTH = 2e-3  # Depth of the tool whose solution is timed at the start [m]
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """Camera pose T (4, 4) [m] in the reference's frame, and error of a position by the camera's motion [m]."""
+    """Camera pose T (4, 4) [m] in the reference's frame; `motion_error` [m]: error of a position by camera motion."""
 
     T: np.ndarray
     motion_error: float
@@ -46,12 +46,12 @@ class CameraPose:
 def interpolate_camera_pose(
     received: Sequence[ReceivedTransform], now: float, stamp: int, position: np.ndarray, max_age: float
 ) -> CameraPose | str:
-    """Interpolate a camera's pose at an image's time stamp, from its poses, the newest last; or return a reason.
+    """Interpolate a camera's pose at an image's time stamp `stamp` from its `received` poses (newest last).
 
-    Between two poses, and just after the newest, see `PoseStream.interpolate`. The error is the camera's
-    possible acceleration between them, at a position (3,) [m] in the reference's frame. Otherwise, and with fewer than
-    three poses, it is the newest pose, and the position's motion in the image since. Without stamps, arrival times of
-    messages are used. A reason has {name} instead of the transform's name.
+    With three or more dense poses, the result is from `PoseStream.interpolate`, and the error of a position (3,) [m]
+    in the reference's frame follows from its covariance. Otherwise the result is the newest pose, and the error is the
+    motion of the position since this pose, at the last speed. Without time stamps, times of arrival are used. If the
+    pose is unknown, the reason is returned, with {name} instead of the transform's name.
     """
     body = received[-1]
     stamped = bool(stamp and all(sent.stamp for sent in received))
@@ -77,16 +77,16 @@ def interpolate_camera_pose(
 
 @dataclass(frozen=True, eq=False)
 class PoseResult:
-    """Result for a pose.
+    """Result for a pose of the tool.
 
     Parameters
     ----------
     stamp
-        The pose's own time stamp; without one, or without a result, that of the computation.
+        Time stamp of the pose, or of the computation if the pose has no time stamp or there is no result.
     tracking
-        Positions of tumour and cortex, with state and text of an overlay.
+        Positions of tumour and cortex, with the state and the warning of the overlay.
     gauge
-        Distance from tip to tumour; None if unknown.
+        Distance from tip to tumour; None if not available.
     """
 
     stamp: int
@@ -98,7 +98,7 @@ class PoseResult:
 class CameraView:
     """Pose of the scan in a camera's frame: T_camera_scan (4, 4) [m].
 
-    `motion_error` is the tumour's error [m] from the time between pose and image.
+    `motion_error` is the error [m] of the tumour's position due to the time between pose and image.
     """
 
     T_camera_scan: np.ndarray
@@ -107,18 +107,18 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class PoseResponder:
-    """Solver for poses: a pure function of the received transforms, except for the start of an FEM solution.
+    """Solver for poses. Results depend only on the received transforms, except for the initial values of a solve.
 
     Parameters
     ----------
     motion
         Model of the brain's motion under a tool.
     tool
-        Shape of the tool, and its pose in the tracked frame.
+        Shape of the tool, and its pose in the frame of the tracked body.
     tracking
-        Standard deviation of the tip's position along each axis [m], which messages do not contain.
+        Standard deviation of the tip's position along each axis [m]; messages do not contain it.
     registration
-        Registration from a file; None: it is received, with unknown error and patient.
+        Registration from a file; None: the registration is received, and its error and patient are unknown.
     """
 
     motion: ToolMotion
@@ -129,7 +129,7 @@ class PoseResponder:
     def compute_result(
         self, transforms: ReceivedTransforms, time: float, wall_time: float, previous: TrackingResult | None = None
     ) -> PoseResult:
-        """Compute the result at a time `time` [s], from the result `previous`; `wall_time`: now, in s since 1970."""
+        """Compute the result at `time` [s], which is `wall_time` [s since 1970]; a solve starts from `previous`."""
         registration = self._find_registration(transforms)
         if isinstance(registration, str):
             return self._build_unknown(registration, wall_time, previous)
@@ -156,7 +156,7 @@ class PoseResponder:
         return PoseResult(stamp, known, gauge)
 
     def measure_solve_time(self) -> float:
-        """Measure the time of one solution [s]: the tool 2 mm deep at the craniotomy, with kernels loaded before."""
+        """Measure the time [s] of a solution with the tool 2 mm deep in the craniotomy, after kernels are compiled."""
         site, pose = self.motion.stage.site, np.eye(4)
         pose[:3] = np.column_stack([site.right, site.up, -site.axis, site.origin + TIMED_DEPTH * site.axis])
         self.motion.compute_motion(pose, self.tracking**2 * np.eye(3))
@@ -165,7 +165,7 @@ class PoseResponder:
         return clock.perf_counter() - begun
 
     def find_camera(self, transforms: ReceivedTransforms, time: float, stamp: int) -> CameraView | str:
-        """Return the scan's pose in the camera's frame at an image's time stamp, or why it is unknown at `time` [s]."""
+        """Return the scan's pose in the camera's frame at an image's time stamp, or the reason why it is unknown."""
         name = transforms.names.camera
         registration, body = self._find_registration(transforms), transforms.find_relative_transform(name, time)
         if isinstance(registration, str) or isinstance(body, str):
@@ -177,7 +177,7 @@ class PoseResponder:
         return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.motion_error)
 
     def _find_registration(self, heard: ReceivedTransforms) -> Registration | str:
-        """Return the registration from the file or the last message, or the reason why there is none."""
+        """Return the registration from the file or from the last message, or the reason why it is not available."""
         if self.registration is not None:
             return self.registration
         sent = heard.newest.get(heard.names.registration)
@@ -186,7 +186,7 @@ class PoseResponder:
         return Registration(np.linalg.inv(sent.T), np.zeros((6, 6)), np.zeros(3), 0.0, 0)
 
     def _describe_doubts(self, known: TrackingResult, before: TrackingResult | None) -> dict[str, object]:
-        """Return state, text and `near` of an unreliable result; only `near` of a reliable result."""
+        """Return fields to change in a result: `was_near`, and `state` and `warning` if the result is unreliable."""
         near = before is not None and before.was_near
         assert known.T_scan_tool is not None
         doubt, near = describe_misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, OWNER_QUESTION)
@@ -198,7 +198,7 @@ class PoseResponder:
         return {"was_near": near}
 
     def _add_band(self, known: TrackingResult, registration: Registration) -> TrackingResult:
-        """Add the bound on the tumour's error [m], and its parts by source, to a reliable result."""
+        """Add the bound on the tumour's error, and its parts by source, to a result if the result is reliable."""
         if not known.is_reliable:
             return known
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
@@ -209,7 +209,7 @@ class PoseResponder:
         return add_error_bound(known, band, parts)
 
     def _build_unknown(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
-        """Build the result without a known position, with the reason."""
+        """Build the result for an unknown pose, with the reason as warning."""
         tool_time = None if before is None else before.tool_time
         near = before is not None and before.was_near
         state = TumourState.NO_TOOL if tool_time is None else TumourState.STALE
@@ -220,14 +220,14 @@ class PoseResponder:
 
 
 def add_error_bound(tracking: TrackingResult, bound: float, contributions: dict[str, float]) -> TrackingResult:
-    """Add a bound [m] on the position, and its parts, to a result; beyond 5 mm it is unreliable."""
+    """Add an error bound [m] and its parts by source to a result; if it exceeds 5 mm, the result is unreliable."""
     if bound <= FollowerSettings().max_overlay_error:
         return replace(tracking, bound=bound, sources=contributions)
     return replace(tracking, state=TumourState.UNSURE, warning=describe_large_error(bound), bound=None, sources={})
 
 
 def mark_late(result: PoseResult, age: float, max_age: float) -> PoseResult:
-    """Return the result for a pose of the given age [s]: stale if older than `max_age`."""
+    """Return the result, marked as stale if the age [s] of its pose exceeds `max_age`."""
     if age <= max_age or not (result.tracking.is_reliable or result.tracking.state is TumourState.UNSURE):
         return result
     words = f"stale, the result is {age:.1f} s old: do not rely on it"

@@ -1,4 +1,4 @@
-"""Received transforms of tool, reference, camera and scan, by OpenIGTLink's names; old ones are unknown."""
+"""Received transforms of tool, reference, camera and scan, by their OpenIGTLink device names."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ MAX_KEPT_TRANSFORMS = 32
 
 @dataclass(frozen=True)
 class TransformNames:
-    """Device names of the received transforms, each AToB: it maps coordinates in frame A to frame B.
+    """Device names of the received transforms; a transform AToB maps coordinates in frame A to frame B.
 
-    If a tool or camera transform has the same frame B as `reference`, its B is the tracker; otherwise it is the
-    patient's reference, also for names of another form.
+    If a transform of tool or camera has the same frame B as `reference`, B is the tracker. Otherwise, also for names of
+    another form, B is the patient's reference.
     """
 
     tool: str = "StylusTipToReference"
@@ -34,18 +34,18 @@ class TransformNames:
 
     @cached_property
     def by_wire(self) -> dict[str, str]:
-        """Names by the bytes of each that fit into a message."""
+        """Complete names, by name as shortened in a message."""
         return {name[:NAME_BYTES].strip(): name for name in (self.tool, self.reference, self.camera, self.registration)}
 
     def is_tracker_transform(self, name: str) -> bool:
-        """Return True if a body's transform is in the tracker's frame."""
+        """Return True if the transform with this name maps to the tracker's frame."""
         tracker = self.reference.rpartition("To")[2]
         return "To" in self.reference and name.rpartition("To")[2] == tracker
 
 
 @dataclass(frozen=True, eq=False)
 class ReceivedTransform:
-    """Received transform: T (4, 4) [m], its time stamp, time of arrival [s], and number of the client."""
+    """Received transform T (4, 4) [m] with its time stamp, time of arrival [s], and number of the sending client."""
 
     T: np.ndarray
     stamp: int
@@ -55,16 +55,16 @@ class ReceivedTransform:
 
 @dataclass(frozen=True, eq=False)
 class ReceivedTransforms:
-    """The newest transforms by name.
+    """Newest transforms, by name.
 
     Parameters
     ----------
     names
         Names of the accepted transforms.
     max_age
-        Maximum age of a moving body's transform [s].
+        Maximum age [s] at which the transform of a moving body is used.
     newest, earlier
-        Newest transforms, and earlier ones (oldest first), by name.
+        Newest transform, and earlier transforms (oldest first), by name.
     """
 
     names: TransformNames
@@ -73,13 +73,13 @@ class ReceivedTransforms:
     earlier: Mapping[str, tuple[ReceivedTransform, ...]] = field(default_factory=dict)
 
     def add_transform(self, name: str, matrix: np.ndarray, stamp: int, time: float, sender: int) -> ReceivedTransforms:
-        """Return the state with a transform (4, 4) [mm] of one client added.
+        """Return a copy with a transform (4, 4) [mm] added, which arrived from a client `sender` at `time` [s].
 
         Raises
         ------
         BadMessageError
-            A matrix that is not a rigid motion, or that marks an invisible body; a time stamp that does not
-            increase; another client that sends the same transform.
+            The matrix is not a rigid transform or marks an invisible body, time stamps do not increase, or another
+            client sends the same transform.
         """
         if not matrix[:3, :3].any():
             raise BadMessageError("zeros, which trackers send for invisible bodies")
@@ -103,7 +103,7 @@ class ReceivedTransforms:
         return replace(self, newest=newest, earlier={**self.earlier, name: kept})
 
     def find_relative_transform(self, name: str, time: float) -> ReceivedTransform | str:
-        """Return a body relative to the patient's reference, with its own time stamp; or why it is unknown."""
+        """Return a body's transform to the patient's reference, or the reason why it is unknown at `time` [s]."""
         needed = (name, self.names.reference) if self.names.is_tracker_transform(name) else (name,)
         for each in needed:
             sent = self.newest.get(each)
@@ -114,7 +114,7 @@ class ReceivedTransforms:
         return self._transform_to_reference(name, self.newest[name])
 
     def list_transforms(self, name: str) -> tuple[ReceivedTransform, ...]:
-        """Return a body's transforms by one sender, oldest first, relative to the current reference."""
+        """Return a body's transforms to the patient's current reference, oldest first; all are from the last sender."""
         newest = self.newest[name]
         every = (*self.earlier.get(name, ()), newest)
         return tuple(self._transform_to_reference(name, sent) for sent in every if sent.sender == newest.sender)
@@ -128,12 +128,12 @@ class ReceivedTransforms:
 
 
 def check_tracker_status(metadata: Mapping[str, str]) -> None:
-    """Reject a transform of a body that its tracker does not see: any status other than OK.
+    """Check that the metadata of a transform contain no tracker status other than OK.
 
     Raises
     ------
     BadMessageError
-        A status, as sent by 3D Slicer and PLUS, other than OK.
+        The tracker does not see the body: a status, as sent by 3D Slicer and PLUS, is not OK.
     """
     for key, value in metadata.items():
         if key.casefold().endswith("status") and value.casefold() != "ok":
@@ -141,12 +141,12 @@ def check_tracker_status(metadata: Mapping[str, str]) -> None:
 
 
 def to_rigid(matrix: np.ndarray) -> np.ndarray:
-    """Return the rigid motion (4, 4) [m] of a matrix (4, 4) [mm], without the rounding of single precision.
+    """Convert a matrix (4, 4) [mm] to a rigid transform (4, 4) [m] with an orthogonal rotation in double precision.
 
     Raises
     ------
     BadMessageError
-        A matrix that is not finite, mirrors, scales or shears, or shifts by more than 10 m.
+        The matrix is not finite, mirrors, scales or shears, or shifts by more than 10 m.
     """
     if not np.isfinite(matrix).all():
         raise BadMessageError("a matrix that is not finite")

@@ -1,4 +1,4 @@
-"""Loop of a live link: the newest pose is solved in a thread, and a separate task reports old poses."""
+"""Event loop of a live link. A thread solves the newest pose; a separate task reports poses that are too old."""
 
 import asyncio
 import re
@@ -43,7 +43,7 @@ MAX_SHORT_BYTES = 1 << 16  # Maximum size of a message without an image or point
 READ_AHEAD_BYTES = 1 << 18  # Read-ahead size of a client [bytes].
 
 Picture = tuple[np.ndarray, int]
-"""Colours (H, W, 3) uint8, and a time stamp."""
+"""Image (H, W, 3) uint8 and its time stamp."""
 
 
 class PoseResponderLike(Protocol):
@@ -52,11 +52,11 @@ class PoseResponderLike(Protocol):
     def compute_result(
         self, transforms: ReceivedTransforms, time: float, wall_time: float, previous: TrackingResult | None = None
     ) -> PoseResult:
-        """Compute the result, as `PoseResponder.compute_result`."""
+        """Compute the result, see `PoseResponder.compute_result`."""
         ...
 
     def find_camera(self, transforms: ReceivedTransforms, time: float, stamp: int) -> CameraView | str:
-        """Return the scan's pose, as `PoseResponder.find_camera`."""
+        """Return the scan's pose in the camera's frame, see `PoseResponder.find_camera`."""
         ...
 
 
@@ -64,34 +64,34 @@ class MessageWriter(Protocol):
     """Interface of an encoder of results."""
 
     def build_scan(self, stamp: int) -> bytes:
-        """Build the scan's message, as `ResultEncoder.build_scan`."""
+        """Build the message with the tumour in the scan, see `ResultEncoder.build_scan`."""
         ...
 
     def build_messages(self, result: PoseResult, points: SentPoints | None = None) -> tuple[bytes, ...]:
-        """Build the messages, as `ResultEncoder.build_messages`."""
+        """Build the messages of a result, see `ResultEncoder.build_messages`."""
         ...
 
     def build_status(self, result: PoseResult, rejected: str) -> bytes:
-        """Build the STATUS, as `ResultEncoder.build_status`."""
+        """Build the STATUS message of a result, see `ResultEncoder.build_status`."""
         ...
 
     def attach_points(self, names: list[str], positions: np.ndarray) -> SentPoints:
-        """Attach points, as `ResultEncoder.attach_points`."""
+        """Attach points to tissue, see `ResultEncoder.attach_points`."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class OverlayCamera:
-    """Overlay of a camera's images; `tracking` is the standard deviation of its position along each axis [m]."""
+    """Overlay on camera images; `tracking` is the standard deviation [m] of the camera's position along each axis."""
 
     calibration: Calibration
     painter: Painter
     tracking: float
 
     def draw(self, image: np.ndarray, tracking: TrackingResult, view: CameraView | str) -> np.ndarray:
-        """Draw a result on an image (H, W, 3) uint8.
+        """Return an image (H, W, 3) uint8 with the drawn result.
 
-        If the scan's pose in the camera's frame is unknown, only the reason is drawn.
+        If `view` is not a pose but the reason why it is unknown, only this reason is drawn.
         """
         if isinstance(view, str):
             tracking = replace(tracking, state=TumourState.NO_REFERENCE, warning=f"{view}: nothing is drawn")
@@ -107,22 +107,22 @@ class OverlayCamera:
 
 
 class LinkSession:
-    """Live link that receives poses, computes results, and publishes them.
+    """Live link that receives poses, computes results, and publishes the results.
 
     All methods except `_compute_messages` and drawing run in the event loop's thread.
 
     Parameters
     ----------
     responder, encoder
-        Solver, and encoder of its results.
+        Solver for poses, and encoder of its results.
     transforms
-        Received transforms, with the names in use.
+        Initial transforms, with the names of the transforms to receive.
     camera
-        Overlay of received images; None: images are not wanted.
+        Overlay on received images; None: images are not accepted.
     max_clients
         Maximum number of clients.
     log
-        Callback for a line when something changes: clients, the source, the state, and rejections.
+        Callback for a line of text when clients, the source or the tumour's state change, or a message is rejected.
     """
 
     def __init__(
@@ -149,21 +149,21 @@ class LinkSession:
         self._ended = asyncio.Event()
 
     def end(self) -> None:
-        """Notify all clients of the end, and end `serve`; callable from any thread."""
+        """Notify all clients of the end, and end `serve`; this method may be called in any thread."""
         with suppress(RuntimeError):  # the loop is closed: it has ended
             self._loop.call_soon_threadsafe(self._ended.set)
 
     async def serve(
         self, host: str, port: int, seconds: float, ready: asyncio.Future[int], source: tuple[str, int] | None = None
     ) -> None:
-        """Serve clients for `seconds`; `ready` is given the port.
+        """Serve clients for `seconds` [s]; `ready` receives the port.
 
-        Poses may also come from a server, `source`, to which nothing is sent; a lost connection is retried.
+        Messages may also be received from a server `source` (host, port); a lost connection to this server is retried.
 
         Raises
         ------
         OSError
-            An address on which no server can be opened.
+            No server can be opened at this address.
         """
         server = await asyncio.start_server(self.clients.serve_connection, host, port, limit=READ_AHEAD_BYTES)
         ready.set_result(server.sockets[0].getsockname()[1])
@@ -213,7 +213,7 @@ class LinkSession:
                 task.result()  # raises the exception of the task
 
     async def _keep_solving(self, thread: ThreadPoolExecutor) -> None:
-        """Compute the solution of the newest pose, repeatedly."""
+        """Compute and publish the result for the newest pose, repeatedly."""
         while True:
             await self._posed.wait()
             self._posed.clear()
@@ -229,7 +229,7 @@ class LinkSession:
             self._show(current, messages if current is result else self._speaks.build_messages(current, places))
 
     async def _keep_reporting(self) -> None:
-        """Publish at each check, independent of the solver, that a pose or its solution is too old, and a STATUS."""
+        """Report repeatedly, independent of the solver, if a pose or its result is too old, and publish a STATUS."""
         said: object = None
         beat = 0.0
         while True:
@@ -245,7 +245,7 @@ class LinkSession:
             await asyncio.sleep(CHECK_INTERVAL)
 
     def _get_current_result(self, now: float) -> PoseResult:
-        """Return the last solution, or the reason why it is not valid at a time [s]; the solver is not called."""
+        """Return the last result; if it is not valid at a time [s], return a result with the reason."""
         if isinstance(self._heard.find_relative_transform(self._heard.names.tool, now), str):
             return self._answers.compute_result(self._heard, now, clock.time(), self._shown.tracking)
         result, waited = mark_late(self._solved, now - self._arrived, self._heard.max_age), now - self._begun
@@ -261,7 +261,7 @@ class LinkSession:
     def _compute_messages(
         self, heard: ReceivedTransforms, places: SentPoints | None, now: float
     ) -> tuple[PoseResult, tuple[bytes, ...]]:
-        """Compute a result and its messages, in the solver's thread."""
+        """Compute a result and its messages; called in the solver's thread."""
         result = self._answers.compute_result(heard, now, clock.time(), self._shown.tracking)
         return result, self._speaks.build_messages(result, places)
 
@@ -273,7 +273,7 @@ class LinkSession:
         self.clients.publish("answer", messages)
 
     def _format_rejected(self, known: TrackingResult) -> str:
-        """Describe rejected messages, and other received transforms if the wanted one does not arrive."""
+        """Describe rejected messages, and, if the tool's transform is missing, list other received transforms."""
         parts = [f"{number} {why}" for why, number in self.clients.refused.most_common(MAX_OTHERS)]
         words = f"; rejected: {', '.join(parts)}" if parts else ""
         if self._others and known.state in (TumourState.NO_TOOL, TumourState.STALE):
@@ -281,7 +281,7 @@ class LinkSession:
         return words
 
     async def _keep_drawing(self, eye: OverlayCamera, thread: ThreadPoolExecutor) -> None:
-        """Draw into the newest image, repeatedly."""
+        """Draw the overlay on the newest image and publish the image, repeatedly."""
         while True:
             await self._pictured.wait()
             self._pictured.clear()
@@ -293,7 +293,7 @@ class LinkSession:
             self.clients.publish("picture", (pack_message("IMAGE", "Overlay", encode_image(drawn), stamp),))
 
     def _get_max_size(self, kind: str) -> int:
-        """Return the maximum size [bytes] of a wanted message of a type; 0: not wanted."""
+        """Return the maximum size [bytes] of a message of a type; 0 if the type is not used."""
         if kind == "IMAGE" and self._eye is not None:
             return IMAGE.size + 4 * self._eye.calibration.width * self._eye.calibration.height + MAX_SHORT_BYTES
         if kind == "POINT":
@@ -301,7 +301,7 @@ class LinkSession:
         return MAX_SHORT_BYTES if kind in ("TRANSFORM", "POSITION", *UNANSWERED) else 0
 
     def _receive(self, number: int, header: Header, content: bytes) -> None:
-        """Process a message; raises `BadMessageError`."""
+        """Process the content of a message from a client; raise `BadMessageError` if the content is invalid."""
         match header.kind:
             case "TRANSFORM" | "POSITION":
                 self._receive_transform(number, header, content)
@@ -337,7 +337,7 @@ class LinkSession:
 
 
 def _describe_state(known: TrackingResult) -> str:
-    """Describe the state of the tumour, for a console."""
+    """Describe the state of the tumour for the console."""
     if known.is_reliable:
         return f"known, {known.state.value}"
     return f"{'doubtful' if known.state is TumourState.UNSURE else 'not known'}: {known.warning}"

@@ -1,1 +1,1 @@
-"""Deformed brains in the files of other programs: fields, images, meshes, markups, segmentations."""
+"""Export of deformed brains to other programs: displacement fields, images, meshes, markups, segmentations."""

@@ -1,4 +1,4 @@
-"""Exported deformation: displacement of an anatomy, its cause, and its error bound."""
+"""Deformed anatomy for export: displacement, cause of the displacement, and error bound."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,27 +26,27 @@ from ..play.stage import Stage
 from ..script.scene import Scene
 
 ENSEMBLE = "registration, segmentation, tissue and skull, as `sulcus uncertainty` has it"
-"""Description of the bound of a scene."""
+"""Description of the sources of error that the error bound of a scene includes."""
 NODE_TOLERANCE = 1e-6  # Largest distance of corresponding nodes in two meshes of one body [m].
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """Cause of a displacement: a description, and a record of its `kind` and properties."""
+    """Cause of a displacement: a description, and a record for JSON with its `kind` and properties."""
 
     description: str
     record: Mapping[str, Any]
 
 
 def describe_scene_cause(scene: Scene, number: int) -> Cause:
-    """Describe frame `number` of a scene as a cause."""
+    """Return frame `number` of a scene as cause of a displacement."""
     time = float(scene.times[number])
     record = {"kind": "scene", "scene": scene.name, "frame": number, "time_s": time}
     return Cause(f"scene {scene.name}, frame {number}, {time:.2f} s", record)
 
 
 def describe_load_cause(loads: Loads) -> Cause:
-    """Describe the single push of a load case as a cause."""
+    """Return the push in a load case as cause of a displacement; `loads` contain exactly one push."""
     (pushed,) = loads.get_all(Pushed)
     place, force = 1e3 * pushed.point[0], pushed.force[0]
     newton = float(np.linalg.norm(force))
@@ -70,22 +70,22 @@ def _round_values(values: np.ndarray) -> list[float]:
 
 @dataclass(frozen=True, eq=False)
 class DeformedAnatomy:
-    """Displaced anatomy.
+    """Anatomy with a displacement.
 
     Parameters
     ----------
     cause
         Cause of the displacement.
     anatomy, remaining
-        Anatomy, and its remaining part after a resection.
+        Complete anatomy, and its remaining part after a resection.
     displacement
-        Displacement of the vertices (V, 3) [m].
+        Displacements (V, 3) [m] of the vertices.
     converged
         True if the solution is reliable.
     bound, bound_text
-        95 % bound of the tumour's surface error [m], None if not available; and its description.
+        95 % bound [m] on the error of the tumour's surface (None if not available), and description of this bound.
     tip
-        Tip of the tool (3,) [m]; None without a tool.
+        Position (3,) [m] of the tool's tip; None without a tool.
     """
 
     cause: Cause
@@ -99,13 +99,13 @@ class DeformedAnatomy:
 
     @property
     def positions(self) -> np.ndarray:
-        """Displaced vertices (V, 3) [m]."""
+        """Deformed positions (V, 3) [m] of the vertices."""
         return self.anatomy.mesh.nodes + self.displacement
 
     def find_gap(self) -> tuple[np.ndarray, float] | None:
-        """Return the tumour's point (3,) [m] nearest to the tip, and its distance [m], 0 inside.
+        """Return the tumour's point (3,) [m] nearest to the tip, and the distance [m] of the tip, which is 0 inside.
 
-        None without a tip or a tumour.
+        The result is None without a tip or a tumour.
         """
         triangles = self.remaining.tumour_surface
         if self.tip is None or not len(triangles):
@@ -117,7 +117,7 @@ class DeformedAnatomy:
 
 @dataclass(frozen=True, eq=False)
 class PlayedScene:
-    """Scene on a body, or a `is_load` as a scene, with the FEM that solves it."""
+    """Scene of a patient, which is solved by FEM; `is_load` is True if the scene consists of a single load."""
 
     patient: PatientSetup
     scene: Scene
@@ -126,7 +126,7 @@ class PlayedScene:
     def solve_frames(
         self, frames: Sequence[int], progress: Callable[[int], object] = lambda more: None
     ) -> list[DeformedAnatomy]:
-        """Return the moments of some frames, in ascending order."""
+        """Solve some frames, given in ascending order; return the deformed anatomy of each frame."""
         fem = self.patient.build_fem(self.scene, TRAIN, 1, live=True)
         needed = range(frames[-1] + 1) if is_history_dependent(fem) else frames
         answers = solve_reference_frames(
@@ -158,12 +158,12 @@ class PlayedScene:
 
 
 def read_deformed_anatomy(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
-    """Return the moment in a result of `sulcus locate` or `sulcus solve` for an anatomy.
+    """Read the deformed anatomy from a result of `sulcus locate` or `sulcus solve`.
 
     Raises
     ------
     InputError
-        See `read_mesh`; a mesh without `displacement` (V, 3), or of another body.
+        See `read_mesh`; also if the mesh has no `displacement` (V, 3) or is not that of the anatomy.
     """
     file = read_mesh(path)
     moved = file.point_data.get("displacement")

@@ -1,4 +1,4 @@
-"""All files of a warp."""
+"""Export of a deformed anatomy into the files of a folder."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ from .places import FoldedRegion, SamplePoints, SpacingSettings, compute_fields,
 from .readme import write_readme
 
 MESH_COLOURS = {"brain": (0.86, 0.72, 0.66, 0.35), "cortex": (0.86, 0.60, 0.54, 1.0), "tumour": (0.20, 0.94, 0.42, 1.0)}
-"""Colours (RGBA, 0 to 1) of the surfaces."""
+"""Colours (RGBA, 0 to 1) of the surfaces, by name."""
 MIN_MOTION = 1e-4  # Displacement above which a vertex moves [m].
 MAX_GRID_ERROR = 0.1  # Grid error at the tumour, relative to the largest motion, above which a warning is given.
 SEQUENCE_SPACING = 3e-3  # Grid spacing of a sequence [m].
@@ -32,7 +32,7 @@ MAX_VALUES = 400_000_000  # Maximum number of values of a sequence.
 
 @dataclass(frozen=True)
 class WarpSettings:
-    """Settings of fields and images: spacing [m] (None: as `compute_fields`), and interpolation of images.
+    """Settings of an export: grid spacing [m] of the fields (None: see `compute_fields`), and interpolation of images.
 
     `source` is the name of the anatomy's file; `step` receives the number of newly finished parts.
     """
@@ -50,14 +50,14 @@ def write_warp(
     settings: WarpSettings,
     sequence: Sequence[tuple[float, DeformedAnatomy]],
 ) -> dict[str, Any]:
-    """Write a moment into the folder of `write_folder_atomically`, and moments of a `sequence` with their times [s].
+    """Write all files of a deformed anatomy, and of a `sequence` of deformed anatomies with their times [s].
 
-    Returns the summary.
+    Return the content of `warp.json`.
 
     Raises
     ------
     InputError
-        See `compute_fields`; a sequence that is too long.
+        See `compute_fields`; also if the sequence is too long.
     """
     begun = process_time()
     fields = compute_fields(deformed, settings.spacing, settings.step)
@@ -123,7 +123,7 @@ def _write_points(place: Path, moment: DeformedAnatomy, marks: Sequence[Landmark
 
 
 def list_named_points(deformed: DeformedAnatomy, landmarks: Sequence[Landmark]) -> dict[str, np.ndarray]:
-    """List points (3,) [m] by name: tissue in the scan and deformed, the tumour's deformed centroid, and the tip."""
+    """Return points (3,) [m] by name: landmarks in the scan and deformed, deformed centroid of the tumour, and tip."""
     points = {}
     for one in landmarks:
         points |= {f"{one.name}, in the scan": one.rest, f"{one.name}, now": one.deformed}
@@ -144,7 +144,7 @@ def _write_sequence(path: Path, sequence: Sequence[tuple[float, DeformedAnatomy]
 
 
 def describe_spaces(files: Sequence[str]) -> dict[str, str]:
-    """Describe the coordinate system of each file; `cause` has coordinates in `warp.json`."""
+    """Return the coordinate system of each file, by file name, and of the coordinates in `warp.json`."""
     known = {"field_resampling.nii.gz": "RAS, mm", "deformed.glb": "left, head, front, m"}
     endings = {".nii.gz": "that of the image", ".txt": ""}
     found = {name: known.get(name, endings.get(name[name.find(".") :], "LPS, mm")) for name in files}
@@ -154,7 +154,7 @@ def describe_spaces(files: Sequence[str]) -> dict[str, str]:
 def collect_figures(
     deformed: DeformedAnatomy, fields: WarpFields, samples: SamplePoints, images: Sequence[WarpedImage], frames: int
 ) -> dict[str, Any]:
-    """Collect the report of a warp: millimetres, shares, counts of voxels, and warnings."""
+    """Return the results of an export by name: lengths [mm], volume ratios, numbers of voxels, and warnings."""
     error = 1e3 * samples.compute_errors(fields)
     moving = np.linalg.norm(samples.displacement, axis=1) > MIN_MOTION
     gap, largest = deformed.find_gap(), 1e3 * float(np.linalg.norm(deformed.displacement, axis=1).max())

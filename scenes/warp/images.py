@@ -1,4 +1,4 @@
-"""Deformed images and label maps of a patient, on their original grids, as NIfTI."""
+"""Deformation of a patient's images and label maps, which are written as NIfTI on their original grids."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ SAMPLING_STRIDE = 3  # Sampling stride along each axis [voxels].
 
 @dataclass(frozen=True)
 class ImageWarningSettings:
-    """Settings of `list_warnings`."""
+    """Thresholds of `list_warnings`."""
 
     min_inside_share: float = 0.98  # Smallest share of the brain inside an image without a warning.
     min_nonzero_share: float = 0.5  # Smallest share of the brain on voxels that are not 0 without a warning.
@@ -41,23 +41,23 @@ IMAGE_WARNINGS = ImageWarningSettings()
 
 SUFFIXES = (".seg.nrrd", *READERS)  # Endings of image files.
 ORDERS = {"nearest": 0, "linear": 1, "cubic": 3}
-"""Spline degree by the name of the interpolation."""
+"""Spline degree of each interpolation, by name."""
 INTEGER_TYPES = np.uint8, np.int16, np.uint16, np.int32
 """Integer types that every reader of NIfTI supports."""
 DISPLACEMENT = 1006
-"""NIfTI's intent: vectors in millimetres, RAS."""
+"""NIfTI intent code of a displacement field with vectors in millimetres, RAS."""
 MOTION_TOLERANCE = 1e-8  # Displacement below which voxels stay unchanged [m].
 BATCH_SLICES = 8  # Number of slices processed together: limits memory.
 
 
 def measure_brain_coverage(affine: np.ndarray, shape: tuple[int, ...], anatomy: Anatomy) -> float:
-    """Return the volume share of a brain inside the grid of voxels (I, J, K) with an affine to metres (RAS)."""
+    """Return the fraction of the brain's volume inside an image (I, J, K) with an affine (4, 4) to metres (RAS)."""
     _, inside = _find_voxels(affine, shape, _compute_centroids(anatomy))
     return float(np.average(inside, weights=anatomy.mesh.volumes))
 
 
 def list_warnings(values: np.ndarray, affine: np.ndarray, is_label_map: bool, anatomy: Anatomy) -> list[str]:
-    """List warnings, as predicates, about an image (I, J, K) that shows a part of a brain."""
+    """Return warnings about an image (I, J, K) that shows a part of the brain; each continues the image's name."""
     found, middles, volumes = [], _compute_centroids(anatomy), anatomy.mesh.volumes
     index, inside = _find_voxels(affine, values.shape, middles)
     share = float(np.average(inside, weights=volumes))
@@ -91,7 +91,7 @@ def list_warnings(values: np.ndarray, affine: np.ndarray, is_label_map: bool, an
 def _is_turned(
     values: np.ndarray, affine: np.ndarray, labels: bool, middles: np.ndarray, volumes: np.ndarray
 ) -> tuple[float, float] | None:
-    """Return shares of the brain on bright voxels, unchanged and with x and y negated, if the latter is much larger."""
+    """Return the fractions of the brain on bright voxels, as is and with x and y negated; None if x and y are right."""
     part = np.nan_to_num(values[::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE].astype(float))
     air, bright = 0.0, part[part > 0.0]
     if len(bright) and not labels:
@@ -111,7 +111,7 @@ def _is_label_like(values: np.ndarray) -> bool:
 
 
 def _compute_equal_share(values: np.ndarray) -> float:
-    """Return the share of the nonzero voxels that have the value of the next voxel along the first axis."""
+    """Return the fraction of neighbouring nonzero voxels along the first axis that have equal values."""
     thin = values[:, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE]
     one, two = thin[:-1:SAMPLING_STRIDE], thin[1::SAMPLING_STRIDE]
     full = (one != 0) & (two != 0)
@@ -124,20 +124,20 @@ def _compute_centroids(anatomy: Anatomy) -> np.ndarray:
 
 
 def _find_voxels(affine: np.ndarray, shape: tuple[int, ...], points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nearest voxels (n, 3) to points (n, 3) [m], and which of these lie within the volume (n,)."""
+    """Return the voxels (n, 3) nearest to points (n, 3) [m], and a mask (n,): True for points inside the image."""
     index, last = compute_voxel_indices(affine, points), np.array(shape) - 1
     inside = np.asarray(((index >= -0.5) & (index <= last + 0.5)).all(axis=1))
     return np.clip(np.rint(index), 0, last).astype(int), inside
 
 
 def compute_voxel_indices(affine: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return indices (n, 3) of points (n, 3) [m] in a volume of an affine (4, 4)."""
+    """Return fractional voxel indices (n, 3) of points (n, 3) [m] in an image with an affine (4, 4)."""
     return (points - affine[:3, 3]) @ np.linalg.inv(affine[:3, :3]).T
 
 
 @dataclass(frozen=True, eq=False)
 class PatientImage:
-    """Image of a patient: file, NIfTI image, values (I, J, K) with their affine, and warnings."""
+    """Image of a patient: path, NIfTI image, volume, True in `labels` for a label map, and warnings."""
 
     path: Path
     image: nibabel.Nifti1Image
@@ -148,7 +148,7 @@ class PatientImage:
 
 @dataclass(frozen=True)
 class WarpedImage:
-    """Name of a warped image, and numbers of voxels that moved, came from outside, and were resected."""
+    """File name of a warped image, and its numbers of voxels, see `Counts`."""
 
     name: str
     moved: int
@@ -157,12 +157,12 @@ class WarpedImage:
 
 
 def read_patient_image(path: Path, anatomy: Anatomy, is_label_map: bool, axes: str = "") -> PatientImage:
-    """Read an image or a label map of the brain of an anatomy.
+    """Read an image or a label map that shows the brain of an anatomy.
 
     Raises
     ------
     InputError
-        See `read_volume`; an image that does not overlap this brain; non-integer labels.
+        See `read_volume`; also if the image does not overlap this brain, or labels are not integers.
     """
     volume = read_volume(path, VoxelSpec(axes=axes), require_finite=False)
     image = _as_nifti(path, volume)
@@ -181,9 +181,9 @@ def read_patient_image(path: Path, anatomy: Anatomy, is_label_map: bool, axes: s
 
 
 def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
-    """Return the NIfTI image of a file.
+    """Return the image in a file as NIfTI image.
 
-    Other formats are converted: same values and positions, integers as integers.
+    Other formats are converted; values and positions stay the same, and integers stay integers.
     """
     if path.name.lower().endswith((".nii", ".nii.gz")):
         return load_nifti(path)
@@ -197,13 +197,13 @@ def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
 
 
 def to_warped_name(path: Path) -> str:
-    """Return the name of a warped image: that of its file, with `_deformed`."""
+    """Return the file name of a warped image: the original name with `_deformed`, and the suffix .nii.gz."""
     ending = next((end for end in SUFFIXES if path.name.lower().endswith(end)), "")
     return f"{path.name[: len(path.name) - len(ending)]}_deformed.nii.gz"
 
 
 def write_warped_image(folder: Path, picture: PatientImage, fields: WarpFields, order: str) -> WarpedImage:
-    """Write an image of the deformed brain, with the original header: type, scale, sform and qform.
+    """Write an image of the deformed brain; type, scale, sform and qform in the header are those of the original.
 
     Label maps use nearest-neighbour interpolation. Voxels whose source is outside the image, or in resected
     tissue, are 0.
@@ -227,9 +227,9 @@ def write_warped_image(folder: Path, picture: PatientImage, fields: WarpFields, 
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Numbers of voxels that moved, that came from outside the image, and that came from resected tissue.
+    """Numbers of voxels that moved, whose source is outside the image, and whose source is in resected tissue.
 
-    `unfilled` (I, J, K) bool: voxels without a source.
+    `unfilled` (I, J, K) is True for voxels without a source.
     """
 
     moved: int
@@ -239,9 +239,9 @@ class Counts:
 
 
 def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, order: int) -> tuple[np.ndarray, Counts]:
-    """Warp values (I, J, K) with an affine to metres (RAS) by the fields; the type is kept.
+    """Warp values (I, J, K) with an affine (4, 4) to metres (RAS) by the fields; the type stays the same.
 
-    Voxels without displacement keep their exact value.
+    Voxels without displacement keep their exact value. Voxels without a source are 0.
     """
     source = values if order == 0 else np.nan_to_num(values.astype(np.float32), posinf=0.0, neginf=0.0)
     if order > 1:
@@ -276,7 +276,7 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
 
 
 def _find_moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nonzero backward displacements (m, 3) [m] at points (n, 3) [m], and their rows (m,)."""
+    """Return nonzero backward displacements (m, 3) [m] at points (n, 3) [m], and the numbers (m,) of these points."""
     index = fields.grid.to_indices(now)
     held = np.flatnonzero(((index > 0.0) & (index < np.array(fields.grid.shape) - 1)).all(axis=1))
     went = fields.grid.interpolate(fields.backward, now[held])

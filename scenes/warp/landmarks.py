@@ -1,4 +1,4 @@
-"""Named points of tissue with undeformed and deformed positions, interpolated in the FEM mesh."""
+"""Named points of tissue with undeformed and deformed positions, which are interpolated in the FEM mesh."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ from surrogate.locating.prior import compute_tumour_weights
 
 TUMOUR, NEAREST, CORTEX = "tumour", "tumour, nearest to its centroid", "open cortex"  # Names of the landmarks.
 CENTROID = "centroid of the tumour now"
-"""Name of the displaced tumour's centroid in Slicer."""
+"""Name of the deformed tumour's centroid in 3D Slicer."""
 DESCRIPTIONS = {
     TUMOUR: "tissue at the centroid of the tumour's volume in the scan, as `sulcus locate` has it.",
     NEAREST: "that centroid lies outside the tissue; this is the tumour's point nearest to it.",
     CORTEX: "tissue on the surface, nearest to the middle of the open cortex in the scan.",
     CENTROID: "of the displaced tumour's volume. The tissue there may be another than in the scan.",
 }
-"""Description of each landmark."""
+"""Description of each landmark, by name."""
 INSIDE_TOLERANCE = 1e-9  # Tolerance within which a point belongs to a tetrahedron [m].
 
 
@@ -34,7 +34,7 @@ class Landmark:
 
 
 def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, ...]:
-    """List the landmarks of the tumour and of the open cortex, if present, under displacements (V, 3) [m].
+    """Return the landmarks of the tumour and of the open cortex, if present, under displacements (V, 3) [m].
 
     Landmarks are interpolated linearly in their tetrahedron or triangle, like the fields.
     """
@@ -56,7 +56,7 @@ def list_landmarks(body: Anatomy, displacement: np.ndarray) -> tuple[Landmark, .
 
 
 def compute_centroid(body: Anatomy, displacement: np.ndarray) -> np.ndarray | None:
-    """Return the centroid (3,) [m] of the tumour's deformed volume; None without a tumour."""
+    """Return the centroid (3,) [m] of the deformed tumour; None without a tumour."""
     tumour = body.mesh.tets[body.in_tumour]
     if not len(tumour):
         return None

@@ -1,4 +1,4 @@
-"""Points and lines as 3D Slicer's markups: JSON in millimetres, LPS."""
+"""Writer of points and lines as markups of 3D Slicer (JSON, in millimetres, LPS)."""
 
 import json
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ SCHEMA = (  # Address of Slicer's schema of markups.
 
 
 def write_markups(path: Path, kind: str, points: Mapping[str, np.ndarray]) -> None:
-    """Write points (3,) [m, RAS] by their labels: as a `Fiducial` list, or two of them as a `Line`."""
+    """Write labelled points (3,) [m, RAS]; `kind` is "Fiducial" for a list of points, or "Line" for two points."""
     controls = [
         {
             "id": str(number),

@@ -1,4 +1,4 @@
-"""Triangles as VTP, STL and glTF files, each with its coordinate system."""
+"""Writers of triangle surfaces as VTP, STL and glTF, each in the coordinate system that the format requires."""
 
 import base64
 import json
@@ -18,12 +18,12 @@ MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942  # glTF's n
 # glTF's numbers of component types, and of what a buffer contains.
 FLOAT, UNSIGNED, VERTICES, INDICES = 5126, 5125, 34962, 34963
 TO_GLTF = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
-"""From RAS to glTF's axes: x to the patient's left, y up to the head, z forwards."""
+"""Rotation from RAS to the axes of glTF: x to the patient's left, y to the head, z to the front."""
 
 
 @dataclass(frozen=True, eq=False)
 class NamedSurface:
-    """A named surface: vertices (n, 3) [m, RAS], displacements (n, 3) [m], triangles (m, 3), colour RGBA."""
+    """Named deformed surface: vertices (n, 3) [m, RAS], displacements (n, 3) [m], triangles (m, 3), colour (RGBA)."""
 
     name: str
     vertices: np.ndarray
@@ -35,13 +35,13 @@ class NamedSurface:
 def build_surface_mesh(
     name: str, triangles: np.ndarray, nodes: np.ndarray, motion: np.ndarray, colour: tuple[float, float, float, float]
 ) -> NamedSurface:
-    """Build the surface of some triangles of nodes (V, 3) [m], displaced by (V, 3) [m], without unused vertices."""
+    """Build the deformed surface of triangles of nodes (V, 3) [m] with displacements `motion` (V, 3) [m]."""
     used, numbers = np.unique(triangles, return_inverse=True)
     return NamedSurface(name, nodes[used] + motion[used], motion[used], numbers.reshape(-1, 3), colour)
 
 
 def write_vtp(path: Path, mesh: NamedSurface) -> None:
-    """Write VTK's XML of polygons in millimetres, LPS, as its field SPACE records; `displacement` [mm] at points."""
+    """Write VTP in millimetres, LPS, with point data `displacement` [mm]; the field SPACE states LPS for 3D Slicer."""
     points, moved = (1e3 * values * LPS for values in (mesh.vertices, mesh.displacement))
     ends = 3 * np.arange(1, len(mesh.triangles) + 1)
     space = " ".join(str(code) for code in (*b"LPS", 0))
@@ -80,7 +80,7 @@ def _format_array(name: str, kind: str, components: int, values: np.ndarray) -> 
 
 
 def write_stl(path: Path, mesh: NamedSurface) -> None:
-    """Write binary STL in millimetres, LPS, with the header from which 3D Slicer reads the coordinate system."""
+    """Write binary STL in millimetres, LPS; 3D Slicer reads the coordinate system from the header."""
     corners = (1e3 * mesh.vertices * LPS)[mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
@@ -91,7 +91,7 @@ def write_stl(path: Path, mesh: NamedSurface) -> None:
 
 
 def write_glb(path: Path, meshes: Sequence[NamedSurface]) -> None:
-    """Write surfaces as binary glTF 2.0, a named node each: metres, y towards the head, z forwards."""
+    """Write surfaces as binary glTF 2.0, with one named node per surface, in metres; for the axes, see `TO_GLTF`."""
     data, views, accessors, parts = b"", [], [], []
     for mesh in meshes:
         place = (mesh.vertices @ TO_GLTF.T).astype("<f4")

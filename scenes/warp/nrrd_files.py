@@ -1,4 +1,4 @@
-"""NRRD files: vector fields and segmentations."""
+"""Writers of displacement fields and segmentations as NRRD."""
 
 import gzip
 from collections.abc import Mapping, Sequence
@@ -14,9 +14,9 @@ from sim.fields.grid_interpolation import interpolate_in_tetrahedra
 TYPES = {"f4": "float", "u1": "unsigned char"}  # Names of data types in NRRD.
 LEVEL = 1  # Lowest compression level: higher levels hardly reduce floats.
 DIGITS = 4
-"""Decimals of displacements [mm]: further decimals have no meaning, and double the file size."""
+"""Number of decimals of displacements [mm]; further decimals have no meaning and double the file size."""
 TUMOUR, SHELL = 1, 2
-"""Labels of the segments: tumour, and tissue that may be tumour."""
+"""Labels of the segments: the tumour, and tissue that may be tumour."""
 COLOURS = {TUMOUR: (0.20, 0.94, 0.42), SHELL: (0.95, 0.75, 0.20)}  # Colours (RGB, 0 to 1) of the segments.
 VOXEL = 0.5e-3  # Edge of a voxel [m].
 MARGIN = 2e-3  # Margin round the segments [m].
@@ -27,13 +27,13 @@ MASS = (  # SNOMED CT's terms for a mass, as Slicer writes them.
 
 
 def write_field_nrrd(path: Path, grid: Grid, field: np.ndarray, direction: str) -> None:
-    """Write a displacement field (3, I, J, K) [m, RAS]; its direction is `modeling` or `resampling`."""
+    """Write a displacement field (3, I, J, K) [m, RAS]; `direction` is "modeling" or "resampling"."""
     header = {"kinds": "vector domain domain domain", **_build_space_header(grid, "none {axes}")}
     write_nrrd(path, _to_millimetres(field), header, _build_displacement_header(direction))
 
 
 def write_field_sequence(path: Path, grid: Grid, fields: Sequence[np.ndarray], times: Sequence[float]) -> None:
-    """Write modelling fields (3, I, J, K) [m, RAS], one for each time [s], as one sequence."""
+    """Write forward displacement fields (3, I, J, K) [m, RAS], one for each time [s], as a sequence of 3D Slicer."""
     vectors = np.stack([_to_millimetres(field) for field in fields], axis=-1)
     header = {
         "kinds": "vector domain domain domain list",
@@ -46,13 +46,13 @@ def write_field_sequence(path: Path, grid: Grid, fields: Sequence[np.ndarray], t
 
 
 def write_labels_nrrd(path: Path, grid: Grid, labels: np.ndarray, metadata: Mapping[str, str]) -> None:
-    """Write labels (I, J, K) uint8 on a grid, with pairs of names and values behind the header."""
+    """Write labels (I, J, K) uint8 on a grid; `metadata` are the key-value pairs of the NRRD file."""
     header = {"kinds": "domain domain domain", **_build_space_header(grid, "{axes}")}
     write_nrrd(path, labels, header, metadata)
 
 
 def write_nrrd(path: Path, values: np.ndarray, header: Mapping[str, str], metadata: Mapping[str, str]) -> None:
-    """Write an array, whose first axis runs fastest in the file, under header fields and pairs of names and values."""
+    """Write an array as NRRD with header fields and key-value pairs; the first axis varies fastest in the file."""
     lines = [
         "NRRD0005",
         f"type: {TYPES[values.dtype.str[1:]]}",
@@ -96,9 +96,9 @@ def _build_displacement_header(direction: str) -> dict[str, str]:
 
 
 def write_segmentation(path: Path, nodes: np.ndarray, tets: np.ndarray, bound: float | None) -> None:
-    """Write the tumour of tetrahedra (T, 4) of nodes (V, 3) [m, RAS], and if known the shell within a bound [m].
+    """Write a tumour with tetrahedra (T, 4) and nodes (V, 3) [m, RAS], and, if a bound [m] is given, a shell.
 
-    The shell is the tissue outside the tumour within this bound. It bounds the surface's position, not the size.
+    The shell is all tissue outside the tumour within this bound. It bounds the position of the surface, not its size.
     """
     grid = build_grid_around(nodes[np.unique(tets)], VOXEL, (bound or 0.0) + MARGIN)
     inside = interpolate_in_tetrahedra(grid, nodes, tets, np.zeros_like(nodes))[1]

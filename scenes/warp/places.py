@@ -1,4 +1,4 @@
-"""Comparison of a warp's fields with FEM, and places where FEM folds."""
+"""Grid spacing of displacement fields, errors of the fields relative to FEM, and regions where FEM folds."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ MAX_REQUESTED_NODES = 96_000_000  # Maximum number of nodes at a spacing given b
 
 @dataclass(frozen=True)
 class SpacingSettings:
-    """Settings of the search for a spacing in `compute_fields`."""
+    """Settings of the search for a grid spacing in `compute_fields`."""
 
     first: float = 1e-3  # Spacing that is tried first [m].
     tolerance: float = 0.05e-3  # Tolerance of the error of tumour and landmarks in the search for a spacing [m].
@@ -38,14 +38,14 @@ class SpacingSettings:
 
 @dataclass(frozen=True, eq=False)
 class SamplePoints:
-    """Sample points: vertices of a mesh, points in its tetrahedra and on its open cortex, and landmarks.
+    """Sample points: vertices of a mesh, points in its tetrahedra and on the open cortex, and landmarks.
 
     Parameters
     ----------
     rest, displacement
-        Positions in the scan, and displacements (n, 3) [m].
+        Positions (n, 3) [m] in the scan, and displacements (n, 3) [m].
     tumour, cortex, landmarks
-        Masks (n,): True for points of the tumour, of the open cortex, and for landmarks.
+        Masks (n,), which are True for points of the tumour, for points of the open cortex, and for landmarks.
     named
         Landmarks, in the order of their points.
     """
@@ -58,7 +58,7 @@ class SamplePoints:
     named: tuple[Landmark, ...]
 
     def compute_errors(self, fields: WarpFields) -> np.ndarray:
-        """Return the distance [m] between fields and FEM at each place (n,): the larger one of the two fields."""
+        """Return the error (n,) [m] relative to FEM at each point: the larger of the errors of both fields."""
         grid, now = fields.grid, self.rest + self.displacement
         forward = grid.interpolate(fields.forward, self.rest) - self.displacement
         backward = grid.interpolate(fields.backward, now) + self.displacement
@@ -66,7 +66,7 @@ class SamplePoints:
 
 
 def list_points(deformed: DeformedAnatomy) -> SamplePoints:
-    """List the vertices of the remaining body, four points per tetrahedron, three per open triangle, and landmarks."""
+    """Return the vertices, 4 points per tetrahedron and 3 per open triangle of the remaining mesh, and landmarks."""
     body, mesh = deformed.remaining, deformed.remaining.mesh
     used, marks = np.unique(mesh.tets), list_landmarks(body, deformed.displacement)
     within, on = len(INNER_WEIGHTS) * len(mesh.tets), len(FACE_WEIGHTS) * len(body.open_surface)
@@ -90,9 +90,9 @@ def list_points(deformed: DeformedAnatomy) -> SamplePoints:
 
 @dataclass(frozen=True)
 class FoldedRegion:
-    """Connected inverted tetrahedra: number, centre in the scan [m, RAS] and volume in the scan [m3].
+    """Region of connected inverted tetrahedra: their number, centre [m, RAS] and volume [m^3] in the scan.
 
-    `field_error`: error of the fields relative to FEM there [m]; no field can represent a fold.
+    `field_error` is the maximum error [m] of the fields relative to FEM there, since no field can represent a fold.
     """
 
     tetrahedra: int
@@ -102,7 +102,7 @@ class FoldedRegion:
 
 
 def find_folds(deformed: DeformedAnatomy, fields: WarpFields) -> tuple[FoldedRegion, ...]:
-    """Find places where FEM folds, largest first."""
+    """Return all regions where FEM folds, largest first."""
     mesh = deformed.remaining.mesh
     bad = mesh.tets[compute_signed_volumes(mesh.nodes + deformed.displacement, mesh.tets) <= 0.0]
     if not len(bad):
@@ -125,7 +125,7 @@ def find_folds(deformed: DeformedAnatomy, fields: WarpFields) -> tuple[FoldedReg
 
 
 def count_steps(spacing: float | None, settings: SpacingSettings = SpacingSettings()) -> int:
-    """Return the number of steps of `compute_fields`: two fields for each tried spacing."""
+    """Return the number of steps of `compute_fields`, which are two fields for each tried spacing."""
     return 2 * (1 + (settings.max_trials if spacing is None else 0))
 
 
@@ -135,14 +135,14 @@ def compute_fields(
     step: Callable[[int], object],
     settings: SpacingSettings = SpacingSettings(),
 ) -> WarpFields:
-    """Compute the fields of a moment at a spacing [m]; None: 1 mm, or finer until tumour and landmarks are accurate.
+    """Compute the fields at a spacing [m]; None: 1 mm, or less until the errors of tumour and landmarks are small.
 
-    `step` receives the number of newly finished steps of `count_steps`.
+    `step` receives the number of newly finished steps, see `count_steps`.
 
     Raises
     ------
     InputError
-        A spacing that makes too many nodes.
+        The grid with this spacing has too many nodes.
     """
     if spacing is not None and (nodes := _count_nodes(deformed, spacing)) > MAX_REQUESTED_NODES:
         raise InputError(
@@ -160,7 +160,7 @@ def compute_fields(
 def find_finer_spacing(
     deformed: DeformedAnatomy, fields: WarpFields, settings: SpacingSettings = SpacingSettings()
 ) -> float | None:
-    """Return a finer spacing [m] that meets the tolerance, or is as near as size allows; None if none is needed."""
+    """Return a finer spacing [m] that is expected to meet the tolerance, within limits; None if there is no need."""
     now = fields.grid.spacing
     places = list_points(deformed)
     worst = float(places.compute_errors(fields)[places.tumour | places.landmarks].max(initial=0.0))

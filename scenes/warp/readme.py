@@ -1,4 +1,4 @@
-"""README of a warp's files: content, how to open them, and limits."""
+"""README of an export: content of the files, instructions to open the files, and limitations."""
 
 from collections.abc import Sequence
 
@@ -56,7 +56,7 @@ These are errors of the grid. How far the tumour may be off: {bound}
 
 
 def write_readme(report: dict, images: Sequence[WarpedImage]) -> str:
-    """Return the text of README.txt from the figures of a warp."""
+    """Return the text of README.txt; `report` contains the results of an export, see `collect_figures`."""
     sequence = (
         "field_sequence.seq.nrrd  the same of many moments, which Slicer plays.\n" if report["sequence_frames"] else ""
     )
