@@ -274,7 +274,7 @@ class Demo:
             self._show_touch(tool_touch, lambda: self.wish.tool == SCRIPT)
 
     def _show_touch(self, touch: Touch, condition: Callable[[], bool]) -> None:
-        """Set the tool's sliders to the values of `touch` if `condition` is true: manual control starts there."""
+        """Set the tool's sliders to the values of `touch`, from which manual control starts, if `condition` is true."""
         if self.stage.scene.tool is not None:
             for label, value in to_slider_values(self.stage.scene, touch).items():
                 self.browser.put(label, value, condition)

@@ -215,7 +215,7 @@ class PatientSetup:
         Raises
         ------
         InputError
-            An unknown name, a model that was trained with other effects, tissue or element, or an unsupported effect.
+            A name is unknown, a model was trained with other effects, tissue or element, or an effect is not supported.
         """
         if name == "fem":
             return self.build_fem(scene, scene.accuracy, live=True)
@@ -335,7 +335,7 @@ def load_models(path: Path, anatomy: Anatomy) -> dict[str, Learned]:
     Raises
     ------
     InputError
-        Unreadable or inconsistent files.
+        Files are not readable or not consistent.
     """
     found: dict[str, Learned] = {}
     for kind in ("model", *SCENES):
@@ -355,8 +355,8 @@ def open_theatre(
     Raises
     ------
     InputError
-        An unknown scene (see `check_scene_exists`; it is tested first); a missing, unreadable or inconsistent file; an
-        unavailable device.
+        A scene is unknown (checked first, see `check_scene_exists`), a file is missing, not readable or not consistent,
+        or the device is not available.
 
     Examples
     --------

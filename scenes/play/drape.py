@@ -83,7 +83,7 @@ def list_border_edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def compute_fold_heights(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Compute fold heights (n,) in 0..1 at distances (n,) from the hole's edge [m] and angles (n,) round it [rad]."""
+    """Return relative fold heights (n,), 0 to 1, at distances (n,) [m] from the hole's edge and angles (n,) [rad]."""
     rise, away = np.clip(distance / FOLD_START, 0.0, 1.0), distance / 15e-3
     folds = []
     for count, start in zip(FOLD_COUNTS, (0.0, 2.0), strict=True):

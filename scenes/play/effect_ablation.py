@@ -121,7 +121,7 @@ def solve_frames(patient: PatientSetup, scene: Scene, frame_step: int) -> Ablati
     Raises
     ------
     InputError
-        A mesh without fixed nodes, or a frame without equilibrium. An unphysical equilibrium is counted, not rejected.
+        The mesh has no fixed nodes, or a frame no equilibrium. An unphysical equilibrium is counted, not rejected.
     """
     before = list_arrays()  # arrays that existed before do not belong to the scene
     fem = patient.build_fem(scene, scene.accuracy, live=True)

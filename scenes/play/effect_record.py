@@ -50,7 +50,7 @@ def read_effect_records(path: Path) -> dict[str, EffectRecord]:
     Raises
     ------
     InputError
-        An invalid or unreadable file.
+        The file is invalid or not readable.
     """
     if not path.is_file():
         return {}

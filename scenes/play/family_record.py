@@ -40,7 +40,7 @@ def read_family_figures(mesh_path: Path, anatomy_digest: str) -> dict[str, Famil
     Raises
     ------
     InputError
-        An invalid or unreadable file.
+        The file is invalid or not readable.
     """
     if not (path := mesh_path.with_suffix(".report.json")).is_file():
         return {}

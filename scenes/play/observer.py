@@ -235,7 +235,7 @@ class RigidError:
 
 
 def sample_rigid_error(model: PointObservation | StereoObservation, number: int) -> RigidError:
-    """Sample the `number`-th rigid registration error of an observation model."""
+    """Return the `number`-th sample of an observation model's rigid registration error."""
     turn, shift = np.random.default_rng([model.seed, 0, number]).standard_normal((2, 3))
     return RigidError(model.turn * turn / np.linalg.norm(turn), model.shift * shift / np.linalg.norm(shift))
 

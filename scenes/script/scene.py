@@ -110,7 +110,7 @@ class Scene:
     Raises
     ------
     InputError
-        An effect that needs a tool in a scene without tool; a duration or a frame rate that is not a number > 0; more
+        An effect needs a tool but the scene has none, duration or frame rate is not a number > 0, or there are more
         than `MAX_FRAMES` frames.
     """
 

@@ -71,7 +71,7 @@ class Appearance:
     Raises
     ------
     InputError
-        An unknown instrument; an aperture or a noise that is not a number >= 0.
+        The instrument is unknown, or aperture or noise is not a number >= 0.
     """
 
     lamp: float = 1.0
@@ -136,7 +136,7 @@ class Viewpoint:
     Raises
     ------
     InputError
-        A calibration that does not fit the image size, an invalid `eye`, or a `field` that is not > 0.
+        The calibration does not fit the image size, `eye` is invalid, or `field` is not > 0.
     """
 
     distance: float = WORKING_DISTANCE

@@ -36,7 +36,7 @@ def detect_board(path: Path, board: Target, size: tuple[int, int] | None = None)
     Raises
     ------
     InputError
-        Unreadable input, images that differ in size or do not have the required size, or no visible board.
+        The input is not readable, images differ in size or do not have the required size, or no board is visible.
     """
     views, count, first, detector = [], 0, "", Detector([board])
     with wrap_errors(path, "images of a board", REMEDY):

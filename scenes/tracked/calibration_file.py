@@ -98,7 +98,7 @@ def write_calibration(path: str | Path, calibration: Calibration, form: Literal[
     Raises
     ------
     InputError
-        An unknown format, a wrong file ending, or a file that cannot be written.
+        The format is unknown, the file ending is wrong, or the file cannot be written.
     """
     path = to_path(path)
     if form not in FORMATS:

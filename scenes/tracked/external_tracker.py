@@ -52,14 +52,14 @@ def track_images(
 
 
 def track_video(path: Path, calibration: Calibration, body: str, reference: str, rate: float) -> Iterator[TrackedPose]:
-    """Yield for each image of a video the pose of `body` relative to `reference`: tool, patient, board or camera.
+    """Yield the pose of `body` relative to `reference` (tool, patient, board or camera) for each image of a video.
 
     Times are the time stamps in the images, or else the times of the video; `rate` [1/s] is that of an image folder.
 
     Raises
     ------
     InputError
-        Unreadable input, or images that do not have the size of the calibration.
+        The input is not readable, or the size of the images differs from the calibration.
     """
     count = 0
     with wrap_errors(path, "a video", REMEDY):

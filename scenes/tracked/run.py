@@ -89,7 +89,7 @@ def read_timed_images(images: Iterator[NamedImage], masks: Iterator[NamedImage] 
     Raises
     ------
     ValueError
-        An image without a mask, a mask without an image, or a mask that does not have the size of its image.
+        An image has no mask, a mask has no image, or the sizes of a mask and its image differ.
     """
     before, days = -np.inf, 0.0
     for number, picture in enumerate(images):

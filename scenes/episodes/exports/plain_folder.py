@@ -28,7 +28,7 @@ def write_folder(
     Raises
     ------
     InputError
-        An episode that is damaged; a folder that cannot be written.
+        An episode is damaged, or the folder cannot be written.
     """
     with write_folder_atomically(folder, 2 * measure_stored_size(episodes)) as partial:
         names = name_files(episodes)

@@ -31,7 +31,7 @@ def write_xdmf(
     Raises
     ------
     InputError
-        An episode that is damaged; a folder that cannot be written.
+        An episode is damaged, or the folder cannot be written.
     """
     bare = 0
     with write_folder_atomically(folder, measure_stored_size(episodes)) as partial:

@@ -21,12 +21,12 @@ Rows = np.ndarray | list[str]
 
 
 def read_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> Rows:
-    """Read the rows of some frames, or of all: (frames, ...) numbers or decoded images, or a list of texts.
+    """Read the rows of some `frames` (None: all) of an array: numbers or decoded images (frames, ...), or texts.
 
-    An array without frames is read whole.
+    An array without a frame axis is read completely.
 
     Colour is (frames, H, W, 3) uint8 sRGB, depth (frames, H, W) float32 [m], labels (frames, H, W) uint8. Frames
-    not solved by FEM are NaN, or an empty text.
+    that are not solved by FEM have NaN, or an empty text.
 
     Raises
     ------
