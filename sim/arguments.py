@@ -11,7 +11,7 @@ MAX_MAGNITUDE = 1e30
 
 
 def is_all_finite(array: np.ndarray) -> bool:
-    """Return True if no value is infinite or NaN; for small arrays three times as fast as `.all()`."""
+    """Return True if all values are finite; three times as fast as `np.isfinite(array).all()` for small arrays."""
     return np.count_nonzero(np.isfinite(array)) == array.size
 
 
@@ -57,7 +57,7 @@ def check_numbers_array(name: str, values: object, limit: float = MAX_MAGNITUDE)
 
 
 def check_integers(name: str, values: object) -> np.ndarray:
-    """Return vertex numbers (n,) as integers.
+    """Return whole numbers (n,) as an integer array; `name` identifies the argument in messages.
 
     Raises
     ------
@@ -75,12 +75,12 @@ def check_integers(name: str, values: object) -> np.ndarray:
 
 
 def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
-    """Return vertex numbers (n,) of a mesh with `count` vertices.
+    """Return valid vertex numbers (n,) of a mesh with `count` vertices, as an integer array.
 
     Raises
     ------
     InputError
-        See `check_integers`; a vertex that the mesh does not have.
+        As `check_integers`, or if a number is not that of a vertex of the mesh.
     """
     vertices = check_integers(name, values)
     beyond = vertices[(vertices < 0) | (vertices >= count)]
