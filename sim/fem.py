@@ -266,8 +266,8 @@ class Fem:
     def compute_series(self, loads: Loads, orders: int, reading: OutputFunctionals, sizes: int = 1) -> np.ndarray:
         """Return power series coefficients (G, terms, r) of the projected solution in the magnitudes of the loads.
 
-        Every `sizes` successive loads form one of G groups. If the m loads of a group, scaled by s_1 to s_m, act together,
-        the solution is the sum of the terms times the monomials of s_1 to s_m in the order of their degree. One load
+        Every `sizes` successive loads form one of G groups. If m loads of a group act at once, scaled by s_1 ... s_m,
+        the solution is the sum of the terms times the monomials of s_1 ... s_m, in the order of their degree. One load
         gives s u_1 + s^2 u_2 + ...; three loads give 3 + 6 + 10 terms up to third order. Convergence is not checked.
 
         Raises

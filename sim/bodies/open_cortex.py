@@ -95,7 +95,7 @@ class OpenCortex:
         return Place(at, normalise_vectors((weights @ self._inward[vertices])[None])[0], vertices, weights)
 
     def place(self, right_mm: float = 0.0, up_mm: float = 0.0) -> Place:
-        """Return the point of the exposed cortex at an offset from the origin in the tangent plane, to the right and up.
+        """Return the point of the exposed cortex at a tangential offset from the origin, to the right and up [mm].
 
         Raises
         ------

@@ -85,7 +85,7 @@ def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
 
 
 def _make_conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
-    """Return the mask `halved` (N,) of edge midpoints, extended until the halved edges of all tetrahedra form patterns."""
+    """Return the mask `halved` (N,) of midpoints, extended until the halved edges of each element form a pattern."""
     halved, middles = halved.copy(), table[:, 4:]
     while True:
         asked = halved[middles]

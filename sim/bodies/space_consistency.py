@@ -96,7 +96,7 @@ def compute_inside_fraction(shape: tuple[int, ...], affine: np.ndarray, points: 
 
 
 def _widen_outline(mask: Mask) -> np.ndarray:
-    """Return the outline points shifted by half a voxel to both sides (n, 3) [m], for the convex hull of a single slice."""
+    """Return the outline shifted by half a voxel to both sides (n, 3) [m], so that one slice also has a convex hull."""
     half = 0.5 * mask.affine[:3, :3].sum(axis=1)
     return np.concatenate([mask.outline - half, mask.outline + half])
 

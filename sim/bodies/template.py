@@ -272,7 +272,7 @@ def _find_site(
 
 
 def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:
-    """Return the tumour shape; `middle` is a function that returns the centre from the unit-scale shape and the scale."""
+    """Return the tumour shape; `middle` is a function of the unit-scale shape and the scale that returns the centre."""
     rng, lobes = np.random.default_rng(tumour.seed), tumour.lobes
     directions = rng.normal(size=(lobes.count if tumour.shape == "lobed" else 0, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
