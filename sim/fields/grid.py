@@ -30,7 +30,7 @@ class Grid:
         return self.origin + self.spacing * np.stack(np.unravel_index(node_numbers, self.shape), axis=-1)
 
     def find_corners(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return node numbers (n, 8) at the corners of the cells that contain points (n, 3) [m], and trilinear weights."""
+        """Return the corner node numbers (n, 8) of the cells that contain points (n, 3) [m], and trilinear weights."""
         index = self.to_indices(points)
         first = np.clip(np.floor(index).astype(int), 0, np.array(self.shape) - 2)
         share, strides = index - first, np.array([self.shape[1] * self.shape[2], self.shape[2], 1])

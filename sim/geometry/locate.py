@@ -26,7 +26,7 @@ class LocatedPoints:
 
 
 def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> LocatedPoints:
-    """Return tetrahedra and weights of points (n, 3) [m]; points outside the mesh get clipped weights of a near element.
+    """Return tetrahedra and weights of points (n, 3) [m]; weights are clipped to a near element for outside points.
 
     The search uses the tetrahedra with the nearest centroids; the default of 64 `candidates` suffices in graded meshes.
     """
