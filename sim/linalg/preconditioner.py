@@ -159,7 +159,7 @@ def _can_invert(count: int, device: Device) -> bool:
 def build_direct_solver(
     stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device, precision: Precision = "float32"
 ) -> Preconditioner:
-    """Return a direct solver of K (3N, 3N) over motions (3N, n), each of one `node` (n,): inverse if it fits, or factor.
+    """Return a direct solver, an inverse if it fits or a factor, of K (3N, 3N) over motions (3N, n) of the nodes (n,).
 
     A factor is stored in `precision`.
 

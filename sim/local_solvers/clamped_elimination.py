@@ -55,7 +55,7 @@ CLAMPED_CYCLE_LIMITS = CycleLimits(max_cycles=30, patience=8, max_rise=1e6, forc
 
 @dataclass(frozen=True, eq=False)
 class ClampedElimination:
-    """Solver of single loads for quadratic elements, for which multigrid inverts the undeformed stiffness approximately.
+    """Solver of single loads for quadratic elements, whose undeformed stiffness multigrid inverts approximately.
 
     problem, preconditioner
         Problem of the whole mesh, and its preconditioner.
@@ -75,7 +75,7 @@ class ClampedElimination:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, max_iter: int, warm_start: Mapping[str, np.ndarray] | None = None
     ) -> DescentResult:
-        """Return the result as `Lbfgs.descend` for one load case, after at most `max_iter` cycles, without a history."""
+        """Return the result as `Lbfgs.descend`, for one load case, after at most `max_iter` cycles; without history."""
         chosen, part, pairs = (
             np.zeros(len(self.space.table), bool),
             None,

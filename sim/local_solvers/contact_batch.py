@@ -14,7 +14,7 @@ from .strained_part import StrainedModel
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """Displacements u (3N, b) [m], gradients (3N, b) [N] of smooth terms and of all terms, their 2-norms and scales (b,)."""
+    """Displacements u (3N, b) [m]; gradients (3N, b) [N] of smooth and of all terms, their 2-norms and scales (b,)."""
 
     u: Any
     smooth_gradient: Any
@@ -38,7 +38,7 @@ class ContactState:
         return ContactState(*parts, self.norm[columns], self.scale[columns])
 
     def put_columns(self, columns: np.ndarray, index: Any, source: ContactState) -> None:
-        """Overwrite the load cases `columns` (k,) with those of `source`; `index` is the selection for device arrays."""
+        """Overwrite load cases `columns` (k,) with those of `source`; `index` is the selection for device arrays."""
         for name in ("u", "smooth_gradient", "gradient"):
             getattr(self, name)[:, index] = getattr(source, name)[:, index]
         self.norm[columns], self.scale[columns] = source.norm[columns], source.scale[columns]

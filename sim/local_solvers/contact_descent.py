@@ -241,7 +241,7 @@ class ContactDescent:
         return batch.failures >= 3 * times
 
     def _compute_steps(self, batch: Batch, some: np.ndarray, force: Any) -> None:
-        """Compute directions, step lengths and predicted decreases of load cases `some` (k,) under tool forces (3n, b)."""
+        """Compute directions, step lengths and predicted decreases of cases `some` (k,) under tool forces (3n, b)."""
         now, device = batch.state, self.problem.device
         on = select_columns(device, some, len(batch.proximal))
         if batch.model is None:
@@ -303,7 +303,7 @@ class ContactDescent:
         return np.maximum(self.limits.proximal, self.limits.growth * drag)
 
     def _try_steps(self, batch: Batch) -> np.ndarray:
-        """Evaluate the trial step of each load case that does not wait; return a mask (b,) of cases that need a direction.
+        """Evaluate the trial step of each case that does not wait; return a mask (b,) of cases that need a direction.
 
         A direction is needed if the step is accepted, because the energy still decreases there, or nearly so; or if
         backtracking leaves almost no step: then the state is unchanged, and the model is reset.

@@ -1,6 +1,6 @@
 """Contact forces: equilibrium of the few touched nodes; all other nodes follow by a quadratic model.
 
-C (3n, 3n) is the compliance of the model at the touchable nodes, and w0 are their positions without contact. w minimises
+C (3n, 3n) is the compliance of the model at the touchable nodes, and w0 are positions without contact. w minimises
 
     (w - w0) . C^-1 (w - w0) / 2 + c(w) + d |w - v|^2 / 2 over the touched,
 
@@ -64,8 +64,8 @@ NONCONVEX = ForceLimits(nonconvex_iterations=FORCES.max_iterations)
 class ContactCompliance:
     """Compliance C at n nodes: compliance of the undeformed mesh, plus updates for each of b load cases.
 
-    `history` (b, 2m, 3n) and `middle` (b, 2m, 2m), in double precision, are L-BFGS updates; None without history. `own`
-    (b, 3n, 3n), in single precision, is the change by strained tissue. `get_scratch` is `allocate_scratch` or a cached one.
+    `history` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision are L-BFGS updates; None without history. `own`
+    (b, 3n, 3n) in single precision is the change by strained tissue. `get_scratch` is `allocate_scratch` or cached.
     """
 
     undeformed: Compliance
@@ -113,8 +113,8 @@ def solve_contact_forces(
 ) -> tuple[Any, np.ndarray]:
     """Return the tool forces f (3n, b) [N], and a mask (b,) of load cases that are solved.
 
-    A load case fails if its model is not convex: negative tool curvature exceeds the stiffness of the tissue, and the step
-    would be far too long. `positions` v (3n, b) [m] are the current positions, `targets` w1 and `known_forces` f1 (3n, b).
+    A load case fails if its model is not convex: the curvature of the tool exceeds the tissue stiffness, and the step
+    would be far too long. `positions` (3n, b) [m] are the current positions v; `targets` are w1, `known_forces` are f1.
     `tolerance` (b,) is relative to the forces. `proximal` (b,) is d divided by the stiffness at a touched node.
     """
     out, status = known_forces + 0.0, np.full(positions.shape[1], OPEN)
@@ -150,7 +150,7 @@ def _solve_forces(
 ) -> tuple[Any, np.ndarray, Any]:
     """Return forces (3n, k), status (k,) and node indices (n, k) of load cases (k,), for up to `room` touched nodes.
 
-    `own` contains current positions, target positions and known forces (3n, k); `asked` has tolerance and proximal (k,).
+    `own` contains current positions, targets and known forces (3n, k); `asked` contains tolerance and proximal (k,).
     """
     device, count = soft.device, len(columns)
     nodes, functions = len(own[0]) // 3, barrier.functions

@@ -62,7 +62,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         c: int,
         me: int,
     ) -> int:
-        """List the nodes with nonzero x in ascending order, set their index in `place` (others: -1), and return their number."""
+        """List the nodes with nonzero x in ascending order, set `place` (-1 for others), and return their number."""
         n = place.shape[0]
         own = (n + threads - 1) // threads
         begin, end = wp.min(me * own, n), wp.min((me + 1) * own, n)
@@ -119,7 +119,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def get_compliance(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
-        """Return a symmetrised entry of the compliance between touched nodes, since half precision may round its columns."""
+        """Return a compliance entry of touched nodes, symmetrised, since half precision may round the columns."""
         return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + get_change(model, c, i, j)
 
     @wp.func

@@ -12,7 +12,7 @@ class ContactLimits:
     forcing, tolerance_factor
         Relative tolerance of the tool forces: the larger of these fractions of the relative residual and the tolerance.
     residual_factor, min_good_step
-        A step is good if it leaves at most this fraction of the residual, and is longer than this fraction of the direction.
+        A step is good if it leaves at most this fraction of the residual and exceeds this fraction of the direction.
     patience
         Number of successive steps that are not good, after which Newton's method continues.
     reset_length
