@@ -22,7 +22,7 @@ from .lbfgs_kernels import PAIRS
 
 @dataclass(frozen=True, eq=False)
 class CurvaturePairs:
-    """Curvature pairs of one load case: s and w = H0 y (m, 3N), oldest first; products s_i . y_j and y_i . w_j (m, m)."""
+    """Curvature pairs of one load case: s, w = H0 y (m, 3N), oldest first; products s_i . y_j, y_i . w_j (m, m)."""
 
     s: np.ndarray
     w: np.ndarray

@@ -46,7 +46,7 @@ CUDA_SCHEDULE = CheckSchedule(check_interval=2, width_ratio=0.75)  # A check sta
 
 @dataclass(frozen=True, eq=False)
 class DescentResult:
-    """Result of a descent: u (3N, b) [m] on the device; status, steps and relative residuals (b,) on the host; history."""
+    """Result of a descent: u (3N, b) [m] on the device; status, steps, relative residuals (b,) on the host; history."""
 
     u: wp.array
     status: np.ndarray

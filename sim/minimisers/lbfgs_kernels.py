@@ -1,8 +1,8 @@
 """Kernels of L-BFGS for many load cases; the next action of each load case is determined on the device.
 
 A curvature pair (s, y) of a step and the change of the gradient along the step is stored as s and w = M^-1 y, where
-M^-1 is the preconditioner. The two-loop recursion of Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4, then
-needs only inner products with s and w, and the direction is their linear combination: one pass over the pairs for each.
+M^-1 is the preconditioner. The two-loop recursion, Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4, then
+needs only inner products with s and w, and the direction is a linear combination of s and w.
 """
 
 from dataclasses import dataclass
@@ -136,7 +136,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         slot: wp.array(dtype=wp.int32),
         aiming: wp.array(dtype=wp.int32),
     ):
-        """Accept the trial step, or backtrack; the first trial is the start. `aiming` marks cases that need a direction."""
+        """Accept the trial step, or backtrack; the first trial is the start. `aiming`: a direction is required."""
         c = wp.tid()
         accepted[c] = 0
         slot[c] = -1
@@ -201,7 +201,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         along_s: wp.array2d(dtype=scalar),
         along_w: wp.array2d(dtype=scalar),
     ):
-        """Add the pair of the accepted step, and compute the direction d = -M^-1 g + sum of (a_i s_i + b_i w_i) by recursion.
+        """Add the pair of the accepted step; two-loop recursion for d = -M^-1 g + sum of (a_i s_i + b_i w_i).
 
         The first `known` slots are filled; slot 0 follows slot m - 1. The first trial length is the secant step of the
         previous line search, since every unit step would be shortened where tissue stiffens.

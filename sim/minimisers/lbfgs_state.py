@@ -22,7 +22,7 @@ Shapes = Mapping[str, tuple[int, ...]]  # Array shapes by name, without the axis
 
 
 def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
-    """Return by number type: dtype, shapes of arrays that move with load cases, shapes of arrays that are recomputed."""
+    """Return by number type: dtype, shapes of arrays that move with load cases, shapes of recomputed arrays."""
     vector, pairs, terms = (problem.rows,), (PAIRS, problem.rows), (len(problem.terms),)
     return {
         "scalar": (
@@ -62,7 +62,7 @@ def allocate_memory(problem: Problem, width: int) -> dict[str, wp.array]:
 
 @dataclass(frozen=True, eq=False)
 class LbfgsState:
-    """L-BFGS arrays of `width` load cases, by name; arrays that move with load cases, by number type; and the memory."""
+    """L-BFGS arrays of `width` load cases, by name; arrays that move with load cases, by number type; memory."""
 
     columns: Mapping[str, wp.array]
     movable: Mapping[str, wp.array]
@@ -239,7 +239,7 @@ class LbfgsWorkspace:
 
 
 def _view_memory(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
-    """Return a view of the memory with a `shape`, from element `first`; slices of Warp arrays cannot skip 2^31 elements."""
+    """Return a view of memory from element `first` with a `shape`; Warp slices cannot skip 2^31 elements."""
     address = ground.ptr + first * wp.types.type_size_in_bytes(ground.dtype)
     return wp.array(ptr=address, dtype=ground.dtype, shape=shape, device=ground.device)
 

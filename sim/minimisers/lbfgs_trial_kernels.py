@@ -20,7 +20,7 @@ ROWS_PER_CPU_THREAD = 1024  # The same on the CPU.
 
 @dataclass(frozen=True)
 class ThreadSpread:
-    """Distribution of rows or nodes to threads: groups of `lanes` adjacent threads, with `rows_per_thread` rows each."""
+    """Distribution of rows or nodes to threads: groups of `lanes` adjacent threads, `rows_per_thread` rows each."""
 
     lanes: int
     rows_per_thread: int
@@ -91,7 +91,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
         total: wp.array2d(dtype=scalar),
         sums: wp.array2d(dtype=wp.float64),
     ):
-        """Project the gradient `total` to `free`; add |total - constant|^2, |total|^2, |free|^2 and free . d to the sums."""
+        """Project the gradient `total` to `free`; add |total - constant|^2, |total|^2, |free|^2, free . d to sums."""
         thread, c = wp.tid()
         own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         first = get_first_row(thread, lanes, each)

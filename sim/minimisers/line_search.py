@@ -42,7 +42,7 @@ def is_step_too_long(slope: Any, predicted: Any) -> Any:
 
 
 def backtrack_by_slopes(slope: Any, predicted: Any) -> Any:
-    """Return the backtracking factors of rejected steps: zero of the secant through the slopes at both ends, within bounds."""
+    """Return the backtracking factors of rejected steps: zero of the secant through both end slopes, within bounds."""
     with np.errstate(invalid="ignore", divide="ignore"):
         kept = np.divide(predicted, np.add(predicted, slope))
     known = np.greater(predicted, 0.0) & np.isfinite(slope)

@@ -35,7 +35,7 @@ class Newton:
         The residual is round-off if it is below this factor times its change by the last digit of every
         displacement.
     stress_free
-        The model is stress-free if the nodal forces of each term are below this factor times their change by that digit.
+        The model is stress-free if the nodal forces of each term are below this factor times that change of forces.
     """
 
     max_forcing: float = 0.25

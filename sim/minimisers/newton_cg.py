@@ -14,7 +14,7 @@ from ..runtime.device import Device
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """Search direction d (3N, b) [m]; predicted decrease (b,) [J] of the energy along d; number of linear iterations."""
+    """Search direction d (3N, b) [m]; predicted energy decrease (b,) [J] along d; number of linear iterations."""
 
     d: wp.array
     decrease: np.ndarray

@@ -27,7 +27,7 @@ CUDA_BATCH = 4096  # The same on CUDA: they fill a GPU.
 
 @dataclass(frozen=True, eq=False)
 class _Some:
-    """Batch of elements of one tissue: indices (k,), and the array P2 (9, 81) float32, which maps a strain to a stiffness."""
+    """Batch of elements of one tissue: indices (k,), and P2 (9, 81) float32, which maps a strain to a stiffness."""
 
     elements: Elements
     chosen: np.ndarray
@@ -106,7 +106,7 @@ def _list_batches(elements: Elements, tensors: np.ndarray, kind: np.ndarray, mos
 
 
 def _build_gradient_matrix(elements: Elements, chosen: np.ndarray) -> sp.csr_array:
-    """Return the matrix from displacements (3N,) to displacement gradients (9 k q,), row by row, in elements `chosen` (k,)."""
+    """Return the matrix from displacements (3N,) to gradients (9 k q,), row by row, in elements `chosen` (k,)."""
     table, slope = elements.table[chosen], elements.gradient[chosen]
     count, points, most = slope.shape[:3]
     row = np.arange(9 * count * points).reshape(count, points, 1, 3, 3)
