@@ -37,7 +37,7 @@ TENSOR_COMPONENTS = 6
 
 @cache
 def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
-    """Return the law, based on `law` with `count` coefficients, that also takes f - 1 and xx, yy, zz, yz, zx, xy of A."""
+    """Return the law, based on `law` of `count` coefficients, that also takes f - 1 and xx, yy, zz, yz, zx, xy of A."""
     scalar, mat = device.scalar, device.matrix
     parts = build_law_split(law, device)
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1 + TENSOR_COMPONENTS))

@@ -36,8 +36,8 @@ def inverse_transpose(H: Any):
 class LawSplit:
     """Warp functions of a split law with coefficients k, for a displacement gradient H with an increment D.
 
-    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], where E is the strain conjugate to a stress A [Pa]. stress
-    and stress_change(H, D, ...) are its derivatives. overstress(H, k) -> S [Pa] is the deviatoric stress conjugate to E.
+    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa]; E is the strain conjugate to a stress A [Pa]. stress and
+    stress_change(H, D, ...) are its derivatives. overstress(H, k) -> S [Pa] is the deviatoric stress conjugate to E.
     """
 
     energy: wp.Function
