@@ -23,12 +23,12 @@ REGION_NAMES = {"brain": BRAIN_LABEL, "tumour": TUMOUR_LABEL, **PART_LABELS}
 
 
 def name_region(label: int) -> str:
-    """Return a region's name; "region 7" if it has none."""
+    """Return the name of the region `label`, or a text such as "region 7" for a region without a name."""
     return next((name for name, number in REGION_NAMES.items() if number == label), f"region {label}")
 
 
 def describe_region(label: int) -> str:
-    """Return a region's label, with its name if it has one."""
+    """Return a text with the label of a region and, if there is one, its name."""
     return f"region {label} ({name_region(label)})" if label in REGION_NAMES.values() else name_region(label)
 
 
@@ -130,7 +130,7 @@ class Anatomy:
 
     @cached_property
     def tumour_surface(self) -> np.ndarray:
-        """Outward triangles (S, 3) of the tumour's surface, without its interface to the necrosis."""
+        """Outward triangles (S, 3) of the tumour's outer surface, without the interface between core and necrosis."""
         return self.mesh.find_boundary(*TUMOUR_LABELS)
 
     @cached_property

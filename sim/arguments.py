@@ -21,7 +21,7 @@ def as_array(name: str, values: object) -> np.ndarray:
     Raises
     ------
     InputError
-        Rows of different lengths, or values that do not form an array.
+        Rows have different lengths, or the values do not form an array.
     """
     try:
         return np.asarray(values)
@@ -32,13 +32,13 @@ def as_array(name: str, values: object) -> np.ndarray:
 
 
 def check_numbers_array(name: str, values: object, limit: float = MAX_MAGNITUDE) -> np.ndarray:
-    """Return real, finite numbers as float64, in any shape; `name` identifies them in messages.
+    """Return real, finite numbers as a float64 array of any shape; `name` identifies the argument in messages.
 
     Raises
     ------
     InputError
-        Text, booleans, complex numbers, objects, rows of different lengths; a number that is not finite, or beyond
-        `limit`.
+        Values are text, booleans, complex numbers or objects, rows have different lengths, or a number is not finite
+        or has a magnitude above `limit`.
     """
     array = as_array(name, values)
     if array.dtype != np.float64:
@@ -62,7 +62,7 @@ def check_integers(name: str, values: object) -> np.ndarray:
     Raises
     ------
     InputError
-        Fractions, booleans, or values that are not one-dimensional.
+        Values are fractions or booleans, or are not one-dimensional.
     """
     array = as_array(name, values)
     if array.dtype.kind == "b":
@@ -95,7 +95,7 @@ def check_integer(name: str, value: object, minimum: int) -> int:
     Raises
     ------
     InputError
-        Any other value, including booleans.
+        The value is not an integer, is a boolean, or is below `minimum`.
     """
     try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""Contact pressure on the surface of a body."""
+"""Contact pressure of tools and skull on the tissue surface."""
 
 import numpy as np
 

@@ -344,7 +344,7 @@ BuiltIn = (
 
 @runtime_checkable
 class OwnEffect(Protocol):
-    """Interface of user-defined effects, frozen dataclasses that build their own `Term`; see `docs/extend.md`."""
+    """Interface of user-defined effects: frozen dataclasses that build their own `Term`; see `docs/extend.md`."""
 
     @property
     def cause(self) -> type | None:

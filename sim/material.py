@@ -332,7 +332,7 @@ BRAIN = Material("neo-hookean", 3000.0, 0.49)
 
 @dataclass(frozen=True)
 class MaterialSet:
-    """Tissue, the time scale for which it is valid, and the source of its constants."""
+    """Tissue with the time scale for which it is valid and the source of its constants."""
 
     tissue: Material | Ogden
     time_scale: str

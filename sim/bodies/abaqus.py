@@ -23,7 +23,7 @@ GENERATORS = "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"
 
 @dataclass(frozen=True, eq=False)
 class CellBlock:
-    """Elements of one type: node indices (n, k) of tetrahedra, (n, 0) of other elements."""
+    """Elements of one type, with node indices (n, k) for tetrahedra and (n, 0) for other elements."""
 
     type: str
     data: np.ndarray

@@ -292,7 +292,7 @@ def _get_convention(sources: MaskSources) -> Convention | None:
 
 
 def _check_sources(sources: MaskSources, convention: Convention | None) -> None:
-    """Reject sources that do not define the brain and the tumour exactly once."""
+    """Reject sources that do not define the brain exactly once and the tumour exactly once."""
     if sources.mask and sources.brain:
         raise InputError("--mask and --brain both define the brain: give only one of them.")
     if sources.mask and sources.tumour_file:

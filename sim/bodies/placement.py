@@ -48,7 +48,7 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class TumourPiece:
-    """Connected component of a tumour: volume [m^3], centre (3,) [m], points (n, 3) [m] on its surface."""
+    """Connected component of a tumour: volume [m^3], centre (3,) [m], and surface points (n, 3) [m]."""
 
     volume: float
     centre: np.ndarray

@@ -15,7 +15,7 @@ from ..errors import InputError
 
 REMEDY = "Give one three-dimensional volume (.nii, .nii.gz, .mgz, .mgh, .nrrd, .seg.nrrd or .nhdr)."
 LPS = np.array([-1.0, -1.0, 1.0])
-"""Signs of the conversion between LPS and RAS."""
+"""Sign of each coordinate in the conversion between LPS and RAS."""
 SURPLUS = 2**24  # maximum data after the voxels, read for a checksum [bytes]
 BLOCK = 2**20  # block size of reading [bytes]
 # Maximum decompressed size of a file whose suffix does not show its compression [bytes].

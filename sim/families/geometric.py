@@ -105,7 +105,7 @@ def _find_main_tissue(body: LinearBody) -> tuple[float, float]:
 
 
 def _compute_spacing(body: LinearBody) -> float:
-    """Return the radius [m] of a disc with the mean area of a vertex of the surface."""
+    """Return the radius [m] of a disc with the mean nodal area of the surface vertices."""
     mesh = body.anatomy.mesh
     return float(np.sqrt(compute_areas(mesh.nodes[mesh.surface]).sum() / (np.pi * len(np.unique(mesh.surface)))))
 

@@ -34,7 +34,7 @@ from ..runtime.views import to_view
 from .linear_body import LinearBody, build_linear_body, check_effects
 
 Respond = Callable[[LinearBody, np.ndarray], np.ndarray]
-"""Function (body, nodes (n,)) -> displacements (a, 3, n, 3) [m/N] of vertices under unit forces at `body.loaded`."""
+"""Function (body, nodes (n,)) that returns displacements (a, 3, n, 3) [m/N] under unit forces at `body.loaded`."""
 
 
 @dataclass(frozen=True, eq=False)

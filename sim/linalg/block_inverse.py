@@ -150,6 +150,6 @@ def _invert_block(block: torch.Tensor) -> torch.Tensor:
 
 
 def release_memory(device: str) -> None:
-    """Release cached GPU memory, which batches of loads need."""
+    """Release the GPU memory that torch has cached, since batches of loads need this memory."""
     if device != "cpu":
         torch.cuda.empty_cache()

@@ -95,7 +95,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Add forces to their rows: out_rows(i) += f_i."""
+        """Add the forces to selected rows: out_rows(i) += f_i."""
         i = wp.tid()
         out[rows[i], 0] += scalar(force[i, 0])
 
@@ -215,7 +215,7 @@ class ContactSteps:
         return self._run("again", self._retry_shorter_step)
 
     def take_step(self) -> None:
-        """Accept the last step."""
+        """Accept the last trial step: its state becomes the current state."""
         self._run("accept", self._take_step)
 
     def set_tools(self, constant: wp.array) -> bool:

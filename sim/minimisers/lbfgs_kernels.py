@@ -71,7 +71,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         total: wp.array2d(dtype=scalar),
         square: wp.array(dtype=wp.float64),
     ):
-        """Add `own` to `total`, set it to zero, and add its squared norm to `square`."""
+        """Add `own` to `total`, add the squared norm of `own` to `square`, and set `own` to zero."""
         block, c = wp.tid()
         squares = wp.float64(0.0)
         for r in range(block * chunk, wp.min((block + 1) * chunk, own.shape[0])):

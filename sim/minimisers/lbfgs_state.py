@@ -209,7 +209,7 @@ class LbfgsWorkspace:
         self._limit_steps()
 
     def _compute_directions(self) -> None:
-        """Compute the next direction of the load cases whose step was accepted, from their new gradients."""
+        """Compute the next direction, from the new gradient, of each load case with an accepted step."""
         a, k = self.columns, self._kernels
         problem, device, g = self._problem, self._problem.device, self._trial.g
         rows, count = a["u"].shape

@@ -57,7 +57,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """Add x . y to out for a single column, with one row per thread."""
+        """Add the inner product x . y of single columns to out, with one row per thread."""
         r = wp.tid()
         total = wp.float64(0.0)
         if r < x.shape[0]:

@@ -57,7 +57,7 @@ def process_pool(devices: Sequence[str], build: Callable[..., Any], *args: Any) 
     ------
     InputError
         Raised by `build`.
-    LostError
+    LostProcessError
         A process that was killed.
     """
     with ExitStack() as closing:
@@ -68,11 +68,11 @@ def process_pool(devices: Sequence[str], build: Callable[..., Any], *args: Any) 
 
 
 def map_parallel(function: Callable[[Task], Any], tasks: Sequence[Task], count: int = 1) -> Iterator[tuple[Task, Any]]:
-    """Yield each task with its result, in order of completion, from at most `count` processes.
+    """Yield each task and its result, in order of completion, from up to `count` processes, killed at the end.
 
     Raises
     ------
-    InputError, LostError
+    InputError, LostProcessError
         See `map_unordered`.
     """
     with process_pool(["cpu"] * min(count, len(tasks)), _return_given, function) as children:
@@ -88,7 +88,7 @@ def map_unordered(
     ------
     InputError
         Raised by `work`.
-    LostError
+    LostProcessError
         A process that was killed. Finished results of the others are yielded first.
     """
     waiting, busy = iter(tasks), {}
@@ -126,7 +126,7 @@ def run_on_each(children: Sequence[ChildProcess], work: Callable[[Any, Task], An
 
     Raises
     ------
-    InputError, LostError
+    InputError, LostProcessError
         See `map_unordered`.
     """
     for child, task in zip(children, tasks, strict=True):
@@ -148,7 +148,7 @@ def _receive(child: ChildProcess) -> Any:
 
     Raises
     ------
-    LostError
+    LostProcessError
         The process was killed, or its GPU failed.
     """
     try:
@@ -242,7 +242,7 @@ def _call(function: Callable[[Task], Any], task: Task) -> Any:
 
 
 def _try_call(function: Callable[..., Any], *given: Any) -> Any:
-    """Return the result of a function, or the exception that it raises, with its traceback as a note."""
+    """Return the result of a function or, if the function raises an exception, this exception with a traceback note."""
     try:
         return function(*given)
     except Exception as error:

@@ -103,7 +103,7 @@ def build_kernels(device: Device) -> SwellingKernels:
         # outputs
         strain: wp.array3d(dtype=mat),
     ):
-        """Replace H by its elastic part F_e - I = (H - r I) / (1 + r)."""
+        """Replace H by the elastic part F_e - I = (H - r I) / (1 + r)."""
         e, q, c = wp.tid()
         r = swells[e] * wider[c]
         strain[e, q, c] = (strain[e, q, c] - r * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + r)

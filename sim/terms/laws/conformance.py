@@ -95,7 +95,7 @@ def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check: relative error, and its limit."""
+    """Result of one check of a law: relative error, and limit of this error."""
 
     name: str
     error: float
@@ -103,7 +103,7 @@ class Finding:
 
     @property
     def is_within_limit(self) -> bool:
-        """True if the error is within its limit; False for NaN."""
+        """True if the error does not exceed its limit; False for NaN."""
         return self.error <= self.limit
 
     def __str__(self) -> str:

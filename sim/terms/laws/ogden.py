@@ -108,8 +108,8 @@ def stress(H: Any, c: Any):
 def stiffness_between(k: int, l: int, e: Any, y: Any, c: Any):
     """Return b_kl [Pa] = sum_i c_i exp(m_i (y_k + y_l) / 2) sinh(m_i d / 2) / (m_i d / 2) x d / tanh d.
 
-    This is the divided difference of a in `kirchhoff` over the eigenvalues e, times the mean squared stretch. With
-    tanh d = (e_k - e_l) / (1 + e_k + e_l) for d = ln(lambda_k / lambda_l), it is accurate for equal stretches too.
+    b_kl is the divided difference of a in `kirchhoff` over the eigenvalues e, times the mean squared stretch. By use of
+    tanh d = (e_k - e_l) / (1 + e_k + e_l) for d = ln(lambda_k / lambda_l), b_kl is also accurate for equal stretches.
     """
     one, two = type(c[0])(1.0), type(c[0])(2.0)
     tanh = wp.abs(e[k] - e[l]) / (one + e[k] + e[l])
