@@ -33,7 +33,7 @@ class Convention:
     exclusive
         Set of labels that never occur all together in one file.
     innermost
-        Labels of inner tissue, whose surface must not touch the outside more than that of other tissue.
+        Labels of inner tissue; its surface must not be more exposed (at label 0) than that of other tissue.
     """
 
     name: str

@@ -101,7 +101,7 @@ def _read_with_meshio(path: Path) -> meshio.Mesh:
     Raises
     ------
     InputError
-        meshio cannot read the file; the message has its reason, if any. Other exceptions of meshio: a damaged file.
+        meshio cannot read the file; the message has the reason. A damaged file may cause other exceptions of meshio.
     """
     import meshio  # optional dependency, missing on machines for training alone
 

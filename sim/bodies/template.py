@@ -63,7 +63,7 @@ class Lobes:
     count
         Number of lobes, in random directions.
     height
-        Maximum height of a lobe, as a fraction of the radius; the minimum height is 0.3 times the maximum.
+        Maximum height of a lobe, as a fraction of the radius. The minimum height is 0.3 times the maximum.
     sharpness
         Sharpness s of all lobes, see `Lobed`.
     """

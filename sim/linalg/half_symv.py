@@ -89,6 +89,6 @@ def list_tiles(size: int, device: str) -> wp.array:
 
 
 def add_product(tiles: wp.array, matrix: wp.array, x: wp.array, y: wp.array) -> None:
-    """Add A x (n,) to y (n,), in single precision; A (n, n) is symmetric, in half precision, and n is a multiple of 64."""
+    """Add A x (n,) to y (n,), in single precision; A (n, n) is symmetric, in half precision, with n % 64 = 0."""
     dim, device = len(tiles) * TILE, matrix.device
     wp.launch(_add_product, dim, [tiles, matrix, x], [y], device=device, block_dim=TILE, record_tape=False)

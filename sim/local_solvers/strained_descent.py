@@ -65,7 +65,7 @@ class StiffnessUpdate:
 
     @property
     def warm_start(self) -> dict[str, np.ndarray]:
-        """Return the entries for the `warm` data of a solution, by name."""
+        """Entries, by name, for the `warm` data of a solution."""
         return {name: getattr(self, field)[None] for field, name in UPDATE_KEYS.items()}
 
 

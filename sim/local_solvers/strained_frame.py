@@ -36,7 +36,7 @@ class UpdatedModel:
 
     @property
     def warm_start(self) -> dict[str, np.ndarray]:
-        """Return the entries for the `warm` data of a solution, by name."""
+        """Entries, by name, for the `warm` data of a solution."""
         return {NODES_KEY: self.nodes.numpy(), MATRIX_KEY: self.matrix.numpy()}
 
 
