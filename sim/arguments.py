@@ -80,7 +80,7 @@ def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
     Raises
     ------
     InputError
-        As `check_integers`, or if a number is not that of a vertex of the mesh.
+        See `check_integers`; also if a number is not that of a vertex of the mesh.
     """
     vertices = check_integers(name, values)
     beyond = vertices[(vertices < 0) | (vertices >= count)]

@@ -57,7 +57,7 @@ class DebondedSolution:
     rounds
         Number of solves.
     converged
-        True if the sets of bonded, sliding and separated vertices no longer change.
+        True if the sets of bonded, sliding and separated vertices have stopped changing.
     """
 
     deformation: Deformation

@@ -169,8 +169,8 @@ class Inertia:
 class Resection:
     """Removal of tissue in steps; `Resected` loads give the number of completed steps (default: all steps).
 
-    The cavity wall is a free surface. A step also removes tissue that is no longer connected by element faces to
-    fixed tissue. `sim.build_fem` builds the solver.
+    The cavity wall is a free surface. A step also removes tissue without a connection, by element faces, to fixed
+    tissue. `sim.build_fem` builds the solver.
 
     The remaining tissue keeps its history variables. Residual stress in the scan is not modelled, so without other
     loads nothing moves.

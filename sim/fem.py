@@ -235,7 +235,7 @@ class Fem:
         Raises
         ------
         InputError
-            As `deform`, or if the effects include inertia, so that solutions are time steps without static equilibrium.
+            See `deform`; also if effects include inertia, whose solutions are time steps without static equilibrium.
         """
         self._check_static(loads)
         self.problem.begin(Cases(loads, answer.time, answer.memory))
@@ -273,7 +273,7 @@ class Fem:
         Raises
         ------
         InputError
-            As `deform`. Loads are not forces, such as prescribed motion, or a group is incomplete. The solver has
+            See `deform`. Loads are not forces, such as prescribed motion, or a group is incomplete. The solver has
             precision float32, whose round-off would dominate the higher orders.
         """
         check_causes(self.effects, loads)

@@ -69,7 +69,7 @@ class ResectedFem:
         Raises
         ------
         InputError
-            As `Fem.deform`, or if a load has more completed steps than the `Resection` has steps.
+            See `Fem.deform`; also if a load has more completed steps than the `Resection` has steps.
         """
         check_loads(loads)
         if start is not None:
@@ -188,7 +188,7 @@ def build_fem(
     Raises
     ------
     InputError
-        As `Fem`, or if a resection step is not possible on this mesh.
+        See `Fem`; also if a resection step is not possible on this mesh.
     """
     effects = tuple(effects)
     cuts = [effect for effect in effects if isinstance(effect, Resection)]

@@ -214,7 +214,7 @@ def read_anatomy(path: str | Path) -> Anatomy:
     Raises
     ------
     InputError
-        As `read_mesh`. The point data `held`, `slide_normal` or `craniotomy` are missing or not finite, or the size of
+        See `read_mesh`. The point data `held`, `slide_normal` or `craniotomy` are missing or not finite, or the size of
         the mesh is outside the limits for coordinates in metres.
 
     Examples

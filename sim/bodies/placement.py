@@ -121,7 +121,7 @@ def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Place
     Raises
     ------
     InputError
-        As `find_opening_at`, or if the outline is too far from the cortex.
+        See `find_opening_at`; also if the outline is too far from the cortex.
     """
     apart = float(KDTree(cortex).query(outline)[0].max())
     if apart > settings.max_surface_distance:

@@ -43,7 +43,7 @@ def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[
     Raises
     ------
     InputError
-        As `compute_remaining_bodies`.
+        See `compute_remaining_bodies`.
     """
     effects = tuple(effects)
     cut = next(effect for effect in effects if isinstance(effect, Resection))

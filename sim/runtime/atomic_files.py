@@ -61,7 +61,7 @@ def write_atomically(path: str | Path, suffix: str, clean: bool = True) -> Itera
     Raises
     ------
     InputError
-        As `check_output`, or if writing fails.
+        See `check_output`; also if writing fails.
     """
     path = check_output(path, suffix, clean=clean)
     partial = to_partial_path(path)
@@ -142,7 +142,7 @@ def write_stream_atomically(path: str | Path, suffix: str, clean: bool = True) -
     Raises
     ------
     InputError
-        As `write_atomically`.
+        See `write_atomically`.
     """
     with write_atomically(path, suffix, clean) as partial, partial.open("w+b", buffering=0) as raw:
         stream = Stream(raw)

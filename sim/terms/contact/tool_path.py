@@ -126,7 +126,7 @@ def _find_clear_pose(
 
 
 def _compute_rise(core: Core, local: np.ndarray, reach: np.ndarray) -> float:
-    """Return the distance [m] by which a core must rise along its z axis to be above all surface points on its path."""
+    """Return the distance [m] by which a core must rise along its z axis to clear every surface point on its path."""
     aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
     highest = (local[:, 2] + reach)[aside <= core.radius + reach].max(initial=-np.inf)
     return max(0.0, float(highest - (core.centre[2] - core.half[2] - core.radius)))
