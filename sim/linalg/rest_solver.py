@@ -40,7 +40,7 @@ class RestStiffnessSolver:
 
     @cached_property
     def exact_inverse(self) -> Preconditioner | None:
-        """Inverse of the undeformed stiffness in the problem's precision, or None if not worthwhile for many solves."""
+        """Inverse of the undeformed stiffness in the problem's precision; None if it is not worthwhile or available."""
         pays = not self.problem.device.on_cuda and self.problem.rows <= self.max_factorised
         return build_rest_solver(self.problem) if pays or is_exact(self.preconditioner) else None
 

@@ -2,7 +2,7 @@
 
 C (3n, 3n) is the compliance of the model at the touchable nodes, and w0 are positions without contact. w minimises
 
-    (w - w0) . C^-1 (w - w0) / 2 + c(w) + d |w - v|^2 / 2 over the touched,
+    (w - w0) . C^-1 (w - w0) / 2 + c(w) + d |w - v|^2 / 2 over touched nodes,
 
 where c is the barrier energy of the tools, and d a proximal coefficient about the current positions v. Newton's method
 solves for the tool forces f, with w = w0 - C f. The forces are zero except at touched nodes, so C is never inverted.

@@ -38,7 +38,7 @@ EMPTY_HISTORY: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS h
 class SolverResult:
     """Solution u (3N, B) [m] on the device; (B,) outcomes, outer steps, residuals, load fractions, inverted elements.
 
-    `warm` is the warm-start data for the next load. With moving tools, `path_fraction` (B,) is the path fraction
+    `warm_start` is data for the next load. With moving tools, `path_fraction` (B,) is the path fraction
     reached, and `restarted` (B,) marks cases that started from the undeformed state.
     """
 

@@ -7,7 +7,7 @@ section 6.10. The step is the derivative of an incremental potential: with Fb = 
     f psi(F) + (1 - f) psi(J^(1/3) I) + Cb : A / 2,  f = 1 - sum_i g_i (1 - exp(-dt / (2 tau_i))),
     A = sum_i (exp(-dt / tau_i) H_i - g_i exp(-dt / (2 tau_i)) S),
 
-S is the deviatoric stress of the law, pulled back by Fb of the last step, and H_i are the overstresses of the Prony
+where S is the deviatoric stress of the law, pulled back by Fb of the last step, and H_i are the overstresses of Prony
 terms. If a law splits into deviatoric and volumetric parts, as Ogden's law, psi(F) - psi(J^(1/3) I) is psi(Fb), as in
 the papers. For other laws psi(Fb) must not be used: it grows faster than psi(F) under compression; tissue collapses.
 
