@@ -15,9 +15,9 @@ FORMER = {
     "torn": "solve_with_debonding",
     "volume_subject": "build_volume_subject",
 }
-"""Former names of public names, for one release."""
+"""New name of each renamed public object, by its former name; former names work for one more release."""
 
 
 def __getattr__(name):
-    """Load a public name, also by its former name."""
+    """Return the public object `name` and import its module on first use; former names are accepted too."""
     return _load(FORMER.get(name, name))

@@ -9,7 +9,7 @@ from .errors import InputError
 
 Precision = Literal["float32", "float64"]  # scalar types of a solver
 MIN_TOLERANCE: dict[str, float] = {"float32": 2e-5, "float64": 1e-11}
-"""Smallest relative residual that each scalar type reaches reliably (round-off of the internal forces)."""
+"""Smallest relative residual that is reached reliably, by scalar type; round-off of the internal forces limits it."""
 
 
 @dataclass(frozen=True)
@@ -19,10 +19,10 @@ class Accuracy:
     Parameters
     ----------
     tolerance
-        Relative tolerance: converged if |residual| <= tolerance x the largest 2-norm among the gradients of the terms
-        and the reaction at constrained nodes.
+        Relative tolerance. A solution has converged if |residual| <= tolerance x the largest of these 2-norms: the
+        gradient of each energy term, and the reaction at constrained nodes.
     outer
-        Maximum Newton steps for one load, and for each of its load steps; in total at most outer x (1 + steps).
+        Maximum Newton steps for one load and for each of its load steps. The total is at most outer x (1 + steps).
     inner
         Maximum conjugate gradient iterations in one Newton step.
     precision
@@ -30,15 +30,15 @@ class Accuracy:
     steps
         Maximum load steps if a load does not converge within `outer`; 0 disables load stepping.
     evaluations
-        Maximum force evaluations of the whole body before Newton, shared by local solvers and L-BFGS; 0: Newton
-        only. None: a device-dependent default. With few `outer` steps only Newton is used.
+        Maximum force evaluations of the whole mesh before Newton's method starts; local solvers and L-BFGS share them.
+        0: Newton's method only. None: a device-dependent default. With few `outer` steps only Newton's method is used.
     limit_strain
-        Report equilibria as not good if tetrahedra are inverted, or strained beyond the range measured on brain.
+        True to report a converged solution as unreliable if a tetrahedron is inverted or strained beyond measured data.
 
     Raises
     ------
     InputError
-        A tolerance below the floor of the scalar type; limits that are not integers or too small.
+        The tolerance is below `MIN_TOLERANCE`, or a limit is not an integer or is too small.
     """
 
     tolerance: float = 1e-6
@@ -51,7 +51,7 @@ class Accuracy:
 
     @property
     def most(self) -> int:
-        """Maximum Newton steps for one load, over all load steps and tool strides."""
+        """Maximum total number of Newton steps for one load, over all load steps and partial tool motions."""
         return self.outer * (1 + self.steps)
 
     def __post_init__(self) -> None:
@@ -72,16 +72,16 @@ class Accuracy:
 
 
 DRAFT = Accuracy(tolerance=1e-2, outer=3, precision="float32", steps=0)
-"""For a quick preview: at most three Newton steps, and no load steps."""
+"""Accuracy of a quick preview: at most three Newton steps, without load steps."""
 LIVE = Accuracy(tolerance=4e-3, outer=30, precision="float32", steps=8)
-"""For frames that start from the previous frame: the default of scenes.
+"""Accuracy of frames that start from the solution of the previous frame: the default of scenes.
 
 Maximum error of 60 such frames: 0.026 mm in palpation, and 0.019 mm under a spatula
 (`python -m benchmarks live --frames 1000 --checked 60` on one H100, default tissue; `docs/notes/figures.md`).
 """
 TRAIN = Accuracy(tolerance=1e-4, precision="float32")
-"""For training data sets: the default of `Fem`."""
+"""Accuracy of training data sets: the default of `Fem`."""
 NO_STRAIN_LIMIT = replace(TRAIN, limit_strain=False)
-"""`TRAIN` for comparisons of solvers and models, which include equilibria of overstrained tissue."""
+"""Accuracy as `TRAIN`, but without the strain limit, so that comparisons of solvers include overstrained tissue."""
 REFERENCE = Accuracy(tolerance=1e-8)
-"""For reference solutions; in double precision, which power series require too."""
+"""Accuracy of reference solutions, in double precision; power series also require double precision."""

@@ -14,26 +14,26 @@ from .geometry.tetmesh import TetMesh, compute_digest
 BRAIN_LABEL, TUMOUR_LABEL, NECROSIS_LABEL = 1, 2, 5
 """Region labels of anatomies made by this package."""
 TUMOUR_LABELS = (TUMOUR_LABEL, NECROSIS_LABEL)
-"""Region labels that together are the tumour."""
+"""Region labels of the whole tumour: its core and its necrosis."""
 PART_LABELS = {"oedema": 3, "ventricles": 4, "necrosis": NECROSIS_LABEL}
-"""Region labels of parts with their own stiffness, if an anatomy marks them: of the brain, and of the tumour."""
+"""Region labels of the optional parts of brain and tumour that have their own stiffness, by part name."""
 
 REGION_NAMES = {"brain": BRAIN_LABEL, "tumour": TUMOUR_LABEL, **PART_LABELS}
 """Region labels by name."""
 
 
 def name_region(label: int) -> str:
-    """Return a region's name; "region 7" if it has none."""
+    """Return the name of the region `label`, or a text such as "region 7" for a region without a name."""
     return next((name for name, number in REGION_NAMES.items() if number == label), f"region {label}")
 
 
 def describe_region(label: int) -> str:
-    """Return a region's label, with its name if it has one."""
+    """Return a text with the label of a region and, if there is one, its name."""
     return f"region {label} ({name_region(label)})" if label in REGION_NAMES.values() else name_region(label)
 
 
 def describe_missing_region(mesh: TetMesh, label: int) -> str:
-    """Return a message that a mesh lacks a region, with the regions it has; empty if it has it."""
+    """Return an error message, with the labels of the mesh, if it has no region `label`; else an empty string."""
     if mesh.mark_elements(label).any():
         return ""
     has = ", ".join(map(describe_region, np.unique(mesh.region).tolist()))
@@ -42,24 +42,24 @@ def describe_missing_region(mesh: TetMesh, label: int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """Mesh with its boundary conditions, in RAS coordinates of the volume [m].
+    """Mesh with its boundary conditions, in the RAS coordinates of the source image [m].
 
     Parameters
     ----------
     mesh
-        Tetrahedra; regions `BRAIN_LABEL`, `TUMOUR_LABELS` if there is a tumour, and those of `PART_LABELS`.
+        Tetrahedral mesh. Its regions are `BRAIN_LABEL` and, if present, `TUMOUR_LABELS` and those in `PART_LABELS`.
     fixed
         Mask (V, 3) of displacement components that are prescribed (zero unless a load sets them).
     slide_normal
-        Unit outward normals (V, 3) of nodes under the skull, zero elsewhere. `Bonded`, `Slide` and `SkullContact`
-        define their contact with the skull.
+        Unit outward normals (V, 3) of nodes under the skull, zero elsewhere. The effects `Bonded`, `Slide` and
+        `SkullContact` define the contact between these nodes and the skull.
     craniotomy
         Mask (V,) of free surface nodes that a tool may touch.
 
     Raises
     ------
     InputError
-        Shapes that do not match the mesh, or slide normals that are neither zero nor of unit length.
+        The shapes do not match the mesh, or a slide normal is neither zero nor of unit length.
     """
 
     mesh: TetMesh
@@ -87,14 +87,14 @@ class Anatomy:
         return orphaned
 
     def remove_elements(self, elements: np.ndarray) -> Anatomy:
-        """Return the body without the tetrahedra `elements` (n,), with the same vertex numbers.
+        """Return the anatomy without the tetrahedra `elements` (n,); the vertex numbers do not change.
 
-        New surfaces are free. Vertices that lose their last tetrahedron are fixed, and neither slide nor are touchable.
+        New surfaces are free. Vertices without any remaining tetrahedron are fixed; tools cannot touch them.
 
         Raises
         ------
         InputError
-            Tetrahedra that the mesh does not have, or all of them.
+            `elements` contains a number that the mesh does not have, or all tetrahedra.
         """
         mesh, taken = self.mesh, np.unique(elements)
         count = len(mesh.tets)
@@ -130,7 +130,7 @@ class Anatomy:
 
     @cached_property
     def tumour_surface(self) -> np.ndarray:
-        """Outward triangles (S, 3) of the tumour's surface, without its interface to the necrosis."""
+        """Outward triangles (S, 3) of the tumour's outer surface, without the interface between core and necrosis."""
         return self.mesh.find_boundary(*TUMOUR_LABELS)
 
     @cached_property
@@ -141,7 +141,7 @@ class Anatomy:
 
     @cached_property
     def bare(self) -> np.ndarray:
-        """Mask (S,) of surface triangles with a corner that is neither fixed nor sliding: tools may touch them."""
+        """Mask (S,) of surface triangles that tools may touch: at least one corner is neither fixed nor sliding."""
         covered = np.logical_or(self.fixed.any(axis=1), self.slide_normal.any(axis=1))
         return np.logical_not(covered[self.mesh.surface].all(axis=1))
 

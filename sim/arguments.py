@@ -11,7 +11,7 @@ MAX_MAGNITUDE = 1e30
 
 
 def is_all_finite(array: np.ndarray) -> bool:
-    """Return True if no value is infinite or NaN; for small arrays three times as fast as `.all()`."""
+    """Return True if all values are finite; three times as fast as `np.isfinite(array).all()` for small arrays."""
     return np.count_nonzero(np.isfinite(array)) == array.size
 
 
@@ -21,7 +21,7 @@ def as_array(name: str, values: object) -> np.ndarray:
     Raises
     ------
     InputError
-        Rows of different lengths, or values that do not form an array.
+        Rows have different lengths, or the values do not form an array.
     """
     try:
         return np.asarray(values)
@@ -32,13 +32,13 @@ def as_array(name: str, values: object) -> np.ndarray:
 
 
 def check_numbers_array(name: str, values: object, limit: float = MAX_MAGNITUDE) -> np.ndarray:
-    """Return real, finite numbers as float64, in any shape; `name` identifies them in messages.
+    """Return real, finite numbers as a float64 array of any shape; `name` identifies the argument in messages.
 
     Raises
     ------
     InputError
-        Text, booleans, complex numbers, objects, rows of different lengths; a number that is not finite, or beyond
-        `limit`.
+        Values are text, booleans, complex numbers or objects, rows have different lengths, or a number is not finite
+        or has a magnitude above `limit`.
     """
     array = as_array(name, values)
     if array.dtype != np.float64:
@@ -57,12 +57,12 @@ def check_numbers_array(name: str, values: object, limit: float = MAX_MAGNITUDE)
 
 
 def check_integers(name: str, values: object) -> np.ndarray:
-    """Return vertex numbers (n,) as integers.
+    """Return whole numbers (n,) as an integer array; `name` identifies the argument in messages.
 
     Raises
     ------
     InputError
-        Fractions, booleans, or values that are not one-dimensional.
+        Values are fractions or booleans, or are not one-dimensional.
     """
     array = as_array(name, values)
     if array.dtype.kind == "b":
@@ -75,12 +75,12 @@ def check_integers(name: str, values: object) -> np.ndarray:
 
 
 def check_vertex_numbers(name: str, values: object, count: int) -> np.ndarray:
-    """Return vertex numbers (n,) of a mesh with `count` vertices.
+    """Return valid vertex numbers (n,) of a mesh with `count` vertices, as an integer array.
 
     Raises
     ------
     InputError
-        See `check_integers`; a vertex that the mesh does not have.
+        See `check_integers`; also if a number is not that of a vertex of the mesh.
     """
     vertices = check_integers(name, values)
     beyond = vertices[(vertices < 0) | (vertices >= count)]
@@ -95,7 +95,7 @@ def check_integer(name: str, value: object, minimum: int) -> int:
     Raises
     ------
     InputError
-        Any other value, including booleans.
+        The value is not an integer, is a boolean, or is below `minimum`.
     """
     try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]

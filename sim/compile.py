@@ -1,6 +1,6 @@
-"""Compilation of effects to a problem: one `match` over all effects, which imports a term's module when needed.
+"""Compilation of effects to a boundary value problem: one `match` statement converts each effect to a term.
 
-User-defined effects build their own terms.
+The module of a term is imported when an effect needs the term. User-defined effects build their own terms.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -67,7 +67,7 @@ CAUSES = {
     ToolContact: Touching,
     Retraction: Retracted,
 }
-"""Cause required by each effect; other effects act without loads."""
+"""Load cause that each effect requires; effects that are not listed act without a load."""
 
 
 def compile_problem(
@@ -77,15 +77,15 @@ def compile_problem(
     space: Discretisation | None = None,
     surface: ContactSurface | None = None,
 ) -> Problem:
-    """Build the terms and constraints of `effects`; default `space`: linear tetrahedra.
+    """Return the boundary value problem with the terms and constraints of `effects`, by default on linear tetrahedra.
 
-    `surface` is the surface of `space`, if it is shared with other code.
+    `surface` is the contact surface of `space`, if the caller has already built it.
 
     Raises
     ------
     InputError
-        Unknown or duplicate effects, none that resists deformation, a region without a law, a body that is not fixed. A
-        user-defined effect that does not return a term, or whose name is in use.
+        An effect is unknown or duplicate, no effect resists deformation, a region has no law, or the body is not fixed.
+        A user-defined effect does not return a term, or its name is already in use.
     """
     effects, space = _check_compatible(effects), space or discretise(anatomy.mesh, "p1")
     surface = surface or ContactSurface(space.nodes, space.surface, device)
@@ -152,7 +152,7 @@ def compile_problem(
 
 
 def _check_compatible(effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Return the effects as a tuple, if they are compatible."""
+    """Return the effects as a tuple; raise `InputError` if they are incompatible."""
     effects = tuple(effects)
     for effect in effects:
         if isinstance(effect, type):
@@ -192,7 +192,7 @@ def check_causes(effects: Iterable[Effect], loads: Loads) -> None:
     Raises
     ------
     InputError
-        With the cause and the required effect; or with the argument given instead of loads.
+        `loads` are not `Loads`, or no effect uses a cause; the message gives the cause and the required effect.
     """
     check_loads(loads)
     effects = tuple(effects)
@@ -218,7 +218,7 @@ def _build_imposed(space: Discretisation, skin: ContactSurface, loads: Loads) ->
 
 @dataclass(frozen=True, eq=False)
 class LocalProblem:
-    """Problem on a subset of a body's nodes, and a function that sets or clears a force (3n, b) [N] on it."""
+    """Problem on a subset of the nodes, and a function that sets or clears an external force (3n, b) [N] there."""
 
     problem: Problem
     set_force: Callable[[wp.array | None], None]
@@ -227,14 +227,14 @@ class LocalProblem:
 def compile_part(
     effects: Iterable[Effect], space: Discretisation, problem: Problem, selected: np.ndarray, nodes: np.ndarray
 ) -> Problem:
-    """Compile the elasticity of the `selected` tetrahedra (T,) bool alone, on their `nodes` (n,), ascending."""
+    """Return the problem with the elasticity of only the `selected` tetrahedra (T,) bool, on their sorted `nodes`."""
     effect = next(effect for effect in effects if isinstance(effect, Elasticity))
     constraint = Constraint(problem.constraint.fixed[nodes], problem.constraint.normal[nodes], problem.device)
     return Problem(tuple(_build_elasticity(effect, space, problem.device, selected, nodes)), constraint, problem.device)
 
 
 def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> LocalProblem:
-    """Return a part with a surrounding stiffness (m, m) [N/m] on its rows (m,) of 3n."""
+    """Return the problem `part` with the `stiffness` (m, m) [N/m] of its surroundings added to its `rows` (m,)."""
     from .terms.schur_stiffness import Exterior
 
     return _build_local_problem(replace(part, terms=(*part.terms, Exterior(rows, stiffness, part.rows, part.device))))
@@ -243,9 +243,9 @@ def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.nda
 def compile_clamped_part(
     effects: Iterable[Effect], space: Discretisation, problem: Problem, selected: np.ndarray, nodes: np.ndarray
 ) -> tuple[LocalProblem, Callable[[], sp.csc_array]]:
-    """Compile as `compile_part`, with nodes fixed that other tetrahedra share.
+    """Return the problem of `compile_part`, in which the nodes shared with tetrahedra that are not selected are fixed.
 
-    Also return a function for its tangent stiffness (3n, 3n) [N/m] at the last linearisation of a single load case.
+    Also return a function that assembles its tangent stiffness (3n, 3n) [N/m] at the last linearisation of one case.
     """
     effect, device = next(effect for effect in effects if isinstance(effect, Elasticity)), problem.device
     terms = _build_elasticity(effect, space, device, selected, nodes)
@@ -272,9 +272,9 @@ def _build_elasticity(
     nodes: np.ndarray | None = None,
     pulsation: Pulsation | None = None,
 ) -> list[AssembledTerm]:
-    """Build one term per law and element part, over the elements of all regions with that law.
+    """Return the elastic terms: one per law and element part, over the elements of all regions with that law.
 
-    `within` (T,) bool restricts it to these tetrahedra, on their own nodes (n,).
+    `within` (T,) bool restricts the terms to these tetrahedra, whose `nodes` (n,) are then the unknowns.
     """
     mesh = space.mesh
     labels = [int(label) for label in np.unique(mesh.region)]
@@ -307,7 +307,7 @@ def _build_elasticity(
 
 
 def collect_laws(effect: Elasticity, labels: Iterable[int]) -> dict[int, Tissue]:
-    """Return the law of each region.
+    """Return the tissue law of each region label in `labels`.
 
     Raises
     ------
@@ -331,9 +331,9 @@ def _build_law_term(
     device: Device,
     swelling: tuple[Pulsation, np.ndarray] | None,
 ) -> AssembledTerm:
-    """Return the term of elements whose tissues, indexed by `which` (T,), have one law; all of them relax, or none.
+    """Return the term of elements with tissue number `which` (T,). All tissues have the same law; all or none relax.
 
-    `swelling`: the effect, and a mask (T,) of elements that swell.
+    `swelling` is the effect and a mask (T,) of the elements that swell, or None.
     """
     from .terms.elasticity import ElasticTerm
 

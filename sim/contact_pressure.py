@@ -1,4 +1,4 @@
-"""Contact pressure on the surface of a body."""
+"""Contact pressure of tools and skull on the tissue surface."""
 
 import numpy as np
 
@@ -11,16 +11,16 @@ from .loads import Loads
 
 
 def compute_pressure(fem: Fem, loads: Loads, answer: Deformation) -> np.ndarray:
-    """Return the mean contact pressure (B, V) [Pa] of tools and separable skull at each vertex: nodal force / area.
+    """Return the contact pressure (B, V) [Pa] of tools and a separable skull at each vertex: nodal force / nodal area.
 
-    The area is a third of each adjacent deformed surface triangle; interior vertices have neither force nor area.
-    Tools are at the poses in `answer`.
+    The nodal area is one third of the adjacent deformed surface triangles; the pressure of interior vertices is 0.
+    The tools have the poses that they have at the end of the solution `answer`.
 
     Raises
     ------
     InputError
-        No contact effect; quadratic elements, whose nodal forces do not give pressures; a solution of other loads, or
-        not at all vertices.
+        There is no contact effect, or elements are quadratic, so that nodal forces do not give pressures. The solution
+        belongs to other loads, or does not contain all vertices.
     """
     if not fem.problem.barriers:
         raise InputError("nothing touches this body: add ToolContact, Retraction or SkullContact to read a pressure.")

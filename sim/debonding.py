@@ -31,7 +31,7 @@ class Debonding:
     tension_tolerance
         Tolerance of tension on a sliding vertex, as a fraction of the largest compression.
     averaging_radius
-        Averaging radius of tractions [m]: bonds fail in patches of that size on any mesh.
+        Averaging radius of tractions [m]. Bonds fail in patches of this size, independent of the mesh size.
     """
 
     max_solves: int = 60
@@ -46,18 +46,18 @@ TEARING = Debonding()
 
 @dataclass(frozen=True, eq=False)
 class DebondedSolution:
-    """Solution of one load with no bond above its strength.
+    """Solution of one load after debonding: no intact bond exceeds its strength.
 
     Parameters
     ----------
     deformation
         Equilibrium; its `bond` is the largest traction ratio of intact bonds.
     sliding, free
-        Debonded mesh vertices (n,): pressed on the skull and sliding without friction, or separated from it.
+        Debonded mesh vertices (n,): those that slide on the skull without friction, and those separated from the skull.
     rounds
         Number of solves.
     converged
-        True if the active set has converged.
+        True if the sets of bonded, sliding and separated vertices have stopped changing.
     """
 
     deformation: Deformation
@@ -79,16 +79,16 @@ def solve_with_debonding(
     element: str | None = None,
     tearing: Debonding = TEARING,
 ) -> DebondedSolution:
-    """Solve one load with debonding: an active set iteration over bonded, sliding and separated vertices.
+    """Solve one load with debonding, by an active set iteration over bonded, sliding and separated vertices.
 
-    Bonds above their strength fail, sliding vertices under tension separate, and vertices that would penetrate slide.
-    Failure is brittle and irreversible. Contact is with the tangent plane of the undeformed position,
-    without a gap. With a strength near zero the skull only presses.
+    Bonds above their strength fail. Sliding vertices under tension separate. Separated vertices that would penetrate
+    the skull slide. Failure is brittle and irreversible. The skull is represented by tangent planes at the undeformed
+    positions, without a gap. With a strength near zero the skull can only press.
 
     Parameters
     ----------
     effects
-        Effects with `Bonded`, whose strengths apply.
+        Effects of the scene, including `Bonded`, which defines the bond strengths.
     loads
         Loads with one load case.
     tearing
@@ -102,7 +102,7 @@ def solve_with_debonding(
     Raises
     ------
     InputError
-        More than one load, no `Bonded`, a body that separates completely, and as `Fem.deform`.
+        There is more than one load, no `Bonded` effect, or the brain separates completely. Errors of `Fem.deform`.
 
     Examples
     --------
@@ -147,7 +147,7 @@ def solve_with_debonding(
 
 
 def _compute_reactions(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
-    """Return the gradient of the energy, the reaction forces (3N, 1) [N]."""
+    """Return the gradient of the energy (3N, 1) [N] at the solution: the reaction forces of the constraints."""
     problem = fem.problem
     problem.begin(Cases(loads, answer.time, answer.memory))
     return problem.gradient(problem.device.upload(fem.guess(loads, answer)))
@@ -158,7 +158,7 @@ def _compute_traction_ratios(
 ) -> np.ndarray:
     """Return the traction ratio (V,) of each bonded vertex: mean traction around it / strength.
 
-    Means include intact bonds only.
+    The averages include only bonds that are intact.
     """
     body = replace(anatomy, slide_normal=np.where(bonded[:, None], anatomy.slide_normal, 0.0))
     bond = BondTraction(skull, body, fem.space, fem.problem.device, around)
@@ -168,7 +168,7 @@ def _compute_traction_ratios(
 
 
 def _sum_at_vertices(fem: Fem, force: wp.array) -> np.ndarray:
-    """Return nodal forces (V, 3) [N], those of mid-edge nodes divided between the ends."""
+    """Return the forces at mesh vertices (V, 3) [N]; forces at mid-edge nodes are divided equally between both ends."""
     whole, count = force.numpy().reshape(-1, 3).astype(np.float64), len(fem.anatomy.mesh.nodes)
     out = whole[:count].copy()
     np.add.at(out, fem.space.edges, 0.5 * whole[count:, None])

@@ -15,13 +15,13 @@ from .errors import InputError
 from .loads import Loads
 
 ROWS = ("reached", "inverted", "leaked", "bond", "strained")
-"""Names of fields (B,) of a `Deformation` that some models do not compute."""
+"""Names of the `Deformation` fields of shape (B,) that some models do not compute."""
 COLUMNS = ("bound", "reaction_bound", "stretch")
-"""Names of fields (2, B) of a `Deformation` that some models do not compute."""
+"""Names of the `Deformation` fields of shape (2, B) that some models do not compute."""
 
 
 class Outcome(Enum):
-    """Outcome of a load case; the value is the description for users."""
+    """Outcome of a load case; the value of each member is its description for users."""
 
     CONVERGED = "converged to the requested tolerance"
     CONVERGED_ANEW = "converged to the requested tolerance from the undeformed state, because the start failed"
@@ -40,19 +40,19 @@ class Outcome(Enum):
 
     @property
     def good(self) -> bool:
-        """Return True if the result is reliable."""
+        """True if a result with this outcome is reliable."""
         return self in (Outcome.CONVERGED, Outcome.CONVERGED_ANEW, Outcome.CONVERGED_IN_STEPS, Outcome.PREDICTED)
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Wall-clock time by stage for the whole batch [s], without set-up (factorisation, compilation)."""
+    """Wall-clock time [s] by solver stage for the whole batch, without set-up such as factorisation or compilation."""
 
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def total(self) -> float:
-        """Sum over the stages [s]."""
+        """Total time [s] of all solver stages."""
         return float(sum(self.seconds.values()))
 
 
@@ -65,43 +65,43 @@ class Deformation:
     displacement
         Displacements (B, n, 3) [m], always finite.
     nodes
-        Mesh vertices (n,) of the rows (a surrogate may be limited to the tumour's).
+        Numbers (n,) of the mesh vertices in `displacement`; a surrogate may return only the vertices of the tumour.
     outcome
         Outcomes of the B load cases.
     iterations, residual, time
-        Outer iterations of all descents, relative residual as in `Accuracy`, time [s], each (B,). A surrogate has 0
-        iterations and NaN residual.
+        Total outer iterations, relative residual as in `Accuracy`, and time [s] of the solution, each (B,). Surrogates
+        report 0 iterations and a residual of NaN.
     reaction
-        Force [N] and moment about the tool's point [N m] that each tool exerts: (B, tools, 6).
+        Force [N] and moment [N m] of each tool on the tissue, (B, tools, 6). Moments refer to the tool's point.
     memory
-        History of tissue and tools, by term name, rows (B, ...); required by the next solution.
+        History variables (B, ...) of each history-dependent term, by term name. The next solution requires this data.
     warm
-        Data that accelerate the next solution, rows (B, ...): optional, and neither stored nor compared.
+        Optional arrays (B, ...) that accelerate the next solution. This data is neither stored in files nor compared.
     cost
         Computing time by stage.
     reached
-        Fraction (B,) of the load or prescribed motion for which the displacement is in equilibrium to the
-        tolerance: 1 if converged, otherwise the largest such fraction, 0 if the displacement is only the
-        last accepted iterate, NaN if the model does not compute it.
+        Fraction (B,) of the load or prescribed motion for which `displacement` is in equilibrium within the tolerance.
+        1 if the solver has converged, otherwise the largest such fraction; 0 if `displacement` is only the last
+        accepted iterate. NaN if the model does not compute this fraction.
     inverted
-        Number (B,) of inverted or collapsed tetrahedra; -1 if the model does not compute it.
+        Number (B,) of inverted or collapsed tetrahedra; -1 if the model does not compute this number.
     leaked
-        Volume (B,) that passes outwards through the closed skull, as a fraction of the volume exchanged through the
-        craniotomy. NaN if the model does not compute it, such as live frames on a GPU or surrogates.
+        Tissue volume (B,) that passes outwards through the closed skull, divided by the volume exchanged through the
+        craniotomy. NaN if the model does not compute this fraction, as in live frames on a GPU or in surrogates.
     bond
-        Largest traction (B,) of a `Bonded` skull, as a fraction of the bond's strength. Above 1 the bond would fail,
-        and the result is no longer valid. NaN without bond, or if the model does not compute it.
+        Largest traction (B,) on a `Bonded` skull, divided by the strength of the bond. Above 1 the bond would fail,
+        and the result is not valid. NaN without a bond, or if the model does not compute this fraction.
     bound
         Bounds (2, B) [m] on the error of all tumour vertices relative to the training reference, with probability 0.95
-        and 0.99; NaN from a model without bounds.
+        and 0.99. NaN if the model has no bounds.
     reaction_bound
-        Bounds (2, B) [N] on the error of each tool force in `reaction`, with the same probabilities.
+        Bounds (2, B) [N] on the error of every tool force in `reaction`, with probability 0.95 and 0.99.
     stretch
-        Smallest and largest principal stretch (2, B) of the tissue. NaN if the model does not compute it.
+        Smallest and largest principal stretch (2, B) of the tissue. NaN if the model does not compute the stretch.
     strained
-        Volume (B,) [m^3] with stretch outside the range measured on brain, 0.5 to 1.5. NaN as `stretch`.
+        Tissue volume (B,) [m^3] with stretch outside 0.5 to 1.5, the range measured on brain. NaN if `stretch` is NaN.
     source
-        Description of the model: elements and tissue of the FEM, or the estimator.
+        Description of the model: elements and tissue of the FEM, or the estimator of a surrogate.
     """
 
     displacement: np.ndarray
@@ -137,7 +137,7 @@ class Deformation:
         return len(self.displacement)
 
     def select(self, index: np.ndarray) -> Deformation:
-        """Return a subset (k,) of the load cases; the cost stays that of all."""
+        """Return the results of the load cases `index` (k,); `cost` remains the cost of all load cases."""
         return replace(
             self,
             displacement=self.displacement[index],
@@ -153,12 +153,12 @@ class Deformation:
         )
 
     def restrict(self, nodes: np.ndarray) -> Deformation:
-        """Return the result at some mesh vertices `nodes` (n,).
+        """Return the result restricted to the mesh vertices `nodes` (n,).
 
         Raises
         ------
         InputError
-            A vertex that is not in `self.nodes`; values that are not integers.
+            `nodes` contains a vertex that is not in `self.nodes`, or a value that is not an integer.
         """
         nodes = check_integers("the vertices", nodes)
         if np.array_equal(nodes, self.nodes):
@@ -176,7 +176,7 @@ class Deformation:
 
 
 def join_deformations(parts: Sequence[Deformation]) -> Deformation:
-    """Concatenate results for the same vertices; times are added, and only memories common to all are kept."""
+    """Concatenate results at the same vertices; costs are added, and only history variables common to all are kept."""
 
     def stacked(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts])
@@ -204,12 +204,12 @@ def join_deformations(parts: Sequence[Deformation]) -> Deformation:
 
 
 def check_start(start: Deformation, count: int, vertex_count: int) -> None:
-    """Reject a start that does not have `count` load cases at all vertices of the mesh.
+    """Reject an initial `start` without `count` load cases at all `vertex_count` mesh vertices.
 
     Raises
     ------
     InputError
-        Another type; displacements of another shape; times or a memory with other rows, or not finite.
+        `start` is of another type, an array has another shape, or a time or a history variable is not finite.
     """
     if not isinstance(start, Deformation):
         raise InputError(f"the start is a {type(start).__name__}: give a Deformation, or none.")
@@ -231,12 +231,12 @@ def check_start(start: Deformation, count: int, vertex_count: int) -> None:
 
 
 def build_start(displacement: np.ndarray) -> Deformation:
-    """Return a start for a deformation model from user-defined displacements (B, V, 3) [m] of all vertices.
+    """Return initial values for `Deformer.deform` from displacements (B, V, 3) [m] of all vertices, given by the user.
 
     Raises
     ------
     InputError
-        Displacements of another shape, or not finite.
+        The displacements have another shape or are not finite.
     """
     displacement = check_numbers_array("a guessed displacement", displacement)
     if displacement.ndim != 3 or displacement.shape[2] != 3:
@@ -253,9 +253,9 @@ class Deformer(Protocol):
 
     @property
     def anatomy(self) -> Anatomy:
-        """Anatomy that is deformed."""
+        """Undeformed anatomy of the model."""
         ...
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Compute the deformation under `loads`, from `start`, at mesh vertices `at` (n,); a pure function."""
+        """Return the deformation under `loads` at mesh vertices `at` (n,), starting from `start`. No side effects."""
         ...

@@ -1,4 +1,4 @@
-"""Effects of a scene, as descriptions; `compile` converts each to a term or a constraint."""
+"""Descriptions of the physical effects of a scene; the module `compile` converts each to a term or a constraint."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ MAX_WAVE_AMPLITUDE = 0.3  # maximum amplitude [volume fraction]
 
 @dataclass(frozen=True)
 class Elasticity:
-    """Elastic resistance of tissue. `regions` gives the law of each region label; other regions have `default`.
+    """Elasticity of tissue. `regions` maps region labels to tissue laws; all other regions have the law `default`.
 
-    Necrosis without its own law has the tumour's. With `default=None` a region without a law is an error.
+    Necrosis without its own law has the law of the tumour. With `default=None` every region must have a law.
 
     Raises
     ------
     InputError
-        A value that is not a tissue.
+        A law is not a valid `Tissue`.
     """
 
     default: Tissue | None = BRAIN
@@ -47,16 +47,16 @@ class Elasticity:
                 check_attributes(tissue)
 
     def get_law(self, label: int) -> Tissue | None:
-        """Return the law of a region, or None."""
+        """Return the tissue law of the region `label`; None if the region has no law."""
         return self.regions.get(label, self.regions.get(_get_enclosing_region(label), self.default))
 
     def restrict(self, labels: Iterable[int]) -> Elasticity:
-        """Return the effect for a body with these regions, without laws of others."""
+        """Return the effect without the laws of regions that are not in `labels`."""
         obeyed = {each for label in labels for each in (label, _get_enclosing_region(label))}
         return replace(self, regions={label: law for label, law in self.regions.items() if label in obeyed})
 
     def __str__(self) -> str:
-        """Return the description of the tissues for results."""
+        """Return a description of the tissues, which is stored with results."""
         named = [] if self.default is None else [str(self.default)]
         return "; ".join([*named, *(f"{describe_region(label)}: {tissue}" for label, tissue in self.regions.items())])
 
@@ -64,28 +64,28 @@ class Elasticity:
 
 
 def _get_enclosing_region(label: int) -> int:
-    """Return the region that contains a region, or itself."""
+    """Return the label of the region whose law applies if the region `label` has no law; `label` if there is none."""
     return TUMOUR_LABEL if label == NECROSIS_LABEL else label
 
 
 @dataclass(frozen=True)
 class Held:
-    """Fixed nodes: components marked in `Anatomy.fixed` do not move, or as `Prescribed` loads define."""
+    """Fixed nodes: components marked in `Anatomy.fixed` have zero displacement, or the values of `Prescribed` loads."""
 
 
 @dataclass(frozen=True)
 class ToolForce:
-    """Tool that pushes with a known force: `Pushed` loads become dead tractions on its footprint."""
+    """Tool that pushes with a known force: each `Pushed` load becomes a dead traction on the footprint of the tool."""
 
 
 @dataclass(frozen=True)
 class ToolDisplacement:
-    """Tool that moves the tissue under its footprint by a known vector: `Displaced` loads become constraints."""
+    """Tool that moves the tissue under its footprint by a known vector: each `Displaced` load becomes a constraint."""
 
 
 @dataclass(frozen=True)
 class NodalForce:
-    """Dead loads at mesh vertices: `Nodal` loads."""
+    """Dead forces at mesh vertices, given by `Nodal` loads."""
 
 
 @dataclass(frozen=True)
@@ -94,12 +94,12 @@ class Gravity:
 
     The scan shows the body in equilibrium under its weight, so only the change of weight since then acts:
     the weight in the `Posture` minus that in the scan, as dead loads in the undeformed configuration. Tissue above the
-    level weighs density x g, below it (density - csf_density) x g. The latter includes Archimedes' buoyancy, the
-    fluid pressure on the tissue except for the compression it causes.
+    fluid level weighs density x g, tissue below the level (density - csf_density) x g. The difference is buoyancy;
+    the compression of tissue by the fluid pressure is neglected.
 
-    Not modelled: tissue that crosses the level, densities of tumour and oedema, and fluid that does not surround
-    the tissue (ventricles, cysts); tissue that loses water or is resected; and the gap that opens where the
-    brain sinks away from the skull, as `Bonded` and `Slide` keep it closed.
+    The model neglects tissue that crosses the level, the densities of tumour and oedema, fluid in ventricles and
+    cysts, and tissue that loses water or is resected. `Bonded` and `Slide` also suppress the gap that opens where
+    the brain sinks away from the skull.
 
     Parameters
     ----------
@@ -109,12 +109,12 @@ class Gravity:
         Height of the fluid in the scan [m] above the origin, against `direction`: points with
         -direction . x < csf_level are submerged. Infinite: the skull was closed and full.
     density, csf_density
-        Densities of tissue and fluid [kg/m^3]; customary values.
+        Densities of tissue and fluid [kg/m^3]; the defaults are common values.
 
     Raises
     ------
     InputError
-        A zero direction, a level that is NaN, a density that is not positive.
+        The direction is zero, the level is NaN, or a density is not positive.
     """
 
     direction: tuple[float, float, float] = (0.0, -1.0, 0.0)
@@ -135,24 +135,24 @@ class Gravity:
 
 @dataclass(frozen=True)
 class Inertia:
-    """Inertia of tissue: solutions form a time series, with one backward Euler step each.
+    """Inertia of tissue: consecutive solutions form a time series, with one backward Euler step per solution.
 
-    The time step is the time of the loads minus that of the start, which also gives the initial displacements and, in
-    its memory, the velocities; undeformed and at rest without a start. In a zero time step body and tools do not
-    move, whatever the loads. Backward Euler is first-order accurate and damps motion faster than the time
-    step: energy does not grow, and a long step gives the static solution.
+    The time step is the time of the loads minus the time of the start solution, which also provides the initial
+    displacements and velocities. Without a start solution, the tissue is initially undeformed and at rest. In a zero
+    time step nothing moves. Backward Euler is first-order accurate and damps motion faster than the time step: the
+    energy does not grow, and a long time step gives the static solution.
 
     Parameters
     ----------
     density
         Density of the tissue [kg/m^3].
     damping
-        Force per mass and velocity [1/s], as in a viscous medium at rest: free motion decays with exp(-damping t).
+        Damping force per mass and velocity [1/s], as in a viscous medium: free motion decays with exp(-damping t).
 
     Raises
     ------
     InputError
-        A density that is not positive, or negative damping.
+        The density is not positive, or the damping is negative.
     """
 
     density: float = 1040.0
@@ -167,23 +167,23 @@ class Inertia:
 
 @dataclass(frozen=True)
 class Resection:
-    """Removal of tissue in steps; `Resected` loads give the number of steps done, by default all.
+    """Removal of tissue in steps; `Resected` loads give the number of completed steps (default: all steps).
 
-    The cavity wall is free surface. Pieces without a face in common with fixed tissue are removed as
-    well. `sim.build_fem` builds the solver.
+    The cavity wall is a free surface. A step also removes tissue without a connection, by element faces, to fixed
+    tissue. `sim.build_fem` builds the solver.
 
-    The remaining tissue keeps its history. Not modelled: residual stress in the scan, so without
-    other loads nothing moves.
+    The remaining tissue keeps its history variables. Residual stress in the scan is not modelled, so without other
+    loads nothing moves.
 
     Parameters
     ----------
     steps
-        Tetrahedron numbers that each step removes.
+        Numbers of the tetrahedra that each step removes.
 
     Raises
     ------
     InputError
-        No steps, numbers that are not integers, an empty step, a tetrahedron that is removed twice.
+        There are no steps, a step is empty, a number is not an integer, or a tetrahedron is removed twice.
     """
 
     steps: tuple[tuple[int, ...], ...]
@@ -211,19 +211,19 @@ class Resection:
 
 @dataclass(frozen=True)
 class Wave:
-    """Periodic volume change, amplitude x sin(2 pi frequency t); zero at t = 0.
+    """Periodic relative volume change: amplitude x sin(2 pi frequency t).
 
     Parameters
     ----------
     frequency
         Frequency [Hz].
     amplitude
-        Maximum change as a fraction of the volume; half of the peak-to-peak change.
+        Maximum volume change as a fraction of the volume; the peak-to-peak change is twice the amplitude.
 
     Raises
     ------
     InputError
-        A frequency that is not positive, an amplitude outside [0, 0.3].
+        The frequency is not positive, or the amplitude is outside [0, 0.3].
     """
 
     frequency: float
@@ -241,24 +241,24 @@ class Wave:
 
 @dataclass(frozen=True)
 class Pulsation:
-    """Volume change of tissue with heartbeat and respiration due to its blood, as a function of `Loads.time`.
+    """Volume change of tissue by the blood volume of heartbeat and respiration, as a function of `Loads.time`.
 
-    The volume fraction is uniform and without delay; tissue bulges through the craniotomy. It is 0 at t = 0, the scan.
-    With the default amplitudes and tissue, the template's cortex in a craniotomy of 50 mm moves by up to 0.5 mm
-    peak to peak, as observed. This is half a millilitre of blood each. The more compressible the tissue, the less
-    it bulges.
+    The relative volume change is uniform, without delay, and 0 at the time t = 0 of the scan. Tissue bulges through the
+    craniotomy; compressible tissue bulges less. With the default amplitudes and tissue, the cortex of the template
+    moves by up to 0.5 mm peak to peak in a craniotomy of 50 mm, as observed in patients. Each of the two default
+    waves corresponds to half a millilitre of blood.
 
     Parameters
     ----------
     cardiac, respiratory
-        Waves of heartbeat and respiration, which are added.
+        Waves of heartbeat and respiration; their sum is the volume change.
     regions
-        Region labels that swell; None: all.
+        Labels of the regions whose volume changes; None: all regions.
 
     Raises
     ------
     InputError
-        An empty tuple of regions.
+        `regions` is an empty tuple.
     """
 
     cardiac: Wave = Wave(1.0, CARDIAC_AMPLITUDE)
@@ -279,15 +279,15 @@ class Pulsation:
 
 @dataclass(frozen=True)
 class ToolContact:
-    """Frictionless contact of tissue with rigid tools of prescribed pose: `Touching` loads.
+    """Frictionless contact of tissue with rigid tools, whose poses are given by `Touching` loads.
 
-    Contact forces start at a distance of `gap` [m]; the distance stays above a few hundredths of it. Only
-    surface that is neither fixed nor under the skull can be touched.
+    Contact forces start at a distance of `gap` [m]; the distance always exceeds a few hundredths of `gap`. Tools
+    can only touch surface that is neither fixed nor under the skull.
 
     Raises
     ------
     InputError
-        No tool, a value that is not a tool, or a gap that is not positive.
+        There is no tool, a value is not a tool, or the gap is not positive.
     """
 
     tools: tuple[Tool, ...]
@@ -304,14 +304,14 @@ class ToolContact:
 
 @dataclass(frozen=True)
 class Retraction:
-    """Retractor blade that is placed on the tissue and moved by a displacement: `Retracted` loads.
+    """Retractor blade that is placed on the tissue and then moved; `Retracted` loads give its pose and displacement.
 
-    Contact is as in `ToolContact`, with the same `gap` [m]; the holding force is the reaction.
+    The contact model and its `gap` [m] are those of `ToolContact`; the reaction is the force that holds the blade.
 
     Raises
     ------
     InputError
-        A blade that is not a `Spatula`, or a gap that is not positive.
+        The blade is not a `Spatula`, or the gap is not positive.
     """
 
     blade: Spatula
@@ -344,40 +344,40 @@ BuiltIn = (
 
 @runtime_checkable
 class OwnEffect(Protocol):
-    """Interface of user-defined effects, frozen dataclasses that build their own `Term`; see `docs/extend.md`."""
+    """Interface of user-defined effects: frozen dataclasses that build their own `Term`; see `docs/extend.md`."""
 
     @property
     def cause(self) -> type | None:
-        """Type of cause that it requires; None: it acts without loads."""
+        """Type of the load cause that the effect requires; None if the effect acts without loads."""
         ...
 
     @property
     def remembers(self) -> bool:
-        """True if a solution depends on the previous one, so that a scene must be solved from its start."""
+        """True if a solution depends on the previous solution, so that a scene must be solved from its first frame."""
         ...
 
     def term(self, body: Body) -> Term:
-        """Build its energy term on a body. Import here modules that only the term needs."""
+        """Return the energy term of this effect on a body. Modules that only the term needs are imported here."""
         ...
 
 
 Effect = BuiltIn | OwnEffect
-"""Any effect of a scene."""
+"""Type of all effects of a scene."""
 
 
 SKULLS = {"bonded": Bonded(), "slide": Slide(), "contact": SkullContact()}
-"""Skull models by name; the first is recommended, the others are its frictionless limits."""
+"""Skull models by name; the first model is recommended, the other two are its frictionless limits."""
 
 
 def build_push_effects(anatomy: Anatomy, tissue: Tissue | Elasticity, skull: str = "bonded") -> tuple[Effect, ...]:
-    """Return the effects for a pushing tool on a body of this tissue, with one of `SKULLS` if there is a skull."""
+    """Return the effects for a pushing tool on tissue, with a skull model of `SKULLS` if the anatomy has a skull."""
     made = tissue if isinstance(tissue, Elasticity) else Elasticity(tissue)
     covered = (SKULLS[skull],) if anatomy.slide_normal.any() else ()
     return (made, Held(), *covered, ToolForce())
 
 
 def has_history(effects: Iterable[Effect]) -> bool:
-    """Return True if a solution depends on the previous one: tool path, velocities, relaxation or resection."""
+    """Return True if a solution depends on the previous solution, by tool path, velocity, relaxation or resection."""
     return any(map(_is_history_dependent, effects))
 
 

@@ -8,4 +8,4 @@ ELEMENTS = {  # descriptions by name
 RECOMMENDED = "smoothed"
 """Default element of scenes and commands, on meshes of linear tetrahedra."""
 OTHER_METHODS = {"springs": "mass-spring model", "element-free": "element-free Galerkin method"}
-"""Discretisations other than finite elements that `Fem` solves: names of the methods, for results."""
+"""Discretisations other than finite elements that `Fem` supports, mapped to the method names shown in results."""

@@ -1,5 +1,5 @@
-"""Exception for errors that a user can correct."""
+"""Exception class for errors that a user can correct."""
 
 
 class InputError(ValueError):
-    """Invalid input; the text gives the value, the reason and the remedy."""
+    """Error for invalid input; its message gives the value, the reason and the remedy."""

@@ -49,7 +49,7 @@ MID_EDGE_KEY = "mid-edge nodes"
 
 
 class Fem:
-    """FEM deformation model: static equilibrium, or a time step if effects require it.
+    """FEM deformation model that computes the static equilibrium, or one time step if the effects require time steps.
 
     Instances are thread-safe: calls are serialised by `lock`, and results do not depend on other threads. To use
     several CPU cores at once, create one `Fem` per thread.
@@ -59,27 +59,27 @@ class Fem:
     anatomy
         Anatomy to be deformed.
     effects
-        Effects of the scene; nothing else is compiled.
+        Effects of the scene; the solver compiles only the terms of these effects.
     accuracy
         Tolerance, iteration limits and precision.
     device
         Device name: "auto", "cpu", "cuda" or "cuda:1".
     batch
-        Maximum load cases solved together; None: a device-dependent default. Quadratic elements with
-        multigrid levels are solved one by one on the CPU.
+        Maximum number of load cases solved together; None: a device-dependent default. On the CPU, load cases of
+        quadratic elements with multigrid levels are solved one by one.
     element
         Name in `elements.ELEMENTS` or `OTHER_METHODS`; None: the recommended one, or p2 for a mesh with mid-edge nodes.
     live
-        True if loads come one at a time. On the CPU the first takes one second more, others 1/3 to 2/3 of the time.
+        True if loads arrive one at a time. On a CPU the first then takes 1 s more, the others 1/3 to 2/3 of the time.
     avoid
         Solvers to skip, for measurements and checks; Newton-CG cannot be skipped.
     stiff_as
-        Another `Fem` with the same undeformed stiffness, for example with other swelling: its factorisation is shared.
+        Another `Fem` with the same undeformed stiffness, whose factorisation is reused; its swelling, say, may differ.
 
     Raises
     ------
     InputError
-        Unsupported effects or elements, a body that is not fixed, a device that is not available, a batch below 1.
+        Effects or elements are not supported, the body is not fixed, the device is not available, or `batch` < 1.
 
     Examples
     --------
@@ -129,7 +129,7 @@ class Fem:
         self._diagnostics = Diagnostics(anatomy, self.space, self.effects, problem.device, accuracy.limit_strain)
         inversion = InversionCounter(self.space, problem.device, problem.prevents_inversion)
         self.strategy = Strategy(problem, preconditioner, inversion, accuracy, plan, *parts)
-        """Solvers of the plan, applied in order."""
+        """Solvers of the plan, tried in order."""
         self._paced = lru_cache(MAX_PRECONDITIONERS)(self._build_strategy)
         self._resting = RestStiffnessSolver(problem, preconditioner, accuracy.inner)
 
@@ -150,26 +150,26 @@ class Fem:
 
     @property
     def problem(self) -> Problem:
-        """Boundary value problem that is solved."""
+        """Boundary value problem of the anatomy and the effects."""
         return self.strategy.problem
 
     @property
     def anatomy(self) -> Anatomy:
-        """Anatomy that is deformed."""
+        """Undeformed anatomy of the model."""
         return self._anatomy
 
     @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Return the static equilibrium under every load case.
+        """Return the equilibrium, or the next time step under inertia, of every load case.
 
-        `start` (B rows, all vertices) gives the initial guess and the memory; without it the body starts undeformed.
-        `at` (n,) selects vertices of the result.
+        `start` (B rows, all vertices) gives the initial guess and the history variables; without `start` the anatomy is
+        initially undeformed. `at` (n,) selects the mesh vertices of the result.
 
         Raises
         ------
         InputError
-            Loads that no effect uses, or that do not touch the body; a start that does not match. A problem that
-            exceeds the memory; a vertex that the mesh does not have.
+            No effect uses a load, a load does not touch the body, or `start` does not match. The problem exceeds the
+            memory, or `at` contains a vertex that the mesh does not have.
         """
         check_causes(self.effects, loads)
         at = None if at is None else self._check_vertices(at)
@@ -193,7 +193,7 @@ class Fem:
         return answer.select(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
     def _get_strategy(self, step: float) -> Strategy | NoMotionStep:
-        """Return the strategy with a preconditioner for a time step [s]; an infinite step is static."""
+        """Return the strategy with a preconditioner for the time step [s]; an infinite step is a static problem."""
         if step == 0.0 or step == math.inf:
             return self.strategy if step else NoMotionStep(self.problem, self.strategy.inversion)
         return self._paced(step)
@@ -203,12 +203,12 @@ class Fem:
         return Strategy(self.problem, preconditioner, self.strategy.inversion, self.accuracy, self.plan)
 
     def _iterate_batches(self, count: int) -> Iterator[slice]:
-        """Iterate over the row slices of the batches, at least one."""
+        """Yield the slice of load cases of each batch; at least one slice, even without load cases."""
         return (slice(first, first + self.batch) for first in range(0, max(count, 1), self.batch))
 
     @cached_property
     def following(self) -> FrameSequence | None:
-        """Solver for frame sequences on CUDA; None if the plan has none, as on the CPU, where it saves no time."""
+        """Solver for frame sequences on CUDA; None if the plan does not include such a solver, as on the CPU."""
         if not self.plan.captures_frames:
             return None
         return build_frame_sequence(
@@ -224,18 +224,18 @@ class Fem:
             raise InputError("solutions under Inertia are time steps without static equilibrium: remove Inertia.")
 
     def _build_linear_stiffness(self, step: float) -> sp.csc_array:
-        """Return the undeformed stiffness (3V, 3V) [N/m] of linear tetrahedra on the same mesh, for a time step [s]."""
+        """Return the undeformed stiffness (3V, 3V) [N/m] of linear tetrahedra on this mesh, for a time step [s]."""
         linear = discretise(self._anatomy.mesh, "p1")
         return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature(step)
 
     @lock_method
     def residual(self, loads: Loads, answer: Deformation) -> np.ndarray:
-        """Return the relative residual (B,), in this solver's precision, of given solutions at all vertices.
+        """Return the relative residual (B,) of solutions at all vertices, in the precision of this solver.
 
         Raises
         ------
         InputError
-            See `deform`; effects with inertia, whose solutions are time steps.
+            See `deform`; also if effects include inertia, whose solutions are time steps without static equilibrium.
         """
         self._check_static(loads)
         self.problem.begin(Cases(loads, answer.time, answer.memory))
@@ -243,12 +243,12 @@ class Fem:
 
     @lock_method
     def build_reading(self, nodes: np.ndarray, modes: np.ndarray) -> OutputFunctionals:
-        """Return the projection of the motion of vertices `nodes` (n,) on modes (r, n, 3), an argument of `series`.
+        """Return functionals for `compute_series` that project the motion of vertices `nodes` (n,) on modes (r, n, 3).
 
         Raises
         ------
         InputError
-            A vertex that the mesh does not have; a problem that exceeds the memory.
+            The mesh does not have a vertex, or the problem exceeds the memory.
         """
         nodes = self._check_vertices(nodes)
         device, rows = self.problem.device, (3 * nodes[:, None] + np.arange(3)).ravel()
@@ -264,17 +264,17 @@ class Fem:
 
     @lock_method
     def compute_series(self, loads: Loads, orders: int, reading: OutputFunctionals, sizes: int = 1) -> np.ndarray:
-        """Return the power series (G, terms, r) of a projection of the solution in the magnitudes of the loads.
+        """Return power series coefficients (G, terms, r) of the projected solution in the magnitudes of the loads.
 
-        Each `sizes` successive loads form one group of G. For a group whose loads, scaled by s_1 ... s_m, act
-        simultaneously, the solution is the sum of the terms times the `products` of s_1 ... s_m, order by order: one
-        load gives s u_1 + s^2 u_2 + ..., three loads 3 + 6 + 10 terms up to third order. Convergence is not checked.
+        Every `sizes` successive loads form one of G groups. If m loads of a group act at once, scaled by s_1 ... s_m,
+        the solution is the sum of the terms times the monomials of s_1 ... s_m, in the order of their degree. One load
+        gives s u_1 + s^2 u_2 + ...; three loads give 3 + 6 + 10 terms up to third order. Convergence is not checked.
 
         Raises
         ------
         InputError
-            See `deform`; loads with prescribed motion, which are not proportional to a force, or an incomplete group.
-            A solver in float32, whose round-off would dominate the higher orders.
+            See `deform`. Loads are not forces, such as prescribed motion, or a group is incomplete. The solver has
+            precision float32, whose round-off would dominate the higher orders.
         """
         check_causes(self.effects, loads)
         if not self.problem.can_accelerate:
@@ -303,7 +303,7 @@ class Fem:
         return found
 
     def guess(self, loads: Loads, start: Deformation) -> np.ndarray:
-        """Return a given solution as columns (3N, B) [m] over the nodes of the element."""
+        """Return the displacements of a solution as columns (3N, B) [m], over all N nodes of the discretisation."""
         vertices = len(self._anatomy.mesh.nodes)
         check_start(start, len(loads), vertices)
         full = self.space.interpolate_field(start.restrict(np.arange(vertices)).displacement)
@@ -331,7 +331,7 @@ class Fem:
         at: np.ndarray | None,
         seconds: Mapping[str, float],
     ) -> Deformation:
-        """Build the deformation from a solver result, with reactions, warm-start data `more` and `seconds` by stage."""
+        """Return the deformation of a solver result, with reactions, warm-start data `more`, and `seconds` by stage."""
         solved = time.perf_counter()
         self.problem.begin(replace(cases, share=found.path_fraction, restarted=found.restarted))
         memory, displaced = dict(self.problem.end(found.u)), cases.loads.get(Displaced) is not None
@@ -368,7 +368,7 @@ class Fem:
 
 
 def describe_solver(element: str, effects: Iterable[Effect]) -> str:
-    """Return the description of the element and the tissue, for results, images and files."""
+    """Return a description of the element type and the tissue, for results, images and files."""
     tissue = next((str(effect) for effect in effects if isinstance(effect, Elasticity)), "no elasticity")
     if element in OTHER_METHODS:
         return f"{OTHER_METHODS[element]} ({tissue})"

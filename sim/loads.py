@@ -1,4 +1,4 @@
-"""Loads: a batch of causes that act on tissue, one row per load case."""
+"""Loads: a batch of load cases, each a sum of causes that act on tissue."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from .errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Pushed:
-    """Dead traction on a round footprint: t(x) = F w(|x - c| / r) / integral of w, w(s) = sqrt(1 - s^2).
+    """Dead traction t on a round footprint: t(x) = F w(|x - c| / r) / (integral of w), with w(s) = sqrt(1 - s^2).
 
-    point (B, 3) [m] in the undeformed configuration, force (B, 3) [N], footprint radius (B,) [m].
+    `point` c (B, 3) [m] in the undeformed configuration, `force` F (B, 3) [N], and `footprint` radius r (B,) [m].
     """
 
     point: np.ndarray
@@ -26,10 +26,10 @@ class Pushed:
 
 @dataclass(frozen=True, eq=False)
 class Displaced:
-    """Prescribed mean motion of a tool's footprint, weighted by w as in `Pushed`.
+    """Prescribed mean displacement of the tissue under a tool's footprint, weighted by w as in `Pushed`.
 
-    The dual of `Pushed`: the required force is the reaction, and `Pushed` with that force gives the
-    same deformation. point (B, 3) [m], displacement (B, 3) [m], footprint radius (B,) [m].
+    The required force is reported as the reaction; a `Pushed` load with this force gives the same deformation.
+    `point` (B, 3) [m], `displacement` (B, 3) [m], and `footprint` radius (B,) [m].
     """
 
     point: np.ndarray
@@ -39,25 +39,25 @@ class Displaced:
 
 @dataclass(frozen=True, eq=False)
 class Nodal:
-    """Dead loads at mesh vertices: force (B, V, 3) [N]."""
+    """Dead forces (B, V, 3) [N] at the mesh vertices."""
 
     force: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Prescribed:
-    """Displacement (B, V, 3) [m] of fixed components; entries of other components are ignored."""
+    """Prescribed displacement (B, V, 3) [m] of fixed components; entries of components that are free are ignored."""
 
     displacement: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """Current direction of gravity and fluid level of the head; the effect `Gravity` has those of the scan.
+    """Current direction of gravity and fluid level of the head; `Gravity` defines both for the time of the scan.
 
-    direction (B, 3) of gravity in mesh coordinates, nonzero. csf_level (B,) [m] above the origin,
-    against the direction. share (B,): fraction of the change of weight since the scan that acts. In the scan's posture
-    there is no force. Half of the load is half of the change, which does not correspond to a posture.
+    `direction` (B, 3) of gravity in mesh coordinates, nonzero. `csf_level` (B,) [m] above the origin, measured against
+    `direction`. `share` (B,): fraction of the change of weight since the scan that acts; scaling a load changes only
+    this fraction, so a scaled load does not correspond to another posture. In the posture of the scan the force is 0.
     """
 
     direction: np.ndarray
@@ -67,16 +67,16 @@ class Posture:
 
 @dataclass(frozen=True, eq=False)
 class Resected:
-    """Number of completed steps of the effect `Resection`: done (B,) integers; not affected by load scaling."""
+    """Number `done` (B,) of completed steps of the effect `Resection`, as integers; load scaling does not change it."""
 
     done: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Touching:
-    """Poses of the tools of `ToolContact`, in its order: T_world_tool pose (B, tools, 4, 4).
+    """Poses of the tools of `ToolContact`, in the same order: T_world_tool `pose` (B, tools, 4, 4).
 
-    Tools move straight from their poses in the start; without one, along their shafts from a pose clear of the body.
+    A tool moves straight from its pose in the start solution or, without it, along its shaft from outside the body.
     """
 
     pose: np.ndarray
@@ -84,20 +84,20 @@ class Touching:
 
 @dataclass(frozen=True, eq=False)
 class Retracted:
-    """Retractor placed at T_world_tool pose (B, 4, 4), clear of the tissue, and moved by displacement (B, 3) [m]."""
+    """Retractor placed at T_world_tool `pose` (B, 4, 4), clear of tissue, then moved by `displacement` (B, 3) [m]."""
 
     pose: np.ndarray
     displacement: np.ndarray
 
 
 class OwnCause(Protocol):
-    """Interface of causes for user-defined effects: frozen dataclasses (eq=False) of arrays (B, ...) by load case."""
+    """Interface of causes of user-defined effects: frozen dataclasses (eq=False) with arrays (B, ...), B load cases."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def magnitude(self) -> str | None:
-        """Name of the array that scales with the load, for load stepping; None: there is none."""
+        """Name of the array that load stepping scales; None if no array scales with the load."""
         ...
 
 
@@ -118,22 +118,22 @@ ROTATION_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """B load cases, each the sum of all causes; without causes only the time changes.
+    """Batch of B load cases, each the sum of all causes; without causes only the time changes.
 
-    `Pushed` may occur several times, once per pushing tool; every other type once.
+    `Pushed` may occur several times, once per pushing tool; every other type may occur only once.
 
     Parameters
     ----------
     causes
         `Pushed`, `Displaced`, `Nodal`, `Prescribed`, `Posture`, `Resected`, `Touching`, `Retracted`, or an `OwnCause`.
     time
-        Time (B,) [s] of the solution; zero if nothing depends on time.
+        Time (B,) [s] of the solution; 0 if no effect depends on time.
 
     Raises
     ------
     InputError
-        Neither cause nor time, a type other than `Pushed` twice, a value that is not a cause, unequal numbers of rows.
-        Arrays that are not real, finite and of the required shapes; footprint radii outside 0.1 to 100 mm.
+        Neither a cause nor a time is given, a value is not a cause, or a type other than `Pushed` occurs twice. Arrays
+        are not real and finite, have wrong shapes or unequal numbers of rows, or a footprint is outside 0.1 to 100 mm.
     """
 
     causes: tuple[Cause, ...]
@@ -169,12 +169,12 @@ class Loads:
         return self.time
 
     def get(self, kind: type[C]) -> C | None:
-        """Return the cause of a type, or None.
+        """Return the only cause of the type `kind`; None if there is no such cause.
 
         Raises
         ------
         InputError
-            Several causes of that type.
+            Several causes are of this type.
         """
         found = self.get_all(kind)
         if len(found) > 1:
@@ -182,23 +182,23 @@ class Loads:
         return found[0] if found else None
 
     def get_all(self, kind: type[C]) -> tuple[C, ...]:
-        """Return all causes of a type."""
+        """Return all causes of the type `kind`."""
         return tuple(cause for cause in self.causes if isinstance(cause, kind))
 
     def drop(self, kind: type[Cause]) -> Loads:
-        """Return the loads without causes of a type."""
+        """Return the loads without the causes of the type `kind`."""
         return Loads(tuple(cause for cause in self.causes if not isinstance(cause, kind)), self.times)
 
     def get_only(self, kind: type[C]) -> C | None:
-        """Return the only cause if it is of a type, else None."""
+        """Return the cause if there is exactly one cause and its type is `kind`; else None."""
         return self.get(kind) if len(self.causes) == 1 else None
 
     def select(self, index: slice | np.ndarray) -> Loads:
-        """Return a subset of the load cases."""
+        """Return the load cases selected by `index`: a slice, numbers or a mask."""
         return Loads(tuple(select_cases(cause, index) for cause in self.causes), self.times[index])
 
     def scale(self, fraction: float | np.ndarray) -> Loads:
-        """Return the loads with all magnitudes multiplied by `fraction`, a scalar or (B,)."""
+        """Return the loads with the magnitudes of all causes multiplied by `fraction`, a scalar or (B,)."""
 
         def grown(cause: Cause) -> Any:
             name = MAGNITUDE.get(type(cause)) if isinstance(cause, BuiltIn) else cause.magnitude
@@ -215,17 +215,17 @@ class Loads:
 
 
 def select_cases(cause: C, index: slice | np.ndarray) -> C:
-    """Return a cause for a subset of the load cases, by number, slice, or mask (B,)."""
+    """Return the rows of a cause for the load cases selected by `index`: a slice, numbers or a mask (B,)."""
     return replace(cause, **{item.name: getattr(cause, item.name)[index] for item in fields(cause)})
 
 
 def stack(parts: Sequence[Loads]) -> Loads:
-    """Concatenate the load cases of several loads.
+    """Return all load cases of several loads in one batch.
 
     Raises
     ------
     InputError
-        No loads, or loads with different types of causes.
+        There are no loads, or the loads have different types of causes.
     """
     kinds = {tuple(type(cause) for cause in part.causes) for part in parts}
     if len(kinds) != 1:
@@ -247,7 +247,7 @@ def check_loads(loads: object) -> None:
     Raises
     ------
     InputError
-        With the value.
+        The value is not `Loads`; the message shows the value.
     """
     if not isinstance(loads, Loads):
         raise InputError(f"loads is {loads!r:.80}: give Loads, such as push(...) makes.")
@@ -273,7 +273,7 @@ def push(point: np.ndarray, force: np.ndarray, footprint: float | np.ndarray) ->
 
 
 def build_posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads:
-    """Return loads for the full change of weight since the scan: direction (3,) or (B, 3), csf_level () or (B,) [m].
+    """Return gravity loads, with the full change since the scan: direction (3,) or (B, 3), csf_level () or (B,) [m].
 
     Raises
     ------
@@ -285,19 +285,19 @@ def build_posture(direction: np.ndarray, csf_level: float | np.ndarray) -> Loads
 
 
 def check_field(name: str, field: np.ndarray, vertices: int) -> None:
-    """Reject a field (B, V, 3) of another mesh.
+    """Reject a field (B, V, 3) whose number of vertices V differs from `vertices`, that of the mesh.
 
     Raises
     ------
     InputError
-        With the field, its number of vertices and that of the mesh.
+        The numbers differ; the message gives `name` and both numbers.
     """
     if field.shape[1] != vertices:
         raise InputError(f"{name} has {field.shape[1]} vertices, but the mesh has {vertices}.")
 
 
 def _repeat_rows(name: str, **given: tuple[object, tuple[int, ...]]) -> dict[str, np.ndarray]:
-    """Return the arrays of a cause, each given with its shape per load case; single values apply to all cases."""
+    """Return the arrays of a cause by name, from values and shapes per case. Single values apply to all cases."""
     arrays = {}
     for key, (values, shape) in given.items():
         array = as_array(f"{name}.{key}", values)
@@ -355,7 +355,7 @@ def _check_cause(cause: Cause) -> Cause:
 
 
 def _check_poses(name: str, pose: np.ndarray, axes: int) -> None:
-    """Reject poses that are not rigid transformations."""
+    """Reject a `pose` array that does not have `axes` axes, or contains a matrix that is not a rigid transformation."""
     if pose.ndim != axes or pose.shape[-2:] != (4, 4):
         raise InputError(
             f"{name}.pose has shape {pose.shape}: give {'(B, tools, 4, 4)' if axes == 4 else '(B, 4, 4)'}."

@@ -1,4 +1,4 @@
-"""Descriptions of tissue laws, and the conversion of (E, nu) to their coefficients."""
+"""Descriptions of tissue laws, and the conversion of Young's modulus E and Poisson's ratio nu to coefficients."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from .terms.laws.law import Law
 
 LAWS = ("linear", "corotational", "neo-hookean", "stable-neo-hookean")
-"""Laws determined by E and nu; `Ogden` has other constants."""
+"""Names of the laws with the constants E and nu; the law `Ogden` has other constants."""
 
 
 HYPERELASTIC = ("neo-hookean", "stable-neo-hookean", "ogden")
-"""Laws that support a Prony series: their energy separates shape from volume at finite strain."""
+"""Names of the laws that support a Prony series: their energy separates shape and volume change at finite strain."""
 Pairs = tuple[tuple[float, float], ...]
 """Prony series of pairs (g, tau [s]): deviatoric stress relaxes by a fraction sum g (1 - exp(-t / tau)) in time t."""
 
@@ -39,12 +39,12 @@ class Material:
     poisson
         Poisson's ratio at small strain, -1 < nu < 0.5.
     prony
-        Prony series of the deviatoric stress, or (); E and nu are then instantaneous.
+        Prony series of the deviatoric stress, or () without relaxation. With it, E and nu are instantaneous values.
 
     Raises
     ------
     InputError
-        Unknown law, E <= 0, nu outside (-1, 0.5), a series that is not physical or not supported by the law.
+        The law is unknown, E <= 0, nu is outside (-1, 0.5), or the series is not physical or not supported by the law.
 
     Examples
     --------
@@ -102,23 +102,23 @@ class Material:
 class Ogden:
     """Ogden's law: psi = sum_i c_i / m_i^2 (l1^m_i + l2^m_i + l3^m_i - 3) + K/2 (ln J)^2, l = J^(-1/3) lambda.
 
-    The convention is FEBio's. Papers on brain tissue and Abaqus write 2 mu_i / alpha_i^2 before the bracket: c_i is
-    2 mu_i, m_i is alpha_i. Ogden 1972 writes mu_i / alpha_i: c_i is mu_i alpha_i.
+    The convention is that of FEBio. Papers on brain tissue and Abaqus write 2 mu_i / alpha_i^2 before the bracket:
+    then c_i = 2 mu_i and m_i = alpha_i. Ogden 1972 writes mu_i / alpha_i: then c_i = mu_i alpha_i.
 
     Parameters
     ----------
     terms
-        Pairs (c_i [Pa], m_i), in any number.
+        Pairs (c_i [Pa], m_i), one or more.
     bulk
         Bulk modulus K [Pa].
     prony
-        Prony series of the deviatoric stress, or (); the terms are then instantaneous.
+        Prony series of the deviatoric stress, or () without relaxation. With it, `terms` are instantaneous values.
 
     Raises
     ------
     InputError
-        No terms, numbers that are not finite, a zero exponent, no stiffness in shear or volume, a series that is not
-        physical.
+        There are no terms, a number is not finite, an exponent is zero, the shear or bulk stiffness is not positive, or
+        the series is not physical.
     """
 
     law = "ogden"
@@ -193,29 +193,29 @@ class Tissue(Protocol):
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """Arguments of the functions, the same number for every tissue of the law."""
+        """Coefficients passed to `functions`; their number is the same for all tissues of the law."""
         ...
 
     def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
         """Return the coefficients for other Lamé parameters (mu, lambda) [Pa] at small strain, including mu = 0.
 
-        The energy is linear in both: smoothed elements separate shape and volume.
+        The energy must be linear in mu and in lambda, since smoothed elements split shape and volume energy.
         """
         ...
 
     @property
     def prony(self) -> Pairs:
-        """Prony series of the deviatoric stress; () without relaxation."""
+        """Prony series of the deviatoric stress, or () without relaxation."""
         ...
 
 
 def check_attributes(tissue: object) -> None:
-    """Reject a value that lacks attributes of a `Tissue`.
+    """Reject a value that lacks an attribute of `Tissue`.
 
     Raises
     ------
     InputError
-        With the missing attributes.
+        An attribute is missing; the message lists all missing attributes.
     """
     asked = ("law", "functions", "lame", "coefficients", "coefficients_at", "prony")
     missing = [name for name in asked if getattr_static(tissue, name, None) is None]
@@ -232,7 +232,7 @@ def build_functions(tissues: Iterable[Tissue]) -> Law:
     Raises
     ------
     InputError
-        Two laws with one name.
+        Two different laws have the same name.
     """
     found = {tissue.functions: tissue.law for tissue in tissues}
     if len(found) > 1:
@@ -246,7 +246,7 @@ def check_prony(prony: Pairs, law: str) -> None:
     Raises
     ------
     InputError
-        A law of small strains, g <= 0, tau <= 0, g that sum to 1 or more.
+        The law is a small-strain law, some g <= 0 or tau <= 0, or the sum of all g is 1 or more.
     """
     if prony and law not in HYPERELASTIC:
         raise InputError(
@@ -264,7 +264,7 @@ def check_prony(prony: Pairs, law: str) -> None:
 
 
 def to_tissue_json(tissue: Tissue) -> str:
-    """Return a line of JSON for `read_tissue_json`."""
+    """Return the tissue as one line of JSON, which `read_tissue_json` reads."""
     constants = asdict(tissue)  # pyright: ignore[reportArgumentType]
     if not tissue.prony:
         constants.pop("prony", None)  # omitted for backward compatibility
@@ -277,7 +277,7 @@ def read_tissue_json(text: str) -> Tissue:
     Raises
     ------
     InputError
-        Text in another format, or invalid constants.
+        The text has another format, or its constants are invalid.
     """
     try:
         constants = json.loads(text)
@@ -299,7 +299,7 @@ MAX_LAME_RATIO = 1.5
 def get_lame(tissue: Tissue, portion: str) -> tuple[float, float]:
     """Return Lamé's (mu, lambda) [Pa] of the "whole" tissue, or of its "shape" or "volume" portion.
 
-    The two portions add up to the whole; in every law lambda multiplies the square of a volume measure.
+    The two portions add up to the whole. In every law lambda multiplies the square of a measure of volume change.
     """
     mu, lam = tissue.lame
     soft = min(lam, MAX_LAME_RATIO * mu)
@@ -309,12 +309,12 @@ def get_lame(tissue: Tissue, portion: str) -> tuple[float, float]:
 def collect_coefficients(tissues: Sequence[Tissue], portion: str = "whole") -> np.ndarray:
     """Return the coefficients (n, k) of one portion (see `get_lame`) of n tissues with one law.
 
-    Shorter Ogden sums are padded with terms (0, 1), which are zero.
+    Ogden laws with fewer terms are padded with terms (0, 1), which contribute no energy.
 
     Raises
     ------
     InputError
-        Tissues of another law with different numbers of coefficients.
+        Tissues of a law other than Ogden's have different numbers of coefficients.
     """
     rows = [tuple(tissue.coefficients_at(*get_lame(tissue, portion))) for tissue in tissues]
     lengths = sorted({len(row) for row in rows})
@@ -327,12 +327,12 @@ def collect_coefficients(tissues: Sequence[Tissue], portion: str = "whole") -> n
 
 
 BRAIN = Material("neo-hookean", 3000.0, 0.49)
-"""Recommended tissue, the default of every scene and command; the recommended element is `elements.RECOMMENDED`."""
+"""Recommended tissue, used by default in every scene and command. See `elements.RECOMMENDED` for the element."""
 
 
 @dataclass(frozen=True)
 class MaterialSet:
-    """Tissue, the time scale for which it is valid, and the source of its constants."""
+    """Tissue with the time scale for which it is valid and the source of its constants."""
 
     tissue: Material | Ogden
     time_scale: str
@@ -375,8 +375,8 @@ MATERIALS = {
         "mu 842 Pa, alpha -4.7, g 0.45 and 0.365, tau 0.5 and 50 s: Miller, Chinzei 2002, J. Biomech. 35:483-490",
     ),
 }
-"""Tissues by the names used in commands, each with the time scale for which it is valid and its source.
+"""Tissues by the names used in commands, each with its valid time scale and the source of its constants.
 
-Brain has no single stiffness: choose by the duration of a load. `default` is used in scenes and the shipped models;
-`viscoelastic` depends on the time of its loads; `seed` is that of the published protocol.
+The stiffness of brain depends on the duration of the load. `default` is the tissue of scenes and of the shipped
+models. `viscoelastic` depends on the time of the loads. `seed` is the tissue of the published protocol.
 """

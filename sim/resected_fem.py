@@ -1,4 +1,4 @@
-"""FEM solver for a body under resection: one solver per resection step."""
+"""FEM solver for an anatomy under resection: one solver for each number of completed resection steps."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
@@ -25,21 +25,21 @@ POSE_SHAPE = (4, 4)
 
 
 class ResectedFem:
-    """FEM deformation model that solves each load case on the body that remains after its resection steps.
+    """FEM deformation model that solves each load case on the tissue that remains after its resection steps.
 
-    Vertices without remaining tissue keep their undeformed position. Memories have the rows of the whole body; removed
-    elements and nodes have zero memory. Instances are thread-safe, as `Fem`.
+    Vertices without remaining tissue keep their undeformed position. History variables have one row for each element or
+    node before resection; rows of removed elements and nodes are zero. Instances are thread-safe, as `Fem`.
 
     Parameters
     ----------
     bodies
-        Bodies after 0, 1, ... all steps.
+        Remaining bodies after 0, 1, ... all resection steps.
     make
         Function that builds the solver of an anatomy.
     ahead
-        True: build all solvers at once and keep them, so that no load waits. False: build each on first use.
+        True: build all solvers immediately and keep all of them. False: build each solver on first use.
     kept
-        Number of solvers that stay in memory if they are built on first use.
+        Maximum number of solvers in memory if solvers are built on first use.
     """
 
     def __init__(
@@ -55,21 +55,21 @@ class ResectedFem:
 
     @property
     def anatomy(self) -> Anatomy:
-        """Anatomy of the whole body."""
+        """Anatomy before resection."""
         return self._bodies[0].anatomy
 
     def get_remaining_body(self, steps_done: int) -> RemainingBody:
-        """Return the body that remains after `steps_done` steps."""
+        """Return the body that remains after `steps_done` resection steps."""
         return self._bodies[steps_done]
 
     @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Compute as `Fem.deform`; `start` may be a solution after another number of steps.
+        """Return the equilibrium as `Fem.deform`; `start` may be a solution after another number of resection steps.
 
         Raises
         ------
         InputError
-            See `Fem.deform`; more steps than there are.
+            See `Fem.deform`; also if a load has more completed steps than the `Resection` has steps.
         """
         check_loads(loads)
         if start is not None:
@@ -99,7 +99,7 @@ class ResectedFem:
         return np.full(len(loads), len(self._bodies) - 1) if cause is None else cause.done.astype(int)
 
     def _convert_to_stage(self, start: Deformation, stage: int, stays: bool) -> Deformation:
-        """Return a solution of the whole body as one of a stage; `stays` if it had the same number of steps."""
+        """Return `start` for the solver after `stage` steps; `stays` is True if `start` has completed as many steps."""
         memory = dict(start.memory) if stays else self._filter_memory(start.memory, stage)
         memory.pop(DONE_KEY, None)
         for name, place in self._index_memories(memory, stage).items():
@@ -110,7 +110,7 @@ class ResectedFem:
         )
 
     def _convert_from_stage(self, result: Deformation, stage: int) -> Deformation:
-        """Return a solution of a stage as one of the whole body, marked with its number of steps."""
+        """Return a solution after `stage` steps with the history rows of the whole anatomy and its number of steps."""
         memory = {**result.memory, DONE_KEY: np.full(len(result), float(stage))}
         for name, place in self._index_memories(memory, stage).items():
             own = memory[name]
@@ -119,12 +119,12 @@ class ResectedFem:
         return replace(result, displacement=self._mask_orphans(result, stage), memory=memory)
 
     def _mask_orphans(self, result: Deformation, stage: int) -> np.ndarray:
-        """Return the displacements of a solution, with zero at orphaned vertices."""
+        """Return the displacements of a solution, with zeros at vertices without a tetrahedron after `stage` steps."""
         orphaned = self._bodies[stage].anatomy.orphaned[result.nodes]
         return np.where(orphaned[:, None], 0.0, result.displacement)
 
     def _join_stages(self, parts: list[Deformation], stages: list[int]) -> Deformation:
-        """Join solutions of several stages; memories that a stage lacks are zero."""
+        """Join solutions after different numbers of steps; history variables that a solution lacks are zero."""
         memories = [self._filter_memory(part.memory, stage) for part, stage in zip(parts, stages, strict=True)]
         shapes = {name: value.shape[1:] for memory in memories for name, value in memory.items()}
         whole = [
@@ -136,7 +136,7 @@ class ResectedFem:
         )
 
     def _filter_memory(self, memory: Mapping[str, np.ndarray], stage: int) -> dict[str, np.ndarray]:
-        """Return the memories that are valid for another body: of elements and nodes, tool poses, steps done."""
+        """Return the history variables that are valid after other steps too: element and node data, poses, steps."""
         rows = self._rows(stage)
         return {
             name: value
@@ -147,27 +147,27 @@ class ResectedFem:
     def _index_memories(
         self, memory: Mapping[str, np.ndarray], stage: int
     ) -> dict[str, tuple[slice, np.ndarray, slice]]:
-        """Return the index of a stage's rows in the whole body's memories of elements and nodes, by name.
+        """Return the rows after `stage` steps as an index into the history variables of the whole anatomy, by name.
 
-        Rows are shorter if the removed tissue had a longer Prony series.
+        The rows are shorter if the removed tissue had a longer Prony series than the remaining tissue.
         """
         rows = self._rows(stage) if stage else {}
         return {name: (slice(None), self._place(stage, name), slice(rows[name][1])) for name in memory if name in rows}
 
     def _get_shape(self, name: str) -> tuple[int, int]:
-        """Return rows and row length of a memory of the whole body's elements or nodes."""
+        """Return the shape (rows, row length) of the history variable `name` of the anatomy before resection."""
         marks, width = self._rows(0)[name]
         return len(marks), width
 
 
 def _list_memory_rows(fem: Fem) -> dict[str, tuple[np.ndarray, int]]:
-    """Return unique keys (n, k) and row length of each memory of elements or nodes, by name."""
+    """Return the unique row keys (n, k) and the row length of each history variable of elements or nodes, by name."""
     terms = [term for term in fem.problem.terms if isinstance(term, HistoryTerm)]
     return {MID_EDGE_KEY: (fem.space.edges, 3)} | {term.name: (term.keys, term.width) for term in terms}
 
 
 def _find_rows(whole: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Return the index (n,) of some rows (n, k) in the whole (m, k)."""
+    """Return the index (n,) in `whole` (m, k) of each row of `some` (n, k)."""
     _, number = np.unique(np.concatenate([whole, some]), axis=0, return_inverse=True)
     known, asked = np.split(number.ravel(), [len(whole)])
     order = np.argsort(known)
@@ -183,12 +183,12 @@ def build_fem(
     element: str | None = None,
     live: bool = False,
 ) -> Fem | ResectedFem:
-    """Return the FEM solver for effects, which may include `Resection`; arguments as `Fem`.
+    """Return the FEM solver for effects, which may include `Resection`; the arguments are those of `Fem`.
 
     Raises
     ------
     InputError
-        See `Fem`; steps that cannot be done.
+        See `Fem`; also if a resection step is not possible on this mesh.
     """
     effects = tuple(effects)
     cuts = [effect for effect in effects if isinstance(effect, Resection)]
@@ -204,7 +204,7 @@ def build_fem(
 
 
 def _restrict_effects(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
-    """Return the effects without references to regions that are completely removed."""
+    """Return the effects without references to the regions that resection has completely removed."""
     present = set(body.mesh.region.tolist())
     removed = set(whole.mesh.region.tolist()) - present
 

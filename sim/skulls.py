@@ -1,4 +1,4 @@
-"""Contact models of brain and skull, as descriptions."""
+"""Descriptions of the contact models between brain and skull."""
 
 import math
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from .errors import InputError
 class Bonded:
     """Brain bonded to the skull by the meninges: nodes with a normal in `Anatomy.slide_normal` do not move.
 
-    Stiff limit of an elastic layer. In the default brain, a layer of 0.1 kPa shear per mm moves the tumour 2 % more.
-    The measured one is stiffer (11 MPa per mm in compression: Mazumder et al. 2013, Acta Bioeng. Biomech. 15(2):3-11).
-    Valid while the traction is below the bond's strength; `Deformation.bond` gives the largest ratio.
+    This is the stiff limit of an elastic layer. In the default brain, a layer of 0.1 kPa shear per mm moves the tumour
+    2 % more. The measured layer is stiffer, 11 MPa per mm in compression (Mazumder et al. 2013, Acta Bioeng. Biomech.
+    15(2):3-11). The model is valid while `Deformation.bond`, the largest ratio of traction to strength, is below 1.
     `Slide` and `SkullContact` are the frictionless limits.
 
     Parameters
     ----------
     tension, shear
-        Tensile and shear strength [Pa]; of sheep, the minima of 2.8 to 3.4 and of 1.8 to 2.1 kPa (Arzemanzadeh, Miller,
-        Rosenow, Vos, Wittek 2025, arXiv 2512.08425).
+        Tensile and shear strength [Pa]. The defaults are minima measured on sheep, 2.8 to 3.4 kPa and 1.8 to 2.1 kPa
+        (Arzemanzadeh, Miller, Rosenow, Vos, Wittek 2025, arXiv 2512.08425).
 
     Raises
     ------
     InputError
-        A strength that is not positive.
+        A strength is not positive.
     """
 
     tension: float = 2.8e3
@@ -38,10 +38,10 @@ class Bonded:
 
 @dataclass(frozen=True)
 class Slide:
-    """Frictionless sliding: nodes with a normal in `Anatomy.slide_normal` move only perpendicular to it.
+    """Frictionless sliding: nodes with a normal in `Anatomy.slide_normal` move only perpendicular to this normal.
 
-    The wall does not separate and has no shear resistance. Undulations of the wall obstruct sliding tissue, so
-    the motion of a deep tumour depends on the smoothness of the surface.
+    The tissue does not separate from the wall, which has no shear resistance. Undulations of the wall obstruct sliding
+    tissue, so the motion of a deep tumour depends on the smoothness of the surface.
     """
 
 
@@ -49,22 +49,22 @@ class Slide:
 class SkullContact:
     """Frictionless unilateral contact with the skull: unlike in `Slide`, the brain can separate.
 
-    Nodes with a normal in `Anatomy.slide_normal` stay on their side of a wall perpendicular to it, at an undeformed
-    distance of `gap` [m]. The wall is curved as the normals around them; contact starts in the last 0.1 mm. Nodes in
-    the craniotomy can rise through it, but touch bone beyond its edge, whose radius is set by the mesh size. The body
-    needs fixed nodes of `Held`, since bone only limits its motion.
+    Nodes with a normal in `Anatomy.slide_normal` stay inside a wall that is perpendicular to the normal, at a distance
+    of `gap` [m] in the undeformed state. The normals around a node define the curvature of the wall. Contact starts in
+    the last 0.1 mm. Nodes in the craniotomy can rise through the opening, but touch bone beyond its edge, whose radius
+    depends on the mesh size. The effect `Held` must fix some nodes, since bone only limits the motion.
 
-    The volume of the gap may pass the closed skull, see `Deformation.leaked`: 0.1 mm around a brain are 6 ml.
+    `Deformation.leaked` includes the volume of the gap: a gap of 0.1 mm around a brain has 6 ml.
 
     Parameters
     ----------
     gap
-        Undeformed distance between brain and bone [m].
+        Distance between brain and bone in the undeformed state [m].
 
     Raises
     ------
     InputError
-        A gap that is not positive.
+        The gap is not positive.
     """
 
     gap: float = 1e-4
@@ -74,6 +74,6 @@ class SkullContact:
 
 
 def check_gap(effect: str, gap: float) -> None:
-    """Reject a gap [m] that is not positive."""
+    """Reject a `gap` [m] that is not positive; `effect` is the name of the effect in the message."""
     if not 0.0 < gap < math.inf:
         raise InputError(f"{effect}.gap is {gap} m: give a positive number.")

@@ -1,8 +1,8 @@
-"""Rigid tools: each is the set of points within a radius of a point, a line, a rectangle or a box (its core).
+"""Rigid tools. A tool is the set of points within a radius of its core: a point, a line, a rectangle or a box.
 
-User-defined tools are unions of several such sets.
+User-defined tools may be unions of several such sets.
 
-In tool coordinates the lowest point is the origin and the shaft points along +z.
+In tool coordinates the origin is the lowest point of the tool, and the shaft points along +z.
 """
 
 import ast
@@ -28,7 +28,7 @@ def _check(tool: object) -> None:
 
 @dataclass(frozen=True)
 class Ball:
-    """Ball of `radius` [m], with its centre at this height on the shaft.
+    """Ball of `radius` [m], with its centre on the shaft at the height `radius` above the origin.
 
     Raises
     ------
@@ -44,7 +44,7 @@ class Ball:
 
 @dataclass(frozen=True)
 class Capsule:
-    """Round rod with hemispherical ends along the shaft: `radius` [m] about a line of `length` [m].
+    """Round rod along the shaft with hemispherical ends: all points within `radius` [m] of a line of `length` [m].
 
     Raises
     ------
@@ -61,14 +61,14 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Spatula:
-    """Flat blade perpendicular to the shaft, `width` [m] along x, `length` [m] along y, thickness 2 `edge` [m].
+    """Flat blade perpendicular to the shaft: `width` [m] along x, `length` [m] along y, thickness 2 x `edge` [m].
 
     The sizes include the rounded edge.
 
     Raises
     ------
     InputError
-        A size that is not positive, or a blade narrower than its edges.
+        A size is not positive, or the blade is narrower than its rounded edges.
     """
 
     width: float
@@ -89,7 +89,7 @@ BuiltIn = Ball | Capsule | Spatula  # tools of this package
 
 @dataclass(frozen=True, eq=False)
 class Core:
-    """Core of a tool, the set of points within `radius` [m] of a box: centre (3,), half sizes (3,) [m], possibly 0."""
+    """Box with `centre` (3,) and half sizes `half` (3,) [m], possibly 0; a tool is all points within `radius` [m]."""
 
     centre: np.ndarray
     half: np.ndarray
@@ -97,23 +97,23 @@ class Core:
 
     @property
     def corners(self) -> np.ndarray:
-        """Distinct corners (n, 3) [m] of the box."""
+        """Distinct corners (n, 3) [m] of the box; fewer than eight if a half size is 0."""
         signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(-1, 3)
         return np.unique(self.centre + signs * self.half, axis=0)
 
     @property
     def extent(self) -> float:
-        """Upper bound of the distance from the tool's origin to its farthest point [m]."""
+        """Upper bound [m] of the distance from the origin of the tool to its farthest point."""
         return float(np.linalg.norm(np.abs(self.centre) + self.half)) + self.radius
 
 
 @runtime_checkable
 class OwnTool(Protocol):
-    """Interface of user-defined tools, frozen dataclasses: one rigid body as the union of several cores."""
+    """Interface of user-defined tools: frozen dataclasses that describe a rigid tool as the union of several cores."""
 
     @property
     def cores(self) -> tuple[Core, ...]:
-        """Cores, which may overlap. The lowest point is the origin, the shaft points along +z."""
+        """Cores of the tool, which may overlap. The origin is the lowest point; the shaft points along +z."""
         ...
 
 
@@ -121,12 +121,12 @@ Tool = BuiltIn | OwnTool  # all tools
 
 
 def parse_tool(text: str) -> BuiltIn:
-    """Return the tool whose `repr` is this text; it may come from an untrusted file, since it is not evaluated.
+    """Return the tool whose `repr` is `text`. The text is parsed but never evaluated, so it may be untrusted.
 
     Raises
     ------
     InputError
-        A text that is not a tool of `BuiltIn`, or one with invalid sizes.
+        The text does not describe a tool of `BuiltIn`, or its sizes are invalid.
     """
     kinds = {kind.__name__: kind for kind in BuiltIn.__args__}
     with suppress(SyntaxError, ValueError, TypeError, RecursionError, MemoryError):
@@ -137,7 +137,7 @@ def parse_tool(text: str) -> BuiltIn:
 
 
 def read_tool_statement(text: str | None, ball: object) -> BuiltIn | None:
-    """Return the tool that a file gives by its `repr`, or older files by the radius [m] of a `ball`; None without both.
+    """Return the tool of a file: from its `repr` in `text`, or from the radius [m] of a `ball` in older files, or None.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def read_tool_statement(text: str | None, ball: object) -> BuiltIn | None:
 
 
 def name_tool(tool: Tool) -> str:
-    """Return the name of a tool with its sizes in millimetres; for a user-defined tool its `repr`."""
+    """Return the name of a tool with its sizes in millimetres; for a user-defined tool, its `repr`."""
     match tool:
         case Ball(radius):
             return f"a ball of {1e3 * radius:g} mm"
@@ -168,7 +168,7 @@ def check_tool(effect: str, tool: object) -> None:
     Raises
     ------
     InputError
-        Another type, no cores, or cores that are not finite or have no radius.
+        The value is of another type or has no cores, or a core is not finite or has no positive radius.
     """
     if not isinstance(tool, Tool):
         allowed = ", ".join(kind.__name__ for kind in BuiltIn.__args__)
@@ -198,14 +198,14 @@ def get_core(tool: BuiltIn) -> Core:
 
 
 def compute_extent(tool: Tool) -> float:
-    """Return an upper bound of the distance from the tool's origin to its farthest point [m]."""
+    """Return an upper bound [m] of the distance from the origin of a tool to its farthest point."""
     return max(core.extent for core in list_cores(tool))
 
 
 def find_foremost_points(tool: BuiltIn, pose: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return points (B, 3) [m] of a tool at T_world_tool `pose` (B, 4, 4) that are farthest in a unit `direction` (3,).
+    """Return the point (B, 3) [m] of a tool at T_world_tool `pose` (B, 4, 4) farthest in a unit `direction` (3,).
 
-    If an edge or a face is perpendicular to the direction, it is its centre.
+    If all points of an edge or a face are equally far, the point is the centre of this edge or face.
     """
     core, local = get_core(tool), np.einsum("bji,j->bi", pose[:, :3, :3], direction)
     corner = core.centre + np.where(np.abs(local) < PERPENDICULAR_TOLERANCE, 0.0, np.sign(local)) * core.half

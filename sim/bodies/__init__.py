@@ -1,1 +1,1 @@
-"""Build an anatomy from an image, a label volume, the template or a mesh file."""
+"""Anatomies from an image, a label volume, the template or a mesh file."""

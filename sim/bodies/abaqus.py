@@ -23,7 +23,7 @@ GENERATORS = "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM"
 
 @dataclass(frozen=True, eq=False)
 class CellBlock:
-    """Elements of one type: node indices (n, k) of tetrahedra, (n, 0) of other elements."""
+    """Elements of one type, with node indices (n, k) for tetrahedra and (n, 0) for other elements."""
 
     type: str
     data: np.ndarray
@@ -31,7 +31,7 @@ class CellBlock:
 
 @dataclass(frozen=True, eq=False)
 class AbaqusMesh:
-    """File contents with the field names of a meshio mesh; each set lists its row indices per block."""
+    """Contents of an Abaqus file, with the attribute names of a meshio mesh. A set lists row indices for each block."""
 
     points: np.ndarray
     cells: list[CellBlock]
@@ -42,13 +42,13 @@ class AbaqusMesh:
 
 
 def read_abaqus(path: Path) -> AbaqusMesh:
-    """Read nodes, elements and element sets of all blocks of a file; names are in capitals.
+    """Read the nodes, elements and element sets of all blocks of a file; set names are converted to capitals.
 
     Raises
     ------
     InputError
-        A file that includes another file, generates nodes by a rule, defines a node twice or uses an undefined one.
-        Instances that are rotated, that have different translations, or several of one part.
+        The file includes another file, generates nodes by a rule, defines a node twice or uses an undefined node.
+        Instances are rotated, have different translations, or belong to the same part.
     """
     index, points = dict[int, int](), list[list[float]]()
     blocks, sets = list[tuple[str, np.ndarray]](), dict[str, list[np.ndarray]]()
@@ -113,7 +113,7 @@ def _parse_translation(instances: list[tuple[str, list[str]]]) -> np.ndarray:
 
 
 def _add_nodes(rows: list[str], index: dict[int, int], points: list[list[float]]) -> None:
-    """Append the nodes of a block: number and up to three coordinates, 0 where blank."""
+    """Append the nodes of a block to `index` and `points`; blank coordinates are 0."""
     for row in rows:
         number, *cells = (cell.strip() for cell in f"{row},,,".split(","))
         place = [float(cell or 0.0) for cell in cells[:3]]
@@ -128,7 +128,7 @@ def _add_nodes(rows: list[str], index: dict[int, int], points: list[list[float]]
 
 
 def _parse_elements(name: str, rows: list[str]) -> tuple[str, np.ndarray]:
-    """Return the type and table (n, 1 + k) of a block: element number and node numbers (k = 0 unless tetrahedra)."""
+    """Return the element type of a block, and a table (n, 1 + k): element number, and k node numbers of tetrahedra."""
     if not name:
         raise InputError("an *ELEMENT has no TYPE: state it, such as TYPE=C3D4.")
     solid = SOLID.match(name)
@@ -140,7 +140,7 @@ def _parse_elements(name: str, rows: list[str]) -> tuple[str, np.ndarray]:
 
 
 def _parse_set_members(rows: list[str], generate: bool, sets: Mapping[str, list[np.ndarray]]) -> list[np.ndarray]:
-    """Return element numbers: listed, or first, last and step (`generate`), plus those of the named sets."""
+    """Return the element numbers of a set: listed, as first, last, step if `generate`, or by names of other sets."""
     if generate:
         return [np.arange(first, last + 1, *step) for first, last, *step in (_parse_integers([row]) for row in rows)]
     cells = [cell.strip(' "') for row in rows for cell in row.split(",")]
@@ -149,5 +149,5 @@ def _parse_set_members(rows: list[str], generate: bool, sets: Mapping[str, list[
 
 
 def _parse_integers(rows: list[str]) -> list[int]:
-    """Parse the integers between commas; blank cells are skipped."""
+    """Return the integers of comma-separated rows; blank cells are skipped."""
     return [int(cell) for row in rows for cell in row.split(",") if cell.strip()]

@@ -1,9 +1,9 @@
 """Graded body-centred cubic lattice of tetrahedra, the background mesh of `isosurface_stuffing`.
 
-A 2:1 balanced octree, filled with tetrahedra as in Labelle & Shewchuk 2007, "Isosurface Stuffing: Fast Tetrahedral
-Meshes with Good Dihedral Angles", section 3. Between cells of one size lie the BCC tetrahedra (dihedral angles 60 and
-90 degrees). Between cells of two sizes lie pyramids, split along the diagonal through the larger face's centre (at
-least 45).
+A 2:1 balanced octree is filled with tetrahedra as in Labelle & Shewchuk 2007, "Isosurface Stuffing: Fast Tetrahedral
+Meshes with Good Dihedral Angles", section 3. Between cells of equal size are BCC tetrahedra (dihedral angles 60 and 90
+degrees). Between cells of different size are pyramids, split along the diagonal through the centre of the larger face
+(dihedral angles of at least 45 degrees).
 """
 
 from collections.abc import Callable
@@ -22,10 +22,10 @@ Sizing = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Tetrahedral lattice that fills a box.
+    """Lattice of tetrahedra that fills a box.
 
-    nodes (V, 3) [m]; tets (T, 4), positively oriented; centre (V,) bool: True at the centre of a cell, False at a cell
-    corner. Edges between a centre and a corner are short, all others long.
+    `nodes` (V, 3) [m]; `tets` (T, 4), positively oriented; `is_centre` (V,) bool: True at a cell centre, False at a
+    cell corner. Edges between a centre and a corner are short; all other edges are long.
     """
 
     nodes: np.ndarray
@@ -36,8 +36,8 @@ class Lattice:
 def build_graded_lattice(low: np.ndarray, high: np.ndarray, max_edge: float, halvings: int, sizing: Sizing) -> Lattice:
     """Return the lattice over the box from `low` (3,) to `high` (3,) [m].
 
-    Cells of edge `max_edge` [m] are halved up to `halvings` times until they are no larger than `sizing`. Neighbouring
-    cells, including diagonal ones, differ by at most one halving.
+    Cells of edge `max_edge` [m] are halved up to `halvings` times, until their edge does not exceed `sizing`. Adjacent
+    cells, including diagonal neighbours, differ by at most one halving.
     """
     count = np.ceil((high - low) / max_edge).astype(int)
     origin = 0.5 * (low + high) - 0.5 * max_edge * count
@@ -72,7 +72,7 @@ def build_graded_lattice(low: np.ndarray, high: np.ndarray, max_edge: float, hal
 def _build_octree(
     origin: np.ndarray, count: np.ndarray, coarsest: float, levels: int, size: Sizing
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return two boolean grids per level: existing cells, and those of them that are halved."""
+    """Return two boolean grids for each octree level: mask of the existing cells, and mask of the halved cells."""
     split, there = [], np.ones(count, bool)
     for level in range(levels):
         edge, index = coarsest / 2**level, np.argwhere(there)
@@ -97,7 +97,7 @@ def _compute_keys(whole: np.ndarray, span: np.ndarray) -> np.ndarray:
 
 
 def _compute_face_corners(corner: np.ndarray, axis: int, edge: int, upper: bool) -> np.ndarray:
-    """Return corners (n, 4, 3), cyclic, of the lower or upper face across `axis` of cells at `corner` (n, 3)."""
+    """Return corners (n, 4, 3), in cyclic order, of the lower or upper face across `axis` of the cells at `corner`."""
     offset = np.zeros((4, 3), int)
     offset[:, [(axis + 1) % 3, (axis + 2) % 3]] = FACE_CORNERS * edge
     offset[:, axis] = edge * upper
@@ -107,7 +107,7 @@ def _compute_face_corners(corner: np.ndarray, axis: int, edge: int, upper: bool)
 def _build_tets_between_equals(
     leaf: np.ndarray, axis: int, edge: int, known: np.ndarray, span: np.ndarray
 ) -> list[np.ndarray]:
-    """Return BCC tetrahedra around each face between two leaves of equal size, halved at edges with a midpoint node."""
+    """Return the BCC tetrahedra around each face between two leaves of equal size, halved at edges with a midpoint."""
     ahead = np.delete(leaf, 0, axis)
     corner = np.argwhere(np.delete(leaf, -1, axis) & ahead) * edge
     below = corner + edge // 2

@@ -22,21 +22,21 @@ def add_boundary_conditions(
     outline: np.ndarray | None = None,
     septa: Sequence[Septum] = (),
 ) -> Anatomy:
-    """Return the anatomy of `mesh` with a craniotomy around `site` (3,) [m], a point on the cortex.
+    """Return the anatomy with boundary conditions of a `mesh`, with a craniotomy around `site` (3,) [m] on the cortex.
 
-    The brainstem is fixed: surface nodes within a fraction of the brain's height from the lowest (least superior) node.
-    The craniotomy is free: surface nodes within a geodesic distance of half its diameter `craniotomy` [m] of the point
-    nearest to `site`. With an `outline` (n, 3) [m], the nodes within it are free instead. Dural sheets, `septa`, fix
-    the nodes at them, except in the craniotomy.
+    The brainstem is fixed: surface nodes within a fraction of the brain's height from the lowest (most inferior) node.
+    The craniotomy is free: surface nodes within a geodesic distance of half its diameter `craniotomy` [m] from the
+    point nearest to `site` or, if an `outline` (n, 3) [m] is given, within this closed curve. Nodes at the dural
+    sheets `septa` are fixed, except in the craniotomy.
 
-    The skull covers the remaining surface; effects define its contact model. Each covered node has a
-    unit normal n_i along the integral of grad N_i. If no node of linear tetrahedra moves along its normal, no volume
-    passes through the skull (Engelman, Sani, Gresho 1982, Int. J. Numer. Methods Fluids 2:225-238).
+    The skull covers the remaining surface; effects define the contact model. Each covered node i has a unit normal
+    along the integral of grad N_i. If no node of linear tetrahedra moves along its normal, no volume passes through
+    the skull (Engelman, Sani, Gresho 1982, Int. J. Numer. Methods Fluids 2:225-238).
 
     Raises
     ------
     InputError
-        A craniotomy with too few nodes, or one that leaves no skull.
+        The craniotomy has too few nodes, or leaves no surface for the skull.
     """
     surface = mesh.surface
     outer = np.unique(surface)

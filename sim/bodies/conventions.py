@@ -1,4 +1,4 @@
-"""Table of label conventions of common segmentation programs, by convention name."""
+"""Label conventions of common segmentation programs."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
@@ -8,32 +8,32 @@ from ..errors import InputError
 
 @dataclass(frozen=True)
 class Convention:
-    """Label numbers of one program; a group may be absent from a file.
+    """Label numbers of one segmentation program, in groups; a group may be absent from a file.
 
     Parameters
     ----------
     name
         Name on the command line.
     source
-        Description of the programs that write such labels.
+        Description of the programs that write labels of this convention.
     brain
         Labels of all tissue between the meninges and of the ventricles, without free fluid.
     required
         Labels of `brain` that a file must contain.
     tumour
-        Labels of the tumour core; () if another file or the user's own numbers must mark it.
+        Labels of the tumour core; () if another file or label numbers given by the user must mark the tumour.
     necrosis, oedema, ventricles
-        Labels of parts of the core, of the brain, and of the brain, respectively.
+        Labels of necrosis, a part of the tumour core, and of oedema and ventricles, which are parts of the brain.
     left, right
         Labels that occur in one hemisphere only.
     is_exhaustive
-        True if a file has no other labels than these.
+        True if a file has no labels other than those of the convention.
     needs_brain_mask
         True if the brain is marked in another file.
     exclusive
-        Labels of which a file lacks at least one.
+        Set of labels that never occur all together in one file.
     innermost
-        Labels of the innermost tissue.
+        Labels of inner tissue; its surface must not be more exposed (at label 0) than that of other tissue.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Convention:
 
 
 def _add_right(*left: int) -> tuple[int, ...]:
-    """Return left-hemisphere labels together with their right-hemisphere counterparts, by FreeSurfer's colour table."""
+    """Return labels of the left hemisphere, followed by those of the same structures on the right (FreeSurfer)."""
     return tuple(sorted((*left, *(RIGHT[label] for label in left))))
 
 
@@ -74,12 +74,12 @@ RIGHT = {
     2: 41, 3: 42, 4: 43, 5: 44, 7: 46, 8: 47, 9: 48, 10: 49, 11: 50, 12: 51, 13: 52, 17: 53, 18: 54, 26: 58, 28: 60,
     30: 62, 31: 63, 78: 79, 81: 82,
 }  # fmt: skip
-"""FreeSurfer labels of the left hemisphere, mapped to those of the right."""
+"""FreeSurfer labels of the right hemisphere, by the label of the same structure on the left."""
 # Parcels of the cortex and of the white matter below it (aparc+aseg, wmparc), thousands per hemisphere.
 PARCELS = tuple(range(1000, 1036)), tuple(range(2000, 2036)), (*range(3000, 3036), 5001), (*range(4000, 4036), 5002)
 VENTRICLES = (*_add_right(4, 5), 14, 15, 72)  # FreeSurfer labels; both hemispheres, and midline
 DEEP = (16, 77, 80, 85, *range(251, 256))
-"""Labels without a side: brainstem, white matter lesions, chiasm and corpus callosum."""
+"""Labels of structures that belong to no side: brainstem, white matter lesions, chiasm and corpus callosum."""
 
 FREESURFER = Convention(
     "freesurfer",
@@ -169,14 +169,14 @@ def check_labels_fit(
     user_labels: Collection[int] = (),
     find_reason: Callable[[Convention], str] = lambda _: "",
 ) -> None:
-    """Reject a file whose `file_labels` do not follow a convention, apart from the `user_labels`.
+    """Reject a file whose labels, except the `user_labels`, do not follow a convention.
 
-    `find_reason` returns the reason why a convention with matching numbers is not that of the file; empty if it may be.
+    `find_reason` returns the reason why a convention does not apply although the numbers match; empty without a reason.
 
     Raises
     ------
     InputError
-        With the labels that are missing, unknown or contradictory, and the conventions that would fit.
+        The labels do not fit; the message lists missing, unknown or contradictory labels and the conventions that fit.
     """
     labels = set(file_labels) - {0} - set(user_labels)
     missing = [label for label in convention.required if label not in labels]

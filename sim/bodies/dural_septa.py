@@ -1,7 +1,7 @@
-"""Falx and tentorium as rigid walls: mesh nodes are fixed so that no free edge crosses a dural sheet.
+"""Falx and tentorium as rigid walls: nodes at a dural sheet are fixed so that every edge across it has a fixed end.
 
-Dural septa act as rigid membranes: Chen et al. 2011, IEEE Trans. Biomed. Eng. 58:499-508 (PMC3864010). Here tissue is
-bonded to them, and does not slide along them.
+Dural septa act as rigid membranes: Chen et al. 2011, IEEE Trans. Biomed. Eng. 58:499-508 (PMC3864010). In this model
+tissue is bonded to the septa and does not slide along them.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ SPACING = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Septum:
-    """Sheet of dura as voxel centres (n, 3) [m]; balls with radius `radius` [m], half a voxel diagonal, cover it."""
+    """Sheet of dura: `name`, voxel centres `points` (n, 3) [m], and `radius` [m] of balls at them that cover it."""
 
     name: str
     points: np.ndarray
@@ -34,15 +34,15 @@ class Septum:
 
 
 def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
-    """Return a synthetic falx in the midline of a head, from surface points (n, 3) [m, RAS].
+    """Return a synthetic falx in the midline of a head, given points (n, 3) [m, RAS] on the cortex.
 
-    It extends inwards from the convexity by a constant `depth` [m] and ends at half of the head's height. A real
-    falx is narrow in front and wide behind. The head outline is convex, as the skull is; sulci are ignored.
+    The falx extends inwards from the convexity by a constant `depth` [m] and ends at half of the head's height; a real
+    falx is narrow in front and wide behind. The convex outline of the points is used, so sulci are ignored.
 
     Raises
     ------
     InputError
-        A depth outside 10 to 60 mm.
+        The depth is outside 10 to 60 mm.
     """
     if not MIN_FALX_DEPTH <= depth <= MAX_FALX_DEPTH:
         raise InputError(
@@ -59,9 +59,9 @@ def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
 
 
 def find_fixed_vertices(mesh: TetMesh, septum: Septum) -> np.ndarray:
-    """Return a mask (V,) of vertices to fix: of each edge that meets the sheet, the end nearer to the intersection.
+    """Return a mask (V,) of the vertices to fix: for each edge that crosses the sheet, the end nearer to the crossing.
 
-    Every mesh edge that the sheet cuts therefore has at least one fixed end.
+    Every mesh edge that crosses the sheet therefore has at least one fixed end.
     """
     ends = np.sort(mesh.tets[:, EDGES].reshape(-1, 2))
     _, first = np.unique(compute_row_keys(ends), return_index=True)

@@ -1,23 +1,23 @@
-"""Voxelisation of a closed surface."""
+"""Voxel mask of the interior of a closed surface."""
 
 import numpy as np
 
 from ..errors import InputError
 
 RAY_OFFSET = np.array([3.37e-5, 7.13e-5])
-"""Offset of the rays from the lattice [voxels], so that no ray hits an edge of triangles aligned with the lattice."""
+"""Offset of the rays from the voxel centres [voxels], so that no ray hits an edge of grid-aligned triangles."""
 
 
 def rasterise_interior(points: np.ndarray, triangles: np.ndarray, voxel_size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return voxels (I, J, K) bool of edge `voxel_size` [m] with centres inside a surface, and their affine (4, 4).
+    """Return a mask (I, J, K) of the voxels with centre inside a surface, and its affine (4, 4); edge `voxel_size` [m].
 
-    The surface has vertices (n, 3) [m] and triangles (m, 3) of either orientation. A centre is inside if
-    a ray to it along z crosses the surface an odd number of times.
+    The surface has vertices (n, 3) [m] and triangles (m, 3) of any orientation. A centre is inside if a ray along z to
+    this centre crosses the surface an odd number of times.
 
     Raises
     ------
     InputError
-        A surface that is not closed: some edge does not have exactly two triangles.
+        The surface is not closed: an edge does not belong to exactly two triangles.
     """
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     if (np.unique(edges, axis=0, return_counts=True)[1] != 2).any():
@@ -35,7 +35,7 @@ def rasterise_interior(points: np.ndarray, triangles: np.ndarray, voxel_size: fl
 
 
 def _find_crossings(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return voxel columns (r, 2) whose ray along z meets a triangle (m, 3, 3) [voxels], and the heights (r,)."""
+    """Return the voxel columns (r, 2) of rays along z that hit a triangle (m, 3, 3) [voxels], and the heights (r,)."""
     low = np.ceil(corners[..., :2].min(axis=1)).astype(int)
     extent = np.maximum(np.floor(corners[..., :2].max(axis=1)).astype(int) - low + 1, 0)
     count = extent.prod(axis=1)

@@ -1,4 +1,4 @@
-"""Height of the fluid around a brain, from a fraction of the brain's height."""
+"""Level of the fluid around a brain, from a fraction of the brain's height."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ LEVEL_MARGIN = 1e-3
 
 
 def compute_fluid_level(nodes: np.ndarray, down: np.ndarray, fill_fraction: float) -> float:
-    """Return the level [m] above the origin, against the unit vector `down` (3,), for nodes (V, 3) [m].
+    """Return the fluid level [m] above the origin, measured against the unit vector `down` (3,), for nodes (V, 3) [m].
 
-    `fill_fraction` ranges from 0 (drained) to 1 (above the highest vertex).
+    `fill_fraction` ranges from 0 (drained, 1 mm below the lowest node) to 1 (full, 1 mm above the highest node).
     """
     height = -nodes @ down
     low, high = height.min() - LEVEL_MARGIN, height.max() + LEVEL_MARGIN

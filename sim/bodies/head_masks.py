@@ -19,7 +19,7 @@ from .voxels import DEFAULT_VOXELS, VoxelGrid, VoxelSpec
 # Fraction of labelled voxels that may lie outside the mask without a note.
 MAX_OUTSIDE_FRACTION = 0.01
 NECROSIS = "necrosis"
-"""Name of the part that belongs to the tumour; all other parts belong to the brain."""
+"""Name of the only part that belongs to the tumour; all other parts belong to the brain."""
 # Margin kept around brain and tumour [voxels]: larger than the tumour extension beyond the cortex.
 CROP_MARGIN = 10
 
@@ -31,20 +31,20 @@ class MaskSources:
     Parameters
     ----------
     labels
-        Label map, whose grid is used.
+        Label map; its voxel grid is used for all masks.
     brain, tumour
-        Labels by number or name; () for those of the convention, or if other files mark them.
+        Labels by number or name; () to use the labels of the convention, or if another file marks the tissue.
     convention
         Name in `CONVENTIONS`, or None.
     mask
-        Volume whose nonzero voxels are brain; replaces `brain`.
+        Volume whose nonzero voxels are the brain; used instead of `brain`.
     tumour_file
-        Label map that the labels `tumour` (all of its labels if empty) and those of necrosis refer to.
+        Label map to which the labels of `tumour` and necrosis refer; if `tumour` is empty, all labels are tumour.
     parts
-        Labels of other tissues by name in `PART_LABELS` or `SEPTA`; they replace the convention's. Necrosis counts as
-        tumour, all other parts as brain.
+        Labels of other tissues, by name in `PART_LABELS` or `SEPTA`; these labels replace those of the convention.
+        Necrosis is part of the tumour; all other tissues are part of the brain.
     axes
-        Axis directions of NIfTI files without orientation, such as RAS.
+        Axis directions, such as RAS, for NIfTI files without orientation.
     """
 
     labels: Path
@@ -58,34 +58,34 @@ class MaskSources:
 
     @property
     def voxel_spec(self) -> VoxelSpec:
-        """Reading options for the files."""
+        """Options for reading the files."""
         return VoxelSpec(axes=self.axes)
 
 
 @dataclass(frozen=True, eq=False)
 class HeadMasks:
-    """Masks (I, J, K) bool on a common grid.
+    """Masks (I, J, K) bool of brain, tumour and other tissues on a common grid.
 
     Parameters
     ----------
     name
         File name or names, for error messages.
     brain_source
-        Description of the brain's source.
+        Description of the source of the brain mask.
     brain, tumour
-        Labelled voxels; the brain mask need not include the tumour.
+        Masks of brain and tumour; the brain mask need not include the tumour.
     border_voxels
-        Number of brain voxels on the border of their file's grid.
+        Number of brain voxels on the border of the grid of their file.
     grids
-        Grids of the files.
+        Voxel grids of the files.
     voxel_spec
-        Reading options for further scans of the head.
+        Options for reading further scans of the head.
     parts
-        Masks of other tissues by name, as in `MaskSources.parts` or from the convention.
+        Masks of other tissues by name, from `MaskSources.parts` or the convention.
     affine
-        (4, 4) from indices to metres (RAS).
+        Affine (4, 4) from voxel indices to metres (RAS).
     notes
-        Notes on assumptions.
+        Notes for the user on assumptions made while reading.
     """
 
     name: str
@@ -106,9 +106,9 @@ def read_head_masks(sources: MaskSources) -> HeadMasks:
     Raises
     ------
     InputError
-        Input that `read_labels` or `read_volume` rejects; an unknown convention, or labels that do not follow it.
-        Labels that are missing or named twice; no labels and no replacement. Left labels on the right
-        side. A tumour in another file that does not lie at the brain.
+        `read_labels` or `read_volume` rejects a file, the convention is unknown, or labels do not follow it. Labels are
+        missing or given twice, or nothing marks the brain or the tumour. Labels of the left hemisphere are on the right
+        side. The tumour in another file is outside the brain.
     """
     convention = _get_convention(sources)
     _check_sources(sources, convention)
@@ -163,7 +163,7 @@ def read_head_masks(sources: MaskSources) -> HeadMasks:
 
 
 def _note_unassigned_labels(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
-    """Return a note on labels of the file that have no assigned meaning."""
+    """Return a note, or (), on the labels of the file to which no tissue is assigned."""
     names = {(one.layer, one.value): one.name for one in whole.segments}
     found = {(layer, value) for layer, present in enumerate(whole.labels_by_layer) for value in present}
     left = [names.get(place, place[1]) for place in sorted(found - set(whole.find_layers(named)))]
@@ -173,7 +173,7 @@ def _note_unassigned_labels(whole: LabelMap, named: Sequence[Label]) -> tuple[st
 def _note_contradictions(
     whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tuple[Label, ...]]
 ) -> tuple[str, ...]:
-    """Return a note on the user's own labels if the anatomy contradicts them."""
+    """Return a note if the anatomy contradicts the labels given by the user, else ()."""
     if whole.layers.shape[-1] > 1 or not {NECROSIS, "oedema"}.intersection(parts):
         return ()
     own = {name: tuple(value for _, value in whole.find_layers(labels)) for name, labels in parts.items()}
@@ -194,7 +194,7 @@ def _note_tumour_side(marked: dict[str, np.ndarray], affine: np.ndarray, path: P
 
 
 def _note_voxels_outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ...]:
-    """Return a note if many labelled voxels lie outside the brain mask."""
+    """Return a note if a large fraction of the labelled voxels is outside the brain mask, else ()."""
     labelled = np.logical_or.reduce([mask for name, mask in marked.items() if name != "brain"])
     out = int((labelled & ~marked["brain"]).sum())
     if out <= MAX_OUTSIDE_FRACTION * labelled.sum():
@@ -206,7 +206,7 @@ def _note_voxels_outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> t
 def _note_cavity(
     whole: LabelMap, convention: Convention | None, named: Mapping[str, Sequence[Label]]
 ) -> tuple[str, ...]:
-    """Return a note on cavity fluid that a tumour convention marks, since a brain mask may include it."""
+    """Return a note if the convention marks a fluid-filled cavity, which the brain mask may include; else ()."""
     fluid = _select_present(convention.csf, whole) if convention and convention.tumour else ()
     if not fluid or set(fluid) <= {label for labels in named.values() for label in labels}:
         return ()
@@ -231,7 +231,7 @@ def _crop_masks(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict
 def _select_labels(
     whole: LabelMap, sources: MaskSources, convention: Convention | None
 ) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
-    """Return the labels of brain and tumour: the user's, or those of the convention that occur."""
+    """Return the labels of brain and of tumour: the user's, or those of the convention that the file contains."""
     brain, tumour = sources.brain, sources.tumour
     if convention is not None:
         necrosis = sources.parts.get(NECROSIS, ())
@@ -260,13 +260,13 @@ def _select_present(labels: Sequence[int], whole: LabelMap) -> tuple[int, ...]:
 
 
 def _build_part_masks(whole: LabelMap, convention: Convention) -> dict[str, np.ndarray]:
-    """Return masks of the convention's other tissues that occur in the file."""
+    """Return the masks of other tissues of the convention that occur in the file, by name."""
     groups = {NECROSIS: convention.necrosis, "oedema": convention.oedema, "ventricles": convention.ventricles}
     return {name: whole.mask(found) for name, of in groups.items() if (found := _select_present(of, whole))}
 
 
 def _read_other_masks(sources: MaskSources, tumour: Sequence[Label]) -> dict[str, Mask]:
-    """Read the masks that other files define, by name."""
+    """Read the masks of brain and tumour that files other than the label map define, by name."""
     others = {}
     if sources.mask:
         volume = read_volume(sources.mask, sources.voxel_spec)
@@ -292,7 +292,7 @@ def _get_convention(sources: MaskSources) -> Convention | None:
 
 
 def _check_sources(sources: MaskSources, convention: Convention | None) -> None:
-    """Reject sources that do not define the brain and the tumour exactly once."""
+    """Reject sources that do not define the brain exactly once and the tumour exactly once."""
     if sources.mask and sources.brain:
         raise InputError("--mask and --brain both define the brain: give only one of them.")
     if sources.mask and sources.tumour_file:
@@ -314,9 +314,9 @@ def _check_sources(sources: MaskSources, convention: Convention | None) -> None:
 
 
 def _check_labels_unique(whole: LabelMap, named: Mapping[str, tuple[str, Sequence[Label]]]) -> None:
-    """Reject a label that two options name; `named` maps each tissue to its option and labels.
+    """Reject a label that two options assign; `named` maps each tissue to its option and its labels.
 
-    A part of the brain may also be labelled brain, and necrosis also tumour.
+    A label of a part of the brain may also be assigned to brain, and a label of necrosis also to tumour.
     """
     for (one, (option, labels)), (two, (other, others)) in combinations(named.items(), 2):
         if one == _get_enclosing_mask(two):
@@ -331,12 +331,12 @@ def _check_labels_unique(whole: LabelMap, named: Mapping[str, tuple[str, Sequenc
 
 
 def _get_enclosing_mask(part: str) -> str:
-    """Return the mask that contains a part; empty for brain and tumour themselves."""
+    """Return the name of the mask that contains a part; an empty string for brain and tumour."""
     return "" if part in ("brain", "tumour") else "tumour" if part == NECROSIS else "brain"
 
 
 def _check_hemispheres(whole: LabelMap, convention: Convention) -> None:
-    """Reject labels of the left hemisphere that lie on the right: the file's orientation is wrong."""
+    """Reject a file with labels of the left hemisphere on the right side, since its orientation is wrong."""
     right = []
     for side in (convention.left, convention.right):
         index = np.argwhere(np.isin(whole.layers[..., 0], side))

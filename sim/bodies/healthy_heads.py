@@ -20,21 +20,21 @@ from .volume import read_volume
 
 VIEW_CENTRE = (1e-3 * MNI_CENTRE[0], 1e-3 * MNI_CENTRE[1], 1e-3 * MNI_CENTRE[2])  # centre of the view [m]
 INNER_SKULL = Path("data", "fsaverage", "fsaverage-inner_skull-bem.fif")
-"""Path of the inner skull surface in the package mne."""
+"""Path of the inner skull surface, relative to the package mne."""
 VOXEL_SIZE = 1e-3
 """Voxel edge for the voxelised skull [m]."""
 REMEDY = install_hint("heads")  # remedy of messages about the package mne
 
 
 def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None = None) -> HealthyHead:
-    """Return the head whose brain is the nonzero voxels of a mask, scaled about its centroid to `volume` [m^3].
+    """Return the head whose brain is the nonzero voxels of a file, scaled about the brain's centroid to `volume` [m^3].
 
-    `t1` is an intensity volume in the same space and is scaled with it.
+    `t1` is an intensity volume in the same space, scaled like the mask.
 
     Raises
     ------
     InputError
-        Input that `read_volume`, `read_intensity` or `fill_brain` rejects, and a volume that is 0 everywhere.
+        `read_volume`, `read_intensity` or `fill_brain` rejects the input, or all voxels of the mask are 0.
     """
     read = read_volume(mask)
     brain = read.values != 0
@@ -50,9 +50,9 @@ def build_masked_head(mask: Path, t1: Path | None = None, volume: float | None =
 
 
 def read_fsaverage_head(volume: float) -> HealthyHead:
-    """Return the head of fsaverage, scaled to a `volume` [m^3]: all that its inner skull encloses counts as brain.
+    """Return the head of fsaverage, scaled to a `volume` [m^3]; the whole space inside the inner skull is brain.
 
-    The brain surface coincides with the skull: there is no fluid between them, and there are no sulci.
+    The brain surface coincides with the inner skull: there is no fluid between brain and skull, and there are no sulci.
 
     Raises
     ------

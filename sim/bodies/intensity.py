@@ -1,4 +1,4 @@
-"""T1 intensities of a mesh: a small NIfTI volume in mesh coordinates, sampled at material points."""
+"""T1 intensities of a mesh: a small NIfTI volume in mesh coordinates, interpolated at undeformed positions."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ class GreyWindow:
     Parameters
     ----------
     low_percent, high_percent
-        Percentiles of the brain by volume, robust against a few voxels such as vessels.
+        Percentiles of the grey values in the brain, weighted by volume; robust against few voxels such as vessels.
     low_grey, high_grey
-        Grey values in 0 .. 1 of these percentiles; values outside are extrapolated linearly and clipped to 0 .. 1.
+        Grey values in 0 .. 1 to which these percentiles are mapped; other values follow linearly, clipped to 0 .. 1.
     max_excess
-        Excess over `high_percent`, in units of high - low, above which a voxel is not tissue: a vessel with contrast
-        agent, fat, or a wrong value.
+        Excess over the upper percentile, in units of upper - lower percentile, above which a voxel is not tissue, but a
+        vessel with contrast agent, fat, or a wrong value.
     flat_grey
-        Grey value if the brain is uniform.
+        Grey value of all voxels if the brain has one uniform value.
     """
 
     low_percent: float = 5.0
@@ -45,12 +45,12 @@ class GreyWindow:
 
 
 STORED_WINDOW = GreyWindow(low_grey=0.25, high_grey=0.75)
-"""Window of the file stored with a mesh: it preserves values darker and lighter than nearly all of the brain."""
+"""Window of the file stored with a mesh; it preserves values darker or lighter than nearly all of the brain."""
 
 
 @dataclass(frozen=True, eq=False)
 class Intensity:
-    """Grey values (I, J, K), and the affine (4, 4) from voxel indices to metres in mesh coordinates (RAS)."""
+    """Grey value volume: `values` (I, J, K), and `affine` (4, 4) from voxel indices to mesh coordinates (RAS) [m]."""
 
     values: np.ndarray
     affine: np.ndarray
@@ -62,12 +62,12 @@ class Intensity:
         return ndimage.map_coordinates(self.values, index, order=1, mode="constant", output=np.float64) / 255.0
 
     def crop(self, points: np.ndarray, mesh: TetMesh, margin: float = 0.015) -> Intensity:
-        """Return the part around the box of points (n, 3) [m], with a margin [m], as 8-bit grey by `STORED_WINDOW`.
+        """Return the part of the volume around points (n, 3) [m] with a `margin` [m], as 8-bit grey by `STORED_WINDOW`.
 
         Raises
         ------
         InputError
-            A volume that does not cover the box, or has no finite values in the brain.
+            The volume does not cover the bounding box of the points, or has no finite values in the brain.
         """
         inverse = np.linalg.inv(self.affine)
         index = points @ inverse[:3, :3].T + inverse[:3, 3]
@@ -82,14 +82,14 @@ class Intensity:
         return Intensity(np.rint(255.0 * part.apply_window(mesh, STORED_WINDOW)).astype(np.uint8), affine)
 
     def apply_window(self, mesh: TetMesh, window: GreyWindow = GreyWindow()) -> np.ndarray:
-        """Return the values (I, J, K) float32 in 0 .. 1 by a window on the brain, a mesh in the same coordinates.
+        """Return the values (I, J, K), mapped to 0 .. 1 by a grey value window on the brain `mesh` (same coordinates).
 
         Values that are not finite or far too bright for tissue are replaced by the brain's median.
 
         Raises
         ------
         InputError
-            A volume without finite values in the brain.
+            The volume has no finite values in the brain.
         """
         corners, inverse = mesh.nodes[mesh.tets], np.linalg.inv(self.affine)
         index = np.rint(corners.mean(axis=1) @ inverse[:3, :3].T + inverse[:3, 3])
@@ -121,7 +121,7 @@ def write_intensity(path: str | Path, intensity: Intensity) -> None:
     Raises
     ------
     InputError
-        A folder that is not writable.
+        The folder is not writable.
     """
     with write_atomically(path, ".gz") as partial:
         partial.write_bytes(encode_intensity(intensity))
@@ -138,12 +138,12 @@ def encode_intensity(intensity: Intensity) -> bytes:
 
 
 def read_intensity(path: str | Path, spec: VoxelSpec = DEFAULT_VOXELS) -> Intensity:
-    """Read a grey value volume, from `write_intensity` or a patient's scan.
+    """Read a grey value volume that `write_intensity` wrote, or a scan of a patient. Non-finite voxels are kept.
 
     Raises
     ------
     InputError
-        A file that is missing, unreadable, or not a volume. Non-finite voxels are kept.
+        The file is missing, unreadable, or not a volume.
     """
     volume = read_volume(path, spec, require_finite=False)
     return Intensity(volume.values, volume.affine)

@@ -1,8 +1,8 @@
 """Isosurface stuffing: snap lattice nodes to a zero level set, then split the tetrahedra that still cross it.
 
-Labelle & Shewchuk 2007, "Isosurface Stuffing: Fast Tetrahedral Meshes with Good Dihedral Angles". Applied twice, it
-gives two materials: first for the outer surface, of which the inside is kept, then for the interface, of which
-both sides are kept.
+Labelle & Shewchuk 2007, "Isosurface Stuffing: Fast Tetrahedral Meshes with Good Dihedral Angles". For two materials the
+method is applied twice: at the outer surface, where only the inside is kept, and at the interface, where both sides
+are kept.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ SPLIT_24 = np.array([[0, 1, 2, 4], [0, 4, 2, 5], [0, 4, 5, 3]])
 
 @dataclass(frozen=True)
 class IsosurfaceStuffingOptions:
-    """Snapping thresholds and edge intersection accuracy of `cut_mesh`.
+    """Options of `cut_mesh`: snapping thresholds, and accuracy of edge crossings.
 
     Parameters
     ----------
     snap_long, snap_short
-        Fractions of a long and of a short lattice edge: a crossing nearer to a node than this snaps the node to the
-        surface. Section 4 of the paper: this pair bounds every dihedral angle by 10.7 degrees on an ungraded lattice.
+        Fractions of a long and of a short lattice edge. If a crossing is nearer to a node than this fraction, the node
+        moves to the surface. On an ungraded lattice every dihedral angle exceeds 10.7 degrees (section 4 of the paper).
     snap_other
-        Fraction of an edge that ends at a node of an earlier cut, for which the paper gives no value.
+        Same fraction for an edge that ends at a node of an earlier cut, for which the paper gives no value.
     snap_shortest
-        Maximum snapping distance, as a fraction of the node's shortest edge. Where the lattice changes size, the
-        fraction of a long edge would invert the small tetrahedra next to it.
+        Maximum snapping distance, as a fraction of the shortest edge at the node. Where the cell size changes, the
+        fraction of a long edge could otherwise invert the small tetrahedra at the node.
     bisections
-        Bisection steps per edge: 24 leave an error of 6e-8 of its length.
+        Bisection steps per edge: 24 steps leave an error of 6e-8 of the edge length.
     """
 
     snap_long: float = 0.24999
@@ -65,10 +65,10 @@ class IsosurfaceStuffingOptions:
 
 @dataclass(frozen=True, eq=False)
 class CutMesh:
-    """Tetrahedra that do not cross any surface cut before.
+    """Tetrahedra that do not cross any of the surfaces at which the mesh was cut.
 
-    nodes (V, 3) [m]; kind (V,): CENTRE, CORNER or CUT; tets (T, 4), positively oriented; inside (T,) bool and
-    surface (V,) bool, both with respect to the last cut.
+    `nodes` (V, 3) [m]; `node_kinds` (V,): CENTRE, CORNER or CUT; `tets` (T, 4), positively oriented; `inside` (T,) bool
+    and `on_surface` (V,) bool with respect to the surface of the last cut.
     """
 
     nodes: np.ndarray
@@ -78,7 +78,7 @@ class CutMesh:
     on_surface: np.ndarray
 
     def select(self, mask: np.ndarray) -> CutMesh:
-        """Return the tetrahedra marked in `mask` (T,) and their nodes, renumbered in order."""
+        """Return the mesh of the tetrahedra marked in `mask` (T,); their nodes are renumbered in the same order."""
         used = np.zeros(len(self.nodes), bool)
         used[self.tets[mask]] = True
         tets = (np.cumsum(used) - 1)[self.tets[mask]]
@@ -86,7 +86,7 @@ class CutMesh:
 
 
 def build_uncut_mesh(lattice: Lattice) -> CutMesh:
-    """Return an uncut lattice as pieces, all of it inside."""
+    """Return the mesh of a lattice before the first cut; all tetrahedra are marked as inside."""
     kind, everywhere = np.where(lattice.is_centre, CENTRE, CORNER), np.ones(len(lattice.tets), bool)
     return CutMesh(lattice.nodes, kind, lattice.tets, everywhere, np.zeros(len(kind), bool))
 
@@ -97,9 +97,9 @@ def cut_mesh(
     fixed: np.ndarray | None = None,
     settings: IsosurfaceStuffingOptions = IsosurfaceStuffingOptions(),
 ) -> CutMesh:
-    """Split `mesh` along the zero level set of `field`.
+    """Return `mesh` split along the zero level set of `field`.
 
-    Nodes near the surface are moved onto it; `fixed` nodes (V,) stay in place and count as lying on it.
+    Nodes near the surface are moved onto the surface, except those marked in `fixed` (V,), which count as on it.
     """
     nodes = mesh.nodes.copy()
     values = field(nodes)
@@ -124,7 +124,7 @@ def cut_mesh(
 
 
 def _find_crossed_edges(tets: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return edges (E, 2), smaller node first, whose ends lie strictly on different sides."""
+    """Return edges (E, 2), smaller node number first, whose ends are strictly on different sides of the surface."""
     sides = np.sign(values)[tets]
     crossed = tets[(sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)]
     edges = np.sort(crossed[:, EDGES].reshape(-1, 2), axis=1)
@@ -136,7 +136,7 @@ def _find_crossed_edges(tets: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _find_crossings(
     field: Field, nodes: np.ndarray, edges: np.ndarray, values: np.ndarray, bisections: int
 ) -> np.ndarray:
-    """Return positions (E,) in (0, 1) of the field's zero on each edge, by bisection: the field may be non-smooth."""
+    """Return the position (E,) in (0, 1) of the field's zero on each edge, by bisection."""
     start, along = nodes[edges[:, 0]], nodes[edges[:, 1]] - nodes[edges[:, 0]]
     sign = np.sign(values[edges[:, 0]])
     low, high = np.zeros(len(edges)), np.ones(len(edges))
@@ -148,7 +148,7 @@ def _find_crossings(
 
 
 def _compute_snap_fractions(pieces: CutMesh, edges: np.ndarray, settings: IsosurfaceStuffingOptions) -> np.ndarray:
-    """Return the fraction (E, 2) of each edge within which a crossing snaps either end."""
+    """Return the fraction (E, 2) of each edge, from either end, within which a crossing snaps this end."""
     kinds = pieces.node_kinds[edges]
     share = np.where(kinds[:, 0] == kinds[:, 1], settings.snap_long, settings.snap_short)
     share = np.where((kinds == CUT).any(axis=1), settings.snap_other, share)
@@ -163,9 +163,9 @@ def _compute_lengths(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def _select_snapped_nodes(edges: np.ndarray, at: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes (S,) to move onto the surface, and the edge (S,) whose crossing each moves to.
+    """Return the nodes (S,) to be moved onto the surface, and for each node the edge (S,) whose crossing is its target.
 
-    Closest pairs come first: a moved node removes the crossings of all its edges, so neighbours may not need to move.
+    Closest pairs come first. A moved node removes the crossings of all its edges; its neighbours may then stay.
     """
     node, edge = edges.T.ravel(), np.tile(np.arange(len(edges)), 2)
     share = np.concatenate([at, 1.0 - at])
@@ -181,14 +181,14 @@ def _select_snapped_nodes(edges: np.ndarray, at: np.ndarray, reach: np.ndarray) 
 
 
 def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split tetrahedra at the crossings of `edges`, numbered from len(side); return them and whether each is inside."""
+    """Return tetrahedra split at the crossings of `edges`, and a mask of those inside; crossings follow the nodes."""
     sides = side[tets]
     inner, outer = (sides < 0).sum(axis=1), (sides > 0).sum(axis=1)
     mixed = (inner > 0) & (outer > 0)
     lone, keys = mixed & ((inner == 1) | (outer == 1)), edges[:, 0] * len(side) + edges[:, 1]
 
     def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the node on edge a-b: its crossing, or the end b if that lies on the surface."""
+        """Return the node on edge a-b: the crossing, or the end b if b is on the surface."""
         key = np.minimum(a, b) * len(side) + np.maximum(a, b)
         crossing = np.searchsorted(keys, key) + len(side)
         return np.where(side[b] == 0, b, crossing)
@@ -221,7 +221,7 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
 
 
 def _split_prisms(prisms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return tetrahedra (n, 4) of prisms (P, 6), and the prism (n,) of each; those with a repeated node are dropped."""
+    """Return the tetrahedra (n, 4) of prisms (P, 6), without those that repeat a node, and the prism (n,) of each."""
     turned = np.take_along_axis(prisms, PRISM_ROTATIONS[np.argmin(prisms, axis=1)], axis=1)
     first = turned[:, [1, 5]].min(axis=1) < turned[:, [2, 4]].min(axis=1)
     tets = np.where(first[:, None, None], turned[:, SPLIT_15], turned[:, SPLIT_24]).reshape(-1, 4)

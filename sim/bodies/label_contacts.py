@@ -1,4 +1,4 @@
-"""Contact areas between labels of a volume, and detection of conventions that contradict the anatomy."""
+"""Contact areas between the labels of a volume, and detection of label conventions that contradict the anatomy."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -29,25 +29,25 @@ CONTRADICTION = ContradictionSettings()
 
 @dataclass(frozen=True, eq=False)
 class LabelContacts:
-    """Labels (n,) of a volume including 0, contact areas (n, n) [m^2] between them, and voxel counts (n,)."""
+    """Labels (n,) of a volume including 0, contact areas (n, n) [m^2] between two labels, and voxel counts (n,)."""
 
     labels: np.ndarray
     areas: np.ndarray
     voxels: np.ndarray
 
     def measure_contact(self, labels: Collection[int], others: Collection[int]) -> float:
-        """Return the fraction of the surface of labels `labels` that touches labels `others`; 0 without surface."""
+        """Return the fraction of the surface of `labels` that touches the labels `others`; 0 without a surface."""
         inside, there = np.isin(self.labels, list(labels)), np.isin(self.labels, list(others))
         surface = self.areas[inside][:, ~inside].sum()
         return float(self.areas[inside][:, there & ~inside].sum() / surface) if surface else 0.0
 
     def compute_voxel_fraction(self, labels: Collection[int]) -> float:
-        """Return the voxels of some labels as a fraction of all labelled voxels."""
+        """Return the number of voxels with one of these `labels`, as a fraction of all labelled voxels."""
         return float(self.voxels[np.isin(self.labels, list(labels))].sum() / self.voxels[self.labels != 0].sum())
 
 
 def count_label_contacts(label_map: LabelMap) -> LabelContacts:
-    """Return contacts of the labels in the first layer; faces on the border of the volume do not count."""
+    """Return the contact areas of the labels in the first layer; faces on the border of the volume do not count."""
     layer, affine = label_map.layers[..., 0], label_map.affine[:3, :3]
     (box,) = ndimage.find_objects((layer != 0).astype(np.uint8))
     layer = layer[tuple(slice(max(part.start - 1, 0), part.stop + 1) for part in box)]
@@ -64,16 +64,16 @@ def count_label_contacts(label_map: LabelMap) -> LabelContacts:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Reason why labels do not follow a convention; not `is_certain` if rare tumours show it as well."""
+    """Reason why labels do not follow a convention; `is_certain` is False if rare tumours also cause this reason."""
 
     reason: str
     is_certain: bool = True
 
 
 def find_contradiction(contacts: LabelContacts, convention: Convention) -> Contradiction | None:
-    """Return a contradiction of a convention with the anatomy, or None.
+    """Return a contradiction between a convention and the anatomy, or None.
 
-    Necrosis must lie inside enhancing tumour, oedema and cortex outside. Either may be missing or at the brain surface.
+    Necrosis must be inside the enhancing tumour; oedema and cortex must be outside. Each of them may be missing.
     """
     there = set(contacts.labels.tolist()) - {0}
     known = convention.tumour, convention.oedema, convention.necrosis
@@ -106,9 +106,9 @@ def find_contradiction(contacts: LabelContacts, convention: Convention) -> Contr
 
 
 def build_contradiction_check(label_map: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
-    """Return a function that gives the reason why the anatomy contradicts a convention; empty if it does not.
+    """Return a function of a convention that gives the reason why the anatomy contradicts it; empty without a reason.
 
-    A contradiction that rare tumours show counts against the `chosen` convention only if another convention fits.
+    An uncertain contradiction counts against the `chosen` convention only if another convention fits.
     """
     if label_map.layers.shape[-1] > 1:
         return lambda _: ""

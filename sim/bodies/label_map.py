@@ -1,4 +1,4 @@
-"""Labels of voxels by number or name, and resampling of masks between grids."""
+"""Voxel labels by number or name, and resampling of masks between voxel grids."""
 
 import unicodedata
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from .voxels import DEFAULT_VOXELS, Segment, VoxelGrid, VoxelSpec
 LABEL_TOLERANCE = 1e-3
 
 Label = int | str
-"""Label number, or its name in the file."""
+"""Label, given by its number or by its name in the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +30,11 @@ class LabelMap:
     path
         File path, for error messages.
     layers
-        Labels (I, J, K, L); most files have one layer.
+        Labels (I, J, K, L); in most files the number of layers L is 1.
     affine
         (4, 4) from indices to metres (RAS).
     notes
-        Notes on assumptions.
+        Notes for the user on assumptions made while reading.
     segments
         Named labels, if the file has names.
     """
@@ -47,17 +47,17 @@ class LabelMap:
 
     @cached_property
     def labels_by_layer(self) -> tuple[frozenset[int], ...]:
-        """Labels that occur in each layer, without 0."""
+        """Set of the nonzero labels in each layer."""
         layers = np.moveaxis(self.layers, -1, 0)
         return tuple(frozenset(np.unique(layer.T).astype(int).tolist()) - {0} for layer in layers)
 
     @property
     def labels(self) -> frozenset[int]:
-        """Labels of all layers, without 0."""
+        """Set of the nonzero labels in all layers."""
         return frozenset().union(*self.labels_by_layer)
 
     def mask(self, labels: Sequence[Label]) -> np.ndarray:
-        """Return a mask (I, J, K) of voxels with one of these labels; of any label if the list is empty.
+        """Return a mask (I, J, K) of the voxels with one of these labels or, if `labels` is empty, with any label.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class LabelMap:
         Raises
         ------
         InputError
-            Labels that do not occur, 0, or a number that several layers use.
+            A label does not occur or is 0, or several layers use the same number.
         """
         found = [self._place(label) for label in labels]
         missing = [label for label, at in zip(labels, found, strict=True) if not at]
@@ -101,7 +101,7 @@ class LabelMap:
         return [(one.layer, one.value) for one in alike if one.value in self.labels_by_layer[one.layer]]
 
     def _format_conflict(self, label: Label, at: list[tuple[int, int]]) -> str:
-        """Format the conflict of several segments that match one label, and the remedy."""
+        """Return a message that several segments match one label, with the remedy."""
         if isinstance(label, int):
             names = ", ".join(sorted(one.name for one in self.segments if (one.layer, one.value) in at))
             return f"have the label {label}: name one of {names}"
@@ -122,7 +122,7 @@ def read_labels(path: str | Path, spec: VoxelSpec = DEFAULT_VOXELS) -> LabelMap:
     Raises
     ------
     InputError
-        Input that `read_volume` rejects; values that are not integers, or all 0.
+        `read_volume` rejects the file, or its values are not integers or are all 0.
     """
     volume = read_volume(path, spec, allow_layers=True)
     values, notes = volume.values, volume.notes
@@ -140,19 +140,19 @@ def read_labels(path: str | Path, spec: VoxelSpec = DEFAULT_VOXELS) -> LabelMap:
 
 
 def has_integers(values: np.ndarray) -> bool:
-    """Return True if all values are integers up to the round-off of a scale."""
+    """Return True if all values are integers, up to the round-off of a scale factor in the file."""
     return bool((np.abs(values - np.rint(values)) <= LABEL_TOLERANCE).all())
 
 
 def format_labels(labels: Sequence[Label]) -> str:
-    """Return the first twenty labels, and the total number if there are more."""
+    """Return a text with the first twenty labels and, if there are more, the total number."""
     shown = ", ".join(map(str, labels[:20]))
     return f"{shown}, ... ({len(labels)} in all)" if len(labels) > 20 else shown
 
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """Marked voxels (I, J, K) bool of a file, the affine (4, 4) from their indices to metres (RAS), and notes."""
+    """Mask of a file: `voxels` (I, J, K) bool, `affine` (4, 4) from voxel indices to metres (RAS), and notes."""
 
     path: Path
     voxels: np.ndarray
@@ -161,12 +161,12 @@ class Mask:
 
     @cached_property
     def outline(self) -> np.ndarray:
-        """Points (n, 3) [m] with the convex hull of the marked voxels' centres: the ends of each row of voxels.
+        """First and last marked voxel of each row, as points (n, 3) [m]; same convex hull as all marked voxel centres.
 
         Raises
         ------
         InputError
-            An empty mask.
+            The mask is empty.
         """
         rows = np.argwhere(self.voxels.any(axis=2))
         if not len(rows):
@@ -183,11 +183,11 @@ class Mask:
 
     @property
     def box(self) -> np.ndarray:
-        """Lowest and highest corner (2, 3) [m] of the bounding box (RAS) of the marked voxels' centres."""
+        """Lowest and highest corner (2, 3) [m] of the bounding box (RAS) of the centres of the marked voxels."""
         return np.stack([self.outline.min(axis=0), self.outline.max(axis=0)])
 
     def resample(self, shape: tuple[int, ...], affine: np.ndarray) -> np.ndarray:
-        """Return the mask (I, J, K) resampled to another grid by nearest neighbour."""
+        """Return the mask (I, J, K), resampled to another voxel grid by nearest neighbour."""
         if _is_same_grid(shape, affine, self):
             return self.voxels
         matrix = np.linalg.inv(self.affine) @ affine
@@ -198,14 +198,14 @@ class Mask:
 
 
 def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple[np.ndarray, np.ndarray]:
-    """Return padding (3, 2) [voxels] at both ends of each axis for a grid to hold `other`, and the new affine (4, 4).
+    """Return the padding (3, 2) [voxels] of each axis that a grid needs to contain `other`, and the new affine (4, 4).
 
     If the grids differ, a margin of one voxel is added.
 
     Raises
     ------
     InputError
-        A grid that would exceed `MAX_VOXELS`.
+        The padded grid would exceed `MAX_VOXELS`.
     """
     inverse = np.linalg.inv(affine)
     index = other.outline @ inverse[:3, :3].T + inverse[:3, 3]
@@ -224,10 +224,10 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
 
 
 def _is_same_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> bool:
-    """Return True if the grid is that of the mask."""
+    """Return True if the mask `other` has this grid."""
     return shape == other.voxels.shape and np.allclose(affine, other.affine, rtol=0.0, atol=1e-9)
 
 
 def count_border(mask: np.ndarray) -> int:
-    """Count marked voxels (I, J, K) on the volume's border."""
+    """Return the number of marked voxels on the border of the volume (I, J, K)."""
     return int(mask.sum() - mask[1:-1, 1:-1, 1:-1].sum())

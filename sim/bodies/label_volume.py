@@ -1,4 +1,4 @@
-"""Subject from a label volume: masks of brain and tumour, and the position of the craniotomy."""
+"""Subject built from a label volume: masks of brain and tumour, and position of the craniotomy."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -29,15 +29,15 @@ class MaskSettings:
     Parameters
     ----------
     min_brain_volume, max_brain_volume
-        Volume limits [m^3]: they cover all mammals on which neurosurgery is performed, but not wrong labels or units.
+        Limits of the brain volume [m^3]: brains of all operated mammals pass, but wrong labels or units do not.
     min_tumour_voxels
-        Minimum voxels of a tumour component, to resolve its shape.
+        Minimum number of voxels of a tumour component, so that its shape is resolved.
     min_component_fraction
-        Minimum volume of a component, as a fraction of the tumour; smaller ones are noise.
+        Minimum volume of a component, as a fraction of the tumour volume; smaller components are noise.
     tumour_extension
-        Extension of a tumour beyond the cortex [voxels]; more than the range of `blur`.
+        Distance [voxels] by which a tumour at the cortex is extended outwards; more than the range of `blur`.
     blur
-        Smoothing of both masks.
+        Smoothing of the masks of brain and tumour.
     """
 
     min_brain_volume: float = 20e-6
@@ -55,12 +55,12 @@ def build_volume_subject(
     t1: str | Path | None = None,
     settings: MaskSettings = MaskSettings(),
 ) -> Subject:
-    """Return the subject in an integer label file, given its `brain` and `tumour` labels.
+    """Return the subject in an integer label file, given the labels of brain and tumour.
 
     Raises
     ------
     InputError
-        Input that `read_head_masks` or `build_masked_subject` rejects.
+        `read_head_masks` or `build_masked_subject` rejects the input.
     """
     return build_masked_subject(read_head_masks(MaskSources(to_path(path), tuple(brain), tuple(tumour))), t1, settings)
 
@@ -70,16 +70,16 @@ def build_masked_subject(
 ) -> Subject:
     """Return the subject whose brain and tumour are voxel masks.
 
-    The solid is the largest component of brain and tumour, with holes filled; tumour components outside it are dropped,
-    and each such change is noted. The craniotomy is above the largest of them. `t1` is an intensity volume in the
-    same space. Parts of brain and tumour named in `regions`, of `PART_LABELS`, become separate regions.
+    The solid is the largest component of brain and tumour, with filled holes. Tumour components outside the solid are
+    dropped. Notes report each change. The craniotomy is above the largest tumour component. `t1` is an intensity volume
+    in the same space. Parts of brain and tumour in `regions`, names in `PART_LABELS`, become separate regions.
 
     Raises
     ------
     InputError
-        A region that is unknown or not marked. A T1 that `read_intensity` rejects, or that is evidently LPS declared as
-        RAS. A tumour of which more than half lies outside the brain. By default,
-        a brain of less than 20 ml or more than 5,000 ml, and a tumour of fewer than 27 voxels; see `settings`.
+        A region is unknown or not marked. `read_intensity` rejects the T1, or its LPS coordinates are declared as RAS.
+        More than half of the tumour is outside the brain. The brain volume or the number of tumour voxels is outside
+        the limits in `settings`: by default, 20 to 5,000 ml and at least 27 voxels.
     """
     for name in regions:
         if name not in PART_LABELS or name not in masks.parts:
@@ -112,7 +112,7 @@ def build_masked_subject(
 
 
 def _build_septum(name: str, masks: HeadMasks) -> Septum:
-    """Return the dural sheet that voxels mark."""
+    """Return the dural sheet `name` from its marked voxels."""
     edges = masks.affine[:3, :3]
     points = np.argwhere(masks.parts[name]) @ edges.T + masks.affine[:3, 3]
     return Septum(name, points, 0.5 * float(np.sqrt((edges**2).sum())))
@@ -121,7 +121,7 @@ def _build_septum(name: str, masks: HeadMasks) -> Septum:
 def _build_parts(
     masks: HeadMasks, solid: np.ndarray, tumour: np.ndarray, regions: Sequence[str], settings: MaskSettings
 ) -> tuple[SubjectPart, ...]:
-    """Return the parts that become regions; each volume counts only voxels that the mesh will assign to it."""
+    """Return the parts that become regions; the volume of a part includes only voxels that are not in a later part."""
     voxel, parts = abs(float(np.linalg.det(masks.affine[:3, :3]))), []
     taken = np.zeros_like(solid)
     for name in reversed(regions):  # if two regions overlap, the later one has priority
@@ -133,12 +133,12 @@ def _build_parts(
 
 
 def fill_brain(masks: HeadMasks, notes: list[str], settings: MaskSettings = MaskSettings()) -> np.ndarray:
-    """Return the mask (I, J, K) of a head's brain and tumour as one component without holes; changes are noted.
+    """Return the mask (I, J, K) of brain and tumour as one component without holes; append changes to `notes`.
 
     Raises
     ------
     InputError
-        A brain volume outside the limits of `settings`.
+        The brain volume is outside the limits in `settings`.
     """
     voxel = abs(float(np.linalg.det(masks.affine[:3, :3])))
     solid = _extract_brain(masks.brain, masks.tumour, voxel, notes)
@@ -158,7 +158,7 @@ def fill_brain(masks: HeadMasks, notes: list[str], settings: MaskSettings = Mask
 
 
 def _extract_brain(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
-    """Return the component of brain or tumour with most of the brain, its holes filled."""
+    """Return the component of the union of brain and tumour that contains most of the brain, with filled holes."""
     component, _ = cast(tuple[np.ndarray, int], ndimage.label(brain | tumour))
     solid = component == np.bincount(component[brain]).argmax()
     lost = int((brain & ~solid).sum())
@@ -174,7 +174,7 @@ def _extract_brain(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: l
 def _extract_tumour(
     name: str, solid: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str], settings: MaskSettings
 ) -> np.ndarray:
-    """Return the tumour's components in the solid, without specks."""
+    """Return the mask of the tumour components in the solid, without components that are too small."""
     inside = tumour & solid
     if not inside.any():
         raise InputError(f"{name}: the tumour lies outside the brain. Check the labels given as brain and as tumour.")
@@ -202,9 +202,9 @@ def _extract_tumour(
 
 
 def _extend_tumour(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
-    """Return the tumour extended outside the brain by up to `by` voxels whose nearest brain voxel is tumour.
+    """Return the tumour with the voxels, up to `by` voxels outside the brain, whose nearest brain voxel is tumour.
 
-    The field of a tumour at the cortex then crosses the cortex instead of touching it.
+    The tumour's level set then crosses the cortex instead of touching the cortex.
     """
     (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(tumour.astype(np.uint8)))
     wide = tuple(slice(max(part.start - by, 0), part.stop + by) for part in box)
@@ -217,7 +217,7 @@ def _extend_tumour(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray
 
 
 def _list_pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[TumourPiece, ...]:
-    """Return the tumour's connected components, the largest first; the centre is the mean of the surface voxels."""
+    """Return the connected components of the tumour, largest first; the centre is the mean of the boundary voxels."""
     component, count = cast(tuple[np.ndarray, int], ndimage.label(tumour, np.ones((3, 3, 3))))
     voxel, pieces = abs(float(np.linalg.det(affine[:3, :3]))), []
     for number in range(1, count + 1):

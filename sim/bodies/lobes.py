@@ -1,4 +1,4 @@
-"""Side and lobe of a tumour, from its place in the proportions of the brain."""
+"""Side and lobe of a tumour, from its relative position in the brain."""
 
 import numpy as np
 
@@ -15,14 +15,14 @@ LOBES = {
     "insular": ((35, 7, 3),),
     "deep": ((11, 11, 9), (24, 4, 2), (11, -18, 8)),
 }
-"""Centroids of gyri and nuclei, left and right alike: MNI [mm], without sign of x (Tzourio-Mazoyer et al. 2002)."""
+"""Centroids of gyri and nuclei by lobe, for both sides: MNI [mm] with x > 0 (Tzourio-Mazoyer et al. 2002)."""
 
 
 def describe_location(anatomy: Anatomy) -> str:
-    """Describe the side and the approximate lobe of an anatomy's tumour, as "right parietal".
+    """Return the side and the approximate lobe of the tumour of an anatomy, such as "right parietal".
 
-    The brain is scaled by its length; the nearest of the reference points names the lobe. Displaced or infiltrated
-    gyri are not recognised: the lobe is a guide for people, not a measurement.
+    Coordinates are scaled by the length of the brain, and the nearest point in `LOBES` gives the lobe. Displaced or
+    infiltrated gyri are not recognised, so the lobe is a rough description, not a measurement.
     """
     nodes = anatomy.mesh.nodes
     low, high = nodes.min(axis=0), nodes.max(axis=0)

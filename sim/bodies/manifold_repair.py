@@ -1,4 +1,4 @@
-"""Removal of tetrahedra so that a mesh is one component with a 2-manifold surface."""
+"""Removal of tetrahedra until a mesh is one component with a 2-manifold surface."""
 
 import numpy as np
 from scipy.sparse import coo_array, csgraph
@@ -19,7 +19,7 @@ def find_largest_component(tets: np.ndarray) -> np.ndarray:
 
 
 def select_manifold(tets: np.ndarray) -> np.ndarray:
-    """Return a mask (T,) of tetrahedra to keep, so that they are one component with a 2-manifold surface.
+    """Return a mask (T,) of tetrahedra to keep; these form one component with a 2-manifold surface.
 
     The surface touches itself at an edge of more than two triangles, or at a node with more than one triangle fan. The
     tetrahedra behind these triangles are removed, except those behind the node's largest fan.
@@ -34,7 +34,7 @@ def select_manifold(tets: np.ndarray) -> np.ndarray:
 
 
 def _find_pinching_tets(tets: np.ndarray) -> np.ndarray:
-    """Return indices of the tetrahedra behind every surface fan except the largest at its node."""
+    """Return the indices of the tetrahedra behind all triangle fans of a node except its largest fan."""
     faces = tets[:, FACES].reshape(-1, 3)
     _, first, count = np.unique(compute_row_keys(faces), return_index=True, return_counts=True)
     outer = np.sort(first[count == 1])
@@ -61,8 +61,8 @@ def _find_pinching_tets(tets: np.ndarray) -> np.ndarray:
 def find_removable_tetrahedra(tets: np.ndarray, candidates: np.ndarray) -> np.ndarray:
     """Return a mask of the `candidates` tetrahedra (T,) whose removal leaves the surface a 2-manifold.
 
-    This holds for three faces on the surface, or two if the edge between the other two faces is an interior
-    edge; of tetrahedra that share a node only one is removed.
+    A tetrahedron is removable if three of its faces are on the surface, or two faces if the edge between the other two
+    faces is an interior edge. Only one of several tetrahedra that share a node is selected.
     """
     faces = tets[:, FACES].reshape(-1, 3)
     _, number, count = np.unique(compute_row_keys(faces), return_inverse=True, return_counts=True)

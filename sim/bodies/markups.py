@@ -14,9 +14,9 @@ from ..runtime.file_limits import MAX_COORDINATE
 from ..runtime.outside_files import to_path, wrap_errors
 
 SIGNS = {"LPS": (-1.0, -1.0, 1.0), "RAS": (1.0, 1.0, 1.0)}
-"""Sign of each coordinate in the conversion to RAS. Slicer writes LPS, the default of its files."""
+"""Sign of each coordinate in the conversion to RAS, by coordinate system; the default of Slicer files is LPS."""
 NUMBERED = {"0": "RAS", "1": "LPS"}
-"""Codes of the coordinate system in older files."""
+"""Coordinate system by its code in older files."""
 REMEDY = "Save a point, a line or a closed curve from 3D Slicer's Markups."
 MAX_FILE_SIZE = 2**22  # maximum file size [bytes]
 MAX_POINTS = 5000  # maximum points of a markup
@@ -28,19 +28,19 @@ DEFINED = "2"  # position status of a placed point
 
 @dataclass(frozen=True, eq=False)
 class Markup:
-    """Markup of a file: its kind as named by Slicer, and its placed points (n, 3) [m, RAS]."""
+    """Markup of a file: its kind as named by Slicer, and its defined points (n, 3) [m, RAS]."""
 
     path: Path
     kind: str
     points: np.ndarray
 
     def fit_curve(self) -> np.ndarray:
-        """Sample points (256, 3) [m] of the smooth closed curve through the points of a `ClosedCurve`.
+        """Return 256 points (256, 3) [m] on the smooth closed curve through the points of a `ClosedCurve`.
 
         Raises
         ------
         InputError
-            Fewer than three points, or coincident consecutive points.
+            There are fewer than three points, or two consecutive points coincide.
         """
         points = np.concatenate([self.points, self.points[:1]])
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -57,8 +57,8 @@ def read_markup(path: str | Path) -> Markup:
     Raises
     ------
     InputError
-        A file that is not a markup file, or has several markups. Units other than mm, a coordinate system other than
-        LPS or RAS. No placed points, or coordinates that are not finite.
+        The file is not a markup file or has several markups. The unit is not mm, or the coordinate system is neither
+        LPS nor RAS. No point is defined, or a coordinate is not finite.
     """
     path = to_path(path)
     with wrap_errors(path, "markups of 3D Slicer", REMEDY):
@@ -80,7 +80,7 @@ def read_markup(path: str | Path) -> Markup:
 
 
 def _parse_json(text: str) -> tuple[str, str, list[list[float]]]:
-    """Parse kind, coordinate system, and placed points [mm] of the only markup in a `.mrk.json` file."""
+    """Return the kind, the coordinate system and the defined points [mm] of the only markup in a `.mrk.json` file."""
     markups = json.loads(text)["markups"]
     if len(markups) != 1:
         raise InputError(f"has {len(markups)} markups; only one is supported. Save each in a separate file.")
@@ -94,10 +94,10 @@ def _parse_json(text: str) -> tuple[str, str, list[list[float]]]:
 
 
 def _parse_fcsv(text: str) -> tuple[str, str, list[list[float]]]:
-    """Parse kind, coordinate system (empty if not given), and placed points [mm] of a `.fcsv` file.
+    """Return the kind, the coordinate system (empty if not given) and the defined points [mm] of a `.fcsv` file.
 
-    Its columns are id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID, and in Slicer 5 the position
-    status, before which Slicer for Windows writes a carriage return.
+    The columns are id,x,y,z,ow,ox,oy,oz,vis,sel,lock,label,desc,associatedNodeID. Slicer 5 adds the position status;
+    Slicer for Windows writes a carriage return before this status.
     """
     stated = re.search(r"^# *CoordinateSystem *= *(\w+)", text, re.MULTILINE)
     lines = (line for line in text.replace("\r", "").split("\n") if line.strip() and not line.startswith("#"))

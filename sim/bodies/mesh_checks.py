@@ -1,4 +1,4 @@
-"""Checks and regions of a given tetrahedral mesh: one conforming body without overlaps."""
+"""Checks that a given tetrahedral mesh is conforming and without overlaps, and its regions."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -24,16 +24,16 @@ MIN_INSIDE_WEIGHT = 1e-3
 # Maximum number of nodes and centroids tested for overlap: enough to detect an overlap of 0.1 % of the volume.
 MAX_PROBES = 2**13
 SPELLINGS = {"tumor": "tumour", "edema": "oedema", "ventricle": "ventricles", **{name: name for name in REGION_NAMES}}
-"""Region names by alternative spelling."""
+"""Region names, by alternative spelling in lower case."""
 
 
 def check_cell_types(mesh: Any, supported: set[str]) -> None:
-    """Reject a mesh that has volume cells of types other than `supported`.
+    """Reject a mesh with volume cells whose type is not in `supported`.
 
     Raises
     ------
     InputError
-        With the names of these types.
+        A type is not supported; the message lists all such types.
     """
     others = {block.type for block in mesh.cells if block.type.startswith(VOLUMES)} - supported
     if others and supported:
@@ -46,12 +46,12 @@ def check_cell_types(mesh: Any, supported: set[str]) -> None:
 def merge_nodes(
     points: np.ndarray, cells: np.ndarray, data: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], int]:
-    """Return points (V, 3), cells (T, n) and point data with coincident nodes merged, and the number of removed nodes.
+    """Merge coincident nodes; return points (V, 3), cells (T, n), point data, and the number of removed nodes.
 
     Raises
     ------
     InputError
-        Coincident nodes with different data.
+        Coincident nodes have different point data.
     """
     used = np.unique(cells)
     whole = used[0] >= 0 and used[-1] < len(points)  # invalid node numbers are rejected with the mesh
@@ -81,7 +81,7 @@ def check_overlaps(points: np.ndarray, tets: np.ndarray) -> None:
     Raises
     ------
     InputError
-        With the number of duplicates, faces or points.
+        Tetrahedra are duplicate or overlap; the message gives the number of duplicates, faces or points concerned.
     """
     faces = tets[:, FACES].reshape(-1, 3)
     turn = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3
@@ -115,7 +115,7 @@ def note_components(mesh: TetMesh) -> tuple[str, ...]:
 
 
 def _count_overlaps(points: np.ndarray, tets: np.ndarray) -> int:
-    """Count nodes and centroids of tetrahedra (T, 4), at most `MAX_PROBES`, that lie inside another tetrahedron."""
+    """Return the number of probes, at most `MAX_PROBES` nodes and centroids, that are inside another tetrahedron."""
     corners = points[tets]
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
@@ -131,14 +131,14 @@ def _count_overlaps(points: np.ndarray, tets: np.ndarray) -> int:
 
 
 def collect_regions(mesh: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the region (T,) of each tetrahedron in the given cell blocks, and a note if it is not cell data `region`.
+    """Return the regions (T,) of the tetrahedra in the cell `blocks`, and a note if there is no cell data `region`.
 
-    Without such data, regions are the only integer cell array that varies, or the cell sets.
+    Without cell data `region`, the regions are the only integer cell array that partitions the cells, or the cell sets.
 
     Raises
     ------
     InputError
-        `region` that is not one integer per tetrahedron, several arrays that differ, or sets that overlap.
+        `region` is not one integer per tetrahedron, several possible arrays differ, or cell sets overlap.
     """
     if "region" in mesh.cell_data:
         region = _to_integers(np.concatenate([mesh.cell_data["region"][number] for number in blocks]))
@@ -164,7 +164,7 @@ def collect_regions(mesh: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str
 
 
 def _is_partition(values: np.ndarray) -> bool:
-    """Return True if integers (T,) partition the cells rather than number them."""
+    """Return True if integers (T,) form at least two groups of cells and are not merely cell numbers."""
     count = len(np.unique(values))
     return count > 1 and (count < len(values) or count <= MAX_ONE_CELL_REGIONS)
 
@@ -179,7 +179,7 @@ def _to_integers(values: np.ndarray) -> np.ndarray | None:
 
 
 def _from_sets(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return regions from the named cell sets of a file; all 0 if no set divides the body."""
+    """Return the regions (T,) by the named cell sets of a file, or 0 if no set divides the mesh, and a note."""
     marked, total = {}, sum(len(raw.cells[number].data) for number in blocks)
     for name, on in raw.cell_sets.items():
         masks = [np.zeros(len(raw.cells[number].data), bool) for number in blocks]
@@ -200,9 +200,9 @@ def _from_sets(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]
 def _match_group_names(
     region: np.ndarray, names: Mapping[int, str], said: str, free: bool = False
 ) -> tuple[np.ndarray, tuple[str]]:
-    """Return regions renumbered to match the group `names`, and a note; `free` numbers are not from the file.
+    """Return the regions (T,), renumbered to match the group `names`, and a note.
 
-    Without contradiction between numbers and known names, numbers of the file are kept.
+    Numbers from the file are kept if they do not contradict a known name; `free` numbers are not from the file.
     """
     known = {number: SPELLINGS.get(names.get(number, "").strip().lower()) for number in np.unique(region).tolist()}
     wrong = [number for number, name in known.items() if name and REGION_NAMES[name] != number]

@@ -1,4 +1,4 @@
-"""Checks for mesh files with external references or oversized arrays, before a library opens them."""
+"""Checks that a mesh file has no external references and no oversized arrays, before a library opens the file."""
 
 from pathlib import Path
 from xml.etree import ElementTree
@@ -15,12 +15,12 @@ SUFFIXES = (
 
 
 def check_mesh_references(path: Path, limits: MeshSizeLimits) -> None:
-    """Reject formats other than `SUFFIXES`, numbers outside the file or its folder, and HDF5 beyond the limits.
+    """Reject files with a suffix not in `SUFFIXES`, with data outside their folder, or with HDF5 data beyond `limits`.
 
     Raises
     ------
     InputError
-        With the reference or the limit.
+        The file is rejected; the message gives the reference or the limit.
     """
     import h5py  # optional dependency, like meshio
 
@@ -36,12 +36,12 @@ def check_mesh_references(path: Path, limits: MeshSizeLimits) -> None:
 
 
 def check_hdf5_storage(path: Path, limits: MeshSizeLimits) -> None:
-    """Reject HDF5 files with external references, or with arrays larger than the limit or than the stored bytes.
+    """Reject HDF5 files with external references, or with arrays larger than the limit or the stored data.
 
     Raises
     ------
     InputError
-        With the array or the link.
+        The file is rejected; the message gives the array or the link.
     """
     import h5py
 
@@ -74,7 +74,7 @@ def check_hdf5_storage(path: Path, limits: MeshSizeLimits) -> None:
 
 
 def _find_references(path: Path) -> set[Path]:
-    """Return the HDF5 files, in the same folder, that an XDMF file refers to."""
+    """Return the paths of the HDF5 files in the same folder to which an XDMF file refers."""
     folder, named = path.resolve().parent, set()
     for item in ElementTree.parse(path).iter():
         kind = item.get("Format")

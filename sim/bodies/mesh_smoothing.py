@@ -1,4 +1,4 @@
-"""Node relocation in a stuffed mesh: fit surfaces to level sets and improve dihedral angles."""
+"""Relocation of nodes after isosurface stuffing, to fit surfaces to level sets and to improve dihedral angles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from ..geometry.tetmesh import EDGES, FACES
 from .signed_distance import Field, project_onto_level
 
 Projection = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Function of desired points (n, 3) [m] and their nodes (n,) that returns the nearest admissible points (n, 3)."""
+"""Function that returns the admissible points (n, 3) [m] nearest to given points (n, 3) [m] of the nodes (n,)."""
 
 # The two faces that meet at each edge of a tetrahedron (face k is opposite corner k).
 EDGE_FACES = np.array([[2, 3], [1, 3], [1, 2], [0, 3], [0, 2], [0, 1]])
@@ -20,18 +20,18 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 @dataclass(frozen=True)
 class Smoothing:
-    """Limits of node moves for surface fitting and angle improvement.
+    """Limits of the node moves that fit surfaces and improve angles.
 
     Parameters
     ----------
     good_angle
-        Tetrahedra with a dihedral angle below it or above 180 less it are bad, and their nodes are moved [degrees].
+        Tetrahedra are bad if a dihedral angle is below `good_angle` or above 180 - `good_angle` [degrees].
     max_iterations
         Maximum number of iterations.
     max_shift
-        Maximum distance of a node from its surface for a better fit [m]: half a voxel, the resolution of the image.
+        Maximum distance of a node from its surface to improve the fit [m]: half a voxel, the image resolution.
     first_step, min_step
-        Fractions of the shortest edge at a node: initial step, and minimum step below which the node is not moved.
+        Initial step and minimum step, as fractions of the shortest edge at a node; smaller moves are not tried.
     """
 
     good_angle: float = 18.0
@@ -49,7 +49,7 @@ class Smoothing:
 def compute_smallest_sines(corners: np.ndarray) -> np.ndarray:
     """Return the smallest sine (...,) of the dihedral angles of each tetrahedron in `corners` (..., 4, 3).
 
-    Negative for inverted tetrahedra; small for angles near 0 and near 180 degrees (Klingner & Shewchuk 2007).
+    The sine is negative for inverted tetrahedra, and small near 0 and 180 degrees (Klingner & Shewchuk 2007).
     """
     faces = corners[..., FACES, :]
     normals = np.cross(faces[..., 1, :] - faces[..., 0, :], faces[..., 2, :] - faces[..., 0, :])
@@ -68,11 +68,11 @@ def fit_nodes(
     volume: float | None = None,
     settings: Smoothing = Smoothing(),
 ) -> np.ndarray:
-    """Return nodes (V, 3) [m] with `movable` ones (V,) moved so that the closed surface of triangles (S, 3) fits best.
+    """Return nodes (V, 3) [m], of which `movable` ones are moved to fit the closed surface `triangles` to `field`.
 
-    With its nodes on a curved surface, a triangle lies on the concave side. Each node moves by the mean deviation of
-    its triangles. A deviation that vanishes at the corners of a triangle and is quadratic between them has a mean of
-    3/4 of its centre value. If a `volume` [m^3] is given, a uniform shift corrects the enclosed volume.
+    A triangle with its corners on a curved surface is on the concave side. Each node therefore moves by the mean
+    deviation of its triangles. The mean is 3/4 of the value at the centroid, since the deviation is quadratic and zero
+    at the corners. If a `volume` [m^3] is given, a uniform shift corrects the enclosed volume.
     """
     on = np.unique(triangles)
     on = on[movable[on]]
@@ -98,7 +98,7 @@ def fit_nodes(
 
 
 def prevent_folds(nodes: np.ndarray, new_nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Return the nodes `new_nodes` (V, 3) [m], except at tetrahedra that this would invert: there they keep `nodes`."""
+    """Return `new_nodes` (V, 3) [m], but `nodes` at the corners of tetrahedra that the new positions would invert."""
     kept = new_nodes.copy()
     while True:
         folded = np.unique(tets[compute_smallest_sines(kept[tets]) <= 0.0])
@@ -122,10 +122,10 @@ def _compute_centres_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tupl
 def improve_mesh(
     nodes: np.ndarray, tets: np.ndarray, project: Projection, settings: Smoothing = Smoothing()
 ) -> np.ndarray:
-    """Return nodes (V, 3) [m] moved until every dihedral angle is good or no bad one improves further.
+    """Return nodes (V, 3) [m], moved until all dihedral angles are good or no bad angle improves any more.
 
-    Each iteration moves a set of nodes of bad tetrahedra, no two in one tetrahedron. Each node tries 26 steps and takes
-    the one with the smallest sum of squared angle deficits around it.
+    Each iteration moves nodes of bad tetrahedra, at most one per tetrahedron. Each node tries 26 steps and takes the
+    step with the smallest sum of squared angle deficits in the adjacent tetrahedra.
     """
     nodes, good = nodes.copy(), settings.good_sine
     order = np.argsort(tets, axis=None, kind="stable")
@@ -164,7 +164,7 @@ def improve_mesh(
 
 
 def _select_independent_nodes(tets: np.ndarray, sines: np.ndarray, step: np.ndarray, settings: Smoothing) -> np.ndarray:
-    """Return nodes of bad tetrahedra that may still move, worst first, no two in one tetrahedron."""
+    """Return the nodes of bad tetrahedra that may still move: worst first, at most one per tetrahedron."""
     bad, worst = np.flatnonzero(sines < settings.good_sine), np.full(len(step), np.inf)
     np.minimum.at(worst, tets[bad].ravel(), np.repeat(sines[bad], 4))
     worst[step < settings.min_step] = np.inf
@@ -176,5 +176,5 @@ def _select_independent_nodes(tets: np.ndarray, sines: np.ndarray, step: np.ndar
 
 
 def _compute_penalties(sines: np.ndarray, good: float) -> np.ndarray:
-    """Return the squared deficit of the sines, the objective of node moves; squaring emphasises the worst angles."""
+    """Return the squared deficits of the sines, the objective of node moves; squares emphasise the worst angles."""
     return np.maximum(good - sines, 0.0) ** 2

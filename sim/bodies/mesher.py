@@ -18,42 +18,42 @@ from .placement import TumourPiece
 from .signed_distance import Field, project_onto_level
 
 INTRICATE = "the surfaces are too intricate", "smooth the labels"
-"""Reason why a mesh does not resolve a solid, and remedy other than more nodes."""
+"""Reason why no number of nodes resolves a solid, and remedy."""
 # Message if a solid has no tetrahedra.
 TOO_COARSE = "so few nodes do not show the brain or the tumour: ask for more nodes, or check the labels."
 
 
 @dataclass(frozen=True)
 class Meshing:
-    """Mesh size, search for the number of nodes, and quality improvement.
+    """Options for mesh size, for the search for the number of nodes, and for quality improvement.
 
     Parameters
     ----------
     tolerance, max_deviation
-        Relative deviations from the requested number of nodes: the search ends within the first, fails beyond the last.
+        Relative deviations from the requested number of nodes: the search ends below the first, fails above the second.
     max_trials
-        Maximum number of lattices in the search.
+        Maximum number of lattices that the search builds.
     fine_ratio
-        Cell size at the tumour and the craniotomy, as a fraction of the coarsest: the regions of interest.
+        Cell size at the tumour and the craniotomy, the regions of interest, as a fraction of the coarsest cell size.
     cells_per_radius
-        Minimum cells per tumour radius, to resolve its shape.
+        Minimum number of cells per tumour radius, to resolve the tumour's shape.
     edge_growth
-        Growth of the cell edge per distance from those regions.
+        Growth of the cell edge per distance from the regions of interest.
     rounding
         Cells up to this factor above the requested size are not halved, so that sizes are correct on average.
     max_halvings
-        Maximum halvings of the coarsest cell: limits the lattice around a very small tumour.
+        Maximum number of halvings of the coarsest cell, which limits the lattice around a very small tumour.
     surface_tolerances
-        Allowed distances of nodes from their surface for better angles, one per attempt [m].
+        Maximum distance of nodes from their surface while angles are improved [m], for each attempt.
     max_volume_error
-        Maximum relative error of the tumour volume. Manual outlines of one glioma agree less: Dice 74 to 85 %,
-        Menze et al. 2015.
+        Maximum relative error of the tumour volume. Manual outlines of the same glioma differ more: Dice 74 to 85 %
+        (Menze et al. 2015).
     min_meshed_fraction
-        A piece of the tumour is lost if the mesh contains less than this fraction of its volume.
+        A tumour piece counts as lost if the mesh contains less than this fraction of its volume.
     factors
-        Factors of the number of nodes, tried only to recommend a sufficient number.
+        Multiples of the number of nodes that are tried after a failure, to recommend a sufficient number.
     stuffing, smoothing
-        Options of the cuts, and of the subsequent node moves.
+        Options of isosurface stuffing, and of the node moves that follow.
     """
 
     tolerance: float = 0.03
@@ -79,15 +79,15 @@ class Solids:
     Parameters
     ----------
     brain, tumour
-        Fields of the whole solid (brain and tumour together) and of the tumour.
+        Level sets of the whole solid (brain and tumour together) and of the tumour.
     low, high
         Corners (3,) [m] of a bounding box of the solid.
     tumour_volume
-        Prescribed volume [m^3], matched as far as the nodes allow, less pieces that the mesh does not resolve.
+        Prescribed tumour volume [m^3], without pieces that the mesh does not resolve; matched as far as possible.
     interface, opening
         Points (n, 3) [m] on the tumour's surface and on the cortex to be exposed, where the mesh is refined.
     pieces
-        Pieces of the tumour, if several.
+        Connected components of the tumour, if there are several.
     """
 
     brain: Field
@@ -101,13 +101,13 @@ class Solids:
 
 
 def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> TetMesh:
-    """Return the mesh of `solids` with `count` nodes, to within 10 % and mostly 3 % by default.
+    """Return the mesh of `solids` with `count` nodes; by default the deviation is at most 10 %, and mostly below 3 %.
 
     Raises
     ------
     InputError
-        A solid or tumour volume that this number of nodes cannot resolve, with a sufficient number if up to 2.5 times
-        as many suffice. A count that the search for a lattice size does not reach.
+        The nodes do not resolve the solid or the tumour volume; the message gives a sufficient number if 2.5 times as
+        many nodes or fewer suffice. The search for a lattice size does not reach the number of nodes.
     """
     mesh = _build_mesh_or_reason(solids, count, settings)
     if isinstance(mesh, TetMesh):
@@ -118,7 +118,7 @@ def build_mesh(solids: Solids, count: int, settings: Meshing = Meshing()) -> Tet
 def build_count_error(
     count: int, why: tuple[str, str], factors: Sequence[float], is_sufficient: Callable[[int], bool]
 ) -> InputError:
-    """Build the error if `count` nodes do not resolve a solid, with the first of `factors` that `is_sufficient`."""
+    """Return the error that `count` nodes do not resolve a solid, with the first sufficient multiple in `factors`."""
     reason, remedy = why
     numbers = (int(round(count * times, -2)) for times in factors)
     enough = next(filter(is_sufficient, numbers), None)
@@ -128,7 +128,7 @@ def build_count_error(
 def find_lost_pieces(
     pieces: Sequence[TumourPiece], nodes: np.ndarray, tets: np.ndarray, settings: Meshing = Meshing()
 ) -> list[bool]:
-    """Return True for each tumour piece that the tetrahedra (T, 4), assigned by nearest surface, do not resolve."""
+    """Return True for each tumour piece that its tetrahedra, those in `tets` nearest to its surface, do not resolve."""
     if len(pieces) < 2:
         return [False for _ in pieces]
     owner = np.repeat(np.arange(len(pieces)), [len(piece.surface) for piece in pieces])
@@ -139,7 +139,7 @@ def find_lost_pieces(
 
 
 def describe_lost_pieces(pieces: Sequence[TumourPiece], is_lost: Sequence[bool]) -> str:
-    """Format the number of lost pieces and their total volume."""
+    """Return a text with the number of lost pieces and their total volume."""
     volume = sum(piece.volume for piece, missing in zip(pieces, is_lost, strict=True) if missing)
     return f"{sum(is_lost)} of the tumour's {len(pieces)} pieces, {1e6 * volume:.2g} ml in all"
 
@@ -152,7 +152,7 @@ def _can_build_mesh(solids: Solids, count: int, settings: Meshing) -> bool:
 
 
 def _build_mesh_or_reason(solids: Solids, count: int, settings: Meshing) -> TetMesh | tuple[str, str]:
-    """Return the mesh with `count` nodes, or reason and remedy if it fails. Raises as `build_mesh`."""
+    """Return the mesh with `count` nodes or, on failure, the reason and the remedy; errors as in `build_mesh`."""
     volume = float(np.prod(solids.high - solids.low))
     edge, best = (volume / count) ** (1.0 / 3.0), None
     for _ in range(settings.max_trials):
@@ -170,7 +170,7 @@ def _build_mesh_or_reason(solids: Solids, count: int, settings: Meshing) -> TetM
 
 
 def cut_lattice(solids: Solids, max_edge: float, settings: Meshing = Meshing()) -> CutMesh:
-    """Return the solid on a lattice with coarsest cell `max_edge` [m], split along the tumour's surface."""
+    """Return the solid, cut from a lattice with coarsest cell `max_edge` [m] and split along the tumour's surface."""
     radius = (0.75 / np.pi * solids.tumour_volume) ** (1.0 / 3.0)
     fine, growth = settings.fine_ratio * max_edge, settings.edge_growth
     wanted = ((KDTree(solids.interface), min(fine, radius / settings.cells_per_radius)), (KDTree(solids.opening), fine))
@@ -191,7 +191,7 @@ def cut_lattice(solids: Solids, max_edge: float, settings: Meshing = Meshing()) 
 
 
 def _fit_mesh_or_reason(solids: Solids, pieces: CutMesh, settings: Meshing) -> TetMesh | tuple[str, str]:
-    """Return the fitted and improved mesh, on failure retried without inverting moves; else reason and remedy."""
+    """Return the fitted and improved mesh, or reason and remedy; a failed fit is repeated without moves that invert."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
     lost = find_lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)
@@ -211,9 +211,9 @@ def _fit_mesh_or_reason(solids: Solids, pieces: CutMesh, settings: Meshing) -> T
 
 
 def _fit_to_surfaces(solids: Solids, pieces: CutMesh, volume: float, settings: Meshing, fold: bool) -> CutMesh:
-    """Fit nodes to the outer surface, then to the tumour's with a `volume` [m^3]; return the updated pieces.
+    """Return `pieces` with nodes fitted to the outer surface, then to the tumour's surface with `volume` [m^3].
 
-    Unless `fold`, nodes keep their position where a tetrahedron would be inverted.
+    If `fold` is False, nodes keep their position where a tetrahedron would be inverted.
     """
     (surface, _), smoothing = _mark_surfaces(pieces), settings.smoothing
     outer, inner = find_boundary_faces(pieces.tets), find_boundary_faces(pieces.tets[pieces.inside])
@@ -224,7 +224,7 @@ def _fit_to_surfaces(solids: Solids, pieces: CutMesh, volume: float, settings: M
 
 
 def _improve_pieces(solids: Solids, pieces: CutMesh, settings: Meshing) -> CutMesh:
-    """Remove flat tetrahedra on the surfaces and improve bad angles."""
+    """Return `pieces` without flat tetrahedra on the surfaces, and with improved angles."""
     for slack in settings.surface_tolerances:
         bad = compute_smallest_sines(pieces.nodes[pieces.tets]) < settings.smoothing.good_sine
         pieces = pieces.select(~find_removable_tetrahedra(pieces.tets, bad))
@@ -234,7 +234,7 @@ def _improve_pieces(solids: Solids, pieces: CutMesh, settings: Meshing) -> CutMe
 
 
 def _mark_surfaces(pieces: CutMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return two masks (V,): nodes on the outer surface, and nodes on the tumour's surface."""
+    """Return two masks (V,): nodes on the outer surface, and nodes on the surface of the tumour."""
     marks = np.zeros((2, len(pieces.nodes)), bool)
     marks[0, find_boundary_faces(pieces.tets)] = True
     marks[1, find_boundary_faces(pieces.tets[pieces.inside])] = True
@@ -242,7 +242,7 @@ def _mark_surfaces(pieces: CutMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _build_projection(solids: Solids, pieces: CutMesh, slack: float) -> Projection:
-    """Return a function that keeps each surface node within `slack` [m] of its current level of the fields."""
+    """Return a projection that keeps the level set value of each surface node within `slack` [m] of its current one."""
     surface, interface = _mark_surfaces(pieces)
     interface[np.setdiff1d(pieces.tets[pieces.inside], pieces.tets[~pieces.inside])] = False  # tumour cortex
     levels = solids.brain(pieces.nodes), solids.tumour(pieces.nodes)
@@ -261,7 +261,7 @@ def _build_projection(solids: Solids, pieces: CutMesh, slack: float) -> Projecti
 
 
 def compute_surface_errors(nodes: np.ndarray, triangles: np.ndarray, field: Field) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances (15 S,) [m] of points on triangles (S, 3) from a field's surface, and their area weights."""
+    """Return distances (15 S,) [m] from a field's surface at 15 points per triangle (S, 3), and their area weights."""
     spread = np.array([(i, j, 12 - i - j) for i in range(1, 12, 2) for j in range(1, 12 - i, 2)]) / 12.0
     corners = nodes[triangles]
     area, points = compute_areas(corners), np.einsum("pk,tki->tpi", spread, corners).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Mesh files: read tetrahedra in most formats of meshio, write `.vtu` atomically."""
+"""Mesh files: reader for tetrahedra in most formats of meshio, and atomic writer for `.vtu`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ REASONS = {
     r"np\.float": "it has `np.float64(...)` in place of numbers, as meshio writes ASCII: save it as binary.",
     r" string$": "it has an array of text (`string`): save it without, as arrays of numbers alone are read.",
 }
-"""Messages by a pattern in meshio's reason, or in a line that meshio cannot read."""
+"""Error messages, by a pattern in the error text of meshio or in a line that meshio cannot read."""
 UNREAD = re.compile(rb"^\$ParametricNodes|^\$NOD\b|np\.float|^\S+ \d+ \d+ string$")  # lines that meshio cannot read
 
 MIN_SIZE = 5e-3  # minimum of an anatomy's longest side [m]; a mouse brain has 15 mm
@@ -59,7 +59,7 @@ MAX_SIZE = 1.0  # maximum of an anatomy's longest side [m]; a whole head has 0.3
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """Mesh in metres, point data (unscaled, vectors in the mesh's space), and notes on changes."""
+    """Mesh in metres, point data (not scaled; vectors in the coordinates of the mesh), and notes on changes."""
 
     mesh: TetMesh
     point_data: Mapping[str, np.ndarray]
@@ -67,17 +67,17 @@ class MeshFile:
 
 
 def read_mesh(path: str | Path, unit: str = "m", limits: MeshSizeLimits = MESH_BYTES) -> MeshFile:
-    """Read tetrahedra with cell data `region`, or else with a mesher's groups (default: one region 0).
+    """Read tetrahedra with regions from cell data `region` or else from the groups of a mesh generator (default: 0).
 
-    Quadratic ones (`tetra10`) keep their curved edges. Points, lines and surfaces are dropped, coincident
-    nodes are merged and negatively oriented tetrahedra are reoriented, each with a note. LPS in the title of a
-    `.vtk` is converted to RAS, with a note. `limits` bound the decompressed size.
+    Quadratic tetrahedra (`tetra10`) keep their curved edges. Points, lines and surfaces are dropped, coincident nodes
+    are merged, and negatively oriented tetrahedra are reoriented. If the title of a `.vtk` file specifies LPS, the file
+    is converted to RAS. Notes report each change. `limits` bound the decompressed size.
 
     Raises
     ------
     InputError
-        A file that is missing or unreadable, without tetrahedra, with both kinds or with other volume cells, or with
-        inconsistent data. Tetrahedra that are listed twice, or overlap. A title with an unknown space.
+        The file is missing or unreadable, has no tetrahedra, has linear and quadratic ones, other volume cells, or
+        inconsistent data. Tetrahedra are listed twice or overlap. The title specifies an unknown space.
     """
     path = to_path(path)
     if not path.is_file():
@@ -101,7 +101,7 @@ def _read_with_meshio(path: Path) -> meshio.Mesh:
     Raises
     ------
     InputError
-        With meshio's reason if it gives one. Its other exceptions indicate a damaged file.
+        meshio cannot read the file; the message has the reason. A damaged file may cause other exceptions of meshio.
     """
     import meshio  # optional dependency, missing on machines for training alone
 
@@ -125,7 +125,7 @@ def _read_with_meshio(path: Path) -> meshio.Mesh:
 
 
 def _build_mesh_file(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
-    """Build the mesh of a parsed file whose length unit is `metre` [m]."""
+    """Return the mesh of a parsed file whose length unit is `metre` metres."""
     kinds = {block.type for block in raw.cells}
     found = kinds.intersection(CELLS.values())
     if not found:
@@ -160,7 +160,7 @@ def _build_mesh_file(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) ->
 
 
 def _read_space(path: Path) -> str:
-    """Read the space in the title of a `.vtk`, as 3D Slicer writes it (`SPACE=LPS`); empty if absent."""
+    """Return the space in the title of a `.vtk` file, as 3D Slicer writes it (`SPACE=LPS`); empty if absent."""
     if path.suffix.lower() != ".vtk":
         return ""
     with path.open("rb") as lines:
@@ -176,12 +176,12 @@ def _read_space(path: Path) -> str:
 def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndarray], space: str = "") -> None:
     """Write `.vtu` in metres, with cell data `region`; `tetra10` cells if the mesh has mid-edge nodes.
 
-    The file records its unit and, if given, its `space`. It is written atomically.
+    The file records its unit and, if given, its `space`. The file is written atomically.
 
     Raises
     ------
     InputError
-        A name that does not end in .vtu, or a folder that is not writable.
+        The name does not end in .vtu, or the folder is not writable.
     """
     import meshio
 
@@ -199,7 +199,7 @@ def write_mesh(path: str | Path, mesh: TetMesh, point_data: Mapping[str, np.ndar
 def _format_space(space: str) -> str:
     """Return unit and space, as a comment and as field data.
 
-    The name carries the information, since meshio cannot read text as field data.
+    The name of the field data contains the information, since meshio cannot read text as field data.
     """
     name = f"{space}, metres per unit".removeprefix(", ")
     return (
@@ -214,8 +214,8 @@ def read_anatomy(path: str | Path) -> Anatomy:
     Raises
     ------
     InputError
-        See `read_mesh`; a mesh without `held`, `slide_normal` or `craniotomy`, or with non-finite values there. A
-        body outside the size limits for coordinates in metres.
+        See `read_mesh`. The point data `held`, `slide_normal` or `craniotomy` are missing or not finite, or the size of
+        the mesh is outside the limits for coordinates in metres.
 
     Examples
     --------
@@ -250,7 +250,7 @@ def read_anatomy(path: str | Path) -> Anatomy:
 
 
 def write_anatomy(path: str | Path, anatomy: Anatomy) -> None:
-    """Write an anatomy as `.vtu` in metres (RAS): `region`, `held`, `slide_normal`, `craniotomy`."""
+    """Write an anatomy as `.vtu` in metres (RAS), with the data `region`, `held`, `slide_normal` and `craniotomy`."""
     write_mesh(
         path,
         anatomy.mesh,

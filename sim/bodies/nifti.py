@@ -28,8 +28,8 @@ def read_nifti(path: Path, spec: VoxelSpec) -> Volume:
     Raises
     ------
     InputError
-        Another format, a truncated file or one that declares too many voxels, a non-finite slope. Exceptions of nibabel
-        for a damaged file.
+        The file has another format, is truncated, declares too many voxels, or has a non-finite slope. For damaged
+        files, exceptions of nibabel also occur.
     """
     image = load_nifti(path)
     with open_volume(path) as file:
@@ -57,8 +57,8 @@ def load_nifti(path: Path) -> Nifti1Image:
     Raises
     ------
     InputError
-        Another format, a qform that is not a rotation, or a header that nibabel rejects. Other exceptions of nibabel
-        for a damaged file.
+        The file has another format, its qform is not a rotation, or nibabel rejects the header. For damaged files,
+        other exceptions of nibabel also occur.
     """
     import nibabel
     from nibabel.imageglobals import LoggingOutputSuppressor
@@ -97,13 +97,13 @@ def _build_file_holder(path: Path) -> FileHolder:
 
 
 def read_mgh(path: Path, spec: VoxelSpec) -> Volume:
-    """Return the volume in a FreeSurfer file, in millimetres; its options `spec` are ignored.
+    """Return the volume in a FreeSurfer file, whose unit is millimetres; the options `spec` are ignored.
 
     Raises
     ------
     InputError
-        A file that is truncated, declares too many voxels, or does not give its orientation. Exceptions of nibabel for
-        a damaged file.
+        The file is truncated, declares too many voxels, or has no orientation. For damaged files, exceptions of
+        nibabel also occur.
     """
     import nibabel
 
@@ -148,12 +148,12 @@ def _check_file_length(path: Path, needed: int) -> None:
 
 
 def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: VoxelSpec) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the affine (4, 4) to metres (RAS) of an image in units of `metre` [m], and notes on inconsistencies.
+    """Return the affine (4, 4) from voxel indices to metres (RAS), and notes; the unit of the image is `metre` metres.
 
     Raises
     ------
     InputError
-        An image without orientation, unless `voxels` give it; invalid axes.
+        The image has no orientation and `voxels` do not give one, or the axes are invalid.
     """
     sform = image.get_sform(coded=True)[0]
     try:
@@ -181,7 +181,7 @@ def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: VoxelSpec
 
 
 def _build_centred_affine(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:
-    """Return the affine (4, 4) to metres of a volume centred at the origin, with axis directions `axes`."""
+    """Return the affine (4, 4) from indices to metres of a volume centred at the origin, with directions `axes`."""
     if not axes:
         raise InputError(
             f"{path}: has neither sform nor qform, so its left side is unknown. Export it with its orientation, or "

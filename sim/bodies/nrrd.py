@@ -42,16 +42,16 @@ ONE_FILE = "Save it as one file (.nrrd), with its header and voxels together."
 
 
 def read_nrrd(path: Path, spec: VoxelSpec) -> Volume:
-    """Return the volume in an NRRD file or in its detached data file; layers of segments are (I, J, K, L).
+    """Return the volume in an NRRD file or in its detached data file; segment layers have the shape (I, J, K, L).
 
-    NRRD gives its unit, millimetres by default, and one affine: the options `spec` are ignored.
+    An NRRD file gives its unit (default: millimetres) and one affine, so the options `spec` are ignored.
 
     Raises
     ------
     InputError
-        A file of another format, or with an incomplete header or without an anatomical space.
-        Voxels in several files, in another folder, or in an encoding other than raw, gzip or bzip2. Fewer voxels
-        than declared, or too many.
+        The file has another format, an incomplete header or no anatomical space. The voxels are in several files, in
+        another folder, or in an encoding other than raw, gzip or bzip2. There are fewer voxels than declared, or
+        too many voxels.
     """
     with path.open("rb") as file:
         fields, keys = _read_header(path, file)
@@ -75,7 +75,7 @@ def read_nrrd(path: Path, spec: VoxelSpec) -> Volume:
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, str]]:
-    """Read the fields, by names in lower case, and the custom keys; the file is then positioned at its voxels."""
+    """Return the fields, by name in lower case, and the custom keys; leave the file position at the voxel data."""
     if not re.fullmatch(rb"(\xef\xbb\xbf)?NRRD000[1-5]\s*", file.readline(MAX_LINE_LENGTH)):
         raise InputError(f"{path}: does not begin with an NRRD header. {REMEDY}")
     fields, keys = {}, {}
@@ -100,7 +100,7 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[dict[str, str], dict[str, 
 
 
 def _get_data_file_name(fields: Mapping[str, str]) -> str:
-    """Return the name of the detached data file; empty if the data is attached."""
+    """Return the name of the detached data file, or an empty string if the data is attached."""
     return fields.get("data file", fields.get("datafile", ""))
 
 
@@ -136,7 +136,7 @@ def _parse_dtype(path: Path, fields: Mapping[str, str]) -> np.dtype:
 
 
 def _read_voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) -> bytes:
-    """Read all bytes of the voxels; memory is allocated only for data that the file can contain."""
+    """Return the decompressed voxel data; memory is allocated only for data that the file can contain."""
     if any(float(fields.get(skip, 0)) for skip in ("byte skip", "byteskip", "line skip", "lineskip")):
         raise InputError(f"{path}: skips bytes before its voxels. {ONE_FILE}")
     coding = _get_field(path, fields, "encoding").lower()
@@ -160,7 +160,7 @@ def _read_voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: 
 
 
 def _parse_affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.ndarray, list[int]]:
-    """Return the affine (4, 4) from indices to metres (RAS), and the non-spatial axes: at most one."""
+    """Return the affine (4, 4) from voxel indices to metres (RAS), and the list of non-spatial axes, at most one."""
     stated = fields.get("space", "").lower()
     space = SHORT.get(stated, stated)
     if space not in SIGNS:
@@ -184,7 +184,7 @@ def _parse_affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.
 
 
 def _parse_segments(path: Path, keys: Mapping[str, str], layers: int) -> tuple[Segment, ...]:
-    """Read Slicer's segment names and labels. Old files have a layer of ones for each segment, without layer keys."""
+    """Return the segments that Slicer wrote. Old files have one layer of ones for each segment and no layer keys."""
     numbers = sorted({int(found[1]) for key in keys if (found := re.match(r"Segment(\d+)_", key))})
     segments = tuple(
         Segment(

@@ -17,16 +17,16 @@ EDGE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Material point of the exposed cortex.
+    """Material point on the exposed cortex.
 
     Parameters
     ----------
     point
         Undeformed position (3,) [m].
     inward
-        Unit surface normal (3,) there, into the brain.
+        Unit normal (3,) of the surface at this point, into the brain.
     vertices, weights
-        Mesh vertices (3,) of its triangle, and barycentric weights (3,).
+        Mesh vertices (3,) of the triangle that contains the point, and its barycentric weights (3,).
     """
 
     point: np.ndarray
@@ -43,7 +43,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class OpenCortex:
-    """Exposed cortex and its coordinate system.
+    """Exposed cortex of an anatomy, with a local coordinate system.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class OpenCortex:
     axis
         Mean inward normal (3,).
     right, up
-        Vectors (3,) that span the tangent plane; `up` points in the most superior tangent direction.
+        Unit vectors (3,) that span the tangent plane; `up` is the most superior tangent direction.
     """
 
     anatomy: Anatomy
@@ -65,17 +65,17 @@ class OpenCortex:
 
     @cached_property
     def corners(self) -> np.ndarray:
-        """Corners (S, 3, 3) [m] of its triangles."""
+        """Corner positions (S, 3, 3) [m] of the triangles of the exposed cortex."""
         return self.anatomy.mesh.nodes[self.anatomy.open_surface]
 
     @cached_property
     def radius(self) -> float:
-        """Radius of the circle with its area [m]."""
+        """Radius of the circle with the same area as the exposed cortex [m]."""
         return float(np.sqrt(compute_areas(self.corners).sum() / np.pi))
 
     @cached_property
     def clearance(self) -> float:
-        """Radius of the largest circle around the origin, perpendicular to the axis, inside the exposed cortex [m]."""
+        """Radius of the largest circle [m] inside the exposed cortex, around the origin, perpendicular to the axis."""
         rim = find_border_edges(self.anatomy.mesh.nodes, self.anatomy.open_surface) - self.origin
         return float(compute_edge_distances(rim - (rim @ self.axis)[..., None] * self.axis, np.zeros((1, 3)))[0])
 
@@ -89,18 +89,18 @@ class OpenCortex:
         return np.linalg.norm(arm - np.outer(arm @ self.axis, self.axis), axis=1)
 
     def find_nearest(self, point: np.ndarray) -> Place:
-        """Return the place nearest to a point (3,) [m]."""
+        """Return the point of the exposed cortex nearest to `point` (3,) [m]."""
         at, triangle, weights = (found[0] for found in find_closest_points(point[None], self.corners))
         vertices = self.anatomy.open_surface[triangle]
         return Place(at, normalise_vectors((weights @ self._inward[vertices])[None])[0], vertices, weights)
 
     def place(self, right_mm: float = 0.0, up_mm: float = 0.0) -> Place:
-        """Return the place at an offset from the origin to the right and up in the tangent plane [mm].
+        """Return the point of the exposed cortex at a tangential offset from the origin, to the right and up [mm].
 
         Raises
         ------
         InputError
-            A value that is not a finite number; a place outside the exposed cortex.
+            A value is not a finite number, or the point is outside the exposed cortex.
         """
         for name, value in (("right_mm", right_mm), ("up_mm", up_mm)):
             given = check_numbers_array(name, value)
@@ -124,7 +124,7 @@ def open_cortex(anatomy: Anatomy) -> OpenCortex:
     Raises
     ------
     InputError
-        An anatomy without exposed cortex.
+        The anatomy has no exposed cortex.
 
     Examples
     --------
@@ -150,7 +150,7 @@ def open_cortex(anatomy: Anatomy) -> OpenCortex:
 
 
 def find_border_edges(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return edges (E, 2, 3) [m] that belong to exactly one of the triangles (S, 3) of points (V, 3) [m]."""
+    """Return the edges (E, 2, 3) [m] that belong to exactly one of the `triangles` (S, 3), with `points` (V, 3) [m]."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges, count = np.unique(edges, axis=0, return_counts=True)
     return points[edges[count == 1]]

@@ -1,4 +1,4 @@
-"""Positions in a head: cortex accessible through the skull, openings, and anatomical directions."""
+"""Positions in a head: cortex that is accessible through the skull, craniotomies, and anatomical directions."""
 
 from dataclasses import dataclass
 
@@ -21,20 +21,20 @@ class Placement:
     Parameters
     ----------
     brainstem_radius
-        Radius of the brainstem around the lowest point, as a fraction of the brain's height: 21 mm in the template, the
-        medulla and adjacent tissue.
+        Radius of the brainstem around the lowest point, as a fraction of the brain's height. In the template this is
+        21 mm and covers the medulla and adjacent tissue.
     max_hull_depth
-        Maximum depth under the convex hull [m]: deeper cortex lies in a fissure, inaccessible through the skull.
+        Maximum depth of accessible cortex under the convex hull [m]; deeper cortex is in a fissure.
     min_height
-        Minimum height of an opening, as a fraction of the brain's height, unless the tumour is lower.
+        Minimum height of a craniotomy, as a fraction of the brain's height; it may be lower if the tumour is lower.
     max_surface_distance
-        Maximum distance of a point from the surface [m], for the intended cortex to be unambiguous.
+        Maximum distance of a given point from the surface [m], so that the intended cortex is unambiguous.
     max_outside_distance
-        Maximum distance of a point outside the brain [m]: coordinates read from images are inexact.
+        Maximum distance of a given point outside the brain [m], since coordinates read from images are inexact.
     midline_half_width
-        Half width of the midline strip, as a fraction of the brain's width.
+        Half of the width of the midline strip, as a fraction of the brain's width.
     min_open_nodes
-        Minimum nodes of a craniotomy, to support a tool.
+        Minimum number of nodes in a craniotomy, to support a tool.
     """
 
     brainstem_radius: float = 0.15
@@ -48,7 +48,7 @@ class Placement:
 
 @dataclass(frozen=True, eq=False)
 class TumourPiece:
-    """Connected component of a tumour: volume [m^3], centre (3,) [m], points (n, 3) [m] on its surface."""
+    """Connected component of a tumour: volume [m^3], centre (3,) [m], and surface points (n, 3) [m]."""
 
     volume: float
     centre: np.ndarray
@@ -56,9 +56,9 @@ class TumourPiece:
 
 
 def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings: Placement = Placement()) -> str:
-    """Describe a place (3,) [m] in a brain's box `low` to `high` (3,), RAS: "left anterior superior" and the like.
+    """Return a description of a point (3,) in a brain's box `low` to `high` (RAS), such as "left anterior superior".
 
-    Left or right is given outside a midline strip; directions of the other axes in the outer thirds.
+    "left" or "right" appears outside the midline strip; words for the other two axes appear in the outer thirds.
     """
     share, words = (np.asarray(point) - low) / (high - low), []
     for axis, names in enumerate(AXES):
@@ -82,7 +82,7 @@ def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement =
     Raises
     ------
     InputError
-        A point that is not finite, or farther than `near` from there; one over the brainstem.
+        The point is not finite, is over the brainstem, or is more than `max_surface_distance` from accessible cortex.
     """
     _check_finite(point, "--opening-at")
     site = _find_nearest_outer(cortex, point, cortex, settings)
@@ -99,12 +99,12 @@ def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement =
 def find_opening_over(
     cortex: np.ndarray, point: np.ndarray, depth: float, settings: Placement = Placement()
 ) -> np.ndarray:
-    """Return the accessible point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) at a `depth` [m] in the brain.
+    """Return the accessible point (3,) [m] of `cortex` (n, 3) nearest to a `point` (3,) in the brain, at `depth` [m].
 
     Raises
     ------
     InputError
-        A point that is not finite, or more than `outside` outside the brain; one over the brainstem.
+        The point is not finite, is more than `max_outside_distance` outside the brain, or is over the brainstem.
     """
     _check_finite(point, "--opening-over")
     if not depth > -settings.max_outside_distance:
@@ -116,12 +116,12 @@ def find_opening_over(
 
 
 def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
-    """Return the accessible point (3,) [m] of `cortex` (n, 3) nearest to the centre of an opening's outline (m, 3).
+    """Return the accessible point (3,) [m] of `cortex` (n, 3) nearest to the centre of a craniotomy `outline` (m, 3).
 
     Raises
     ------
     InputError
-        See `find_opening_at`; an outline that is not at the surface.
+        See `find_opening_at`; also if the outline is too far from the cortex.
     """
     apart = float(KDTree(cortex).query(outline)[0].max())
     if apart > settings.max_surface_distance:
@@ -135,9 +135,9 @@ def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Place
 
 
 def find_within_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """Return a mask (n,) of points (n, 3) within a closed curve (m, 3), projected onto its best-fit plane.
+    """Return a mask (n,) of points (n, 3) inside a closed curve (m, 3), both projected onto its best-fit plane.
 
-    Points farther from that plane than the radius of the curve are excluded: they lie on the head's other side.
+    Points farther from the plane than the radius of the curve are on the other side of the head and are excluded.
     """
     middle = outline.mean(axis=0)
     axes = np.linalg.svd(outline - middle, full_matrices=False)[2]
@@ -154,7 +154,7 @@ def find_within_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
 
 
 def _find_nearest_outer(points: np.ndarray, place: np.ndarray, cortex: np.ndarray, settings: Placement) -> np.ndarray:
-    """Return the point nearest to a place (3,) among `points` (k, 3) of the `cortex` (n, 3) near its convex hull."""
+    """Return the point nearest to `place` (3,) among those `points` (k, 3) that are near the hull of the `cortex`."""
     hull = ConvexHull(cortex).equations
     order = np.argsort(np.linalg.norm(points - place, axis=1), kind="stable")
     parts = (points[order[first : first + BLOCK_SIZE]] for first in range(0, len(order), BLOCK_SIZE))

@@ -21,7 +21,7 @@ MIDPOINT_NODES = {frozenset(edge): 4 + k for k, edge in enumerate(QUADRATIC_EDGE
 
 
 def _build_patterns() -> dict[tuple[int, ...], list[list[int]]]:
-    """Return the children of a tetrahedron by its halved edges: none, one, two opposite ones, or those of a face."""
+    """Return the child tetrahedra by halved edges: no edge, one edge, two opposite edges, or all edges of a face."""
     found: dict[tuple[int, ...], list[list[int]]] = {(): [[0, 1, 2, 3]]}
     for a, b in combinations(range(4), 2):
         c, d = (k for k in range(4) if k not in (a, b))
@@ -39,7 +39,7 @@ PATTERNS = _build_patterns()  # children by halved edges
 
 
 def _find_closing_patterns() -> np.ndarray:
-    """Return the smallest pattern (64, 6) bool that contains each set of halved edges; all six if no other does."""
+    """Return, for each of the 64 sets of halved edges, the smallest pattern (64, 6) bool that contains the set."""
     sets = (np.arange(64)[:, None] >> np.arange(6)) & 1 > 0
     known = np.array([np.isin(np.arange(4, 10), one) for one in sorted(PATTERNS, key=len)] + [np.ones(6, bool)])
     return known[(sets[:, None] <= known).all(axis=2).argmax(axis=1)]
@@ -49,17 +49,17 @@ CLOSING_PATTERNS = _find_closing_patterns()  # smallest pattern by the bit mask 
 
 
 def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
-    """Return the anatomy with every edge halved, or those near the exposed cortex.
+    """Return the anatomy with all edges halved or, if `near_opening`, only the edges near the exposed cortex.
 
-    Near: the midpoint is within a mean edge length of it. Original nodes come first and keep their numbers. Fixed
-    and sliding nodes are those of quadratic elements. A tetrahedron becomes eight, at the border of the refined region
-    two or four: red and green refinement, Bey 1995, "Tetrahedral grid refinement", Computing 55:355-378. Bey's fixed
-    diagonal of the inner octahedron is replaced by the shortest one.
+    An edge is near if its midpoint is within a mean edge length of the exposed cortex. Original nodes keep their
+    numbers. New nodes are fixed or slide by the rules for quadratic elements. A tetrahedron is split into eight or, at
+    the border of the refined region, into two or four: Bey 1995, "Tetrahedral grid refinement", Computing 55:355-378.
+    In contrast to the paper, the inner octahedron is split along its shortest diagonal.
 
     Raises
     ------
     InputError
-        A mesh with mid-edge nodes.
+        The mesh has mid-edge nodes.
     """
     mesh = anatomy.mesh
     if mesh.middles is not None:
@@ -85,7 +85,7 @@ def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
 
 
 def _make_conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
-    """Return the marked nodes (N,) bool with further edge midpoints added, until each tetrahedron has a pattern."""
+    """Return the mask `halved` (N,) of midpoints, extended until the halved edges of each element form a pattern."""
     halved, middles = halved.copy(), table[:, 4:]
     while True:
         asked = halved[middles]
@@ -96,7 +96,7 @@ def _make_conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
 
 
 def _build_children(nodes: np.ndarray, table: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return children (C, 4) and their parents (C,), in the parents' order; `cut` (T, 6) marks the halved edges."""
+    """Return child tetrahedra (C, 4) and their parents (C,), sorted by parent; `cut` (T, 6) marks the halved edges."""
     tets, parent = [], []
     for pattern, parts in PATTERNS.items():
         rows = np.flatnonzero((cut == np.isin(np.arange(4, 10), pattern)).all(axis=1))

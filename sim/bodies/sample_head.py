@@ -1,4 +1,4 @@
-"""Synthetic patient with the brain surface of an anatomy: label map and T1, for users without data."""
+"""Synthetic patient with the brain surface of an anatomy, as label map and T1, for users without patient data."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ SAMPLE_TUMOUR = Tumour(0.012, shape="lobed", seed=3, middle=(-0.028, 0.018, 0.03
 
 @dataclass(frozen=True)
 class SampleHead:
-    """Shape, tumour, voxels and grey values of the patient; lengths [m], angles [rad]."""
+    """Shape, tumour, voxels and grey values of the sample patient; lengths in metres, angles in radians."""
 
     stretch: tuple[float, float, float] = (0.97, 1.03, 0.98)  # Factors of the brain's coordinates (x, y, z).
     tumour: Tumour = SAMPLE_TUMOUR  # Tumour in the stretched brain.
@@ -35,12 +35,12 @@ class SampleHead:
 def build_sample_head(brain: TetMesh, head: SampleHead = SampleHead()) -> tuple[Intensity, Intensity]:
     """Return the label map (`BRAIN_LABEL`, `TUMOUR_LABEL`) and the T1 of a patient, as 8-bit volumes on one grid.
 
-    `brain` gives the surface. Sulci exist in the T1 only.
+    `brain` is the mesh whose surface is used. Only the T1 shows sulci.
 
     Raises
     ------
     InputError
-        A surface that is not closed, or a tumour that would extend beyond the brain.
+        The surface is not closed, or the tumour would extend beyond the brain.
     """
     (a, b), (c, d) = ((np.cos(angle), np.sin(angle)) for angle in head.angles)
     edges = np.array([[c, -d * a, d * b], [d, c * a, -c * b], [0.0, b, a]]) * head.voxel * [-1.0, -1.0, 1.0]
@@ -53,9 +53,9 @@ def build_sample_head(brain: TetMesh, head: SampleHead = SampleHead()) -> tuple[
 
 
 def _draw_t1(mask: np.ndarray, tumour: np.ndarray, head: SampleHead) -> np.ndarray:
-    """Return grey values (I, J, K) uint8 for a brain mask and signed distances to the tumour (I, J, K) [m].
+    """Return grey values (I, J, K) uint8, from a brain mask and the signed distance to the tumour, each (I, J, K) [m].
 
-    Sulci are the zero crossings of band-pass noise.
+    The sulci are the zero crossings of band-pass filtered noise.
     """
     noise = np.random.default_rng(head.seed).standard_normal(mask.shape)
     scale = head.sulcus_distance / np.array(head.voxel)

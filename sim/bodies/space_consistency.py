@@ -1,4 +1,4 @@
-"""Consistency of the spaces of several files; detects LPS declared as RAS."""
+"""Consistency of the coordinate systems of several files; detection of LPS coordinates declared as RAS."""
 
 from collections.abc import Iterable
 
@@ -16,12 +16,12 @@ EXPORT_REMEDY = "one of the two states LPS as RAS. Export that one again."
 
 
 def is_mirroring_ambiguous(brain: Mask, tumour: Mask) -> bool:
-    """Return True if brain and tumour, on different grids, would also fit with x and y of one negated.
+    """Return True if brain and tumour have different grids and would also fit with x and y of the tumour negated.
 
     Raises
     ------
     InputError
-        A tumour outside the brain, and LPS that is evidently declared as RAS.
+        The tumour is outside the brain, or LPS coordinates are evidently declared as RAS.
     """
     check_not_negated(brain.grid, tumour.grid)
     boxes = [mask.box for mask in (brain, tumour)]
@@ -43,12 +43,12 @@ def is_mirroring_ambiguous(brain: Mask, tumour: Mask) -> bool:
 
 
 def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -> None:
-    """Reject a scan that is evidently LPS declared as RAS; `grids` are those of the files that mark the `brain`.
+    """Reject a scan with LPS coordinates declared as RAS; `grids` are those of the files that mark the `brain`.
 
     Raises
     ------
     InputError
-        A grid that equals one of `grids` with x and y negated, or a scan that would contain the brain if they were.
+        The scan's grid equals one of `grids` with x and y negated, or the scan contains the brain only if negated.
     """
     for grid in grids:
         check_not_negated(grid, scan)
@@ -62,12 +62,12 @@ def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -
 
 
 def check_not_negated(grid: VoxelGrid, other: VoxelGrid) -> None:
-    """Reject two grids of which one equals the other with x and y negated.
+    """Reject two grids if one grid equals the other with x and y negated.
 
     Raises
     ------
     InputError
-        For such grids.
+        The grids are equal with x and y negated.
     """
     negated = np.array([*LPS, 1.0])[:, None] * other.affine
     if _is_same_grid(grid, VoxelGrid(other.path, other.shape, negated)):
@@ -79,30 +79,30 @@ def _is_same_grid(one: VoxelGrid, other: VoxelGrid) -> bool:
 
 
 def _thin_points(points: np.ndarray) -> np.ndarray:
-    """Return a regular subset of at least `TEST_POINTS` points, or all."""
+    """Return a regular subset of the points, with at least `TEST_POINTS` points or all points."""
     return points[:: max(1, len(points) // TEST_POINTS)]
 
 
 def _compute_positions(grid: VoxelGrid, index: np.ndarray) -> np.ndarray:
-    """Return the positions (n, 3) [m] of voxel indices (n, 3)."""
+    """Return the positions (n, 3) [m] of the voxels with indices (n, 3)."""
     return index @ grid.affine[:3, :3].T + grid.affine[:3, 3]
 
 
 def compute_inside_fraction(shape: tuple[int, ...], affine: np.ndarray, points: np.ndarray) -> float:
-    """Return the fraction of points (n, 3) [m] that lie in a volume (I, J, K) with an affine (4, 4) to metres."""
+    """Return the fraction of points (n, 3) [m] inside a volume (I, J, K) with affine (4, 4) from indices to metres."""
     inverse = np.linalg.inv(affine)
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3])
     return float(((index >= 0) & (index < np.array(shape))).all(axis=1).mean())
 
 
 def _widen_outline(mask: Mask) -> np.ndarray:
-    """Return the outline shifted by half a voxel to both sides (n, 3) [m], so that a single slice has a convex hull."""
+    """Return the outline shifted by half a voxel to both sides (n, 3) [m], so that one slice also has a convex hull."""
     half = 0.5 * mask.affine[:3, :3].sum(axis=1)
     return np.concatenate([mask.outline - half, mask.outline + half])
 
 
 def _share_within(planes: np.ndarray, points: np.ndarray) -> float:
-    """Return the fraction of points (n, 3) inside all planes of a convex hull."""
+    """Return the fraction of points (n, 3) that are inside all planes of a convex hull."""
     outermost = np.full(len(points), -np.inf)
     for part in np.array_split(planes, max(1, len(planes) // 64)):
         np.maximum(outermost, (points @ part[:, :3].T + part[:, 3]).max(axis=1), out=outermost)

@@ -1,4 +1,4 @@
-"""Head model before meshing, common to the template and to label volumes."""
+"""Head model before meshing, used for the template and for label volumes."""
 
 from dataclasses import dataclass, field
 from itertools import product
@@ -37,18 +37,18 @@ class MeshPlan:
     nodes
         Requested number of nodes.
     craniotomy
-        Diameter of the craniotomy along the cortex [m]. None: by the tumour, see `choose_diameter`.
+        Diameter of the craniotomy along the cortex [m]. None: depends on the tumour, see `choose_diameter`.
     meshing
-        Mesh generation and smoothing.
+        Options for mesh generation and smoothing.
     placement
         Limits of brainstem and craniotomy.
     fine_opening
-        True to halve edges at the exposed cortex, in addition to `nodes`: contact forces depend less on the mesh.
+        True to halve edges at the exposed cortex, so that contact forces depend less on the mesh; adds further nodes.
 
     Raises
     ------
     InputError
-        Nodes outside 2,000 to 250,000, or a craniotomy outside 15 to 120 mm.
+        `nodes` is outside 2,000 to 250,000, or the craniotomy is outside 15 to 120 mm.
     """
 
     nodes: int = 5300
@@ -69,9 +69,9 @@ class MeshPlan:
 
 @dataclass(frozen=True, eq=False)
 class SubjectPart:
-    """Part of brain or tumour with its own stiffness: region label, level set, and volume [m^3] in the labels.
+    """Part of brain or tumour with its own stiffness: region label, level set, and volume [m^3] in the label map.
 
-    Necrosis is a part of the tumour, all others of the brain.
+    Necrosis is a part of the tumour; all other parts belong to the brain.
     """
 
     label: int
@@ -81,30 +81,30 @@ class SubjectPart:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """Brain with a tumour, in RAS coordinates of the volume [m].
+    """Brain with a tumour, in the RAS coordinates of the source image [m].
 
     Parameters
     ----------
     brain, tumour
         Level sets of the whole solid (brain and tumour together) and of the tumour.
     cortex, interface
-        Points (n, 3) [m] on the solid's surface and on the tumour's.
+        Points (n, 3) [m] on the surface of the solid, and on the surface of the tumour.
     tumour_volume
         Volume of the tumour [m^3].
     site
         Centre (3,) [m] of the craniotomy on the cortex.
     intensity
-        T1 intensities, if available.
+        T1 intensities, or None.
     notes
-        Notes on changes made while reading.
+        Notes for the user on changes made while reading.
     pieces
-        Connected components of the tumour, largest first.
+        Connected components of the tumour, the largest component first.
     parts
-        Parts that become regions; if two overlap, the later one has priority.
+        Parts that become regions; if two parts overlap, the later part has priority.
     septa
-        Fixed sheets of dura.
+        Dural sheets at which nodes are fixed.
     outline
-        Closed curve (n, 3) [m] around the opening, instead of a disc.
+        Closed curve (n, 3) [m] around the craniotomy, or None for a disc.
     """
 
     brain: Field
@@ -122,12 +122,12 @@ class Subject:
 
 
 def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
-    """Mesh a subject and add its boundary conditions; the result is deterministic, bit by bit.
+    """Return the mesh of a subject with boundary conditions; the result is reproducible bit by bit.
 
     Raises
     ------
     InputError
-        Input that `build_mesh` or `add_boundary_conditions` rejects.
+        `build_mesh` or `add_boundary_conditions` rejects the input.
     """
     craniotomy = choose_diameter(subject, plan)
     opening = subject.cortex[find_exposed_cortex(subject, craniotomy)]
@@ -141,7 +141,7 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
 
 
 def choose_diameter(subject: Subject, plan: MeshPlan) -> float:
-    """Return the plan's diameter of the craniotomy [m], or 10 mm more than the tumour on all sides; 50 to 120 mm."""
+    """Return the diameter [m] in the plan or, if None, that of the tumour plus 10 mm on each side, in 50 to 120 mm."""
     if plan.craniotomy is not None:
         return plan.craniotomy
     centre = subject.interface.mean(axis=0)
@@ -154,7 +154,7 @@ def choose_diameter(subject: Subject, plan: MeshPlan) -> float:
 def _assign_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
     """Return the mesh with the regions of the subject's parts.
 
-    Each part takes the tetrahedra with the largest fraction inside, until their volume is closest to its own.
+    Tetrahedra are assigned to a part in order of their fraction inside it, until the volumes agree best.
     """
     region = mesh.region.copy()
     for part in reversed(subject.parts):
@@ -169,9 +169,9 @@ def _assign_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
 
 
 def find_exposed_cortex(subject: Subject, diameter: float) -> np.ndarray:
-    """Return a mask (n,) of the subject's cortex points under its outlined opening, or under one of this diameter [m].
+    """Return a mask (n,) of the cortex points in the craniotomy: inside its outline, or in a disc of `diameter` [m].
 
-    Distances are Euclidean; those on the mesh are geodesic and slightly longer.
+    Distances are Euclidean, slightly shorter than the geodesic distances used on the mesh.
     """
     if subject.outline is not None:
         return find_within_outline(subject.cortex, subject.outline)
@@ -179,7 +179,7 @@ def find_exposed_cortex(subject: Subject, diameter: float) -> np.ndarray:
 
 
 def find_boundary_voxels(mask: np.ndarray, affine: np.ndarray) -> np.ndarray:
-    """Return the centres (n, 3) [m] of boundary voxels of `mask` (I, J, K)."""
+    """Return the centres (n, 3) [m] of the voxels on the boundary of a `mask` (I, J, K)."""
     padded = np.pad(mask, 1)
     index = np.argwhere(padded & ~cast(np.ndarray, ndimage.binary_erosion(padded))) - 1
     return index @ affine[:3, :3].T + affine[:3, 3]

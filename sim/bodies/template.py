@@ -1,4 +1,4 @@
-"""Synthetic tumour in a healthy head; by default the MNI152 brain in the nilearn wheel, scaled to a typical volume."""
+"""Synthetic tumour in a healthy head, by default the MNI152 brain of nilearn, scaled to a typical volume."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ SITES = {
     "temporal": (66.0, -22.0, 2.0),
     "occipital": (28.0, -92.0, 14.0),
 }
-"""Named points on the right hemisphere's convexity, seen from `MNI_CENTRE`: MNI152 coordinates [mm]."""
+"""Named points that define directions from `MNI_CENTRE` to the right hemisphere: MNI152 coordinates [mm]."""
 
 Shape = Literal["sphere", "lobed"]  # tumour shapes
 MIN_RADIUS = 3e-3  # minimum tumour radius [m]
@@ -41,11 +41,11 @@ class HeadScaling:
     volume
         Volume of the scaled brain [m^3]; the mask has 1,883 ml, more than a typical brain.
     threshold
-        Intensity threshold of brain voxels, as a fraction of the maximum: that of nilearn's own mask.
+        Intensity threshold of brain voxels, as a fraction of the maximum intensity; the default is that of nilearn.
     smoothing_length
-        Length over which the cortex is averaged for its inward normal [m].
+        Length over which the cortex is averaged to compute its inward normal [m].
     clearance
-        Minimum brain around the tumour [m].
+        Minimum thickness of brain around the tumour [m].
     """
 
     volume: float = 1470e-6
@@ -63,7 +63,7 @@ class Lobes:
     count
         Number of lobes, in random directions.
     height
-        Maximum height of a lobe, as a fraction of the radius; the minimum is 0.3 of it.
+        Maximum height of a lobe, as a fraction of the radius. The minimum height is 0.3 times the maximum.
     sharpness
         Sharpness s of all lobes, see `Lobed`.
     """
@@ -84,16 +84,16 @@ class Tumour:
     cover
         Distance from the cortex at the `site`, a name in `SITES`, to the top of the tumour [m].
     shape, lobes
-        "sphere" or "lobed", and parameters of the lobes.
+        Shape, "sphere" or "lobed", and parameters of the lobes.
     seed
         Random seed of the lobes' directions and heights.
     middle
-        Centre (x, y, z) [m], RAS, instead of `cover` and `site`.
+        Centre (x, y, z) [m, RAS] of the tumour; replaces `cover` and `site`.
 
     Raises
     ------
     InputError
-        A radius outside 3 to 35 mm, a cover outside 1 to 60 mm, an unknown shape or site, or a centre that
+        The radius is outside 3 to 35 mm, the cover is outside 1 to 60 mm, the shape or site is unknown, or the centre
         is not finite.
     """
 
@@ -126,7 +126,7 @@ class Tumour:
 
     @property
     def place(self) -> str:
-        """Description of the position, for messages."""
+        """Description of the tumour position, for messages."""
         if self.middle is not None:
             return f"at {', '.join(f'{1e3 * value:g}' for value in self.middle)} mm"
         return f"with {self.cover * 1e3:g} mm of cover at the {self.site} site"
@@ -141,11 +141,11 @@ class HealthyHead:
     mask, affine
         Brain voxels (I, J, K) bool, and affine (4, 4) from their indices to metres (RAS).
     intensity
-        Grey values in the same space, if any.
+        Grey values in the same coordinates, or None.
     origin
-        Origin (3,) [m] of the directions in `SITES`; None for the centre of the brain's box.
+        Origin (3,) [m] of the directions in `SITES`; None: the centre of the brain's bounding box.
     notes
-        Notes on assumptions.
+        Notes for the user on assumptions.
     """
 
     mask: np.ndarray
@@ -159,7 +159,7 @@ class HealthyHead:
 class Lobed:
     """Star-shaped solid whose radius in unit direction n is scale * (1 + sum_k height_k exp(s (n . d_k - 1))).
 
-    middle (3,) [m]; unit directions (L, 3); heights (L,); scale [m]; sharpness s. A ball has no lobes.
+    `middle` (3,) [m]; unit `directions` d (L, 3); `heights` (L,); `scale` [m]; `sharpness` s. L = 0 is a ball.
     """
 
     middle: np.ndarray
@@ -183,12 +183,12 @@ class Lobed:
 
 
 def build_template_subject(tumour: Tumour, head: HeadScaling = HeadScaling()) -> Subject:
-    """Return the template with a tumour, in the template's RAS coordinates, scaled about the brain's centroid.
+    """Return the template with a tumour, in RAS coordinates of the template, scaled about the centroid of the brain.
 
     Raises
     ------
     InputError
-        A tumour that would extend beyond the brain.
+        The tumour would extend beyond the brain.
 
     Examples
     --------
@@ -201,7 +201,7 @@ def build_template_subject(tumour: Tumour, head: HeadScaling = HeadScaling()) ->
 
 
 def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: HeadScaling = HeadScaling()) -> Subject:
-    """Return a healthy head with a synthetic tumour; volume and threshold of `head` are ignored.
+    """Return a healthy head with a synthetic tumour; `volume` and `threshold` of `head` are ignored.
 
     Raises
     ------
@@ -229,7 +229,7 @@ def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: HeadScal
 
 
 def scale_affine(affine: np.ndarray, centre: np.ndarray, factor: float, new_centre: np.ndarray) -> np.ndarray:
-    """Return the affine (4, 4) scaled by a factor about a `centre` (3,), which is moved to `new_centre` (3,)."""
+    """Return the affine (4, 4), scaled by a factor about `centre` (3,), which is then moved to `new_centre` (3,)."""
     moved = affine.copy()
     moved[:3, 3] -= centre
     moved[:3] *= factor
@@ -238,7 +238,7 @@ def scale_affine(affine: np.ndarray, centre: np.ndarray, factor: float, new_cent
 
 
 def measure_centroid_and_volume(mask: np.ndarray, affine: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return centroid (3,) and volume of the voxels `mask` (I, J, K), in the units of their affine (4, 4)."""
+    """Return the centroid (3,) and the volume of the marked voxels, in the units of the affine (4, 4)."""
     centre = affine[:3, :3] @ np.argwhere(mask).mean(axis=0) + affine[:3, 3]
     return centre, float(mask.sum() * abs(np.linalg.det(affine[:3, :3])))
 
@@ -260,7 +260,7 @@ def _load_scaled_template(head: HeadScaling) -> HealthyHead:
 def _find_site(
     brain: Field, cortex: np.ndarray, seen_from: tuple[float, float, float] | None, name: str, smooth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the point (3,) [m] where the ray to a named site leaves the brain, and the inward normal (3,) there."""
+    """Return the point (3,) [m] at which the ray to the site `name` leaves the brain, and the inward normal (3,)."""
     middle = 0.5 * (cortex.min(axis=0) + cortex.max(axis=0))
     outward = 1e-3 * np.array(SITES[name]) - (middle if seen_from is None else np.array(seen_from))
     outward /= np.linalg.norm(outward)
@@ -272,7 +272,7 @@ def _find_site(
 
 
 def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:
-    """Return the tumour around a `middle` (3,) [m], a function of its shape at unit scale and its scale [m]."""
+    """Return the tumour shape; `middle` is a function of the unit-scale shape and the scale that returns the centre."""
     rng, lobes = np.random.default_rng(tumour.seed), tumour.lobes
     directions = rng.normal(size=(lobes.count if tumour.shape == "lobed" else 0, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

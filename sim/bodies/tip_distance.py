@@ -16,23 +16,23 @@ from .open_cortex import OpenCortex, open_cortex
 
 @dataclass(frozen=True, eq=False)
 class TipGauge:
-    """Distance of a round tool's tip from the closest point of the tumour's surface.
+    """Distance from the tip of a round tool to the nearest point of the tumour's surface.
 
-    A pushing tool is a ball with its footprint's radius. It is lowered along the exposed cortex's inward axis until
-    it touches the deformed surface, on a line through the deformed position of the pushed point. The tip is its lowest
-    point along that axis. For tool poses, the tip follows from the pose.
+    A pushing tool is a ball with the radius of its footprint. The ball is lowered along the inward axis of the exposed
+    cortex, through the deformed position of the pushed point, until it touches the deformed surface. The tip is the
+    lowest point of the ball along this axis. For loads with tool poses, the tip follows from the pose.
 
     Parameters
     ----------
     anatomy
         Anatomy with exposed cortex.
     block_size
-        Load cases per block, which limits memory.
+        Number of load cases computed at once, which limits memory.
 
     Raises
     ------
     InputError
-        An anatomy without exposed cortex.
+        The anatomy has no exposed cortex.
     """
 
     anatomy: Anatomy
@@ -40,17 +40,17 @@ class TipGauge:
 
     @cached_property
     def cortex(self) -> OpenCortex:
-        """Exposed cortex and its coordinate system."""
+        """Exposed cortex, with its coordinate system."""
         return open_cortex(self.anatomy)
 
     @cached_property
     def nodes(self) -> np.ndarray:
-        """Sorted mesh vertices (n,) whose displacement is required: exposed cortex, and the tumour's surface."""
+        """Sorted mesh vertices (n,) whose displacement is required: exposed cortex and surface of the tumour."""
         return np.union1d(self._open[0], self._tumour[0])
 
     @cached_property
     def _open(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mesh vertices (m,) of the exposed cortex, and its triangles (S, 3) of them."""
+        """Mesh vertices (m,) of the exposed cortex, and its triangles (S, 3) as indices into these vertices."""
         return np.unique(self.anatomy.open_surface, return_inverse=True)
 
     @cached_property
@@ -60,24 +60,24 @@ class TipGauge:
     def compute_distances(
         self, loads: Loads, displacement: np.ndarray, nodes: np.ndarray, tool: BuiltIn | None = None, lift: float = 0.0
     ) -> np.ndarray:
-        """Return distances (B,) [m] from tip to tumour.
+        """Return the distances (B,) [m] from the tip of the tool to the tumour.
 
         Parameters
         ----------
         loads
-            B pushes, or poses of one tool.
+            B load cases of one pushing tool, or of one tool with given poses.
         displacement, nodes
             Displacements (B, n, 3) [m] of mesh vertices (n,), which include all of `self.nodes`.
         tool
-            Tool of the poses.
+            Tool to which the poses refer; not required for a pushing tool.
         lift
-            Distance [m] by which a pushing tool has been retracted against the axis.
+            Distance [m] by which a pushing tool has been retracted from the surface, against the axis.
 
         Raises
         ------
         InputError
-            Other loads, poses of an unknown tool, missing vertices, an anatomy without
-            tumour, or a ball that misses the exposed cortex.
+            The loads are of another type, `tool` or vertices are missing, the anatomy has no tumour, or the ball misses
+            the exposed cortex.
         """
         if not len(self.anatomy.tumour_nodes):
             raise InputError("the anatomy has no tumour: use one with a tumour to measure the distance of a tip.")
@@ -100,7 +100,7 @@ class TipGauge:
     def _compute_tips(
         self, loads: Loads, displacement: np.ndarray, row: np.ndarray, tool: BuiltIn | None, lift: float
     ) -> np.ndarray:
-        """Return the tool tips (B, 3) [m]; `row` (m,) are the rows of the exposed cortex in `displacement`."""
+        """Return the tip positions (B, 3) [m]; `row` (m,) are the rows of the exposed cortex in `displacement`."""
         axis, touching = self.cortex.axis, loads.get(Touching)
         if touching is not None and tool is not None:
             return find_foremost_points(tool, touching.pose[:, 0], axis)
@@ -121,5 +121,5 @@ class TipGauge:
 
 @lru_cache(8)
 def build_tip_gauge(anatomy: Anatomy) -> TipGauge:
-    """Return the cached gauge of an anatomy; every frame uses it."""
+    """Return the gauge of an anatomy from a cache, since every frame uses the gauge."""
     return TipGauge(anatomy)

@@ -1,4 +1,4 @@
-"""Reader for voxel volumes of several formats, with any affine, in metres, RAS."""
+"""Reader for voxel volumes of several formats with any affine; positions are in metres (RAS)."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,16 +23,16 @@ READERS = {
 def read_volume(
     path: str | Path, spec: VoxelSpec = DEFAULT_VOXELS, require_finite: bool = True, allow_layers: bool = False
 ) -> Volume:
-    """Read one numeric volume from a file; unless `require_finite` is False, all values must be finite.
+    """Return the numeric volume in a file; if `require_finite`, all values must be finite.
 
-    If `allow_layers`, the values of a segmentation may be (I, J, K, L), in layers that overlap.
+    If `allow_layers`, the values of a segmentation may be (I, J, K, L), with L layers that overlap.
 
     Raises
     ------
     InputError
-        A path that is not a readable file of these formats, or a truncated file. Several volumes, a slice, colours or
-        complex numbers. Values or a slope that are not finite. A missing orientation, a singular
-        affine. Voxels that are too coarse, too fine, or too many.
+        The file is unreadable, truncated or of another format. It contains several volumes, only a slice, colours or
+        complex numbers, or values or a slope that are not finite. The orientation is missing or the affine singular.
+        Voxels are too coarse, too fine, or too many.
     """
     path = to_path(path)
     if not path.is_file():

@@ -15,7 +15,7 @@ from ..errors import InputError
 
 REMEDY = "Give one three-dimensional volume (.nii, .nii.gz, .mgz, .mgh, .nrrd, .seg.nrrd or .nhdr)."
 LPS = np.array([-1.0, -1.0, 1.0])
-"""Signs of the conversion between LPS and RAS."""
+"""Sign of each coordinate in the conversion between LPS and RAS."""
 SURPLUS = 2**24  # maximum data after the voxels, read for a checksum [bytes]
 BLOCK = 2**20  # block size of reading [bytes]
 # Maximum decompressed size of a file whose suffix does not show its compression [bytes].
@@ -29,11 +29,11 @@ class VoxelSpec:
     Parameters
     ----------
     min_edge, max_edge
-        Limits of the voxel edges [m]: no brain scanner is finer, and coarser voxels do not resolve the surface.
+        Limits of the voxel edges [m]: no brain scanner has finer voxels; coarser voxels do not resolve the surface.
     max_sform_difference
-        Maximum distance between the sform and qform positions of a voxel, to allow for round-off [m].
+        Maximum distance [m] between the positions of a voxel by sform and by qform; only round-off is allowed.
     axes
-        Axis directions of a NIfTI file without orientation, such as RAS or LPS; if empty, such a file is rejected.
+        Axis directions of NIfTI files without orientation, such as RAS or LPS; if empty, such files are rejected.
     """
 
     min_edge: float = 1e-5
@@ -43,12 +43,12 @@ class VoxelSpec:
 
     @property
     def ignored_axes_note(self) -> tuple[str, ...]:
-        """Note that `axes` are ignored since the file has its own orientation; () without `axes`."""
+        """Note that `axes` are ignored because the file has an orientation; () if `axes` is empty."""
         return (f"its own orientation is used: axes {self.axes} are ignored",) if self.axes else ()
 
 
 DEFAULT_VOXELS = VoxelSpec()
-"""Default limits, for brain scanners."""
+"""Default limits and options, for brain scanners."""
 
 
 @dataclass(frozen=True)
@@ -62,18 +62,18 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Voxels and their position.
+    """Voxel values and their positions.
 
     Parameters
     ----------
     values
-        (I, J, K), or (I, J, K, L) for a segmentation with several layers.
+        Values (I, J, K), or (I, J, K, L) of a segmentation with L layers.
     affine
-        (4, 4) from their indices to metres (RAS).
+        Affine (4, 4) from voxel indices to metres (RAS).
     notes
-        Notes on assumptions.
+        Notes for the user on assumptions.
     segments
-        Named segments, if the file has any.
+        Named segments; () if the file has no segments.
     """
 
     values: np.ndarray
@@ -92,18 +92,18 @@ class VoxelGrid:
 
 
 def open_volume(path: Path) -> Any:
-    """Open a file for reading, decompressed according to its content, not its name.
+    """Return the file opened for reading; decompression depends on its content, not on its name.
 
     Raises
     ------
     InputError
-        An archive of several files.
+        The file is an archive of several files.
     """
     return _find_opener(path)(path, "rb")
 
 
 def unpack_file(path: Path) -> str | BytesIO:
-    """Return the file name if it shows the compression to nibabel, else the decompressed bytes."""
+    """Return the file name if its suffix matches the compression, as nibabel requires; else the decompressed bytes."""
     named = gzip.open if path.name.lower().endswith(("gz", "mgz")) else open
     if _find_opener(path) is named:
         return str(path)
@@ -121,15 +121,15 @@ def _find_opener(path: Path) -> Callable[..., Any]:
 
 
 def check_volume(path: Path, volume: Volume, spec: VoxelSpec, require_finite: bool, allow_layers: bool) -> Volume:
-    """Return the volume without singleton axes beyond the third, if it is numeric and has a position.
+    """Return a valid volume, without singleton axes after the third axis.
 
     `allow_layers` accepts several layers of a segmentation, as (I, J, K, L).
 
     Raises
     ------
     InputError
-        Colours or complex numbers; a slice or several volumes; segments that overlap, unless `allow_layers`. If
-        `require_finite`, non-finite values. A singular affine, and voxels that are too fine or too coarse.
+        The values are colours, complex numbers, a slice, several volumes, overlapping segments (unless `allow_layers`),
+        or not finite (if `require_finite`). The affine is singular, or voxels are too fine or too coarse.
     """
     values, affine = volume.values, volume.affine
     shape = " x ".join(map(str, values.shape))

@@ -1,4 +1,4 @@
-"""Uncompressed size of a `.vtu` file, measured in bounded memory: a few bytes may expand to gigabytes."""
+"""Measurement of the uncompressed size of a `.vtu` file in bounded memory, since few bytes may expand to gigabytes."""
 
 import base64
 import lzma
@@ -25,14 +25,14 @@ WORDS = {"UInt32": "u4", "UInt64": "u8"}  # header word type
 
 
 def check_vtu_size(path: Path, max_bytes: int) -> bool:
-    """Reject a file whose compressed arrays expand to more than `max_bytes` bytes, or to more than they declare.
+    """Reject a file whose compressed arrays expand to more than `max_bytes` bytes, or to more than their declared size.
 
-    Return False if the arrays cannot be measured as reliably as meshio reads them: not XML, raw or uncompressed data.
+    Return True if all arrays could be measured; False if the file is not XML or its data is raw or not compressed.
 
     Raises
     ------
     InputError
-        With the limit.
+        The file is too large; the message gives the limit.
     """
     text, behind = path.read_bytes(), None
     try:
@@ -78,10 +78,10 @@ def check_vtu_size(path: Path, max_bytes: int) -> bool:
 
 
 def _parse_blocks(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[bytes]]:
-    """Return the size an array declares [bytes], and its compressed blocks.
+    """Return the declared size of an array [bytes], and an iterator over its compressed blocks.
 
-    They follow a header: number of blocks, size of a block and of the last one, compressed size of each.
-    `inside` is raw, or the header and the blocks are base64.
+    The blocks follow a header: number of blocks, size of a block, size of the last block, compressed size of each.
+    `inside` contains raw bytes, or header and blocks in base64.
     """
 
     def part(place: int, size: int) -> bytes:
@@ -98,12 +98,12 @@ def _parse_blocks(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[by
 
 
 def _count_base64_characters(size: int) -> int:
-    """Return the base64 characters for `size` bytes."""
+    """Return the number of base64 characters that encode `size` bytes."""
     return -(-size // 3) * 4
 
 
 def _measure_inflated_size(opener: Callable[[], Any], block: bytes, most: int) -> int:
-    """Return the decompressed size of all streams of a block [bytes], or any number above `most`."""
+    """Return the decompressed size [bytes] of all streams of a block, or any number above `most` if it is exceeded."""
     total, rest = 0, block
     while rest and total <= most:
         opened = opener()

@@ -1,1 +1,1 @@
-"""Checks of a solution beyond equilibrium: traction on the bond, tissue that passes the skull, excessive strain."""
+"""Checks of an equilibrium: traction on the bond to the skull, tissue that passes the skull, excessive strain."""

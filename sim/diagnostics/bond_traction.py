@@ -1,4 +1,4 @@
-"""Traction on the bond between brain and skull, relative to its strength."""
+"""Traction on the bond between brain and skull, relative to the strength of the bond."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ from ..runtime.device import Device, forward_kernel
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
-    """Build the kernel for a device's scalar type, over (patch, load case)."""
+    """Return the kernel over (patch, load case), for the scalar type of the device."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -31,7 +31,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         share: wp.array2d(dtype=wp.float64),
         most: wp.array(dtype=wp.float64),
     ):
-        """Compute s = |(max(t.n, 0) / tension, t - (t.n) n / shear)| per patch, t = forces / area, and its maximum."""
+        """Compute s = |(max(t.n, 0) / tension, (t - (t.n) n) / shear)| per patch, t = force / area, and max(s)."""
         p, c = wp.tid()
         t = wp.vec3d()
         for k in range(first[p], first[p + 1]):
@@ -49,12 +49,12 @@ def build_kernel(device: Device) -> wp.Kernel:
 
 
 class BondTraction:
-    """Largest traction between brain and skull, relative to the strength in `Bonded`.
+    """Traction between brain and skull, relative to the strengths in `Bonded`.
 
     Tension and shear are combined as sqrt((t_n / tension)^2 + (t_s / shear)^2): the quadratic nominal stress criterion
     of cohesive layers (Camanho, Davila 2002, NASA/TM-2002-211737, eq. 16). Pressure never breaks the bond. Tractions
-    are means over a radius `around` [m] of each node: at the edge of a craniotomy they are singular, but their mean is
-    not.
+    are averaged over a radius `around` [m] of each node, since tractions are singular at the edge of a craniotomy, but
+    averages are not.
     """
 
     def __init__(self, effect: Bonded, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 5e-3):
@@ -79,19 +79,19 @@ class BondTraction:
         ]
 
     def compute_ratios(self, force: wp.array) -> np.ndarray:
-        """Compute the relative traction (n, B) at `nodes` (n,) from the skull's forces (3N, B) [N] on the brain."""
+        """Return the relative traction (n, B) at `nodes` (n,), from the forces (3N, B) [N] of skull on brain."""
         share = wp.zeros((len(self.nodes), force.shape[1]), dtype=wp.float64, device=self._device.name)
         self._compute_largest_ratio(force, share)
         return share.numpy()
 
     def compute_max_ratio(self, force: wp.array) -> np.ndarray:
-        """Return the maximum of `shares` (B,): above 1 the bond would fail. NaN without a skull."""
+        """Return the largest relative traction (B,); above 1 the bond would fail. NaN without a skull."""
         return self._compute_largest_ratio(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
 
     def _compute_largest_ratio(self, force: wp.array, share: wp.array | None = None) -> wp.array:
-        """Compute the largest relative traction of each load case (B,), on the device.
+        """Return the largest relative traction (B,) of each load case, as a device array.
 
-        All values (n, B) are written to `share`, if it is given.
+        If `share` is given, the relative tractions (n, B) of all nodes are written to this array.
         """
         most = wp.zeros(force.shape[1], dtype=wp.float64, device=self._device.name)
         inputs = [force, *self._arrays, wp.float64(self._effect.tension), wp.float64(self._effect.shear)]

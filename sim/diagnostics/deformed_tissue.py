@@ -1,4 +1,4 @@
-"""Diagnostic fields of a `Deformation`: leak, bond, stretch, and the outcomes that follow from them."""
+"""Diagnostic fields of a `Deformation`: leak, bond and stretch, and the outcomes that follow from these fields."""
 
 from collections.abc import Iterable
 
@@ -16,7 +16,7 @@ from .stretch import TissueStretch
 
 
 class Diagnostics:
-    """Diagnostics of the deformations of an anatomy under some effects."""
+    """Diagnostics of deformations of an anatomy under given effects."""
 
     def __init__(
         self, anatomy: Anatomy, space: Discretisation, effects: Iterable[Effect], device: Device, limit_strain: bool
@@ -28,22 +28,22 @@ class Diagnostics:
 
     @property
     def needs_forces(self) -> bool:
-        """True if `fields` needs the forces at fixed nodes."""
+        """True if `compute_fields` needs the forces at fixed nodes."""
         return self._bond is not None
 
     def compute_fields(self, u: wp.array, force: wp.array | None) -> dict[str, np.ndarray]:
-        """Compute `leaked`, `bond`, `stretch` and `strained` at u (3N, B) [m] with internal forces (3N, B) [N]."""
+        """Return `leaked`, `bond`, `stretch`, `strained` by name, at u (3N, B) [m] with internal forces (3N, B) [N]."""
         bond = self._bond.compute_max_ratio(force) if self._bond and force is not None else np.array(np.nan)
         return {"leaked": self._leak.compute_fraction(u), "bond": bond, **self.compute_strains(u)}
 
     def compute_strains(self, u: wp.array) -> dict[str, np.ndarray]:
-        """Compute `stretch` and `strained` at u (3N, B) [m]."""
+        """Return `stretch` and `strained`, by name, at u (3N, B) [m]."""
         return self._stretch.measure_stretch(u)
 
     def mark_outcomes(self, outcome: np.ndarray, inverted: np.ndarray, strained: np.ndarray) -> np.ndarray:
-        """Return outcomes (B,), in which equilibria that real tissue cannot have are marked, if strains are limited.
+        """Return the outcomes (B,); if strains are limited, equilibria with inverted or overstrained tissue are marked.
 
-        inverted (B,) counts tetrahedra; strained (B,) [m^3] as in `Deformation`.
+        `inverted` (B,) are numbers of tetrahedra, and `strained` (B,) are volumes [m^3], as in `Deformation`.
         """
         good, out = np.array([one.good and self._limit_strain for one in outcome], bool), outcome.copy()
         out[good & self._stretch.is_beyond_range(strained)] = Outcome.OVERSTRAINED

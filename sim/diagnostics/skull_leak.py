@@ -19,10 +19,10 @@ WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 
 def integrate_facet_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Integrate N_i n (S, n, 3) [m^2] over outward triangles (S, n): n = 3 or, quadratic and perhaps curved, 6.
+    """Return the integrals of N_i n, (S, k, 3) [m^2], over outward triangles (S, k): k = 3 or, if quadratic, k = 6.
 
-    With N_i the shape function of node i (nodes (N, 3) [m]) and n the outward normal. The sum of products with the
-    nodes' displacements is the volume that the triangle sweeps.
+    N_i is the shape function of node i, `nodes` (N, 3) [m], and n is the outward normal. The sum of the products with
+    the displacements of the nodes is the volume that the triangle sweeps.
 
     Engelman, Sani, Gresho 1982, "The implementation of normal and/or tangential boundary conditions in finite element
     codes for incompressible fluid flow", Int. J. Numer. Methods Fluids 2:225-238.
@@ -42,7 +42,7 @@ def integrate_facet_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndar
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
-    """Build the kernel for a device's scalar type, over (patch, load case)."""
+    """Return the kernel over (patch, load case), for the scalar type of the device."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -55,7 +55,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """Compute v = sum a_i . u_i of a patch; add max(v, 0) to out_0 if covered by the skull, or |v| to out_1."""
+        """Compute v = sum a_i . u_i of a patch; add max(v, 0) to out_0 if skull covers the patch, else |v| to out_1."""
         s, c = wp.tid()
         v = wp.float64(0.0)
         for i in range(first[s], first[s + 1]):
@@ -70,11 +70,11 @@ def build_kernel(device: Device) -> wp.Kernel:
 
 
 class SkullLeak:
-    """Volume that passes out through the closed skull, relative to the volume swept by the open surface.
+    """Tissue volume that passes outwards through the closed skull, relative to the volume swept by the open surface.
 
-    The flux through each covered facet is averaged over those within `around` [m], the size of a palpating tool. Sums
-    over the facets of one node would not work: nodes that slide along the mean normal of their facets make these zero
-    by construction, whatever passes each facet.
+    The flux through each covered facet is averaged over all facets within `around` [m], the size of a palpating tool.
+    Sums over the facets of one node would not show a leak: for a node that slides perpendicular to the mean normal of
+    its facets, this sum is zero by construction.
     """
 
     def __init__(self, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 7e-3):
@@ -102,7 +102,7 @@ class SkullLeak:
         ]
 
     def compute_fraction(self, u: wp.array) -> np.ndarray:
-        """Compute the relative leak (B,) at u (3N, B) [m] on the device; 0 without leak, NaN if nothing is open."""
+        """Return the relative leak (B,) at u (3N, B) [m]; 0 without a leak, NaN without an open surface."""
         out = wp.zeros((2, u.shape[1]), dtype=wp.float64, device=self._device.name)
         self._device.launch(build_kernel(self._device), (len(self._arrays[3]), u.shape[1]), [u, *self._arrays], [out])
         passed, swept = out.numpy()

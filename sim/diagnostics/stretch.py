@@ -1,4 +1,4 @@
-"""Principal stretches of deformed tissue, and the volume that is strained beyond measured data on brain."""
+"""Principal stretches of deformed tissue, and the tissue volume with strain beyond measurements on brain."""
 
 from functools import cache
 
@@ -20,7 +20,7 @@ MAX_FRACTION = 0.1  # Relative to a small mesh.
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
-    """Build the kernel over (element, load case)."""
+    """Return the kernel over (element, load case)."""
     scalar, vec, mat = device.scalar, device.vector, device.matrix
     low, high = (
         wp.constant(wp.float64((MIN_STRETCH - ROUND_OFF) ** 2)),
@@ -37,10 +37,10 @@ def build_kernel(device: Device) -> wp.Kernel:
         # outputs: least and most square stretch, volume
         found: wp.array2d(dtype=wp.float64),
     ):
-        """Compute the extreme eigenvalues of C = F^T F: q + 2 p cos(phi), q + 2 p cos(phi + 2 pi / 3).
+        """Compute the extreme eigenvalues of C = F^T F: q + 2 p cos(phi) and q + 2 p cos(phi + 2 pi / 3).
 
         q = tr C / 3, 6 p^2 = |C - q I|^2, cos(3 phi) = det((C - q I) / p) / 2: Smith 1961, "Eigenvalues of a symmetric
-        3 x 3 matrix", Commun. ACM 4:168. The bounds q +- 2 p make them unnecessary for most elements.
+        3 x 3 matrix", Commun. ACM 4:168. For most elements the bounds q +- 2 p suffice.
         """
         e, c = wp.tid()
         for k in range(gradient.shape[1]):
@@ -68,7 +68,7 @@ def build_kernel(device: Device) -> wp.Kernel:
 
 
 class TissueStretch:
-    """Stretch of the displacement gradients in a discretisation's material law: averages in smoothed elements."""
+    """Stretch of the deformation gradients that the material law uses; these are averages in smoothed elements."""
 
     def __init__(self, space: Discretisation, device: Device):
         elements = space.build_elements(np.ones(len(space.mesh.tets), bool))[0].elements
@@ -83,12 +83,12 @@ class TissueStretch:
         ]
 
     def measure_stretch(self, u: wp.array) -> dict[str, np.ndarray]:
-        """Compute `stretch` and `strained` of a `Deformation` at u (3N, B) [m] on the device."""
+        """Return the fields `stretch` and `strained` of a `Deformation`, by name, at u (3N, B) [m]."""
         found = self._device.upload(np.repeat([[1.0], [1.0], [0.0]], u.shape[1], axis=1), wp.float64)
         self._device.launch(build_kernel(self._device), (len(self._shape[1]), u.shape[1]), [u, *self._shape], [found])
         least, most, volume = found.numpy()
         return {"stretch": np.sqrt(np.stack([least.clip(0.0), most])), "strained": volume}
 
     def is_beyond_range(self, strained: np.ndarray) -> np.ndarray:
-        """Return True (B,) for volumes (B,) [m^3] strained beyond the measured range that make results unreliable."""
+        """Return a mask (B,): True if the volume `strained` (B,) [m^3] is so large that the result is unreliable."""
         return strained > self._limit

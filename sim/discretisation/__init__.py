@@ -1,1 +1,1 @@
-"""Elements, constraints, footprints, the Term interface, and the problem as a sum of terms."""
+"""Elements, constraints, tool footprints, the interface `Term`, and boundary value problems as sums of terms."""

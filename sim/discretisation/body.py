@@ -10,11 +10,11 @@ from .space import Discretisation
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Discretised body with N nodes; the mesh vertices come first.
+    """Discretised anatomy with N nodes; the mesh vertices are the first nodes.
 
-    `space.count` is N; `space.nodes` (N, 3) [m] are undeformed; `skin` is the surface for tools; `device` allocates
-    arrays and launches kernels. Resection creates a new body with the same vertices. Preconditioners may use another
-    element.
+    `space.count` is N; `space.nodes` (N, 3) [m] are the undeformed positions; `skin` is the surface that tools touch;
+    `device` allocates arrays and launches kernels. Resection creates a new body with the same vertices. Preconditioners
+    may use another element type.
     """
 
     anatomy: Anatomy

@@ -1,8 +1,8 @@
-"""Boundary conditions as one projection: fixed, prescribed and sliding nodes, and footprints with prescribed motion.
+"""Boundary conditions as a projection: fixed, prescribed and sliding nodes, and footprints with prescribed motion.
 
 Every constraint is linear, C u = value. `project` maps a gradient or a direction to the subspace of admissible
-motions; `close_gap` returns the smallest motion that satisfies the constraints. The node projection P acts on each
-node separately. A footprint's mean motion W^T u adds the three rows W^T P, with their Gram matrix G = W^T P W.
+motions; `close_gap` returns the smallest motion that satisfies the constraints. The node projection P acts on each node
+separately. The mean motion W^T u of a footprint adds three rows W^T P, whose Gram matrix is G = W^T P W.
 """
 
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ class MinFreeDofs:
     Parameters
     ----------
     normal_norm
-        Minimum norm of a slide normal's free components; below it, the normal has no effect on them.
+        Minimum norm of the free components of a slide normal; a smaller normal does not constrain the free components.
     footprint_fraction
-        Minimum free fraction of a footprint's squared weights in every direction.
+        Minimum fraction, in every direction, of the squared footprint weights that is at free components.
     """
 
     normal_norm: float = 1e-6
@@ -35,7 +35,7 @@ class MinFreeDofs:
 
 @dataclass(frozen=True)
 class ConstraintKernels:
-    """Constraint kernels for one scalar type."""
+    """Kernels of the constraints, for one scalar type."""
 
     project: wp.Kernel
     close_gap: wp.Kernel
@@ -56,7 +56,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         v: wp.array2d(dtype=scalar),
     ):
-        """Project onto the admissible motions: v_i -= n (n . v_i); fixed components of v are zero."""
+        """Project v onto the admissible motions: v_i -= n (n . v_i), then fixed components are set to zero."""
         i, c = wp.tid()
         x, n = vec(v[3 * i, c], v[3 * i + 1, c], v[3 * i + 2, c]), normal[i]
         x -= wp.dot(n, x) * n
@@ -89,7 +89,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Add the weighted mean over a chunk of nodes: out_kc += sum of w_ic v_(3i+k)c."""
+        """Add the weighted sum over a chunk of nodes to the mean motion: out_kc += sum of w_ic v_(3i+k)c."""
         block, c = wp.tid()
         total = vec()
         for i in range(block * chunk, wp.min((block + 1) * chunk, weight.shape[0])):
@@ -113,15 +113,15 @@ def build_kernels(device: Device) -> ConstraintKernels:
 
 
 class Constraint:
-    """Boundary conditions of N nodes.
+    """Boundary conditions on the displacements of N nodes.
 
     Parameters
     ----------
     fixed
         Mask (N, 3) of components with prescribed values.
     normal
-        Unit normals (N, 3) of sliding nodes, zero elsewhere. If components of a sliding node are fixed, the
-        others follow them along the plane.
+        Unit normals (N, 3) of sliding nodes, zero elsewhere. If some components of a sliding node are fixed, its free
+        components are constrained so that the node stays in its tangent plane.
     device
         Device of the arrays.
     freedom
@@ -140,14 +140,14 @@ class Constraint:
         self._target, self._gram = np.zeros((3, 0)), np.zeros((0, 3, 3))
 
     def begin(self, displacement: np.ndarray | None, footprint: np.ndarray | None, motion: np.ndarray | None) -> None:
-        """Set the values (3N, b) [m] of fixed components for a batch; None for zero.
+        """Set the values `displacement` (3N, b) [m] of fixed components for a batch; None: zero.
 
-        Footprint weights (N, b) with prescribed mean motion `motion` (3, b) [m], or None.
+        `footprint` has the weights (N, b) of a footprint with the prescribed mean motion `motion` (3, b) [m], or None.
 
         Raises
         ------
         InputError
-            A footprint that is too constrained to move.
+            The constraints leave the footprint too little freedom to move.
         """
         self._value = None if displacement is None else self.device.upload(displacement)
         self._weight = None
@@ -163,7 +163,7 @@ class Constraint:
                 )
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep these load cases (k,) of the batch."""
+        """Keep only the load cases `columns` (k,) of the batch."""
         if self._value is not None:
             self._value = gather_columns(self.device, self._value, columns)
         if self._weight is not None:
@@ -172,7 +172,7 @@ class Constraint:
 
     @property
     def node_arrays(self) -> tuple[wp.array, wp.array]:
-        """Arrays of `project_nodes` on the device: fixed components (N, 3) int8 and normals (N,)."""
+        """Device arrays that `project_nodes` uses: fixed components (N, 3) int8, and slide normals (N,)."""
         return self._fixed, self._normal
 
     @property
@@ -188,12 +188,12 @@ class Constraint:
             self.project_nodes(v)
 
     def project_nodes(self, v: wp.array) -> None:
-        """Project v (3N, b) onto the motions that fixed and sliding nodes admit, in place, regardless of the loads."""
+        """Project v (3N, b) in place onto the motions that fixed and sliding nodes admit, regardless of footprints."""
         dim = (len(self.fixed), v.shape[1])
         self.device.launch(build_kernels(self.device).project, dim, [self._fixed, self._normal], [v])
 
     def close_gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
-        """Return the smallest motion (3N, b) from u (3N, b) to the constraints, and its largest component (b,) [m]."""
+        """Return the smallest motion (3N, b) [m] that makes u (3N, b) satisfy the constraints, and its maximum (b,)."""
         gap = self.device.allocate(*u.shape)
         value = self._value if self._value is not None else gap
         inputs = [self._fixed, self._normal, self._drag, value, u]
@@ -206,9 +206,9 @@ class Constraint:
         return gap, np.abs(gap.numpy()).max(axis=0, initial=0.0)
 
     def compute_footprint_force(self, gradient: wp.array) -> np.ndarray | None:
-        """Return the multipliers (3, b) [N], the force of the tool on its footprint, or None without one.
+        """Return the force (3, b) [N] of the tool on its footprint, by Lagrange multipliers; None without a footprint.
 
-        In equilibrium P gradient = P W force. The gradient (3N, b) is projected in place.
+        In equilibrium, P gradient = P W force. The array `gradient` (3N, b) is projected in place.
         """
         if self._weight is None:
             return None
@@ -216,7 +216,7 @@ class Constraint:
         return self._solve_gram(self._average(gradient))
 
     def build_basis(self) -> sp.csc_array:
-        """Return a sparse orthonormal basis (3N, n) of the motions that fixed and sliding nodes admit."""
+        """Return a sparse orthonormal basis (3N, n) of the motions that the fixed and sliding nodes admit."""
         sliding = (self.normal != 0.0).any(axis=1)
         rows = [np.flatnonzero(~self.fixed & ~sliding[:, None])]
         columns, values = [np.arange(len(rows[0]))], [np.ones(len(rows[0]))]
@@ -250,9 +250,9 @@ class Constraint:
 
 
 def _restrict_normals(fixed: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the unit normals (N, 3) of sliding nodes without their fixed components; zero if these leave too little.
+    """Return the slide normals (N, 3) without their fixed components, normalised; zero if their norm is below `least`.
 
-    Also return `drag` (N, 3), the motion along them per unit of each fixed component, so that normal . u = 0.
+    Also return `drag` (N, 3): motion along the normal per unit of each fixed component that keeps a node in its plane.
     """
     inside = np.where(fixed, 0.0, normal)
     length = np.linalg.norm(inside, axis=1, keepdims=True)

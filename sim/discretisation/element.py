@@ -1,4 +1,4 @@
-"""Finite elements as arrays: node numbers, shape function gradients and quadrature weights."""
+"""Arrays of finite elements: node numbers, shape function gradients and quadrature weights."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)  # fractions of the volum
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """T elements with at most n nodes and q quadrature points.
+    """Set of T elements with at most n nodes and q quadrature points each.
 
-    table (T, n) node numbers. gradient (T, q, n, 3) of the shape functions in the undeformed configuration [1/m].
-    weight (T, q) undeformed volume of each quadrature point [m^3]. nodes: number of nodes of the discretisation.
-    owner (T,) tetrahedron of the mesh from which each element takes its tissue. keys (T, k) vertices and labels that
-    identify each element, whatever is cut from the mesh. sizes (T,) number of nodes of each row, which
-    come first; None: all n.
+    `table` (T, n): node numbers. `gradient` (T, q, n, 3): undeformed gradients of the shape functions [1/m]. `weight`
+    (T, q): undeformed volume of each quadrature point [m^3]. `nodes`: number of nodes of the discretisation. `owner`
+    (T,): mesh tetrahedron whose tissue the element has. `keys` (T, k): vertices and labels that identify each element,
+    also after a resection. `sizes` (T,): number of valid entries, at the start, in each row of `table`; None: all.
     """
 
     table: np.ndarray
@@ -36,12 +35,12 @@ class Elements:
     sizes: np.ndarray | None = None
 
     def restrict(self, nodes: np.ndarray) -> Elements:
-        """Return the elements renumbered to a subset of nodes (n,), ascending, that contains all of theirs."""
+        """Return the elements with node numbers relative to `nodes` (n,), a sorted subset that contains their nodes."""
         return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), node_count=len(nodes))
 
 
 def build_linear_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
-    """Build linear tetrahedra with one quadrature point; the mask `selected` (T,) selects elements."""
+    """Return linear elements with one quadrature point, for the tetrahedra marked in `selected` (T,)."""
     tets = mesh.tets[selected]
     corners = mesh.nodes[tets]
     jacobian = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
@@ -52,7 +51,7 @@ def build_linear_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
 
 
 def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, selected: np.ndarray) -> Elements:
-    """Build ten-node tetrahedra, straight or curved, with eight quadrature points of degree 3.
+    """Return ten-node tetrahedral elements, straight or curved, with eight quadrature points of degree 3.
 
     Zienkiewicz, Taylor 2005, "The Finite Element Method", section 4.7. nodes (N, 3) [m]; table (T, 10): corners, then
     midpoints of `QUADRATIC_EDGES`; the mask `selected` (T,) selects elements.
@@ -60,7 +59,7 @@ def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, selected: np.
     Raises
     ------
     InputError
-        An element folded by its mid-edge nodes.
+        The mid-edge nodes fold an element.
     """
     table, slope = table[selected], compute_quadratic_gradients(EIGHT_POINTS)
     jacobian = np.einsum("tai,qaj->tqij", nodes[table], slope)
@@ -79,9 +78,9 @@ def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, selected: np.
 def pack_gradients(
     domain: np.ndarray, node: np.ndarray, gradient: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sum gradients (m, 3) by domain (m,) and node (m,): `table`, `sizes` and `gradient` of `Elements`, one point each.
+    """Return `table`, `sizes` and `gradient` of one-point `Elements`, from sums of gradients (m, 3) by domain and node.
 
-    Domains are numbered from 0, without gaps.
+    Each domain becomes an element; domain numbers (m,) start at 0 and have no gaps.
     """
     most = int(node.max(initial=0)) + 1
     pair, place = np.unique(domain.astype(np.int64) * most + node, return_inverse=True)
@@ -116,9 +115,9 @@ def assemble_hooke_stiffness(
 ) -> sp.csc_array:
     """Assemble the undeformed stiffness (3N, 3N) [N/m] of isotropic elements with Lamé parameters mu, lam (T,) [Pa].
 
-    K = integral of 2 mu E^T E + lambda D^T D, with the operators of strain E and volume change D. See Hughes
-    2000, "The Finite Element Method", section 2.8. It is a sum of sparse matrix products, since elements have any
-    number of nodes. Blocks of at most `block_size` numbers limit the memory.
+    K = integral of 2 mu E^T E + lambda D^T D, with the operators E of strain and D of volume change: Hughes 2000, "The
+    Finite Element Method", section 2.8. K is computed by sparse matrix products, since elements may have any number
+    of nodes; blocks of at most `block_size` numbers limit the memory.
     """
     total = sp.csr_array((3 * elements.node_count,) * 2)
     count, points, most = elements.gradient.shape[:3]
@@ -139,12 +138,12 @@ def assemble_hooke_stiffness(
 
 
 def _build_divergence(slope: np.ndarray) -> np.ndarray:
-    """Return the blocks (M, 1, 3) of the divergence for shape functions with gradients (M, 3)."""
+    """Return the blocks (M, 1, 3) of the divergence operator, for shape functions with gradients (M, 3)."""
     return slope[:, None]
 
 
 def _build_strain(slope: np.ndarray) -> np.ndarray:
-    """Return the blocks (M, 6, 3) of the small strain, Mandel's order (xx, yy, zz, root 2 times yz, xz, xy)."""
+    """Return the blocks (M, 6, 3) of the small-strain operator in Mandel notation: xx, yy, zz, sqrt(2) yz, xz, xy."""
     blocks = np.zeros((len(slope), 6, 3))
     for i in range(3):
         blocks[:, i, i] = slope[:, i]

@@ -1,10 +1,10 @@
-"""Element-free Galerkin method: moving least squares on the vertices, tetrahedra as integration cells.
+"""Element-free Galerkin method: moving least squares at the mesh vertices, with tetrahedra as integration cells.
 
-Belytschko, Lu, Gu 1994, "Element-free Galerkin methods", Int. J. Numer. Meth. Eng. 37:229-256; on the brain, in the
+Belytschko, Lu, Gu 1994, "Element-free Galerkin methods", Int. J. Numer. Meth. Eng. 37:229-256. For the brain, in the
 undeformed configuration: Horton, Wittek, Joldes, Miller 2010, Int. J. Numer. Meth. Biomed. Eng. 26:977-998. Each cell
-has one gradient, the mean over its volume as an integral over its faces, so that linear patch tests are exact: Chen,
-Wu, Yoon, You 2001, "A stabilized conforming nodal integration for Galerkin mesh-free methods", Int. J. Numer. Meth.
-Eng. 50:435-466, on tetrahedra instead of Voronoi cells.
+has one gradient, its volume average, computed as an integral over the faces; so linear patch tests are exact (Chen, Wu,
+Yoon, You 2001, "A stabilized conforming nodal integration for Galerkin mesh-free methods", Int. J. Numer. Meth. Eng.
+50:435-466, here with tetrahedra instead of Voronoi cells).
 """
 
 import numpy as np
@@ -21,11 +21,11 @@ RADIUS = 1.1  # Support radius, relative to the distance of the farthest node of
 
 
 def build_element_free(mesh: TetMesh, selected: np.ndarray) -> Elements:
-    """Build one integration cell per tetrahedron of the mask `selected` (T,).
+    """Return one integration cell for each tetrahedron marked in `selected` (T,).
 
-    grad N_a = 1/V sum over faces of N_a(centroid) n A. Cells share the values N_a of a face, so the gradients sum to
-    the surface integral of N_a n. On surfaces and between regions the face's three vertices have a third each: loads
-    and fixed nodes act as on linear tetrahedra, and strain may jump between tissues. Other supports cross no such face.
+    grad N_a = 1/V sum over faces of N_a(centroid) n A. Adjacent cells use the same N_a at a common face, so gradients
+    sum to the surface integral of N_a n. At outer surfaces and region interfaces, N_a = 1/3 at the three vertices of a
+    face: loads and fixed nodes act as on linear tetrahedra, strain may jump, and no support crosses such a face.
     """
     tets = mesh.tets[selected]
     corner = tets[:, FACES].reshape(-1, 3)
@@ -53,7 +53,7 @@ def build_element_free(mesh: TetMesh, selected: np.ndarray) -> Elements:
 
 
 def compute_shape_functions(points: np.ndarray, nodes: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Compute shape functions (m, k) at points (m, 3) [m] with supports `nodes` (m, k, 3) [m], as far as `mask` (m, k).
+    """Return shape functions (m, k) at points (m, 3) [m] with support `nodes` (m, k, 3) [m] marked in `mask` (m, k).
 
     N_a = w_a p_a^T M^-1 p(x), M = sum of w_a p_a p_a^T, p = (1, x - x_a): linear fields are reproduced. The weight
     w = ((s^2 + e)^-2 - (1 + e)^-2) / (e^-2 - (1 + e)^-2) at distance s, relative to the support radius, makes
@@ -72,9 +72,9 @@ def compute_shape_functions(points: np.ndarray, nodes: np.ndarray, mask: np.ndar
 
 
 def _choose_supports(nodes: np.ndarray, tets: np.ndarray, links: sp.csr_array, corner: np.ndarray) -> np.ndarray:
-    """Choose the nearest `MAX_SUPPORT` vertices to faces (m, 3) among those near enough by `STEPS`; -1: none.
+    """Return the `MAX_SUPPORT` vertices nearest to each face (m, 3), at most `STEPS` cells away; -1 if there are fewer.
 
-    links (m, T) bool: the two tetrahedra of each face.
+    `links` (m, T) bool marks the two tetrahedra of each face.
     """
     incidence = sp.csr_array(
         (np.ones(tets.size, bool), tets.ravel(), np.arange(0, tets.size + 1, 4)), (len(tets), len(nodes))

@@ -1,7 +1,7 @@
 """Footprint of a round tool on a triangulated surface: distribution of its force over the vertices.
 
-The traction w(s) = sqrt(1 - s^2), s = |x - c| / r, is the Hertz pressure of a smooth indenter. It is
-integrated over triangles subdivided until they are small compared with the footprint, so that force and moment are
+The traction w(s) = sqrt(1 - s^2), s = |x - c| / r, is the Hertz pressure of a smooth indenter. It is integrated over
+triangles, which are subdivided until they are small compared with the footprint. Force and moment are then
 independent of the mesh.
 """
 
@@ -29,11 +29,11 @@ class EdgeSubdivision:
     Parameters
     ----------
     max_edge_ratio
-        Maximum edge length of the subdivision, as a fraction of the footprint's radius.
+        Maximum edge length after subdivision, as a fraction of the footprint radius.
     min_subdivisions
-        Minimum subdivisions per edge, doubled until fine enough.
+        Initial number of subdivisions per edge, which is doubled until `max_edge_ratio` is reached.
     max_subdivisions
-        Maximum subdivisions per edge: needed for a footprint of 0.1 mm on a triangle of 50 m.
+        Maximum number of subdivisions per edge; the default suffices for a footprint of 0.1 mm on a triangle of 50 m.
     """
 
     max_edge_ratio: float = 0.12
@@ -43,10 +43,10 @@ class EdgeSubdivision:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Footprints of B tools on M nodes: a force F adds weight / total x F to every node.
+    """Footprints of B tools on M nodes: a tool force F adds the force F x weight / total to every node.
 
-    nodes (M,) numbers; weight (M, B) float64 and sums (B,) of 4-vectors on the device: the total, and the sum of
-    weight x position [m].
+    `nodes` (M,): node numbers. On the device, `weight` (M, B) float64 and `sums` (B,) of 4-vectors: total weight, and
+    sum of weight x position [m].
     """
 
     nodes: np.ndarray
@@ -54,23 +54,23 @@ class Footprints:
     sums: wp.array
 
     def to_matrix(self, count: int) -> sp.csr_array:
-        """Return normalised weights (B, `count`) over all nodes of a mesh, each row with sum one, on the host."""
+        """Return normalised weights (B, `count`) of all nodes of a mesh; the sum of each row is 1."""
         weight, total = self.weight.numpy().T, self.sums.numpy().reshape(-1, 4)[:, 0]
         tool, place = np.nonzero(weight)
         share = weight[tool, place] / total[tool]
         return sp.csr_array((share, (tool, self.nodes[place])), shape=(len(weight), count))
 
     def compute_centres(self) -> np.ndarray:
-        """Return the centre (B, 3) [m] of each force, on the host."""
+        """Return the points (B, 3) [m] at which the tool forces act, the weighted centroids of the footprints."""
         sums = self.sums.numpy().reshape(-1, 4)
         return sums[:, 1:] / sums[:, :1]
 
 
 @dataclass(frozen=True, eq=False)
 class FootprintArrays:
-    """Device arrays for B footprints: `tools` (B,) point and radius [m], `contacts` (B,) contact point and distance.
+    """Device arrays for B footprints: `tools` (B,) as point and radius [m], `contacts` (B,) as point and distance.
 
-    `levels` (n, B) reduction levels of the nearest points; weight (M, B) and sums (B,) as in `Footprints`.
+    `levels` (n, B) are reduction levels of the nearest points; `weight` (M, B) and `sums` (B,) are as in `Footprints`.
     """
 
     tools: wp.array
@@ -81,20 +81,20 @@ class FootprintArrays:
 
 
 class ContactSurface:
-    """Surface for tool contact, on a device.
+    """Triangulated surface for tool contact, on a device.
 
     Parameters
     ----------
     nodes
         Nodes (N, 3) [m].
     triangles
-        Triangles (S, 3), or quadratic (S, 6) with midpoints of `TRIANGLE_EDGES`; geometry is that of the corners.
+        Triangles (S, 3), or quadratic (S, 6) with midpoints of `TRIANGLE_EDGES`; edges are treated as straight.
     device
         Device of the arrays.
     name
         Name for messages.
     division
-        Subdivision of its triangles under a footprint.
+        Subdivision of the triangles under a footprint.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class ContactSurface:
         self._last: tuple[bytes, Footprints] | None = None
 
     def find_nearest(self, points: np.ndarray, max_distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return nearest points (B, 3) [m] to points (B, 3), and distances (B,), inf if > `max_distance` (B,) [m]."""
+        """Return the surface point nearest to each of B points [m], and its distance, inf if > `max_distance` (B,)."""
         imprint = self.allocate_footprints(self._pack_tools(points, max_distance))
         self._find_contacts(imprint)
         touched = imprint.contacts.numpy().reshape(-1, 4)
@@ -129,13 +129,13 @@ class ContactSurface:
     def find_footprints(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
         """Return the footprints of tools at `points` (B, 3) with `radii` (B,) [m].
 
-        A point off the surface is moved to the nearest surface point, by at most its radius. The last result is cached,
-        since a solve requests its tools more than once.
+        A point outside the surface is moved to the nearest surface point, by at most its radius. The last result is
+        cached, since a solve requests the footprints of the same tools more than once.
 
         Raises
         ------
         InputError
-            A footprint that does not touch the surface, or is too small for the subdivision of its triangles.
+            A footprint does not touch the surface, or is too small for the maximum subdivision of the triangles.
         """
         key, last = np.column_stack([points, radii]).tobytes(), self._last
         if last is None or last[0] != key:
@@ -143,7 +143,7 @@ class ContactSurface:
         return last[1]  # another thread may have replaced self._last since
 
     def allocate_footprints(self, tools: wp.array) -> FootprintArrays:
-        """Allocate the footprint arrays of tools (B,)."""
+        """Return allocated footprint arrays for `tools` (B,)."""
         count, device = len(tools), self.device.name
         found, left = [], len(self._ball)
         while left > 1 or not found:
@@ -154,7 +154,7 @@ class ContactSurface:
         return FootprintArrays(tools, found[-1].flatten(), tuple(found), weight, sums)
 
     def compute_footprints(self, footprints: FootprintArrays) -> None:
-        """Compute the footprints on the device alone; distance inf and weight 0 for a tool without contact."""
+        """Compute the footprints in place, on the device; a tool without contact has distance inf and weight 0."""
         self._find_contacts(footprints)
         footprints.weight.zero_()
         footprints.sums.zero_()
@@ -165,12 +165,12 @@ class ContactSurface:
         )
 
     def check_contact(self, points: np.ndarray, radii: np.ndarray) -> None:
-        """Reject tools, with arguments as `find_footprints`, if one does not touch the surface.
+        """Reject tools at `points` (B, 3) with `radii` (B,) [m] if a tool does not touch the surface.
 
         Raises
         ------
         InputError
-            With the first such tool.
+            A tool does not touch the surface; the message describes the first such tool.
         """
         self._check_touching(points, radii, self.find_nearest(points, radii)[1])
 
@@ -200,7 +200,7 @@ class ContactSurface:
         return self.device.upload(np.column_stack([points, radii]), wp.vec4d)
 
     def _find_contacts(self, imprint: FootprintArrays) -> None:
-        """Find the first contact point of each tool and its distance; inf if larger than its radius."""
+        """Find the contact point of each tool and its distance, which is inf if larger than the radius of the tool."""
         inputs = [self._corners, self._ball, imprint.tools]
         self.device.launch(_search, imprint.levels[0].shape, inputs, [imprint.levels[0]])
         for some, fewer in pairwise(imprint.levels):
@@ -210,13 +210,13 @@ class ContactSurface:
 def compute_footprint_weights(
     nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, radii: np.ndarray
 ) -> sp.csr_array:
-    """Compute weights (B, N) of unit row sums on the host; arguments as `ContactSurface` and its `find_footprints`."""
+    """Return normalised footprint weights (B, N) of all nodes; the arguments are those of `ContactSurface`."""
     surface = ContactSurface(nodes, triangles, find_device("cpu", "float64"))
     return surface.find_footprints(points, radii).to_matrix(len(nodes))
 
 
 def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Return the point (3,) nearest to `point` (3,) on triangles with `corners` (S, 3, 3) [m]."""
+    """Return the point (3,) on triangles with `corners` (S, 3, 3) [m] that is nearest to `point` (3,)."""
     apart = np.arange(3 * len(corners)).reshape(-1, 3)
     skin = ContactSurface(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))
     return skin.find_nearest(point[None], np.array([np.inf]))[0][0]
@@ -224,7 +224,7 @@ def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 @wp.func
 def _find_on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
-    """Return the point nearest to `point` on the segment a-b."""
+    """Return the point on the segment a-b that is nearest to `point`."""
     edge = b - a
     square = wp.dot(edge, edge)
     along = wp.float64(0.0)
@@ -235,16 +235,16 @@ def _find_on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def _select_nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
-    """Return the one of two points that is nearer to `point`."""
+    """Return `one` or `other`, the point that is nearer to `point`."""
     return wp.where(wp.length_sq(one - point) <= wp.length_sq(other - point), one, other)
 
 
 @wp.func
 def nearest_on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
-    """Return the point nearest to `point` on a triangle.
+    """Return the point on the triangle a, b, c that is nearest to `point`.
 
-    Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the projection onto the plane if it lies inside, else
-    the nearest point of the edges. Degenerate triangles use their edges only.
+    Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the projection onto the plane if it is inside the
+    triangle, else the nearest point of the edges. For degenerate triangles only the edges are used.
     """
     nearest = _select_nearer(
         _select_nearer(_find_on_edge(a, b, point), _find_on_edge(b, c, point), point), _find_on_edge(c, a, point), point
@@ -262,7 +262,7 @@ def nearest_on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) 
 
 @wp.func
 def _place(of: wp.vec4d) -> wp.vec3d:
-    """Return the centre of a ball or the point of a tool; the fourth component is its radius."""
+    """Return the centre of a ball or the point of a tool, the first three components; the fourth one is the radius."""
     return wp.vec3d(of[0], of[1], of[2])
 
 
@@ -279,7 +279,7 @@ def _search(
     # outputs
     found: wp.array2d(dtype=wp.vec4d),
 ):
-    """Find the nearest point on a chunk of triangles and its distance; inf if none is in range."""
+    """Find the nearest point on a chunk of triangles and its distance; inf if no point is in range."""
     chunk, c = wp.tid()
     point = _place(tools[c])
     best = tools[c][3]
@@ -300,7 +300,7 @@ def _reduce_candidates(
     # outputs
     nearest: wp.array2d(dtype=wp.vec4d),
 ):
-    """Reduce groups of candidates to their nearest."""
+    """Reduce each group of candidate points to the nearest one."""
     group, c = wp.tid()
     best = found[group * CHUNK, c]
     for k in range(1, CHUNK):
@@ -325,9 +325,9 @@ def _press(
     weight: wp.array2d(dtype=wp.float64),
     sums: wp.array(dtype=wp.vec4d),
 ):
-    """Add the integral of w N_a over a triangle, up to a factor, by the centroids of n^2 equal parts.
+    """Add the integral of w N_a over a triangle, up to a constant factor, from the centroids of n^2 equal parts.
 
-    A row of parts, y constant, meets the footprint in an interval: A j^2 + 2 B j + C < 0 at its j-th part.
+    In a row of parts with constant y, part j is inside the footprint if A j^2 + 2 B j + C < 0, an interval of j.
     """
     s, c = wp.tid()
     point, radius = _place(touched[c]), tools[c][3]
@@ -381,9 +381,9 @@ def _press(
 
 
 def compute_push_reactions(surface: ContactSurface, loads: Loads, tool_force: np.ndarray | None = None) -> np.ndarray:
-    """Compute force and moment about its point that each tool exerts [N, N m]: (B, tools, 6).
+    """Return force [N] and moment [N m] about the tool's point, for each pushing tool: (B, tools, 6).
 
-    `tool_force` (3, B) [N] are the forces of `Displaced` loads.
+    `tool_force` (3, B) [N] is the force of the `Displaced` load, if there is one.
     """
     rows = []
     for cause in loads.causes:

@@ -1,4 +1,4 @@
-"""Detection of inverted tetrahedra: an equilibrium may have them, but it is not physical."""
+"""Detection of inverted tetrahedra, which make an equilibrium unphysical."""
 
 from functools import cache
 
@@ -12,7 +12,7 @@ from .space import Discretisation
 
 @cache
 def build_kernel(device: Device, size: int, points: int, min_ratio: float) -> wp.Kernel:
-    """Build the kernel for tetrahedra of `size` nodes and `points` quadrature points, over (tetrahedron, load case)."""
+    """Return the kernel over (tetrahedron, load case) for tetrahedra of `size` nodes and `points` quadrature points."""
     scalar, vec = device.scalar, device.vector
 
     @forward_kernel(module="unique")
@@ -23,7 +23,7 @@ def build_kernel(device: Device, size: int, points: int, min_ratio: float) -> wp
         # outputs
         out: wp.array(dtype=wp.int32),
     ):
-        """Add 1 to n if det F <= least at some point, F = I + sum over nodes of u_a (x) grad N_a."""
+        """Add 1 to the count if det F <= least at any quadrature point; F = I + sum over nodes of u_a (x) grad N_a."""
         e, c = wp.tid()
         for q in range(points):
             F = wp.identity(n=3, dtype=scalar)
@@ -38,11 +38,11 @@ def build_kernel(device: Device, size: int, points: int, min_ratio: float) -> wp
 
 
 class InversionCounter:
-    """Counter of tetrahedra that are inverted or collapsed at some quadrature point.
+    """Counter of tetrahedra that are inverted or collapsed at any quadrature point.
 
-    Linear tetrahedra have one point, quadratic ones eight. With smoothed and element-free strains, which are averages,
-    single tetrahedra are still tested. A tetrahedron with J below `collapsed` counts as collapsed, since round-off
-    determines the sign. `bounded`: the law's energy is infinite for inverted (averaged) deformation gradients.
+    Linear tetrahedra have one point, quadratic ones eight. Smoothed and element-free strains are averages, but the test
+    uses single tetrahedra. A tetrahedron with J below `collapsed` counts, since the sign of J is then round-off.
+    `bounded` is True if the energy of the law is infinite for inverted (averaged) deformation gradients.
     """
 
     def __init__(self, space: Discretisation, device: Device, bounded: bool = False, collapsed: float = 1e-6):
@@ -58,21 +58,21 @@ class InversionCounter:
         self._gradient = device.upload(elements.gradient, device.vector)
 
     def find_suspect(self, counts: np.ndarray) -> np.ndarray:
-        """Return a mask (B,) of states with `counts` (B,) > 0 tetrahedra that may be unphysical equilibria.
+        """Return a mask (B,) of load cases whose inverted tetrahedra, `counts` (B,) > 0, make the equilibrium suspect.
 
-        All False if the law is `bounded` and sees averages only: then a descent cannot invert these, and a strong load
-        may invert single tetrahedra from any start.
+        The mask is False if the law is `bounded` and uses averages: a descent cannot invert the averages, and a strong
+        load may invert single tetrahedra for any initial values.
         """
         return self._telling & (counts > 0)
 
     def count(self, u: wp.array) -> np.ndarray:
-        """Count inverted tetrahedra (B,) in u (3N, B) [m], on the device."""
+        """Return the number (B,) of inverted tetrahedra at the displacements u (3N, B) [m]."""
         out = wp.zeros(u.shape[1], dtype=wp.int32, device=self._device.name)
         self.add_count(u, out)
         return out.numpy()
 
     def add_count(self, u: wp.array, out: wp.array) -> None:
-        """Add the number of inverted tetrahedra in u (3N, B) [m] to out (B,) int32, on the device alone."""
+        """Add the number of inverted tetrahedra at u (3N, B) [m] to out (B,) int32, on the device alone."""
         _, points, size = self._gradient.shape
         inputs = [u, self._table, self._gradient]
         kernel = build_kernel(self._device, size, points, self._collapsed)

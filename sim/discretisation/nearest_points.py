@@ -1,4 +1,4 @@
-"""Nearest points of triangles to a rigid tool's core, and distances."""
+"""Points of triangles nearest to the core of a rigid tool, and their distances."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PROJECTION_ITERATIONS = 16
 
 
 class NearestPoints(NamedTuple):
-    """Barycentric coordinates (S, 3) of surface points, distances (S,) [m], and directions from the core (S, 3)."""
+    """Nearest points on S triangles: `barycentric` (S, 3), `distance` (S,) [m], `normal` (S, 3) away from the core."""
 
     barycentric: np.ndarray
     distance: np.ndarray
@@ -25,11 +25,11 @@ class NearestPoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlacedBox:
-    """Core of a tool in its pose, a box with the tool within a radius around it; a point for a ball, a line for a rod.
+    """Core of a tool at its pose: a box, which is a point for a ball and a line for a rod.
 
-    The flat core of a blade contacts tissue below it only: penetration depth is the height above it.
+    The flat core of a blade touches only tissue below the blade: the penetration depth is the height above the core.
 
-    centre (3,) [m]; axes (3, 3), as columns; half_sizes (3,) [m].
+    `centre` (3,) [m]; `axes` (3, 3), one axis per column; `half_sizes` (3,) [m].
     """
 
     centre: np.ndarray
@@ -37,7 +37,7 @@ class PlacedBox:
     half_sizes: np.ndarray
 
     def move(self, translation: np.ndarray) -> PlacedBox:
-        """Return the box translated by (3,) [m]."""
+        """Return the box moved by `translation` (3,) [m]."""
         return replace(self, centre=self.centre + translation)
 
     @property
@@ -47,9 +47,9 @@ class PlacedBox:
         return self.centre + (signs * self.half_sizes) @ self.axes.T
 
     def find_nearest(self, corners: np.ndarray) -> NearestPoints:
-        """Return the points nearest to the box on triangles with `corners` (S, 3, 3) [m].
+        """Return, on each triangle with `corners` (S, 3, 3) [m], the point nearest to the box.
 
-        Alternating projections with momentum (Beck, Teboulle 2009, "A fast iterative
+        The method is alternating projection with momentum (Beck, Teboulle 2009, "A fast iterative
         shrinkage-thresholding algorithm", SIAM J. Imaging Sci. 2:183-202, equations 4.1 to 4.3).
         """
         return NearestSearch(len(corners)).find_nearest(self, corners)
@@ -68,7 +68,7 @@ class PlacedBox:
 
 
 class NearestSearch:
-    """Nearest point search on a fixed number of triangles, with reused memory."""
+    """Nearest point search on a fixed number of triangles, with reused arrays."""
 
     def __init__(self, count: int):
         self._corners = np.empty((count, 3, 3))
@@ -84,7 +84,7 @@ class NearestSearch:
         )
 
     def find_nearest(self, core: PlacedBox, corners: np.ndarray) -> NearestPoints:
-        """Return the points as `PlacedBox.find_nearest`; overwrites the previous result."""
+        """Return the result of `PlacedBox.find_nearest`; this overwrites the arrays of the previous result."""
         if self._launch is None:  # no triangles
             return self._found
         self._corners[:] = corners
@@ -106,7 +106,7 @@ def _find_nearest(
     distance: wp.array(dtype=wp.float64),
     normal: wp.array(dtype=wp.vec3d),
 ):
-    """Iterate y = x + (t - 1) / t' (x - x'), x the triangle point nearest to the box point nearest to y.
+    """Iterate y = x + (t - 1) / t' (x - x'); x is the triangle point nearest to the box point that is nearest to y.
 
     The momentum parameter is t' = (1 + sqrt(1 + 4 t^2)) / 2.
     """
@@ -147,7 +147,7 @@ def _find_nearest(
 
 @wp.func
 def _compute_face_height(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.float64:
-    """Return the height of a point above a flat box if it is over the face; else -1."""
+    """Return the height of a point above a flat box if the point is over the upper face; else -1."""
     none = wp.float64(0.0)
     local = wp.transpose(axes) @ (point - middle)
     within = wp.abs(local[0]) <= half[0] and wp.abs(local[1]) <= half[1] and local[2] >= none

@@ -1,4 +1,4 @@
-"""Boundary value problem: sum of energy terms under constraints."""
+"""Boundary value problem: energy as a sum of terms, under constraints."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ from .term import Barrier, Cases, StepTerm, StrainTerm, Term
 
 @dataclass(frozen=True, eq=False)
 class ImposedMotion:
-    """Prescribed values of a batch, the arguments of `Constraint.begin`."""
+    """Prescribed values of a batch: the arguments of `Constraint.begin`."""
 
     displacement: np.ndarray | None = None
     footprint: np.ndarray | None = None
@@ -28,17 +28,17 @@ class ImposedMotion:
 
 
 def build_zero_motion(loads: Loads) -> ImposedMotion:
-    """Return zero values for fixed components, and no footprint motion."""
+    """Return zero displacement of fixed components and no footprint motion, for loads without prescribed motion."""
     return ImposedMotion()
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Terms, constraints, and displacements prescribed by loads; N nodes on one device.
+    """Boundary value problem with N nodes on one device: energy terms, constraints, and prescribed displacements.
 
-    Arrays are (3N, b), one column per active load case. `barriers` are the contact terms.
-    `is_elastic`: only elastic terms resist deformation; user-defined effects may be others. A constraint gap of up to
-    `gap_round_off` units of round-off of the largest displacement counts as closed.
+    Arrays are (3N, b), with one column per active load case. `barriers` are the contact terms. `is_elastic` is False if
+    user-defined terms also resist deformation. A violation of constraints by at most `gap_round_off` units of round-off
+    of the largest displacement counts as zero.
     """
 
     terms: tuple[Term, ...]
@@ -56,7 +56,7 @@ class Problem:
 
     @property
     def can_accelerate(self) -> bool:
-        """True if only constant loads and purely resisting terms act, as solver accelerations require."""
+        """True if all terms are constant loads or passive, as solver accelerations require."""
         return self.is_elastic and all(term.constant or term.passive for term in self.terms)
 
     @property
@@ -75,7 +75,7 @@ class Problem:
         return any(isinstance(term, StepTerm) for term in self.terms)
 
     def find_overlaps(self, u: wp.array) -> np.ndarray:
-        """Return a mask (2, b) of load cases with overlaps in any barrier, as `Barrier.find_overlaps`."""
+        """Return masks (2, b) of load cases with overlaps in any barrier; see `Barrier.find_overlaps`."""
         none = np.zeros((2, u.shape[1]), bool)
         return np.logical_or.reduce([none, *(term.find_overlaps(u) for term in self.barriers)])
 
@@ -87,32 +87,32 @@ class Problem:
             term.begin(cases)
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep these load cases (k,) of the batch."""
+        """Keep only the load cases `columns` (k,) of the batch."""
         self.constraint.keep(columns)
         for term in self.terms:
             term.keep(columns)
 
     def end(self, u: wp.array) -> Mapping[str, Any]:
-        """Return the memory of every term that has one, by name."""
+        """Return the history variables of all history-dependent terms at the solution u, by term name."""
         kept = {term.name: term.end(u) for term in self.terms}
         return {name: memory for name, memory in kept.items() if memory is not None}
 
     def energy(self, u: wp.array) -> np.ndarray:
-        """Return the total potential energy (b,) [J]; +inf outside the domain."""
+        """Return the total potential energy (b,) [J] at u (3N, b); +inf outside the domain of the energy."""
         out = wp.zeros(u.shape[1], dtype=wp.float64, device=self.device.name)
         for term in self.terms:
             term.energy(u, out)
         return out.numpy()
 
     def gradient(self, u: wp.array) -> wp.array:
-        """Return the gradient (3N, b) [N] of the total potential energy."""
+        """Return the gradient (3N, b) [N] of the total potential energy at u (3N, b)."""
         out = self.device.allocate(*u.shape)
         for term in self.terms:
             term.add_gradient(u, out)
         return out
 
     def residual(self, u: wp.array) -> tuple[wp.array, np.ndarray, np.ndarray]:
-        """Return the residual (3N, b) [N] (projected gradient), its 2-norm (b,), and its scale (b,).
+        """Return the residual (3N, b) [N], which is the projected gradient, its 2-norm (b,), and its scale (b,).
 
         The scale is the largest 2-norm among the gradients of the terms and the reaction at constrained nodes.
         """
@@ -132,9 +132,9 @@ class Problem:
         return total, np.where(np.isfinite(scale), free, np.inf), scale
 
     def compute_gap(self, u: wp.array) -> tuple[wp.array, np.ndarray]:
-        """Return the smallest motion (3N, b) [m] from u (3N, b) to the constraints, and a mask (b,) of open gaps.
+        """Return the smallest motion (3N, b) [m] that makes u satisfy the constraints, and a mask (b,) of violations.
 
-        A gap of the order of round-off counts as closed and gives zero motion.
+        A violation of the order of round-off is not marked and gives zero motion.
         """
         gap, size = self.constraint.close_gap(u)
         with run_in_order(self.device):
@@ -149,7 +149,7 @@ class Problem:
             term.linearise(u, flags)
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """Add the tangent stiffness times p, K p (3N, b) [N], not projected."""
+        """Add the product K p of the tangent stiffness and p (3N, b) to out (3N, b) [N], without projection."""
         for term in self.terms:
             term.add_curvature(p, out)
 
@@ -161,14 +161,14 @@ class Problem:
         return out
 
     def rest_curvature(self, time_step: float = math.inf) -> sp.csc_array:
-        """Assemble the undeformed stiffness (3N, 3N) [N/m] of the terms that provide one, for a time step [s]."""
+        """Return the sum of the undeformed stiffnesses (3N, 3N) [N/m] that terms provide, for a time step [s]."""
         offered = [matrix for matrix in (term.rest_curvature() for term in self.terms) if matrix is not None]
         if time_step < math.inf:
             offered += [term.compute_step_stiffness(time_step) for term in self.terms if isinstance(term, StepTerm)]
         return reduce(lambda a, b: a + b, offered, sp.csc_array((self.rows, self.rows)))
 
     def longest_step(self, u: wp.array, du: wp.array) -> np.ndarray:
-        """Return the largest fraction (b,), at most 1, of du (3N, b) that every term allows."""
+        """Return the largest fraction (b,), at most 1, of du (3N, b) that stays inside the domain of all terms."""
         out = wp.full(u.shape[1], 1.0, dtype=self.device.scalar, device=self.device.name)
         for term in self.terms:
             term.longest_step(u, du, out)

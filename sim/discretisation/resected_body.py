@@ -1,4 +1,4 @@
-"""Remaining body after each step of a resection, and its disconnected parts."""
+"""Remaining body after each step of a resection; disconnected parts are removed too."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -18,11 +18,11 @@ class RemainingBody:
     Parameters
     ----------
     steps_done
-        Number of steps.
+        Number of completed resection steps.
     anatomy
-        Remaining anatomy, with the vertex numbers of the whole body.
+        Remaining anatomy, with the vertex numbers of the anatomy before resection.
     loose_tetrahedra
-        Tetrahedra (n,) of the whole body, removed because they lost contact with all fixed nodes.
+        Numbers (n,), before resection, of tetrahedra removed because they lost the connection to all fixed nodes.
     """
 
     steps_done: int
@@ -30,7 +30,7 @@ class RemainingBody:
     loose_tetrahedra: np.ndarray
 
     def __str__(self) -> str:
-        """Return the description for users."""
+        """Return a description for users."""
         said = f"{self.steps_done} step{'' if self.steps_done == 1 else 's'} done"
         if not len(self.loose_tetrahedra):
             return said
@@ -38,7 +38,7 @@ class RemainingBody:
 
 
 def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[RemainingBody, ...]:
-    """Return the remaining bodies under effects with a `Resection`; `Anatomy.fixed` counts only if they include `Held`.
+    """Return the remaining bodies for effects with `Resection`; without `Held`, `Anatomy.fixed` is ignored.
 
     Raises
     ------
@@ -54,12 +54,12 @@ def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[
 
 
 def compute_remaining_bodies(anatomy: Anatomy, effect: Resection, sliding: bool = True) -> tuple[RemainingBody, ...]:
-    """Return the remaining bodies after 0, 1, ... all steps; `sliding`: slide normals support tissue.
+    """Return the remaining bodies after 0, 1, ... all steps; `sliding` is True if slide normals also support tissue.
 
     Raises
     ------
     InputError
-        A body that is not fixed; a step with a tetrahedron that the mesh does not have, or the last of the body.
+        The body is not fixed, a step contains a tetrahedron that the mesh does not have, or no tetrahedron remains.
     """
     return tuple(_iterate_bodies(anatomy, effect, sliding))
 

@@ -1,4 +1,4 @@
-"""Rigid body modes: test that the constraints prevent rigid motion of every part of a body."""
+"""Rigid body modes: test that the constraints prevent rigid motion of all parts of a body."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -9,16 +9,16 @@ from ..geometry.tetmesh import FACES, TetMesh, compute_row_keys
 
 
 def check_fixed(mesh: TetMesh, fixed: np.ndarray, normal: np.ndarray, tolerance: float = 1e-6) -> None:
-    """Reject a body with a part that can translate or rotate freely.
+    """Reject a mesh with a part that can translate or rotate freely.
 
-    fixed (V, 3) bool and normal (V, 3) are the constraints. A node without element must be fixed.
-    Elements joined by faces form a rigid cluster; clusters that share only a corner or an edge are hinged there. A
-    rigid motion is resisted if it moves the constraints by more than a fraction `tolerance` of it, on average.
+    `fixed` (V, 3) bool and `normal` (V, 3) are the constraints. Nodes without an element must be fixed. Elements joined
+    by faces form a rigid cluster; clusters with only a common corner or edge are hinged there. A rigid motion is
+    resisted if its mean violation of the constraints exceeds a fraction `tolerance` of the motion.
 
     Raises
     ------
     InputError
-        With the part and the missing constraints.
+        A part can move; the message describes the part and the missing constraints.
     """
     count = len(mesh.nodes)
     used = np.zeros(count, bool)
@@ -49,7 +49,7 @@ def check_fixed(mesh: TetMesh, fixed: np.ndarray, normal: np.ndarray, tolerance:
 
 
 def find_loose_tetrahedra(anatomy: Anatomy, sliding: bool = True, tolerance: float = 1e-6) -> np.ndarray:
-    """Return tetrahedra (n,) that can move rigidly: without fixed nodes or, if `sliding`, sufficient slide normals."""
+    """Return tetrahedra (n,) that can move rigidly despite fixed nodes and, if `sliding`, slide normals."""
     normal = anatomy.slide_normal if sliding else np.zeros_like(anatomy.slide_normal)
     cluster, nodes = _label_clusters(anatomy.mesh.tets), anatomy.mesh.nodes
     loose = []
@@ -64,13 +64,13 @@ def find_loose_tetrahedra(anatomy: Anatomy, sliding: bool = True, tolerance: flo
 
 
 def _label_components(first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:
-    """Return the component numbers (count,) of a graph with edges (first, second)."""
+    """Return the connected component number (count,) of each vertex of a graph with edges (first, second)."""
     graph = sp.coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
     return sp.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def _label_clusters(tets: np.ndarray) -> np.ndarray:
-    """Return the cluster (T,) of each element; face neighbours belong to one cluster."""
+    """Return the cluster number (T,) of each element; elements with a common face belong to the same cluster."""
     keys = compute_row_keys(tets[:, FACES].reshape(-1, 3))
     order = np.argsort(keys)
     same = keys[order[1:]] == keys[order[:-1]]
@@ -82,8 +82,8 @@ def _count_free_motions(
 ) -> tuple[int, int]:
     """Return the number of unresisted rigid motions, and the cluster that moves most in one of them.
 
-    `cluster` (m,) and `node` (m,) pair the clusters with their nodes. There are six unknowns per cluster. Equations:
-    fixed components and normals do not move, nodes shared by clusters move equally.
+    `cluster` (m,) and `node` (m,) are pairs of a cluster and its node. Each cluster has six unknowns. The equations:
+    fixed components and normals do not move, and a node moves equally in all its clusters.
     """
     names, local = np.unique(cluster, return_inverse=True)
     size = np.bincount(local)

@@ -1,4 +1,4 @@
-"""Linear tetrahedra with strain averaged over edges and nodes: no locking, no additional nodes.
+"""Linear tetrahedra with strain averaged around edges and nodes, which avoids locking without additional nodes.
 
 Selective edge- and node-based smoothing, "ES/NS-FEM-T4": Onishi, Amaya 2014, Int. J. Numer. Meth. Eng. 99:354-371,
 after Liu, Nguyen-Thoi 2010, "Smoothed Finite Element Methods". The displacement gradient is averaged over the elements
@@ -13,21 +13,21 @@ from .element import Elements, build_linear_elements, pack_gradients
 
 
 def build_edge_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
-    """Build one element per edge and region, over the `selected` tetrahedra (T,) bool around it."""
+    """Return one element per edge and region, from the `selected` tetrahedra (T,) bool around the edge."""
     ends = np.sort(mesh.tets[selected][:, EDGES].reshape(-1, 2))
     return _build_averaged_elements(mesh, selected, compute_row_keys(ends).reshape(-1, len(EDGES)), ends)
 
 
 def build_node_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
-    """Build one element per node and region, over the `selected` tetrahedra (T,) bool around it."""
+    """Return one element per node and region, from the `selected` tetrahedra (T,) bool around the node."""
     corners = mesh.tets[selected].astype(np.int64)
     return _build_averaged_elements(mesh, selected, corners, corners.reshape(-1, 1))
 
 
 def _build_averaged_elements(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray, vertices: np.ndarray) -> Elements:
-    """Build one element per distinct number in `key` (T, k); tetrahedron t adds V_t / k to each of its numbers.
+    """Return one element per distinct number in `key` (T, k); tetrahedron t adds V_t / k to each element it belongs to.
 
-    `vertices` (T k, n) are the mesh vertices of each number. Regions are not mixed, since their tissues differ.
+    `vertices` (T k, n) are the mesh vertices that identify each entry of `key`. Elements do not mix regions.
     """
     linear = build_linear_elements(mesh, chosen)
     count, lent = key.shape

@@ -1,4 +1,4 @@
-"""Nodes and elements of an element type over a mesh; mesh vertices come first."""
+"""Nodes and elements of an element type on a mesh; the mesh vertices are the first nodes."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -17,7 +17,7 @@ from .smoothed import build_edge_elements, build_node_elements
 
 @dataclass(frozen=True, eq=False)
 class ElementPart:
-    """Elements and the part of the stiffness they carry: "whole", "shape" or "volume"."""
+    """Set of elements, and the part of the stiffness that these elements have: "whole", "shape" or "volume"."""
 
     elements: Elements
     portion: str
@@ -25,9 +25,9 @@ class ElementPart:
 
 @dataclass(frozen=True, eq=False)
 class Discretisation:
-    """N nodes: the mesh's V, then one on each of `edges` (E, 2), for quadratic elements on a linear mesh.
+    """Discretisation with N nodes: V mesh vertices, then one node on each of `edges` (E, 2) for quadratic elements.
 
-    table (T, n) node numbers of the tetrahedra: corners, and midpoints of `QUADRATIC_EDGES` if quadratic.
+    `table` (T, n): node numbers of the tetrahedra, the corners and, if quadratic, the midpoints of `QUADRATIC_EDGES`.
     """
 
     mesh: TetMesh
@@ -47,7 +47,7 @@ class Discretisation:
 
     @property
     def keys(self) -> np.ndarray:
-        """Unique key (N, 2) of each node, whatever is cut: its vertex twice, or the ends of its edge."""
+        """Unique key (N, 2) of each node, also after resection: its vertex number twice, or the ends of its edge."""
         return np.concatenate([np.repeat(np.arange(len(self.mesh.nodes))[:, None], 2, axis=1), self.edges])
 
     @cached_property
@@ -75,12 +75,12 @@ class Discretisation:
         return np.column_stack([corners, middles.reshape(-1, 3)])
 
     def build_elements(self, selected: np.ndarray) -> tuple[ElementPart, ...]:
-        """Build the elements over the `selected` tetrahedra (T,) bool.
+        """Return the elements on the `selected` tetrahedra (T,) bool.
 
         Raises
         ------
         InputError
-            Quadratic elements that are folded.
+            A quadratic element is folded.
         """
         if self.element == "p1":
             return (ElementPart(build_linear_elements(self.mesh, selected), "whole"),)
@@ -91,9 +91,9 @@ class Discretisation:
         return _build_averaged_parts(self.mesh, self.element, selected.tobytes())
 
     def extend_fixed(self, fixed: np.ndarray) -> np.ndarray:
-        """Return the fixed components (N, 3) of all nodes from those of the mesh (V, 3).
+        """Return the mask (N, 3) of fixed components of all nodes, from the mask (V, 3) of the mesh vertices.
 
-        An added node is fixed if its edge lies on a surface triangle whose corners are all fixed.
+        An added node is fixed if its edge belongs to a surface triangle whose corners are all fixed.
         """
         out = np.zeros((self.count, 3), bool)
         out[: len(fixed)] = fixed
@@ -103,12 +103,12 @@ class Discretisation:
         return out
 
     def extend_normals(self, normal: np.ndarray, fixed: np.ndarray, min_cosine: float = 0.75) -> np.ndarray:
-        """Return the slide normals (N, 3) of all nodes from those of the mesh (V, 3); fixed (V, 3) bool.
+        """Return the slide normals (N, 3) of all nodes, from `normal` (V, 3) and `fixed` (V, 3) of the mesh vertices.
 
-        An added node slides if its edge lies on a surface triangle whose corners all slide or are fixed. Its normal
-        is the integral of its shape function's gradient over all adjacent triangles, so no volume passes through.
-        If that normal deviates from its ends' (at the edge of a box, for example), only the sliding triangles count.
-        Normals deviate if their cosine is at most `min_cosine`.
+        An added node slides if its edge belongs to a surface triangle whose corners all slide or are fixed. Its normal
+        is the integral of the gradient of its shape function, so that no volume passes through the surface. If this
+        normal deviates from the normals at the ends of the edge, as at the edge of a box, the integral includes only
+        sliding triangles. Normals deviate if their cosine is at most `min_cosine`.
         """
         out = np.zeros((self.count, 3))
         out[: len(normal)] = normal
@@ -128,13 +128,13 @@ class Discretisation:
         return out
 
     def interpolate_field(self, field: np.ndarray) -> np.ndarray:
-        """Interpolate a field (..., V, 3) to all nodes (..., N, 3), linear along each edge."""
+        """Return a field (..., V, 3) interpolated to all nodes (..., N, 3), linear along each edge."""
         return np.concatenate([field, field[..., self.edges, :].mean(axis=-2)], axis=-2)
 
 
 @lru_cache(2)  # shared by effects, tissues and diagnostics: 10 % of a locator's set-up on a GPU
 def _build_averaged_parts(mesh: TetMesh, element: str, chosen: bytes) -> tuple[ElementPart, ...]:
-    """Build smoothed or element-free elements over the `chosen` tetrahedra (T,), given as bytes of bool."""
+    """Return smoothed or element-free elements on the tetrahedra of the mask `chosen` (T,), given as bytes."""
     tets = np.frombuffer(chosen, bool)
     if element == "element-free":
         return (ElementPart(build_element_free(mesh, tets), "whole"),)
@@ -142,19 +142,19 @@ def _build_averaged_parts(mesh: TetMesh, element: str, chosen: bytes) -> tuple[E
 
 
 def recommend_element(mesh: TetMesh) -> str:
-    """Return the default element: `RECOMMENDED`, or p2 for a mesh with mid-edge nodes."""
+    """Return the name of the default element: `RECOMMENDED`, or p2 for a mesh with mid-edge nodes."""
     return RECOMMENDED if mesh.middles is None else "p2"
 
 
 def discretise(mesh: TetMesh, element: str | None = None) -> Discretisation:
-    """Return the nodes and elements of type `element`, one of `ELEMENTS` or `OTHER_METHODS`, over a mesh.
+    """Return the discretisation of a mesh by the type `element`, a name in `ELEMENTS` or `OTHER_METHODS`.
 
-    None selects `recommend_element`.
+    If `element` is None, `recommend_element` chooses the type.
 
     Raises
     ------
     InputError
-        An unknown type; a linear type on a mesh with mid-edge nodes.
+        The type is unknown, or is linear although the mesh has mid-edge nodes.
     """
     element = recommend_element(mesh) if element is None else element
     if element not in (*ELEMENTS, *OTHER_METHODS):  # tuple, since `element` may be unhashable

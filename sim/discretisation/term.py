@@ -1,4 +1,4 @@
-"""Interface of energy terms: energy, gradient and tangent stiffness, for effects and their accelerations."""
+"""Interfaces of energy terms: energy, gradient and tangent stiffness, and data for solver accelerations."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .element import Elements
 
 @dataclass(frozen=True, eq=False)
 class Cases:
-    """Load cases of a batch: loads, start times, and memories of the terms.
+    """Load cases of a batch: loads, start times, and history variables of the terms.
 
-    loads have B rows; start_time is (B,) [s]. memory: by term name, arrays with B rows, as `Term.end` returned them.
-    displacement (B, N, 3) [m] of the nodes at the start; None: undeformed. share (B,): path fraction that tools have
-    covered, 1 if None. `restarted` (B,) bool: descents that start undeformed and without contact; none if None.
-    warm: data of an earlier solution that speed up this one, rows (B, ...).
+    `loads` has B load cases; `start_time` (B,) [s]. `memory`: history variables (B, ...) by term name, from `Term.end`.
+    `displacement` (B, N, 3) [m] of the nodes at the start; None: undeformed. `share` (B,): fraction of their path that
+    the tools have covered; None: 1. `restarted` (B,) bool marks descents that start undeformed and without contact;
+    None: no descent. `warm`: arrays (B, ...) of an earlier solution that accelerate this solution.
     """
 
     loads: Loads
@@ -36,7 +36,7 @@ class Cases:
 
     @property
     def path_fraction(self) -> np.ndarray:
-        """Path fractions (B,) that tools have covered."""
+        """Fraction (B,) of the path that the tools have covered."""
         return np.ones(len(self.loads)) if self.share is None else self.share
 
     @property
@@ -46,7 +46,7 @@ class Cases:
         Raises
         ------
         InputError
-            Loads before their start.
+            The time of a load is before its start time.
         """
         steps = self.loads.times - self.start_time
         if (steps < 0.0).any():
@@ -58,7 +58,7 @@ class Cases:
         return steps
 
     def select(self, index: slice | np.ndarray) -> Cases:
-        """Return a subset of the cases."""
+        """Return the load cases selected by `index`."""
         memory = {name: value[index] for name, value in self.memory.items()}
         displacement = None if self.displacement is None else self.displacement[index]
         share = None if self.share is None else self.share[index]
@@ -67,12 +67,12 @@ class Cases:
         return Cases(self.loads.select(index), self.start_time[index], memory, displacement, share, restarted, warm)
 
     def get_past(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the memory of the term `name`, (B, *shape) float64; zeros without one.
+        """Return the history variables of the term `name`, (B, *shape) float64; zeros if there are none.
 
         Raises
         ------
         InputError
-            A memory of another body, discretisation or set of tools.
+            The history variables belong to another mesh, discretisation or set of tools.
         """
         whole = (len(self.loads), *shape)
         found = self.memory.get(name)
@@ -89,38 +89,38 @@ class Cases:
 
 @runtime_checkable
 class Term(Protocol):
-    """Summand of the total potential energy, for b load cases at once.
+    """Interface of energy terms: summands of the total potential energy, for b load cases at once.
 
-    Arrays are Warp's, on the problem's device, batch last: (3N, b), one column per active load case; N counts the
-    discretisation's nodes. Results are added to `out`, except in `longest_step`, which takes the minimum.
+    Arrays are Warp arrays on the device of the problem, (3N, b) for N nodes with one column per active load case.
+    Methods add their results to `out`, except `longest_step`, which takes the minimum.
     """
 
     @property
     def name(self) -> str:
-        """Name, unique in a problem; key of its memory."""
+        """Unique name of the term in a problem; key of its history variables."""
         ...
 
     @property
     def constant(self) -> bool:
-        """True if the gradient depends on the cases only, not on the displacement."""
+        """True if the gradient depends only on the load cases, not on the displacement."""
         ...
 
     @property
     def passive(self) -> bool:
-        """True if it only resists, as elastic tissue does: zero gradient in the undeformed state, for all cases."""
+        """True if the gradient is zero in the undeformed state for all load cases, as for elastic tissue."""
         ...
 
     @property
     def steep(self) -> bool:
-        """True if its tangent may differ strongly from the undeformed stiffness, as in contact."""
+        """True if the tangent stiffness may differ strongly from the undeformed stiffness, as in contact."""
         ...
 
     def begin(self, cases: Cases) -> None:
-        """Set loads, times and memory of every load case."""
+        """Set loads, times and history variables of every load case."""
         ...
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep these load cases (k,), in this order: the others have left the batch."""
+        """Keep only the load cases `columns` (k,), in this order, for all further calls in the batch."""
         ...
 
     def energy(self, u: wp.array, out: wp.array) -> None:
@@ -130,17 +130,17 @@ class Term(Protocol):
     def add_gradient(self, u: wp.array, out: wp.array) -> None:
         """Add the gradient of the energy [N] at u (3N, b) to out (3N, b); not finite outside the domain.
 
-        Unless `constant`: computed on the device alone, and with the same arrays for all batches of one width, since
-        CUDA graphs replay it.
+        Unless `constant`, the computation is on the device alone, and uses the same arrays for all batches with the
+        same number of columns, since CUDA graphs replay the computation.
         """
         ...
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """Set the linearisation point u (3N, b); definite (b,) int32: 1 requests a positive semi-definite tangent."""
+        """Set the linearisation point u (3N, b); `definite` (b,) int32: 1 for a positive semi-definite tangent."""
         ...
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
-        """Add the tangent stiffness at the last `linearise` times p (3N, b) [m] to out (3N, b) [N]."""
+        """Add the product of the tangent stiffness, at the last `linearise`, and p (3N, b) [m] to out (3N, b) [N]."""
         ...
 
     def add_diagonal(self, out: wp.array) -> None:
@@ -148,122 +148,122 @@ class Term(Protocol):
         ...
 
     def rest_curvature(self) -> sp.csc_array | None:
-        """Return the undeformed stiffness (3N, 3N) [N/m] for factorised preconditioners, or None to be left out.
+        """Return the undeformed stiffness (3N, 3N) [N/m] for factorised preconditioners, or None to be omitted there.
 
-        A steep term may return a better approximation of its later tangent.
+        A steep term may return a better approximation of its tangent stiffness in later states.
         """
         ...
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Reduce out (b,) to the largest fraction of du (3N, b) that stays inside the domain; on the device alone."""
+        """Reduce out (b,) to the largest fraction of the step du (3N, b) inside the domain; on the device alone."""
         ...
 
     def end(self, u: wp.array) -> Any:
-        """Return the memory for the next call, rows first (B, ...), or None."""
+        """Return the history variables (B, ...) for the next solution, or None."""
         ...
 
 
 @runtime_checkable
 class StepTerm(Term, Protocol):
-    """Term whose stiffness grows as time steps shrink, which preconditioners must include."""
+    """Interface of terms whose stiffness grows as time steps shrink; preconditioners must include this stiffness."""
 
     def compute_step_stiffness(self, time_step: float) -> sp.csc_array:
-        """Return the addition to the undeformed stiffness (3N, 3N) [N/m] for a time step [s]."""
+        """Return the stiffness (3N, 3N) [N/m] that a time step [s] adds to the undeformed stiffness."""
         ...
 
 
 @runtime_checkable
 class HistoryTerm(Term, Protocol):
-    """Term whose memory, if any, belongs to elements or nodes: (B, n, width), one row for each."""
+    """Interface of terms whose history variables (B, n, width) have one row for each of n elements or nodes."""
 
     @property
     def keys(self) -> np.ndarray:
-        """Unique key (n, k) of each row by vertices and other numbers, whatever is cut from the mesh."""
+        """Unique key (n, k) of each row, by vertices and other numbers; the keys do not change in a resection."""
         ...
 
     @property
     def width(self) -> int:
-        """Length of a row."""
+        """Number of history variables in a row."""
         ...
 
 
 @runtime_checkable
 class StrainTerm(Term, Protocol):
-    """Term of elements whose stiffness depends on the strain; H is the displacement gradient."""
+    """Interface of element terms whose stiffness depends on the strain; H is the displacement gradient."""
 
     @property
     def prevents_inversion(self) -> bool:
-        """True if its energy is infinite for inverted elements."""
+        """True if the energy is infinite for inverted elements."""
         ...
 
     def compute_second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
-        """Return elements (T,), half the second stress derivative (k, 9, 9, 9) [Pa] by tissue, tissue indices (T,).
+        """Return elements (T,), half of the second derivative of the stress (k, 9, 9, 9) [Pa], and tissue indices (T,).
 
-        Derivative of stress component a by gradient components b and c, row-major, in the undeformed configuration.
+        The derivative of stress component a by gradient components b and c, row-major, is in the undeformed state.
         """
         ...
 
     def find_elements_on(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the elements (k,) whose nodes are all marked in `nodes` (N,) bool."""
+        """Return the elements (k,) all of whose nodes are marked in `nodes` (N,) bool."""
         ...
 
     def update_max_strain(self, elements: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
-        """Raise out (N, k) to |H| at the nodes of some elements (m,) int32, for load cases (k,) int32 of u (3N, b)."""
+        """Raise out (N, k) to the largest |H| of the given elements at each node, for load cases (k,) of u (3N, b)."""
         ...
 
     def add_stiffening(
         self, elements: wp.array, u: wp.array, columns: wp.array, min_strain: wp.array, index: wp.array, out: wp.array
     ) -> None:
-        """Add the tangent stiffness minus the undeformed one [N/m] of these elements to out (k, p, p) float64.
+        """Add tangent minus undeformed stiffness [N/m] of the given elements to out (k, p, p) float64.
 
-        Only points with |H| above `min_strain` (k,) count. The rows of a node in out begin at 3 `index` (N, k).
+        Quadrature points with |H| <= `min_strain` (k,) are omitted. A node has the rows in out from 3 `index` (N, k).
         """
         ...
 
 
 class Barrier(Term, Protocol):
-    """Term for contact with a gap, which a descent may widen at first; tools may move."""
+    """Interface of contact terms with a gap, which a descent may widen at first; the tools may move."""
 
     def compute_stride(self, cases: Cases, u: wp.array) -> np.ndarray:
-        """Return the path fraction (B,), at most 1, that tools may move at once, with the body at u (3N, B) [m]."""
+        """Return the fraction (B,) of the path that tools may move at once, at most 1, for tissue at u (3N, B) [m]."""
         ...
 
     def compute_path_in_gaps(self, cases: Cases) -> np.ndarray:
-        """Return the motion (B,) of the tools on their whole path, or of the tissue, in units of the gap."""
+        """Return the total motion (B,) of the tools on their path, or of the tissue, in units of the gap."""
         ...
 
     def find_penetrating(self, u: wp.array) -> np.ndarray:
-        """Return a mask (b,) of load cases with a tool inside the body at u (3N, b) [m], even without contact."""
+        """Return a mask (b,) of load cases with a tool inside the tissue at u (3N, b) [m], with or without contact."""
         ...
 
     def find_overlaps(self, u: wp.array) -> np.ndarray:
-        """Return masks (2, b) of load cases where a tool overlaps touchable surface at u (3N, b) [m], or bone."""
+        """Return two masks (2, b) of load cases: a tool overlaps the touchable surface at u (3N, b) [m], or bone."""
         ...
 
     def widen_gap(self, factor: float) -> None:
-        """Widen the gap by a factor until the next batch begins."""
+        """Multiply the gap by `factor` until the next batch begins."""
         ...
 
     def compute_reaction(self, u: wp.array) -> np.ndarray:
-        """Return force [N] and moment about its origin [N m] that each tool exerts at u (3N, b) [m]: (b, tools, 6)."""
+        """Return the force [N] and the moment about its origin [N m] of each tool, at u (3N, b) [m]: (b, tools, 6)."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class BlockFunctions:
-    """Warp functions of a Barrier for thread blocks; all threads of a block must call them.
+    """Warp functions of a `Barrier` for thread blocks; all threads of a block must call each function.
 
     Parameters
     ----------
     barrier_struct, pairs_struct
-        Structs of their arguments: the barrier, and its near pairs, which they update.
+        Types of the struct arguments: the barrier, and its near pairs, which the functions update.
     add_force
-        (x, stage, near, column, thread, out): add the gradient at x (3n, b) to out (3n, b).
+        Function (x, stage, near, column, thread, out) that adds the gradient at x (3n, b) to out (3n, b).
     add_matrix
-        (x, stage, near, definite, place, column, thread, out): add the tangent stiffness to out (b, 3m, 3m), as
-        `ReducedBarrier.compute_stiffness`, after `add_force` at the same x.
+        Function (x, stage, near, definite, place, column, thread, out) that adds the tangent stiffness to out
+        (b, 3m, 3m), as in `ReducedBarrier.compute_stiffness`; call `add_force` at the same x before.
     bound_step
-        (x, way, stage, near, column, thread): return the fraction of a step, at most 1, that stays inside the domain.
+        Function (x, way, stage, near, column, thread) that returns the fraction of a step, at most 1, in the domain.
     """
 
     barrier_struct: Any
@@ -274,63 +274,63 @@ class BlockFunctions:
 
 
 class ReducedBarrier(Protocol):
-    """Barrier of b load cases on the n touchable nodes, as a function of their displacement w (3n, b) [m].
+    """Interface of a barrier of b load cases as a function of the displacement w (3n, b) [m] of n touchable nodes.
 
-    Arrays are those of `views.library`, float64.
+    Arrays are float64 arrays of the library that `views.get_library` returns.
     """
 
     @property
     def functions(self) -> BlockFunctions:
-        """Warp functions for kernels."""
+        """Warp functions of the barrier, for kernels."""
         ...
 
     def build_structs(self, columns: np.ndarray) -> tuple[Any, Any]:
-        """Return the structs of barrier and near pairs for some load cases (k,)."""
+        """Return the structs of the barrier and its near pairs, for the load cases `columns` (k,)."""
         ...
 
     def compute_gradient(self, w: Any) -> Any:
-        """Return the gradient (3n, b) [N]."""
+        """Return the gradient (3n, b) [N] of the barrier energy at w."""
         ...
 
     def compute_stiffness(self, w: Any, index: Any, size: int, definite: np.ndarray) -> Any:
         """Return the tangent stiffness (b, 3 size, 3 size) [N/m] between the nodes with `index` (n, b) >= 0.
 
-        It is positive semi-definite for load cases marked `definite` (b,).
+        The stiffness is positive semi-definite for load cases marked in `definite` (b,).
         """
         ...
 
 
 @runtime_checkable
 class LocalBarrier(Barrier, Protocol):
-    """Barrier that acts on a subset of the nodes only."""
+    """Interface of barriers that act only on a subset of the nodes."""
 
     @property
     def touchable_nodes(self) -> np.ndarray:
-        """Nodes (n,), ascending, on which it can act."""
+        """Sorted node numbers (n,) on which the barrier can act."""
         ...
 
     def select_nodes(self, max_nodes: int) -> np.ndarray:
-        """Return the touchable nodes, followed by the nearest others up to `max_nodes` in total: (k,)."""
+        """Return the touchable nodes, followed by the nearest other nodes: at most `max_nodes` in total (k,)."""
         ...
 
     def reduce(self, columns: np.ndarray) -> ReducedBarrier | None:
-        """Return the barrier on these nodes, for some load cases (k,), in its current state; None without contact.
+        """Return the current barrier on the touchable nodes, for load cases `columns` (k,); None without contact.
 
-        The object is reused: it reflects the latest call.
+        The returned object is reused, so the next call changes it.
         """
         ...
 
     def get_active_stiffness(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return active nodes (a,) of these n at the last linearisation, of one load case, and their tangent stiffness.
+        """Return the active touchable nodes (a,) at the last linearisation of one load case, and their stiffness.
 
-        The matrix (3a, 3a) [N/m] is positive semi-definite.
+        The tangent stiffness (3a, 3a) [N/m] is positive semi-definite.
         """
         ...
 
 
 class AssembledTerm(Term, Protocol):
-    """Term that provides its tangent stiffness as a matrix."""
+    """Interface of terms that provide their tangent stiffness as a matrix."""
 
     def assemble_stiffness(self) -> sp.csc_array:
-        """Assemble K(u) (3N, 3N) [N/m] at the last linearisation, of one load case."""
+        """Return the tangent stiffness K(u) (3N, 3N) [N/m] at the last linearisation of one load case."""
         ...

@@ -1,1 +1,1 @@
-"""Families of deformation models other than finite elements, on the same anatomies, loads and effects."""
+"""Families of deformation models other than finite elements, for the same anatomies, loads and effects."""

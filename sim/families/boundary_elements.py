@@ -23,10 +23,10 @@ CHUNK = 8  # Collocation points whose integrals are computed together.
 
 @dataclass(frozen=True, eq=False)
 class _Region:
-    """Region with one tissue.
+    """Region of uniform tissue, with its boundary.
 
-    members (n,) are its vertices, triangles (S, 3) its outward boundary by vertex numbers. `displaced` (u, 3 S) and
-    `loaded` (t, 3 S) sum over corners of triangles: unknown displacements; unknown tractions, then unit forces.
+    `members` (n,) are its vertices, `triangles` (S, 3) its outward boundary by vertex numbers. `displaced` (u, 3 S)
+    sums triangle corners to unknown displacements, `loaded` (t, 3 S) to unknown tractions and then unit forces.
     """
 
     nodes: np.ndarray
@@ -37,11 +37,11 @@ class _Region:
     loaded: sp.csr_array
 
     def integrate(self, vertices: np.ndarray, column: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
-        """Integrate over the boundary for loads at vertices (n,) of the region, a few at a time.
+        """Yield boundary integrals for loads at the `vertices` (n,) of the region, for a few vertices at a time.
 
-        column (n,) is the unknown displacement of the nearest vertex on the boundary, -1 if that is fixed. Its
-        coefficient follows from a rigid motion, which has no tractions. Yields p of the vertices, and the coefficients
-        H (3 p, 3 u) and G (3 p, 3 t) of Somigliana's identity: u = G t - H u inside, 0 = G t - H u on the boundary.
+        `column` (n,) is the unknown displacement of the nearest boundary vertex, or -1 if this vertex is fixed. Its
+        coefficient follows from a rigid motion without tractions. Each item has p vertices, and H (3 p, 3 u) and
+        G (3 p, 3 t) of Somigliana's identity: u = G t - H u inside, 0 = G t - H u on the boundary.
         """
         inside = ~np.isin(vertices, self.triangles)
         for first in range(0, len(vertices), CHUNK):
@@ -63,17 +63,17 @@ class _Region:
 def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     """Return displacements (a, 3, n, 3) [m/N] of vertices `nodes` (n,) under unit forces at `body.loaded` (a,).
 
-    The second axis is the force's direction. Collocation at the vertices of the boundary, with linear displacements
-    and tractions on its triangles (Brebbia & Dominguez 1992, ch. 4; James & Pai 1999 for simulated surgery).
-    Displacements are continuous and tractions in equilibrium between brain and tumour. Triangles of the free surface
-    are divided into four. A unit force acts as the traction of the dual shape function of its vertex, 4 N_a - 1 on each
-    undivided triangle, which has the same force and moment, and the same work as nodal forces (Wohlmuth 2000).
+    The second axis is the force direction. The equations are collocated at boundary vertices, with linear displacements
+    and tractions on triangles (Brebbia & Dominguez 1992, ch. 4; James & Pai 1999 for simulated surgery). Between brain
+    and tumour, displacements are continuous and tractions are in equilibrium. Triangles of the free surface are divided
+    into four. A unit force acts as the traction of the dual shape function of its vertex, 4 N_a - 1 on each undivided
+    triangle, with the force, moment and work of nodal forces (Wohlmuth 2000).
 
     Raises
     ------
     InputError
-        More than one tissue in the brain or in the tumour, fixed vertices inside the body or at the tumour, no fixed
-        triangle, forces at vertices that are not on the free surface, vertices that the mesh does not have.
+        Brain or tumour have more than one tissue. A fixed vertex is in the interior or at the tumour, or no triangle is
+        fixed. A force acts at a vertex that is not on the free surface. The mesh does not have a vertex.
     """
     nodes = check_vertex_numbers("nodes", nodes, len(body.fixed))
     regions, move, pull = _build_regions(body)
@@ -100,7 +100,7 @@ def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
 
 
 def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndarray]:
-    """Return the regions, and the numbers (N,) of the unknown displacement and traction of each vertex, or -1."""
+    """Return the regions and, for each vertex, the numbers (N,) of its unknown displacement and traction, or -1."""
     mesh, parts = body.anatomy.mesh, _find_tissues(body)
     boundaries = [find_boundary_faces(mesh.tets[some]) for some, _ in parts]
     triangles, region = np.vstack(boundaries), np.repeat(np.arange(len(parts)), [len(each) for each in boundaries])
@@ -140,10 +140,10 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
 
 
 def _refine(nodes: np.ndarray, triangles: np.ndarray, marked: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Divide triangles (S, 3) that are `marked` (S,) into four.
+    """Divide the triangles (S, 3) that are marked in `marked` (S,) into four.
 
-    Returns nodes (N, 3) [m], those given first; triangles; the number of the triangle that each is a part of; and the
-    edges (E, 2) at whose centres the other nodes are. Vertices may lie on edges of undivided triangles: these are
+    Return the nodes (N, 3) [m], given nodes first; the triangles; the original triangle of each; and the edges (E, 2)
+    whose midpoints are the new nodes. New nodes may lie on edges of undivided triangles, since these triangles are
     fixed, and tractions may be discontinuous.
     """
     edges = triangles[marked][:, TRIANGLE_EDGES].reshape(-1, 2)
@@ -156,26 +156,26 @@ def _refine(nodes: np.ndarray, triangles: np.ndarray, marked: np.ndarray) -> tup
 
 
 def _number(vertices: np.ndarray, count: int) -> np.ndarray:
-    """Return the position (count,) of each vertex in `vertices`, -1 elsewhere."""
+    """Return, for each of `count` vertices, its index in `vertices`, or -1 if it is not there."""
     numbers = np.full(count, -1)
     numbers[vertices] = np.arange(len(vertices))
     return numbers
 
 
 def _distribute(row: np.ndarray, value: np.ndarray, count: int) -> sp.csr_array:
-    """Return the matrix (count, n) with `value` (n,) in `row` (n,) of each column, and nothing if the row is -1."""
+    """Return the sparse matrix (count, n) with `value` (n,) in `row` (n,) of each column; -1 makes a column empty."""
     some = np.flatnonzero(row >= 0)
     return sp.csr_array((value[some], (row[some], some)), shape=(count, len(row)))
 
 
 def _is_among(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Mark (n,) the rows (n, k) of vertex numbers that equal one of other rows (m, k), in any order of the numbers."""
+    """Return a mask (n,) of rows (n, k) of vertex numbers that occur in `others` (m, k), in any order of numbers."""
     keys = compute_row_keys(np.vstack([rows, others]))
     return np.isin(keys[: len(rows)], keys[len(rows) :])
 
 
 def _find_tissues(body: LinearBody) -> list[tuple[np.ndarray, tuple[float, float]]]:
-    """Return the tetrahedra (T,) and (mu, lambda) [Pa] of the brain and, if it differs, of the tumour."""
+    """Return a mask (T,) and (mu, lambda) [Pa] of the brain and, if its tissue differs, of the tumour."""
     mesh, tissues = body.anatomy.mesh, []
     for some in (~body.anatomy.in_tumour, body.anatomy.in_tumour):
         labels = np.unique(mesh.region[some]).tolist()
@@ -189,7 +189,7 @@ def _find_tissues(body: LinearBody) -> list[tuple[np.ndarray, tuple[float, float
 
 
 def _check_places(body: LinearBody, covered: np.ndarray, interface: np.ndarray) -> None:
-    """Raise `InputError` if boundary elements cannot represent the fixed vertices or the forces."""
+    """Reject fixed vertices or forces that boundary elements cannot represent."""
     surface = np.isin(np.arange(len(body.fixed)), body.anatomy.mesh.surface)
     inner = surface < ~body.anatomy.orphaned
     inner[interface] = True

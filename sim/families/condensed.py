@@ -1,4 +1,4 @@
-"""Condensed linear finite elements: the compliance between the free surface and other vertices.
+"""Condensed linear finite elements: compliance between the free surface and other vertices.
 
 Bro-Nielsen, Cotin 1996, "Real-time volumetric deformable models for surgery simulation using finite elements and
 condensation", Comput. Graph. Forum 15:57-66.
@@ -20,7 +20,7 @@ TOGETHER = 96  # Right-hand sides that are solved together.
 def compute_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     """Return displacements (a, 3, n, 3) [m/N] of vertices `nodes` (n,) under unit forces at `body.loaded` (a,).
 
-    The stiffness is that of smoothed tetrahedra in the undeformed state, factorised in double precision.
+    The stiffness of smoothed tetrahedra in the undeformed state is factorised in double precision.
     """
     anatomy, device = body.anatomy, find_device("cpu", "float64")
     fixed = np.repeat(body.fixed[:, None], 3, axis=1)

@@ -25,11 +25,11 @@ class ExplicitSteps:
     Parameters
     ----------
     max_steps, check_interval
-        Largest number of steps; steps between two tests of convergence.
+        Maximum number of steps, and number of steps between two convergence tests.
     step_fraction
-        Step as a fraction of the critical one in the undeformed state; compressed tissue is stiffer.
+        Time step as a fraction of the critical step in the undeformed state; below 1, as compressed tissue is stiffer.
     min_eigenvalue
-        Lowest eigenvalue at the start, relative to the highest.
+        Initial estimate of the lowest eigenvalue, relative to the highest eigenvalue.
     """
 
     max_steps: int = 4000
@@ -44,9 +44,9 @@ TOLERANCE = 1e-3  # Relative residual of convergence.
 def build_solver(
     problem: Problem, space: Discretisation, tissue: Elasticity, settings: ExplicitSteps = ExplicitSteps()
 ) -> Callable[[int], tuple[wp.array, int]]:
-    """Return the function that relaxes a number of load cases: displacements (3N, b) [m] and steps.
+    """Return a solver: a function of the number b of load cases that returns displacements (3N, b) [m] and steps.
 
-    Masses are sums of rows of the undeformed stiffness, so that no eigenvalue of M^-1 K exceeds 1 (Gershgorin).
+    Masses are row sums of the undeformed stiffness, so that no eigenvalue of M^-1 K exceeds 1 (Gershgorin).
     """
     device = problem.device
     rows = np.asarray(abs(problem.rest_curvature()).sum(axis=1)).reshape(-1, 1)

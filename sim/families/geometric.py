@@ -1,8 +1,8 @@
-"""Geometry-based models: a motion of the surface is continued into the body by smooth functions, without mechanics.
+"""Geometry-based models: smooth functions extend a motion of the surface into the volume, without mechanics.
 
-A point of the surface moves as the surface of a half-space would under the same force (Cerruti, Boussinesq); fixed
-vertices stay. Thin-plate splines and free-form lattices continue this motion; Kelvinlets are motions of an infinite
-body themselves.
+Surface points move like the surface of a half-space under the same force (Cerruti, Boussinesq); fixed vertices do not
+move. Thin-plate splines and free-form lattices extend this motion into the volume. Kelvinlets are displacement fields
+of an infinite body.
 """
 
 import numpy as np
@@ -21,8 +21,8 @@ SMOOTHING = 1e-2  # Weight of a lattice's roughness relative to its misfit.
 def compute_kelvinlet_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     """Return displacements (a, 3, n, 3) [m/N] by regularised Kelvinlets that vanish at `PINS` fixed vertices.
 
-    Forces at fixed vertices bring these back (section 6 of the paper cited by `compute_kelvinlets`). The infinite body
-    has the tissue of most of the mesh.
+    Forces at fixed vertices cancel the motion there (section 6 of the paper cited in `compute_kelvinlets`). The
+    infinite body has the tissue of the largest region.
     """
     points, pins, (mu, nu) = body.anatomy.mesh.nodes, _choose_pins(body), _find_main_tissue(body)
     sources, places = (points[np.concatenate([some, pins])] for some in (body.loaded, nodes))
@@ -35,7 +35,7 @@ def compute_kelvinlet_response(body: LinearBody, nodes: np.ndarray) -> np.ndarra
 
 
 def compute_kelvinlets(points: np.ndarray, sources: np.ndarray, radius: float, poisson: float) -> np.ndarray:
-    """Return displacements times 4 pi mu (s, 3, n, 3) [1/m] at points (n, 3) [m] under unit forces at sources (s, 3).
+    """Return 4 pi mu x displacements (s, 3, n, 3) [1/m] at points (n, 3) [m] under unit forces at sources (s, 3).
 
         u = ((1 - b) / r_e + e^2 / (2 r_e^3) + b / r_e^3 r r^T) f / (4 pi mu),  r_e^2 = r^2 + e^2,  b = 1 / (4 - 4 nu)
 
@@ -50,7 +50,7 @@ def compute_kelvinlets(points: np.ndarray, sources: np.ndarray, radius: float, p
 
 
 def compute_thin_plate_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
-    """Return displacements (a, 3, n, 3) [m/N] that a thin-plate spline, phi(r) = r, continues from the surface.
+    """Return displacements (a, 3, n, 3) [m/N] of a thin-plate spline, phi(r) = r, that interpolates the surface motion.
 
     Bookstein 1989, "Principal warps", IEEE Trans. Pattern Anal. Mach. Intell. 11:567-585, in three dimensions.
     """
@@ -61,7 +61,7 @@ def compute_thin_plate_response(body: LinearBody, nodes: np.ndarray) -> np.ndarr
 
 
 def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
-    """Return displacements (a, 3, n, 3) [m/N] of a lattice of cubic B-splines fitted to the motion of the surface.
+    """Return displacements (a, 3, n, 3) [m/N] of a lattice of cubic B-splines, fitted to the surface motion.
 
     Sederberg, Parry 1986, "Free-form deformation of solid geometric models"; with the B-splines of Rueckert et al.
     1999, IEEE Trans. Med. Imaging 18:712-721, fitted by least squares with a penalty on the differences of neighbours.
@@ -80,9 +80,9 @@ def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
 
 
 def _continue_half_space(body: LinearBody, weight: np.ndarray) -> np.ndarray:
-    """Return displacements (a, 3, n, 3) [m/N] at n points with weights (n, a) of the loaded vertices' motion.
+    """Return displacements (a, 3, n, 3) [m/N] at n points: `weight` (n, a) times the motion of the loaded vertices.
 
-    That is the surface motion of a half-space under unit forces at these vertices.
+    The loaded vertices move like the surface of a half-space under unit forces at these vertices.
     Johnson 1985, "Contact Mechanics", sections 3.2 and 3.6; r_e^2 = r^2 + e^2 / 4 bounds the singular point, so that
     the centre of a disc of radius e moves as under uniform pressure.
     """
@@ -105,13 +105,13 @@ def _find_main_tissue(body: LinearBody) -> tuple[float, float]:
 
 
 def _compute_spacing(body: LinearBody) -> float:
-    """Return the radius [m] of a disc with the mean area of a vertex of the surface."""
+    """Return the radius [m] of a disc with the mean nodal area of the surface vertices."""
     mesh = body.anatomy.mesh
     return float(np.sqrt(compute_areas(mesh.nodes[mesh.surface]).sum() / (np.pi * len(np.unique(mesh.surface)))))
 
 
 def _choose_pins(body: LinearBody) -> np.ndarray:
-    """Return at most `PINS` fixed vertices of the surface, far from each other."""
+    """Return at most `PINS` fixed vertices of the surface that are far from each other."""
     points, fixed = body.anatomy.mesh.nodes, np.setdiff1d(body.anatomy.mesh.surface, body.loaded)
     chosen, far = [0], np.full(len(fixed), np.inf)
     while len(chosen) < min(PINS, len(fixed)):

@@ -14,7 +14,7 @@ PARTS = 0.5 * np.stack([*(CORNERS + CORNERS[:, None]), 1.0 - CORNERS])
 
 
 def _build_gauss_rule() -> tuple[np.ndarray, np.ndarray]:
-    """Return barycentric points (7, 3) and weights (7,) of degree 5 (Radon 1948)."""
+    """Return barycentric points (7, 3) and weights (7,) of a rule of degree 5 (Radon 1948)."""
     root = np.sqrt(15.0)
     near, far = ((6.0 + sign * root) / 21.0 for sign in (-1.0, 1.0))
     points = [np.full((1, 3), 1.0 / 3.0), *(s + (1.0 - 3.0 * s) * CORNERS for s in (near, far))]
@@ -22,16 +22,16 @@ def _build_gauss_rule() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _build_duffy_rule(count: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Return barycentric points (count, 3) and weights (count,) for f/r and g/r^2 with the pole at corner 0.
+    """Return barycentric points (count, 3) and weights (count,) of a rule for f/r and g/r^2, with the pole at corner 0.
 
-    Here f and g are linear and g vanishes at the pole. On lines from the pole one point is exact (Duffy 1982).
+    f and g are linear, and g is zero at the pole. On each line from the pole, one point is exact (Duffy 1982).
     """
     place, weight = np.polynomial.legendre.leggauss(count)
     return np.stack([np.full(count, 0.5), 0.25 * (1.0 - place), 0.25 * (1.0 + place)], axis=1), 0.5 * weight
 
 
 GAUSS, DUFFY = _build_gauss_rule(), _build_duffy_rule()
-"""Rules (points, weights) for regular and singular integrals over a triangle of unit area."""
+"""Quadrature rules (points, weights) for regular and singular integrals over a triangle of unit area."""
 
 
 @forward_kernel
@@ -43,7 +43,7 @@ def integrate_kelvin(
     # outputs
     out: wp.array3d(dtype=wp.mat33d),
 ):
-    """Integrate mu U (0) and T (1) times each shape function over triangles, for a unit force at the origin.
+    """Integrate mu U (index 0) and T (index 1) times each shape function over triangles, for a unit force at 0.
 
     U_ij = ((3 - 4 nu) d_ij + r_i r_j / r^2) / (16 pi mu (1 - nu) r)
     T_ij = -(r_k n_k ((1 - 2 nu) d_ij + 3 r_i r_j / r^2) + (1 - 2 nu) (n_i r_j - n_j r_i)) / (8 pi (1 - nu) r^3)
@@ -73,7 +73,7 @@ def integrate_kelvin(
 
 
 def _integrate(corners: np.ndarray, rule: tuple[np.ndarray, np.ndarray], poisson: float) -> np.ndarray:
-    """Return `integrate_kelvin` (m, 2, 3, 3, 3) over triangles (m, 3, 3) [m] by a rule."""
+    """Return the results (m, 2, 3, 3, 3) of `integrate_kelvin` over triangles (m, 3, 3) [m], by a quadrature `rule`."""
     device, out = find_device("cpu", "float64"), wp.zeros((len(corners), 2, 3), dtype=wp.mat33d, device="cpu")
     points = device.upload(rule[0], wp.vec3d), device.upload(rule[1])
     device.launch(integrate_kelvin, (len(corners),), [device.upload(corners, wp.vec3d), *points, poisson], [out])
@@ -81,18 +81,18 @@ def _integrate(corners: np.ndarray, rule: tuple[np.ndarray, np.ndarray], poisson
 
 
 def _is_near(corners: np.ndarray) -> np.ndarray:
-    """Mark (m,) the triangles with corners (m, 3, 3) that are too close to the origin for the regular rule."""
+    """Return a mask (m,) of triangles with corners (m, 3, 3) that are too close to the origin for the regular rule."""
     centroid = corners.mean(axis=1)
     radius = ((corners - centroid[:, None]) ** 2).sum(axis=2).max(axis=1)
     return (centroid**2).sum(axis=1) < NEAR**2 * radius
 
 
 def integrate_triangles(corners: np.ndarray, poisson: float) -> np.ndarray:
-    """Integrate Kelvin's solution for a unit force at the origin over triangles with corners (m, 3, 3) [m].
+    """Return integrals of Kelvin's solution for a unit force at the origin, over triangles with corners (m, 3, 3) [m].
 
-    Returns (m, 2, 3, 3, 3): displacements times the shear modulus [m], and tractions; times the shape function of each
-    corner; direction of the force, and component. The tractions times the shape function of a corner at the origin
-    are not integrable, and zero here. Triangles near the origin are subdivided, those with a corner there are
+    The axes of the result (m, 2, 3, 3, 3) are: triangle; displacement times shear modulus [m], or traction; corner
+    whose shape function is a factor; force direction; component. For a corner at the origin, the traction integral does
+    not exist and is set to zero. Triangles near the origin are subdivided; triangles with a corner at the origin are
     integrated in Duffy's coordinates.
     """
     out = _integrate(corners, GAUSS, poisson)

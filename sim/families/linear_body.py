@@ -1,4 +1,4 @@
-"""Body of a linear deformation model: fixed vertices, loaded vertices and Lamé parameters."""
+"""Data of linear deformation models: fixed vertices, loaded vertices and Lamé parameters."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..runtime.device import find_device
 
 SUPPORTED = (Elasticity, Held, Bonded, ToolForce, NodalForce)
-"""Effects that models outside the finite elements compute: forces on tissue that is fixed to bone."""
+"""Effects that models other than finite elements support: forces on tissue that is fixed to bone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class LinearBody:
     fixed
         Mask (V,) of vertices that do not move.
     loaded
-        Vertices (a,), ascending, of the surface that is not fixed: forces act on these.
+        Sorted vertices (a,) of the surface that are not fixed; forces may act there.
     lame
         Lamé parameters mu, lambda [Pa] at small strain, by region label.
     tissue
@@ -42,12 +42,12 @@ class LinearBody:
 
 
 def check_effects(family: str, effects: Iterable[Effect]) -> Elasticity:
-    """Return the tissue, if a family called `family` supports all effects.
+    """Return the tissue among the effects; reject effects that the model family `family` does not support.
 
     Raises
     ------
     InputError
-        Another effect, tissue that relaxes, or no tissue.
+        An effect is not supported, the tissue relaxes, or there is no tissue.
     """
     effects = tuple(effects)
     other = next((type(effect).__name__ for effect in effects if not isinstance(effect, SUPPORTED)), None)
@@ -63,13 +63,13 @@ def check_effects(family: str, effects: Iterable[Effect]) -> Elasticity:
 
 
 def build_linear_body(family: str, anatomy: Anatomy, effects: Iterable[Effect]) -> LinearBody:
-    """Return the body of a family called `family`.
+    """Return the linear body of an anatomy for the model family `family`, a name for messages.
 
     Raises
     ------
     InputError
-        Effects that are not supported, or that `compile_problem` rejects; vertices fixed in some directions only; no
-        free vertices; a quadratic mesh.
+        An effect is not supported or `compile_problem` rejects it. A vertex is fixed in some directions only, no
+        vertex is free, or the mesh is quadratic.
     """
     effects = tuple(effects)
     tissue = check_effects(family, effects)
@@ -85,12 +85,12 @@ def build_linear_body(family: str, anatomy: Anatomy, effects: Iterable[Effect]) 
 
 
 def list_fixed_vertices(family: str, problem: Problem) -> np.ndarray:
-    """Return the mask (V,) of vertices that are fixed, for a family called `family`.
+    """Return the mask (V,) of fixed vertices, for the model family `family`.
 
     Raises
     ------
     InputError
-        Vertices that are fixed in some directions only.
+        A vertex is fixed in some directions only.
     """
     fixed = problem.constraint.fixed
     if (fixed.any(axis=1) != fixed.all(axis=1)).any():

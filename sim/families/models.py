@@ -1,4 +1,4 @@
-"""Deformation models under forces: a table of linear responses, and steps that approach the equilibrium."""
+"""Deformation models under forces: linear models with a compliance matrix, and models that iterate to equilibrium."""
 
 import time
 from abc import ABC, abstractmethod
@@ -34,19 +34,19 @@ from ..runtime.views import to_view
 from .linear_body import LinearBody, build_linear_body, check_effects
 
 Respond = Callable[[LinearBody, np.ndarray], np.ndarray]
-"""Function (body, nodes (n,)) -> displacements (a, 3, n, 3) [m/N] of vertices under unit forces at `body.loaded`."""
+"""Function (body, nodes (n,)) that returns displacements (a, 3, n, 3) [m/N] under unit forces at `body.loaded`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relaxation:
-    """Method that approaches the equilibrium.
+    """Iterative method that approaches the equilibrium.
 
     Parameters
     ----------
     element
-        Element of `Discretisation`.
+        Element type of the `Discretisation`.
     build_solver
-        Function that returns the method for a problem: (number of load cases) -> displacements (3N, b) [m] and steps.
+        Function that returns the solver of a problem: (number b of load cases) -> displacements (3N, b) [m], steps.
     tolerance
         Relative residual at which a load case counts as converged.
     """
@@ -57,7 +57,7 @@ class Relaxation:
 
 
 class _ForceModel(ABC):
-    """Deformation model under forces that measures the strain and inversion of elements `watched`."""
+    """Base class of deformation models under forces; inversion and strain are measured in the elements `watched`."""
 
     def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], watched: Discretisation, device: Device):
         self._name, self.anatomy, self.effects, self.lock = name, anatomy, tuple(effects), RLock()
@@ -66,12 +66,12 @@ class _ForceModel(ABC):
 
     @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Return the displacement under every load case; `start` has no influence.
+        """Return the deformation under every load case; `start` is ignored.
 
         Raises
         ------
         InputError
-            Loads that no effect uses or the model does not compute; a vertex that the mesh lacks.
+            No effect uses a load, the model does not support a load, or the mesh does not have a vertex.
         """
         check_causes(self.effects, loads)
         for cause in loads.causes:
@@ -82,12 +82,12 @@ class _ForceModel(ABC):
 
     @abstractmethod
     def _deform(self, loads: Loads, nodes: np.ndarray) -> Deformation:
-        """Return the deformation of `nodes` (n,)."""
+        """Return the deformation under `loads` at the vertices `nodes` (n,)."""
 
     def _measure(self, loads: Loads, u: wp.array, outcome: np.ndarray) -> dict[str, Any]:
-        """Return fields of a `Deformation` with displacements u (3N, b) [m] of the watched elements.
+        """Return `Deformation` fields, by name, for displacements u (3N, b) [m] of the watched elements.
 
-        `outcome` (b,) is that of load cases without inverted or overstrained elements.
+        `outcome` (b,) applies to load cases without inverted or overstrained elements.
         """
         strains, inverted = self._stretch.measure_stretch(u), self._inversion.count(u)
         outcome[self._stretch.is_beyond_range(strains["strained"])] = Outcome.OVERSTRAINED
@@ -97,23 +97,23 @@ class _ForceModel(ABC):
 
 
 class RelaxationModel(_ForceModel):
-    """Deformation model that approaches the equilibrium under forces from the undeformed state.
+    """Deformation model that iterates from the undeformed state towards equilibrium under forces.
 
-    Its results are the states after the last step.
+    The result is the state after the last step.
 
     Parameters
     ----------
     name
         Name of the family, for messages.
     anatomy, effects, device, batch
-        Arguments of `Fem`; only forces on tissue that is fixed to bone.
+        Arguments of `Fem`. Only forces on tissue that is fixed to bone are supported.
     method
-        Method that approaches the equilibrium.
+        Iterative method.
 
     Raises
     ------
     InputError
-        Effects that the method does not compute, and input that `Fem` rejects.
+        The method does not support an effect, or `Fem` rejects the input.
     """
 
     def __init__(
@@ -153,27 +153,27 @@ class RelaxationModel(_ForceModel):
 
 
 class LinearModel(_ForceModel):
-    """Deformation model with a table of responses to unit forces at the free surface.
+    """Linear deformation model with a compliance matrix for forces at the free surface.
 
-    `inverted`, `stretch` and `strained` of its results count tetrahedra at the free surface and in the tumour only.
-    Its outcome does not include the error of linear theory, which is 10 % of the motion at surgical forces.
+    `inverted`, `stretch` and `strained` of a result include only tetrahedra at the free surface and in the tumour. The
+    outcome ignores the error of linear theory, which is 10 % of the motion at surgical forces.
 
     Parameters
     ----------
     name
         Name of the family, for messages.
     anatomy, effects
-        Arguments of `Fem`; only forces on tissue that is fixed to bone.
+        Arguments of `Fem`. Only forces on tissue that is fixed to bone are supported.
     respond
-        Function that computes responses.
+        Function that computes displacements under unit forces.
     outcome
-        Outcome of load cases whose tissue is neither inverted nor strained too far.
+        Outcome of load cases whose tissue is neither inverted nor overstrained.
 
     Raises
     ------
     InputError
-        Input that `build_linear_body` or `respond` rejects. `deform`: loads other than `Pushed` and `Nodal`; forces at
-        vertices inside the body.
+        `build_linear_body` or `respond` rejects the input. In `deform`: a load is neither `Pushed` nor `Nodal`, or a
+        force acts at a vertex inside the body.
     """
 
     def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], respond: Respond, outcome: Outcome):
@@ -205,7 +205,7 @@ class LinearModel(_ForceModel):
         )
 
     def _build_table(self, respond: Respond, vertices: bytes) -> np.ndarray:
-        """Return the responses at vertices (n,), given as bytes of int64; fixed vertices do not move."""
+        """Return the responses at `vertices` (n,), given as bytes of int64; responses of fixed vertices are zero."""
         nodes = np.frombuffer(vertices, np.int64)
         needed = 2 * 9 * 8 * len(self._body.loaded) * len(nodes)
         if needed > measure_free_bytes(self._surface.device):
@@ -218,12 +218,12 @@ class LinearModel(_ForceModel):
         return table
 
     def _compute_motion(self, force: np.ndarray, acting: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Return displacements (B, n, 3) [m] of `nodes` under forces (B, a, 3) [N], nonzero at `loaded` only."""
+        """Return displacements (B, n, 3) [m] of `nodes` under forces (B, a, 3) [N], nonzero only at rows `acting`."""
         table = self._respond(nodes.tobytes())[acting]
         return np.tensordot(force[:, acting], table, axes=2)
 
     def _compute_forces(self, loads: Loads) -> np.ndarray:
-        """Return the forces (B, a, 3) [N] at `body.loaded`; fixed vertices bear the rest."""
+        """Return the forces (B, a, 3) [N] at `body.loaded`; forces at fixed vertices have no effect."""
         acting, count = self._body.loaded, len(self.anatomy.mesh.nodes)
         force = np.zeros((len(loads), len(acting), 3))
         for cause in loads.causes:

@@ -21,24 +21,24 @@ FAMILIES = {
     "explicit": "total Lagrangian explicit finite elements, damped to the equilibrium",
     "element-free": "total Lagrangian element-free Galerkin method with moving least squares",
 }
-"""Descriptions by name; the finite elements of `Fem` are the reference."""
+"""Descriptions of the families by name; the finite elements of `Fem` are the reference."""
 
 ELEMENTS_BY_FAMILY = {"mass-spring": "springs", "element-free": "element-free"}
-"""Families that `Fem` solves, and their element: these compute contact, gravity, resection and other effects."""
+"""Element types of the families that `Fem` solves; these families support contact, gravity, resection and more."""
 
 
 def build_family(
     name: str, anatomy: Anatomy, effects: Iterable[Effect], device: str = "auto", accuracy: Accuracy = TRAIN
 ) -> Deformer:
-    """Return a deformation model of one of `FAMILIES`.
+    """Return a deformation model of the family `name` in `FAMILIES`.
 
-    `device` and `accuracy` are as of `Fem`. Models with a table compute on the CPU; only the element-free and the
-    mass-spring model use `accuracy`.
+    `device` and `accuracy` are arguments of `Fem`. Models with a compliance matrix use the CPU; only the element-free
+    and the mass-spring model use `accuracy`.
 
     Raises
     ------
     InputError
-        An unknown name, effects that the family does not compute, and input that `Fem` rejects.
+        The name is unknown, the family does not support an effect, or `Fem` rejects the input.
 
     Examples
     --------

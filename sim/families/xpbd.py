@@ -1,7 +1,7 @@
 """Extended position-based dynamics (XPBD) of a mass-spring model, with a fixed number of iterations, as in games.
 
 Macklin, Muller, Chentanez 2016, "XPBD: position-based simulation of compliant constrained dynamics", equations 17 and
-18, with the springs and the volumes of `laws.springs` as constraints.
+18. The constraints are the springs and the volumes of `laws.springs`.
 """
 
 from collections.abc import Callable
@@ -26,16 +26,16 @@ from .models import Relaxation
 
 @dataclass(frozen=True)
 class Substeps:
-    """Time steps of the motion.
+    """Options of the time steps.
 
     Parameters
     ----------
     count, iterations
-        Number of time steps, and of iterations in each.
+        Number of time steps, and number of iterations in each step.
     step
         Duration of a step [s].
     velocity_factor
-        Fraction of the velocity that a step keeps.
+        Fraction of the velocity that remains after a step.
     density
         Density of the tissue [kg/m^3].
     """
@@ -73,9 +73,9 @@ def solve_constraints(
     u: wp.array2d(dtype=wp.float64),
     multiplier: wp.array3d(dtype=wp.float64),
 ):
-    """Change the multiplier m of the constraints C of a tetrahedron, six lengths and a volume, and its positions.
+    """Update the multipliers m and the positions for the constraints C of a tetrahedron: six lengths and one volume.
 
-    dm = (-C - a m) / (sum of w |grad C|^2 + a), dx = w grad C dm, with compliance a over the time step squared.
+    dm = (-C - a m) / (sum of w |grad C|^2 + a) and dx = w grad C dm, where a is compliance / (time step)^2.
     """
     t, c = wp.tid()
     e = order[t]
@@ -109,12 +109,12 @@ def solve_constraints(
 def build_solver(
     problem: Problem, space: Discretisation, tissue: Elasticity, settings: Substeps = Substeps()
 ) -> Callable[[int], tuple[wp.array, int]]:
-    """Return the function that moves a number of load cases: displacements (3N, b) [m] and iterations.
+    """Return a solver: a function of the number b of load cases that returns displacements (3N, b) [m] and iterations.
 
     Raises
     ------
     InputError
-        Vertices that are fixed in some directions only.
+        A vertex is fixed in some directions only.
     """
     device, mesh = problem.device, space.mesh
     elements = build_linear_elements(mesh, np.ones(len(mesh.tets), bool))
@@ -135,7 +135,7 @@ def build_solver(
     colours = [device.upload(tets, wp.int32) for tets in group_tetrahedra(mesh.tets)]
 
     def relax(count: int) -> tuple[wp.array, int]:
-        """Predict positions by u += kept (u - u-) + h^2 a, and solve the constraints, in every step."""
+        """Predict positions by u += kept (u - u_previous) + h^2 a, then solve the constraints, in every step."""
         u, before = device.allocate(problem.rows, count), device.allocate(problem.rows, count)
         multiplier, (x, old) = device.allocate(len(mesh.tets), 7, count), map(to_view, (u, before))
         with run_in_order(device):
@@ -154,7 +154,7 @@ def build_solver(
 
 
 def group_tetrahedra(tets: np.ndarray) -> list[np.ndarray]:
-    """Return groups of tetrahedra (T, 4) in which no two share a vertex, by the greedy rule."""
+    """Return groups of tetrahedra without common vertices, by greedy colouring of the tetrahedra (T, 4)."""
     used = np.zeros(tets.max() + 1, object)
     colour = np.empty(len(tets), int)
     for number, nodes in enumerate(tets.tolist()):

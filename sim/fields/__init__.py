@@ -1,1 +1,1 @@
-"""Displacement fields on regular grids: interpolation in a body, smooth extension around it, and inversion."""
+"""Displacement fields on regular grids: interpolation in a mesh, smooth extension around the mesh, and inversion."""

@@ -1,4 +1,4 @@
-"""Extension of a field outside its domain: nearest known value, faded to zero."""
+"""Extension of a field outside its domain: the nearest known value, which fades to zero with distance."""
 
 import numpy as np
 from scipy import ndimage
@@ -8,10 +8,10 @@ SMOOTHING_ITERATIONS = 6
 
 
 def extend_field(field: np.ndarray, defined: np.ndarray, max_distance: float) -> np.ndarray:
-    """Fill nodes of a field (3, I, J, K) outside the mask `defined` (I, J, K); zero beyond `max_distance` [nodes].
+    """Fill the nodes of a field (3, I, J, K) outside the mask `defined` (I, J, K); zero beyond `max_distance` [nodes].
 
-    Filled nodes take the nearest known value, scaled down with distance, and are smoothed. Their values do not exceed
-    the known ones.
+    A filled node has the nearest known value, reduced with the distance; then the filled nodes are smoothed. Their
+    values do not exceed the known values. The field is changed in place.
     """
     filled = np.where(defined, field, np.float32(0.0))
     moving = np.argwhere(filled.any(axis=0))
@@ -25,7 +25,7 @@ def extend_field(field: np.ndarray, defined: np.ndarray, max_distance: float) ->
 
 
 def _fill(field: np.ndarray, known: np.ndarray, reach: float) -> None:
-    """Fill as `extend_field`, in place; known nonzero nodes must be farther than `reach` from the edge."""
+    """Fill a field in place, as `extend_field`; known nonzero nodes must be more than `reach` from the border."""
     nearest = np.empty((3, *known.shape), np.int32)
     ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True, indices=nearest)
     square = np.zeros(known.shape, np.int32)  # squared distance; SciPy's distances take twice the time and memory
@@ -41,7 +41,7 @@ def _fill(field: np.ndarray, known: np.ndarray, reach: float) -> None:
 
 
 def smooth_field(field: np.ndarray, free: np.ndarray, iterations: int) -> None:
-    """Replace nodes marked `free` (I, J, K), except at the edge, by the mean of their neighbours, `iterations` times.
+    """Replace nodes marked in `free` (I, J, K) by the mean of their neighbours, `iterations` times; not at the border.
 
     The field (3, I, J, K) is changed in place.
     """

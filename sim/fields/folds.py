@@ -38,11 +38,11 @@ CORNER_SIGNS = (1.0 - 2.0 * CORNERS).prod(axis=1)
 
 
 def compute_jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
-    """Return least determinants (I - 1, J - 1, K - 1) of 1 + gradient of a field (3, I, J, K) [m], at a `spacing` [m].
+    """Return the smallest Jacobian determinant of each cell (I - 1, J - 1, K - 1) for a field (3, I, J, K) [m].
 
-    At each of a cell's eight corners, gradients are differences along its three edges, which are
-    the gradients of trilinear interpolation. The field folds where the determinant is negative. For cells with small
-    deformation, one corner is evaluated.
+    The determinant is that of 1 + gradient. At each of the eight corners of a cell, the gradient of the trilinear
+    interpolation follows from differences along three edges, with node `spacing` [m]. The field folds where the
+    determinant is negative. For cells with small deformation, only one corner is evaluated.
     """
     found = np.empty(tuple(side - 1 for side in field.shape[1:]), np.float32)
     for first in range(0, len(found), BLOCK_SLICES):
@@ -71,7 +71,7 @@ def compute_jacobians(field: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def find_corner_nodes(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return node numbers (n, 8, 4) in a grid: each corner of cells (n, 3), and the ends of its edges."""
+    """Return node numbers (n, 8, 4) in a grid: each corner of cells (n, 3), then the other ends of its edges."""
     return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(cells[:, None, None] + CORNER_NEIGHBOURS, -1, 0)), shape))
 
 
@@ -82,12 +82,12 @@ def compute_corner_volumes(positions: np.ndarray, corners: np.ndarray) -> np.nda
 
 
 def unfold_field(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spacing: float) -> float:
-    """Remove folds of a field (3, I, J, K) [m] in place, and return the least determinant that remains.
+    """Remove folds of a field (3, I, J, K) [m] in place, and return the smallest Jacobian determinant afterwards.
 
-    Nodes inside the body (I, J, K) move least, then those of the collar (I, J, K) around it, since the body's surface
-    lies between these and the rest. The squared volume deficit of cell corners is minimised, as Escobar et al. do
-    for meshes (Simultaneous untangling and smoothing of tetrahedral meshes, 2003). Persistent folds are smoothed and
-    tried again; there the body itself may fold.
+    Nodes in the mask `inside` (I, J, K) of the mesh change least, then nodes of the surrounding layer `collar` (I, J,
+    K); the surface of the mesh is between these two. The squared volume deficit of cell corners is minimised, as for
+    meshes in Escobar et al. 2003, "Simultaneous untangling and smoothing of tetrahedral meshes". Folds that remain are
+    smoothed before another attempt; there the mesh itself may be folded.
     """
     found = compute_jacobians(field, spacing)
     for turn in range(UNFOLDING.max_attempts):
@@ -110,7 +110,7 @@ def unfold_field(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spac
 
 
 def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float) -> None:
-    """Move nodes marked `near` (I, J, K) of a field part (3, I, J, K) [m] until its cells have positive volume."""
+    """Change nodes in the mask `near` of a field part (3, I, J, K) [m], in place, until no cell is folded."""
     shape = near.shape
     near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
     cells = np.argwhere(ndimage.maximum_filter(near, 2, origin=-1)[:-1, :-1, :-1])

@@ -1,4 +1,4 @@
-"""Interpolation of vertex values in tetrahedra at the nodes of a grid."""
+"""Interpolation of vertex values in tetrahedra to the nodes of a grid."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,7 +14,7 @@ INSIDE_TOLERANCE = 1e-7
 
 
 class _Hits(NamedTuple):
-    """Nodes in tetrahedra: node number (n,), tetrahedron (n,), and weights (n, 3) of its last three corners."""
+    """Grid nodes inside tetrahedra: node number (n,), tetrahedron (n,), weights (n, 3) of its last three corners."""
 
     node: np.ndarray
     tet: np.ndarray
@@ -24,9 +24,9 @@ class _Hits(NamedTuple):
 def interpolate_in_tetrahedra(
     grid: Grid, nodes: np.ndarray, tets: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate values (V, 3) at vertices `nodes` (V, 3) [m] of tetrahedra (T, 4), linearly within each.
+    """Interpolate `values` (V, 3) at vertices `nodes` (V, 3) [m] to grid nodes, linearly in each tetrahedron (T, 4).
 
-    Returns the field (3, I, J, K) in float32, zero outside, and a mask (I, J, K) of nodes inside.
+    Return the field (3, I, J, K) float32, which is zero outside the mesh, and a mask (I, J, K) of the nodes inside.
     """
     count = int(np.prod(grid.shape))
     field, inside = np.zeros((3, count), np.float32), np.zeros(count, bool)
@@ -38,7 +38,7 @@ def interpolate_in_tetrahedra(
 
 
 def _iterate_hits(shape: tuple[int, int, int], corners: np.ndarray) -> Iterator[_Hits]:
-    """Yield the grid nodes in tetrahedra with corners (T, 4, 3) [indices], in blocks of lines along the last axis."""
+    """Yield blocks of the grid nodes inside tetrahedra with corners (T, 4, 3) [indices], line by line."""
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)  # barycentric
     slack = INSIDE_TOLERANCE * np.linalg.norm(gradients, axis=2)

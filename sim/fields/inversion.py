@@ -1,4 +1,4 @@
-"""Inverse of a displacement field on a grid, outside the tetrahedra."""
+"""Inverse of a displacement field on a grid, for points outside the deformed mesh."""
 
 from dataclasses import dataclass
 
@@ -21,10 +21,10 @@ INVERSION = InversionSettings()
 
 
 def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Solve d = -forward(y + d) for d (n, 3) [m] at points y (n, 3) [m], from a guess (n, 3).
+    """Return the solution d (n, 3) [m] of d = -forward(y + d) at points y (n, 3) [m], from the initial `guess` (n, 3).
 
-    Most points converge by fixed-point iteration. It diverges where tissue is sheared by more than 45
-    degrees; these points use Newton's method.
+    Most points converge by fixed-point iteration. The iteration diverges where tissue is sheared by more than 45
+    degrees; these points are solved by Newton's method.
     """
     found, going, left = guess.copy(), np.arange(len(points)), []
     last = np.full(len(points), np.inf)
@@ -43,7 +43,7 @@ def invert_field(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.
 
 
 def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess: np.ndarray) -> np.ndarray:
-    """Invert as `invert_field`, by Newton's method; a point that does not converge returns its best iterate."""
+    """Return the result of `invert_field` by Newton's method; the best iterate for a point that does not converge."""
     best, least = guess.copy(), np.full(len(points), np.inf)
     trial, going, share = guess.copy(), np.arange(len(points)), np.ones(len(points))
     step = np.zeros_like(guess)
@@ -64,7 +64,7 @@ def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess:
 
 
 def _compute_newton_step(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return the Newton step (n, 3) [m] at places (n, 3) [m] with residuals `rest` (n, 3)."""
+    """Return the Newton steps (n, 3) [m] at positions `at` (n, 3) [m] with residuals `rest` (n, 3)."""
     half, columns = 0.25 * grid.spacing, []
     for axis in np.eye(3):
         ahead, behind = (grid.interpolate(forward, at + sign * half * axis) for sign in (1.0, -1.0))

@@ -1,4 +1,4 @@
-"""Extrapolation of a body's field to points just outside its surface."""
+"""Extrapolation of the displacement field of a mesh to points just outside its surface."""
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -15,10 +15,10 @@ MIN_DIVISOR = 1e-30  # guard against division by 0
 def extrapolate_beyond_surface(
     nodes: np.ndarray, tets: np.ndarray, values: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
-    """Return values (n, 3) at points (n, 3) [m] near the surface of tetrahedra (T, 4), from values at vertices (V, 3).
+    """Return values (n, 3) at points (n, 3) [m] near the surface of a mesh, from `values` (V, 3) at its vertices.
 
-    A point takes the value of the closest surface point plus a linear extrapolation. The gradient is
-    the mean over the tetrahedra around each vertex; the change is limited to half of the value.
+    The value of a point is that of the closest surface point plus a linear extrapolation. The gradient is the mean over
+    the tetrahedra around each vertex; the extrapolation is limited to half of the surface value.
     """
     surface = find_boundary_faces(tets)
     corners, slopes = nodes[surface], compute_vertex_gradients(nodes, tets, values)
@@ -37,7 +37,7 @@ def extrapolate_beyond_surface(
 
 
 def compute_vertex_gradients(nodes: np.ndarray, tets: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Compute gradients (V, 3, 3) of values (V, 3): volume-weighted means over the tetrahedra around each vertex."""
+    """Return gradients (V, 3, 3) of `values` (V, 3): volume-weighted means over the tetrahedra around each vertex."""
     corners, at = nodes[tets], values[tets]
     edges = corners[:, 1:] - corners[:, :1]
     gradients = np.linalg.solve(edges, at[:, 1:] - at[:, :1]).transpose(0, 2, 1)

@@ -1,4 +1,4 @@
-"""L2 projection of a body's field onto a grid, where sampling at the nodes is not accurate enough."""
+"""L2 projection of the field of a mesh onto a grid, where sampling at the grid nodes is not accurate enough."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ PROJECTION = ProjectionSettings()
 
 @dataclass(frozen=True, eq=False)
 class NodalField:
-    """Field (V, 3) [m] at vertices `nodes` (V, 3) [m], linear in each of the tetrahedra (T, 4)."""
+    """Field of values (V, 3) [m] at vertices `nodes` (V, 3) [m], linear in each tetrahedron of `tets` (T, 4)."""
 
     nodes: np.ndarray
     tets: np.ndarray
@@ -48,7 +48,7 @@ class NodalField:
 
 
 class _Samples(NamedTuple):
-    """Sample points (n, 3) [m], their values (n, 3), weights (n,), and tetrahedra or triangles (n,)."""
+    """Sample points (n, 3) [m], with values (n, 3), weights (n,), and their tetrahedra or triangles (n,)."""
 
     points: np.ndarray
     values: np.ndarray
@@ -57,12 +57,12 @@ class _Samples(NamedTuple):
 
 
 def project_field(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.ndarray, body: NodalField) -> None:
-    """Fit a field (3, I, J, K), sampled in a body (mask `inside`) and its `collar`, to the body's field between nodes.
+    """Fit a grid field (3, I, J, K), sampled at nodes in a mesh (`inside`) and its `collar`, to the mesh field `body`.
 
-    Nodes at interpolation errors above 0.02 mm change in place, in the collar only where it moves. The squared
-    error is minimised over points of the tetrahedra and of their surface (L2 projection). The field has a kink at the
-    surface, which nodes outside represent. Small weights keep changes small and even, and the field straight in
-    the collar.
+    Nodes near interpolation errors above 0.02 mm are changed in place; collar nodes only if their value is not zero.
+    The squared error is minimised over sample points in the tetrahedra and on their surface (L2 projection). Nodes
+    outside the mesh represent the kink of the field at the surface. Penalties with small weights keep changes small and
+    uniform, and the field linear in the collar.
     """
     flat, bad = field.reshape(3, -1), np.zeros(len(body.tets), bool)
     for some in _sample_tetrahedra(grid, body, np.arange(len(body.tets)), PROJECTION.test_density):
@@ -94,12 +94,12 @@ def project_field(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.
 
 
 def _read(flat: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Interpolate a flat field (3, N) by node numbers and weights: (n, 3)."""
+    """Return values (n, 3) of a flattened field (3, N), by node numbers (n, m) and weights (n, m)."""
     return np.stack([np.einsum("nc,nc->n", part[numbers], weights) for part in flat], axis=-1)
 
 
 def _sample_tetrahedra(grid: Grid, body: NodalField, which: np.ndarray, density: float) -> Iterator[_Samples]:
-    """Yield `density` points per grid spacing along the longest edge of some tetrahedra, weighted by volume [cells]."""
+    """Yield samples of tetrahedra `which`, `density` per grid spacing along the longest edge, weighted by volume."""
     corners = body.nodes[body.tets[which]]
     volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / (6.0 * grid.spacing**3)
     for some in _sample_simplices(grid, body, body.tets[which], volumes, density):
@@ -107,7 +107,7 @@ def _sample_tetrahedra(grid: Grid, body: NodalField, which: np.ndarray, density:
 
 
 def _sample_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
-    """Yield points of the surface triangles with a vertex in `touched` (V,)."""
+    """Yield samples of the surface triangles that have a vertex in the mask `touched` (V,)."""
     faces = find_boundary_faces(body.tets)
     faces = faces[touched[faces].any(axis=1)]
     a, b, c = body.nodes[faces].transpose(1, 0, 2)
@@ -118,7 +118,7 @@ def _sample_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterat
 def _sample_simplices(
     grid: Grid, body: NodalField, simplices: np.ndarray, weights: np.ndarray, density: float
 ) -> Iterator[_Samples]:
-    """Yield regular lattice points of simplices (n, c) of vertices; the points of one share its weight (n,)."""
+    """Yield regular lattice points of `simplices` (n, c); the weight (n,) of a simplex is divided among its points."""
     corners, size = body.nodes[simplices], simplices.shape[1]
     first, second = np.triu_indices(size, 1)
     longest = np.linalg.norm(corners[:, first] - corners[:, second], axis=2).max(axis=1, initial=0.0)
@@ -138,14 +138,14 @@ def _sample_simplices(
 
 @cache
 def _build_lattice(order: int, size: int) -> np.ndarray:
-    """Return barycentric weights (n, size) of the lattice points that divide a simplex's edges into `order` parts."""
+    """Return barycentric weights (n, size) of a regular lattice that divides simplex edges into `order` parts."""
     parts = np.indices((order + 1,) * (size - 1)).reshape(size - 1, -1)
     weights = np.stack([*parts, order - parts.sum(axis=0)], axis=1)
     return weights[weights[:, -1] >= 0] / order
 
 
 def _build_rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> sparse.csr_matrix:
-    """Build the sparse matrix (n, free) that sums nodes (n, m) with weights (n, m), without fixed nodes."""
+    """Return the sparse matrix (n, free) of sums over free nodes, with node numbers (n, m) and weights (n, m)."""
     columns = column[numbers]
     free = columns >= 0
     row = np.repeat(np.arange(len(numbers)), free.sum(axis=1))
@@ -156,7 +156,7 @@ def _build_rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) ->
 def _build_penalties(
     grid: Grid, flat: np.ndarray, nodes: np.ndarray, column: np.ndarray, inside: np.ndarray, collar: np.ndarray
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Return matrix and right side (n, 3) of the penalties on size, unevenness and curvature."""
+    """Return the matrix and right-hand side (n, 3) of penalties on size, unevenness and curvature of the changes."""
     pairs, bends = [], []
     for index, side, stride in zip(
         np.unravel_index(nodes, grid.shape), grid.shape, (grid.shape[1] * grid.shape[2], grid.shape[2], 1), strict=True

@@ -1,4 +1,4 @@
-"""Displacement fields of a body and its surroundings on a grid, forward and backward."""
+"""Forward and backward displacement fields of a mesh and its surroundings on a grid."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ MIN_DIVISOR = 1e-30  # guard against division by 0
 
 @dataclass(frozen=True)
 class WarpFieldSettings:
-    """Settings of the grid of a warp and of its small displacements."""
+    """Settings for the grid of displacement fields and for negligible displacements."""
 
     min_fade_distance: float = 5e-3  # constant part of the distance over which the field fades to zero [m]
     fade_factor: float = 2.0  # variable part of that distance [maximum displacements]
@@ -42,18 +42,18 @@ class WarpFields:
     Parameters
     ----------
     grid
-        Grid that contains the undeformed and the deformed body, with a margin.
+        Grid that contains the undeformed and the deformed mesh, with a margin.
     forward
-        (3, I, J, K) [m]: undeformed position x moves to x + forward(x). Also called *modelling*.
+        Field (3, I, J, K) [m]: the undeformed position x moves to x + forward(x). Also called *modelling*.
     backward
-        (3, I, J, K) [m]: deformed position y was at y + backward(y). Also called *resampling*.
+        Field (3, I, J, K) [m]: the deformed position y was at y + backward(y) before. Also called *resampling*.
     resected
-        (I, J, K) bool: nodes in resected tissue, in the undeformed configuration.
+        Mask (I, J, K) of nodes in resected tissue, in the undeformed configuration.
     min_determinants
-        Least Jacobian determinants of the two fields, and least relative volume of a tetrahedron.
-        If one is <= 0, the fields fold, or the body alone.
+        Smallest Jacobian determinants of `forward` and `backward`, and smallest relative volume of a tetrahedron. A
+        value <= 0 shows a fold of this field or of the mesh.
     fade_distance
-        Distance from the body over which the field fades to zero [m].
+        Distance from the mesh over which the fields fade to zero [m].
     """
 
     grid: Grid
@@ -65,31 +65,31 @@ class WarpFields:
 
     @property
     def has_folds(self) -> bool:
-        """True if one of the fields folds."""
+        """True if `forward` or `backward` has a fold."""
         return not min(self.min_determinants[:2]) > 0.0
 
 
 def compute_fade_distance(displacement: np.ndarray) -> float:
-    """Return the distance [m] over which the field of displacements (..., 3) [m] fades to zero."""
+    """Return the distance [m] over which the field fades to zero outside the mesh, from displacements (..., 3) [m]."""
     largest = float(np.linalg.norm(displacement, axis=-1).max())
     return WARP_FIELDS.min_fade_distance + WARP_FIELDS.fade_factor * largest
 
 
 def compute_cutoff(displacement: np.ndarray) -> float:
-    """Return the limit [m] below which displacements (..., 3) [m] are neglected, so that the grid can be smaller."""
+    """Return the magnitude [m] below which displacements (..., 3) [m] are neglected to make the grid smaller."""
     largest = float(np.linalg.norm(displacement, axis=-1).max())
     return min(WARP_FIELDS.zeroing_threshold, WARP_FIELDS.zeroing_fraction * largest)
 
 
 def remove_negligible(displacement: np.ndarray) -> np.ndarray:
-    """Return displacements (..., 3) [m] with negligible ones set to zero."""
+    """Return displacements (..., 3) [m], with negligible displacements set to zero."""
     size = np.linalg.norm(displacement, axis=-1, keepdims=True)
     share = np.clip(size / max(compute_cutoff(displacement), MIN_DIVISOR) - 1.0, 0.0, 1.0)
     return displacement * (share * share * (3.0 - 2.0 * share))
 
 
 def build_warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float) -> Grid:
-    """Build the grid with a spacing [m] around the part of a body that displacements (B, V, 3) [m] move."""
+    """Return the grid with a `spacing` [m] around the part of the anatomy that `displacements` (B, V, 3) [m] move."""
     mesh, moves = anatomy.mesh, np.asarray(displacements.any(axis=(0, 2)))
     tets, faces = (of[moves[of].any(axis=1)] for of in (mesh.tets, mesh.surface))
     held, outer = np.unique(tets if len(tets) else mesh.tets), np.unique(faces)
@@ -101,15 +101,15 @@ def build_warp_grid(anatomy: Anatomy, displacements: np.ndarray, spacing: float)
 
 
 def find_collar(inside: np.ndarray) -> np.ndarray:
-    """Return the nodes (I, J, K) outside a body that are neighbours of nodes inside."""
+    """Return the mask (I, J, K) of the nodes outside a mesh that are neighbours of nodes in the mask `inside`."""
     return np.asarray(ndimage.maximum_filter(inside, 3) & ~inside)
 
 
 def compute_forward(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the field (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian determinant.
+    """Return the forward field (3, I, J, K) [m] of a displacement (V, 3) [m], and its smallest Jacobian determinant.
 
-    It is linear in each tetrahedron, and fitted where sampling is not accurate between grid nodes. It is
-    extrapolated just outside, to be accurate up to the surface, and then fades to zero.
+    The field is linear in each tetrahedron, and fitted where sampling is not accurate between grid nodes. Just outside
+    the mesh the field is extrapolated, to be accurate up to the surface; farther away it fades to zero.
     """
     nodes, tets = body.mesh.nodes, body.mesh.tets
     field, inside = interpolate_in_tetrahedra(grid, nodes, tets, displacement)
@@ -126,9 +126,9 @@ def compute_forward(grid: Grid, body: Anatomy, displacement: np.ndarray) -> tupl
 def compute_inverse(
     grid: Grid, body: Anatomy, displacement: np.ndarray, forward: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the inverse (3, I, J, K) [m] of a body's displacement (V, 3) [m], and its least Jacobian determinant.
+    """Return the backward field (3, I, J, K) [m] of a displacement (V, 3) [m], and its smallest Jacobian determinant.
 
-    In the deformed body it is linear in each tetrahedron, and fitted. Outside it is the forward field's inverse.
+    In the deformed mesh the field is linear in each tetrahedron, and fitted. Outside, it is the inverse of `forward`.
     """
     now, tets = body.mesh.nodes + displacement, body.mesh.tets
     field, inside = interpolate_in_tetrahedra(grid, now, tets, -displacement)
@@ -147,10 +147,10 @@ def compute_warp_fields(
     remaining: Anatomy | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> WarpFields:
-    """Return the fields of a displacement (V, 3) [m] on a grid with a spacing [m].
+    """Return forward and backward fields of a displacement (V, 3) [m] on a grid with a `spacing` [m].
 
-    `remaining` is the remaining body after a resection. Outside the body the fields fade. `progress` is
-    called after each of the two fields.
+    `remaining` is the remaining anatomy after a resection. Outside the mesh the fields fade to zero. The function
+    `progress` is called after each of the two fields.
     """
     displacement = remove_negligible(displacement)
     body, grid = remaining or anatomy, build_warp_grid(anatomy, displacement[None], spacing)

@@ -1,1 +1,1 @@
-"""Tetrahedral meshes and triangulated surfaces, in NumPy only."""
+"""Tetrahedral meshes and triangulated surfaces, implemented in NumPy."""

@@ -1,4 +1,4 @@
-"""Closest point of a triangulated surface, in plain NumPy."""
+"""Closest point of a triangulated surface, implemented in NumPy."""
 
 from typing import NamedTuple
 
@@ -17,11 +17,11 @@ class ClosestPoints(NamedTuple):
 
 
 def find_closest_points(points: np.ndarray, corners: np.ndarray) -> ClosestPoints:
-    """Find the closest points to points (B, 3) [m] on triangles with corners (S, 3, 3), or (B, S, 3, 3) [m].
+    """Return the closest points to `points` (B, 3) [m] on triangles with corners (S, 3, 3) or (B, S, 3, 3) [m].
 
-    It is the projection to a triangle's plane if this is inside, else the closest point of an edge. Triangles without
-    area still have edges. For triangles shared by all points, the distances to all centroids select the few triangles
-    that may be closest to each point.
+    The closest point of a triangle is the projection to its plane if this is inside, else the closest point of an edge.
+    For triangles without area, only the edges are used. For corners (S, 3, 3), distances to centroids select the few
+    triangles that may be closest to each point.
     """
     if corners.ndim == 3:
         middle, reach = compute_bounding_balls(corners)
@@ -58,18 +58,18 @@ def find_closest_points(points: np.ndarray, corners: np.ndarray) -> ClosestPoint
 
 
 def compute_bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute centroids (S, 3) and radii (S,) [m] of balls that contain a triangle each, of corners (S, 3, 3) [m]."""
+    """Return centroids (S, 3) and radii (S,) [m] of balls that each contain a triangle with corners (S, 3, 3) [m]."""
     middle = corners.mean(axis=1)
     return middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
 
 
 def _list_candidates(points: np.ndarray, middle: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """List triangles (B, k), given by their `compute_bounding_balls`, that include the closest one to each point.
+    """Return the triangles (B, k) that may be closest to each point; `middle` and `reach` are their bounding balls.
 
-    A triangle is left out if no point of it can be closer than the nearest centroid.
+    A triangle is omitted if no point of this triangle can be closer than the nearest centroid.
 
-    Each row begins with the possibly closest triangles in ascending order, so that the first of equals is found.
-    The remainder of the row repeats its first triangle.
+    Each row starts with the possibly closest triangles in ascending order, so that of equally close triangles the first
+    is found. The remainder of the row repeats its first triangle.
     """
     x, y, z = (points[:, axis, None] - middle[:, axis] for axis in range(3))
     away = np.sqrt(x * x + y * y + z * z)

@@ -10,33 +10,33 @@ TOLERANCE = 1e-9  # Tolerance relative to the radius, so that by rounding no bal
 def find_resting_tip(
     nodes: np.ndarray, triangles: np.ndarray, line_point: np.ndarray, inward: np.ndarray, radius: float
 ) -> np.ndarray:
-    """Find the tip (3,) [m] of one ball: `find_resting_tips` on nodes (V, 3) [m], along a line through (3,) [m]."""
+    """Return the tip (3,) [m] of one ball, as `find_resting_tips`, for nodes (V, 3) [m] and `line_point` (3,) [m]."""
     return find_resting_tips(nodes[None], triangles, line_point[None], inward, np.array([radius]))[0]
 
 
 def find_resting_tips(
     nodes: np.ndarray, triangles: np.ndarray, line_point: np.ndarray, inward: np.ndarray, radius: np.ndarray
 ) -> np.ndarray:
-    """Find the tips (B, 3) [m] of balls, each moved down a line until its first contact with its own surface.
+    """Return the tips (B, 3) [m] of balls, each moved along a line until its first contact with its own surface.
 
     A ball comes from infinity; its centre stays on the line. Its tip is its lowest point along `inward`, which need not
-    be the point of contact. The centre enters a triangle's neighbourhood of the ball's radius: a plate, three cylinders
-    and three balls (Ericson 2005, "Real-Time Collision Detection", section 5.5.6); the first of them is the contact.
+    be the contact point. Contact occurs when the centre first enters a triangle enlarged by the radius: a plate, three
+    cylinders and three balls (Ericson 2005, "Real-Time Collision Detection", section 5.5.6).
 
     Parameters
     ----------
     nodes, triangles
-        Surfaces: positions (B, V, 3) [m], and vertex numbers (F, 3) that they share. Triangles without area count as
-        edges.
+        Vertex positions (B, V, 3) [m] of the B surfaces, and their common vertex numbers (F, 3). Triangles without area
+        count as edges.
     line_point, inward
-        Any point (B, 3) [m] of each line, and the unit direction (3,) in which the balls move.
+        Any point (B, 3) [m] on each line, and the unit direction (3,) in which all balls move.
     radius
         Radius of each ball (B,) [m].
 
     Raises
     ------
     InputError
-        A ball whose path misses the surface.
+        The path of a ball misses its surface.
     """
     across = nodes - line_point[:, None]
     across = across - (across @ inward)[..., None] * inward
@@ -60,14 +60,14 @@ def find_resting_tips(
 
 
 def _compute_vertex_paths(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Compute the centre's path (M, 3) [m] to the first contact with each corner (M, 3, 3) [m]; inf: no contact."""
+    """Return the path of the centre (M, 3) [m] to the first contact with each corner (M, 3, 3) [m]; inf: no contact."""
     along = corners @ inward
     room = radius**2 - (np.einsum("mpi,mpi->mp", corners, corners) - along**2)
     return np.where(room >= 0.0, along - np.sqrt(np.maximum(room, 0.0)), np.inf)
 
 
 def _compute_edge_paths(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Compute the centre's path (M, 3) [m] to the first contact with each edge's interior; inf: no contact."""
+    """Return the path of the centre (M, 3) [m] to the first contact with the interior of each edge; inf: no contact."""
     edge = np.roll(corners, -1, axis=1) - corners
     square = np.einsum("mei,mei->me", edge, edge)
     unit = edge / np.sqrt(np.where(square > 0.0, square, 1.0))[..., None]
@@ -83,7 +83,7 @@ def _compute_edge_paths(corners: np.ndarray, inward: np.ndarray, radius: np.ndar
 
 
 def _compute_face_paths(corners: np.ndarray, inward: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Compute the centre's path (M, 1) to the first contact with the interior of each triangle, from either side."""
+    """Return the path of the centre (M, 1) [m] to the first contact with each triangle's interior, on either side."""
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(ab, ac)
     twice = np.linalg.norm(normal, axis=1)

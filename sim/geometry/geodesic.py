@@ -9,12 +9,12 @@ from .tetmesh import compute_row_keys
 def compute_geodesic_distances(
     nodes: np.ndarray, triangles: np.ndarray, source: np.ndarray, max_distance: float, points_per_edge: int = 4
 ) -> np.ndarray:
-    """Compute the shortest paths (V,) [m] over the surface `triangles` (S, 3) from `source` (3,) to each node.
+    """Return the lengths (V,) [m] of the shortest paths over `triangles` (S, 3) from `source` (3,) to each node.
 
-    Infinite for nodes off the surface or farther than `max_distance` [m]. Dijkstra's algorithm on a graph of the nodes
-    and of further points on the edges, joined straight across each triangle (Lanthier, Maheshwari & Sack 2001). The
-    source is joined to the triangles around its nearest node. With four `points_per_edge` the paths are at most about
-    1 % too long.
+    The length is infinite for nodes that are not on the surface or farther than `max_distance` [m]. Dijkstra's
+    algorithm is applied to a graph of the nodes and of additional points on the edges, connected by straight lines
+    within each triangle (Lanthier, Maheshwari & Sack 2001). The source is connected to the triangles around its nearest
+    node. With four `points_per_edge` the paths are at most about 1 % too long.
     """
     size = np.linalg.norm(nodes[triangles] - nodes[np.roll(triangles, 1, axis=1)], axis=2).max()
     near = np.linalg.norm(nodes[triangles] - source, axis=2).min(axis=1) <= max_distance + size
@@ -37,7 +37,7 @@ def compute_geodesic_distances(
 
 
 def _add_steiner_points(nodes: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return all points of the graph, the nodes first, and their numbers on each triangle (S, 3 + 3 count)."""
+    """Return the points of the graph, nodes first, and the numbers of the points on each triangle (S, 3 + 3 count)."""
     sides = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     _, first, number = np.unique(compute_row_keys(sides), return_index=True, return_inverse=True)
     edges, share = sides[first], (np.arange(count) + 1.0) / (count + 1.0)

@@ -1,4 +1,4 @@
-"""Interpolation of one mesh's solution at material points of another: tetrahedron and barycentric weights of points."""
+"""Tetrahedron and barycentric weights of points, to interpolate a solution from one mesh to another mesh."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,20 +15,20 @@ WEIGHT_TOLERANCE = 1e-12  # Barycentric weights below this are round-off.
 
 @dataclass(frozen=True, eq=False)
 class LocatedPoints:
-    """Points in a mesh: vertices (n, 4) of the tetrahedron that contains each, and barycentric weights (n, 4)."""
+    """Points in a mesh: vertices (n, 4) of the tetrahedron that contains each point, and barycentric weights (n, 4)."""
 
     vertices: np.ndarray
     weights: np.ndarray
 
     def interpolate(self, field: np.ndarray) -> np.ndarray:
-        """Interpolate values (B, V, k) at the vertices linearly to the points: (B, n, k)."""
+        """Return values (B, n, k) at the points, by linear interpolation of values (B, V, k) at the vertices."""
         return np.einsum("nc,bnck->bnk", self.weights, field[:, self.vertices])
 
 
 def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> LocatedPoints:
-    """Locate points (n, 3) [m]; for one outside the mesh, its weights are clipped to a nearby tetrahedron.
+    """Return tetrahedra and weights of points (n, 3) [m]; weights are clipped to a near element for outside points.
 
-    In graded meshes the tetrahedron of a point is among the 64 `candidates` with the nearest centroids.
+    The search uses the tetrahedra with the nearest centroids; the default of 64 `candidates` suffices in graded meshes.
     """
     tet, weights = _choose_tetrahedra(mesh, points, min(FIRST_CANDIDATES, candidates))
     unheld = np.flatnonzero(weights.min(axis=1) < -WEIGHT_TOLERANCE)
@@ -38,9 +38,9 @@ def locate(mesh: TetMesh, points: np.ndarray, candidates: int = 64) -> LocatedPo
 
 
 class _Cells(NamedTuple):
-    """Centroids of a mesh's tetrahedra, their first corners (T, 3) [m], and inverses (T, 3, 3) [1/m] of their edges.
+    """Search data of a mesh: centroids, first corners (T, 3) [m], and inverses (T, 3, 3) [1/m] of edge matrices.
 
-    An inverse maps a point's position relative to the first corner to the barycentric weights of the others.
+    An inverse maps a position relative to the first corner to the barycentric weights of the other three corners.
     """
 
     middles: KDTree
@@ -56,7 +56,7 @@ def _build_cells(mesh: TetMesh) -> _Cells:
 
 
 def _choose_tetrahedra(mesh: TetMesh, points: np.ndarray, candidates: int) -> tuple[np.ndarray, np.ndarray]:
-    """Choose, of the nearest `candidates`, the tetrahedra (n,) with the largest minimum weight, and weights (n, 4)."""
+    """Return the tetrahedra (n,) with the largest minimum weight among the nearest `candidates`, and weights (n, 4)."""
     cells, count = _build_cells(mesh), min(candidates, len(mesh.tets))
     near = cells.middles.query(points, k=count)[1].reshape(len(points), count)
     inner = np.einsum("nkij,nkj->nki", cells.inverse[near], points[:, None] - cells.corner[near])

@@ -1,4 +1,4 @@
-"""Triangulated surfaces: areas, normals, and a test whether a closed one contains a point."""
+"""Triangulated surfaces: areas, normals, and a test if a closed surface contains a point."""
 
 from dataclasses import dataclass
 
@@ -7,17 +7,17 @@ import numpy as np
 
 @dataclass(frozen=True)
 class BlurRange:
-    """Limits of a blurred surface.
+    """Options for normals of a blurred surface.
 
     Parameters
     ----------
     cutoff
         Cut-off radius [standard deviations of the blur].
     min_blur_ratio
-        Minimum blur, relative to the longest edge: every corner has a triangle's centroid within two thirds of that
-        edge.
+        Minimum blur, as a fraction of the longest edge, since the centroid of a triangle may be up to two thirds of
+        an edge away from a corner.
     block_size
-        Points summed at once: bounds the memory.
+        Number of points computed at once, which limits memory.
     """
 
     cutoff: float = 3.5
@@ -28,12 +28,12 @@ class BlurRange:
 def compute_blurred_normals(
     nodes: np.ndarray, triangles: np.ndarray, points: np.ndarray, blur: float, limits: BlurRange = BlurRange()
 ) -> np.ndarray:
-    """Compute unit outward normals (n, 3) at points (n, 3) [m] of the body within outward triangles (S, 3), with blur.
+    """Return outward unit normals (n, 3) at points (n, 3) [m] of a blurred solid bounded by outward triangles (S, 3).
 
-    They are the negative gradient of the body's indicator after a Gaussian of standard deviation `blur` [m]. By the
-    divergence theorem that is the integral over its surface of the Gaussian times the outward normal. Folds narrower
-    than the blur disappear, and the finer the mesh, the less the normals depend on it. For triangles too wide for the
-    blur, it is increased to a fraction of their longest edge.
+    The normal is the negative gradient of the indicator function of the solid, blurred by a Gaussian with standard
+    deviation `blur` [m]. By the divergence theorem, this is the surface integral of the Gaussian times the outward
+    normal. Folds narrower than the blur disappear, and normals on fine meshes do not depend on the mesh. If triangles
+    are too large for the blur, it is increased to a fraction of the longest edge.
     """
     from scipy.spatial import KDTree  # slow to import, and not needed for help texts
 
@@ -53,7 +53,7 @@ def compute_blurred_normals(
 
 
 def compute_vertex_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Compute unit normals (V, 3) at nodes (V, 3) [m] of outward triangles (S, 3), weighted by area; zero off them."""
+    """Return area-weighted unit normals (V, 3) at nodes (V, 3) [m] of outward triangles (S, 3); zero at other nodes."""
     corners = nodes[triangles]
     twice = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(nodes)
@@ -63,7 +63,7 @@ def compute_vertex_normals(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarr
 
 
 def normalise_vectors(vectors: np.ndarray) -> np.ndarray:
-    """Scale vectors (n, 3) to unit length; zero stays zero."""
+    """Return vectors (n, 3) scaled to unit length; zero vectors remain zero."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)
 
@@ -71,7 +71,7 @@ def normalise_vectors(vectors: np.ndarray) -> np.ndarray:
 def is_enclosing(corners: np.ndarray, point: np.ndarray) -> bool:
     """Return True if a closed surface of triangles with corners (S, 3, 3) [m] contains a point (3,) [m].
 
-    By its winding number: the solid angles of the triangles sum to +-4 pi inside, and to zero outside.
+    The test uses the winding number: the solid angles of the triangles sum to +-4 pi inside and to 0 outside.
     """
     a, b, c = np.moveaxis(corners - point, 1, 0)
     x, y, z = (np.linalg.norm(arm, axis=1) for arm in (a, b, c))
@@ -93,5 +93,5 @@ def compute_areas(corners: np.ndarray) -> np.ndarray:
 
 
 def compute_vertex_areas(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Compute a third (n,) [m^2] of the area of the triangles (S, 3) at each of the nodes (n, 3) [m]."""
+    """Return the nodal areas (n,) [m^2]: one third of the area of the triangles (S, 3) at each node (n, 3) [m]."""
     return np.bincount(triangles.ravel(), np.repeat(compute_areas(nodes[triangles]) / 3.0, 3), len(nodes))

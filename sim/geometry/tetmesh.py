@@ -1,4 +1,4 @@
-"""Tetrahedral meshes: nodes, linear or quadratic tetrahedra, region labels, and their surface."""
+"""Tetrahedral meshes: nodes, linear or quadratic tetrahedra, region labels, and surfaces."""
 
 import hashlib
 import warnings
@@ -20,11 +20,11 @@ SLIVER_DEGREES = 1.0  # Dihedral angle below which an element is a sliver [degre
 
 
 class MeshWarning(UserWarning):
-    """Warning about a mesh that reduces accuracy, or is probably not as intended."""
+    """Warning that a mesh reduces the accuracy or is probably not as intended."""
 
 
 def compute_signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Compute the signed volumes (T,) [m^3] of tetrahedra `tets` (T, 4) over `nodes` (V, 3) [m]."""
+    """Return the signed volumes (T,) [m^3] of tetrahedra `tets` (T, 4) with `nodes` (V, 3) [m]."""
     a, b, c, d = (nodes[tets[:, k]] for k in range(4))
     return np.einsum("ti,ti->t", np.cross(b - a, c - a), d - a) / 6.0
 
@@ -37,9 +37,9 @@ def find_boundary_faces(tets: np.ndarray) -> np.ndarray:
 
 
 def compute_row_keys(rows: np.ndarray) -> np.ndarray:
-    """Return one number (n,) for each row (n, 2) or (n, 3) of node numbers, independent of their order in the row.
+    """Return one key (n,) for each row (n, 2) or (n, 3) of node numbers, independent of the order within a row.
 
-    Sorting such numbers is ten times faster than sorting rows. They are distinct up to two million nodes.
+    Sorting keys is ten times faster than sorting rows. Keys are unique for up to two million nodes.
     """
     key, base = np.int64(0), np.int64(rows.max()) + 1
     for column in np.sort(rows, axis=1).T:
@@ -63,24 +63,24 @@ class TetMesh:
     Parameters
     ----------
     nodes
-        (V, 3) float64 [m].
+        Node coordinates (V, 3) float64 [m].
     tets
-        (T, 4) node numbers, positively oriented.
+        Node numbers (T, 4) of positively oriented tetrahedra.
     region
-        (T,) integer labels; a tissue law is chosen per label.
+        Integer region labels (T,); each label may have its own tissue law.
     middles
-        (T, 6) node numbers on the `QUADRATIC_EDGES` of quadratic tetrahedra, or None.
+        Numbers (T, 6) of the mid-edge nodes on `QUADRATIC_EDGES` of quadratic tetrahedra, or None.
 
     Raises
     ------
     InputError
-        Wrong shapes, non-finite coordinates, node numbers out of range, and elements of zero or negative
-        volume (`orient_tetrahedra` turns negative ones).
+        A shape is wrong, a coordinate is not finite, a node number is out of range, or the volume of an element is zero
+        or negative (`orient_tetrahedra` corrects negative volumes).
 
     Warns
     -----
     MeshWarning
-        Dihedral angles below one degree; a body smaller than 1 mm or larger than 10 m.
+        A dihedral angle is below one degree, or the mesh is smaller than 1 mm or larger than 10 m.
 
     Examples
     --------
@@ -121,47 +121,47 @@ class TetMesh:
 
     @property
     def arrays(self) -> tuple[np.ndarray, ...]:
-        """Arrays that define the mesh: nodes, tetrahedra, regions, and mid-edge nodes if there are any."""
+        """Arrays that define the mesh: nodes, tetrahedra, regions and, if present, mid-edge nodes."""
         linear = self.nodes, self.tets, self.region
         return linear if self.middles is None else (*linear, self.middles)
 
     @cached_property
     def table(self) -> np.ndarray:
-        """Nodes of each tetrahedron, (T, 4) or, quadratic, (T, 10): corners, then mid-edge nodes."""
+        """Node numbers of each tetrahedron: (T, 4) or, if quadratic, (T, 10) with corners, then mid-edge nodes."""
         return self.tets if self.middles is None else np.hstack([self.tets, self.middles])
 
     @cached_property
     def volumes(self) -> np.ndarray:
-        """Element volumes (T,) [m^3], with straight edges."""
+        """Element volumes (T,) [m^3], computed with straight edges."""
         return compute_signed_volumes(self.nodes, self.tets)
 
     @cached_property
     def surface(self) -> np.ndarray:
-        """Outer triangles (S, 3), by their corners, with outward normals."""
+        """Outer triangles (S, 3), as corner node numbers, with outward normals."""
         return find_boundary_faces(self.tets)
 
     def mark_elements(self, *labels: int) -> np.ndarray:
-        """Mark (T,) bool the elements of these regions."""
+        """Return the mask (T,) of the elements in the regions `labels`."""
         return np.isin(self.region, labels)
 
     def find_boundary(self, *labels: int) -> np.ndarray:
-        """Return the boundary triangles (S, 3) of these regions together, by their corners, with outward normals."""
+        """Return the boundary triangles (S, 3) of the union of regions, by corner node numbers, normals outwards."""
         return find_boundary_faces(self.tets[self.mark_elements(*labels)])
 
     def find_nodes(self, *labels: int) -> np.ndarray:
-        """Return the node numbers (n,) of these regions' elements, ascending."""
+        """Return the sorted node numbers (n,) of the elements in the regions `labels`."""
         return np.unique(self.table[self.mark_elements(*labels)])
 
     @cached_property
     def digest(self) -> str:
-        """Hash of `arrays` (hexadecimal), equal for equal meshes."""
+        """Hexadecimal hash of `arrays`, equal for equal meshes."""
         return compute_digest(*self.arrays)
 
     within, nodes_of = mark_elements, find_nodes  # Former names, for one release.
 
 
 def compute_digest(*arrays: np.ndarray) -> str:
-    """Compute the SHA-256 of the arrays' bytes and shapes, shortened to 16 hexadecimal digits."""
+    """Return the SHA-256 hash of bytes and shapes of the arrays, shortened to 16 hexadecimal digits."""
     sha = hashlib.sha256()
     for array in arrays:
         little = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
@@ -170,14 +170,14 @@ def compute_digest(*arrays: np.ndarray) -> str:
 
 
 def orient_tetrahedra(nodes: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return tetrahedra with positive volumes, and the number of those reoriented. Zero volumes stay as they are.
+    """Return positively oriented tetrahedra, and the number of reoriented ones. Zero volumes remain unchanged.
 
-    table (T, 4) corners or (T, 10) corners and mid-edge nodes: if corners are swapped, so are the edges between them.
+    `cells` are corners (T, 4), or corners and mid-edge nodes (T, 10), which are swapped along with the corners.
 
     Raises
     ------
     InputError
-        Wrong shapes, non-finite coordinates, node numbers out of range.
+        A shape is wrong, a coordinate is not finite, or a node number is out of range.
     """
     tets = cells[:, :4] if cells.shape[1:] == (10,) else cells
     _check_corners(nodes, tets)

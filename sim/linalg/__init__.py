@@ -1,1 +1,1 @@
-"""Conjugate gradients, factors, inverses and multigrid, and the choice of a preconditioner."""
+"""Linear solvers: conjugate gradients, factors, inverses and multigrid, and the choice of a preconditioner."""

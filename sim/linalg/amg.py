@@ -1,8 +1,8 @@
 """Smoothed-aggregation algebraic multigrid, for meshes whose stiffness is too large to factorise.
 
 Vanek, Mandel, Brezina 1996, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
-problems", Computing 56:179-196; the coarse levels must represent the rigid motions. PyAMG builds the levels once, on
-the host (Bell, Olson, Schroder, Southworth 2023, J. Open Source Softw. 8:5495); the cycle is that of `multigrid.py`.
+problems", Computing 56:179-196. The coarse levels must represent rigid motions. PyAMG builds the levels once, on the
+host (Bell, Olson, Schroder, Southworth 2023, J. Open Source Softw. 8:5495); `multigrid.py` implements the cycle.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from .multigrid import CHEBYSHEV, Chebyshev, ReducedPreconditioner, TwoLevelCycl
 from .pcg import Preconditioner
 
 Direct = Callable[[sp.csc_array, sp.csc_array, np.ndarray], Preconditioner]
-"""Function that solves K over motions L (n, m), unknowns numbered by node (m,), as `multifrontal.SparseFactor` does."""
+"""Function (K, L, node (m,)) that builds a solver of K over motions L (n, m), as `multifrontal.SparseFactor`."""
 # No strength threshold. Energy-minimising smoothing draws no random numbers: the same mesh gives the same levels.
 AMG_SETTINGS: dict[str, Any] = {
     "strength": ("symmetric", {"theta": 0.0}),
@@ -37,14 +37,14 @@ def build_multigrid_cycle(
     max_coarsest: int = 1_000,
     smoother: Chebyshev = CHEBYSHEV,
 ) -> Preconditioner:
-    """Build one V-cycle on K (3N, 3N) [N/m], positive definite in blocks of nodes, with rigid rigid_motions (3N, 6).
+    """Return one V-cycle for a positive definite `stiffness` (3N, 3N) [N/m] with `rigid_motions` (3N, 6).
 
-    The last level has at most `max_coarsest` nodes, of six unknowns each.
+    The coarsest level has at most `max_coarsest` nodes, with six unknowns each.
 
     Raises
     ------
     RuntimeError
-        K is singular over the last level's motions.
+        The stiffness is singular on the coarsest level.
     """
     *fine, _ = pyamg.smoothed_aggregation_solver(
         sp.bsr_matrix(stiffness), B=rigid_motions, max_coarse=max_coarsest, **AMG_SETTINGS
@@ -65,7 +65,7 @@ def build_multigrid_cycle(
 
 
 def _build_direct_solver(stiffness: sp.csc_array, motions: sp.csc_array, size: int, direct: Direct) -> Preconditioner:
-    """Build a direct solver over the motions, `size` to a node; zero motions, of small aggregates, are left out."""
+    """Return a direct solver over the motions, `size` per node; zero motions of small aggregates are omitted."""
     moving = np.flatnonzero(abs(motions).sum(axis=0) > 0.0)
     return direct(stiffness, motions[:, moving], moving // size)
 
@@ -75,7 +75,7 @@ def _to_bsr(matrix: sp.bsr_matrix) -> sp.bsr_array:
 
 
 def build_rigid_motions(points: np.ndarray) -> np.ndarray:
-    """Return translations and rotations (3N, 6) of points (N, 3), with lengths relative to the extent of the points."""
+    """Return translations and rotations (3N, 6) of points (N, 3), lengths relative to the extent of the points."""
     arm = points - points.mean(axis=0)
     arm /= np.abs(arm).max()
     turns = [np.cross(axis, arm) for axis in np.eye(3)]

@@ -1,4 +1,4 @@
-"""Cholesky factorisation and solution of small dense systems, one per block of threads, in double precision.
+"""Cholesky factorisation and solution of small dense systems in double precision, one system per thread block.
 
 Golub, Van Loan 2013, "Matrix Computations", algorithm 4.2.1 in its outer product form.
 """
@@ -14,7 +14,7 @@ from ..runtime.device import Device
 
 @dataclass(frozen=True)
 class BlockFactorFunctions:
-    """Warp functions for matrices (b, n, n) and vectors (b, n), of which the first `size` rows are used."""
+    """Warp functions for matrices (b, n, n) and vectors (b, n); only the first `size` rows and columns are used."""
 
     factor: wp.Function
     solve: wp.Function
@@ -22,15 +22,15 @@ class BlockFactorFunctions:
 
 @cache
 def build_functions(device: Device) -> BlockFactorFunctions:
-    """Build the functions for the blocks of a device."""
+    """Return the functions for thread blocks of a device."""
     down, across = get_block_shape(device)
     threads = down * across
 
     @wp.func
     def factor(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int) -> bool:
-        """Factorise A = L L' in place: A is read from the upper half; False if A is not positive definite.
+        """Factorise A = L L' in place, from the upper half of A; return False if A is not positive definite.
 
-        Then the contents of `a` are invalid.
+        In this case the contents of `a` are invalid.
         """
         i0, j0 = me // across, me % across
         for k in range(size):
@@ -56,7 +56,7 @@ def build_functions(device: Device) -> BlockFactorFunctions:
 
     @wp.func
     def solve(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int, x: wp.array2d(dtype=wp.float64)):
-        """Solve A x = b in place, with the result of `factor`."""
+        """Solve A x = b in place in `x`, with the result of `factor`."""
         for k in range(size):
             y = x[c, k] / a[c, k, k]
             for i in range(k + 1 + me, size, threads):

@@ -1,9 +1,9 @@
-"""Inversion and elimination of symmetric positive definite matrices on CUDA: in place, lower half only, in blocks.
+"""Inversion and elimination of symmetric positive definite matrices on CUDA, in place and in blocks of the lower half.
 
 The first unknowns of a symmetric matrix [[A, B^T], [B, C]] are exchanged with their right-hand sides. This gives
 [[-A^-1, A^-1 B^T], [B A^-1, C - B A^-1 B^T]]. Goodnight 1979, "A tutorial on the SWEEP operator", Am. Stat. 33:149-158.
-Exchanging all unknowns gives the inverse, in n^3 operations and 4 n^2 bytes of double precision, while a library needs
-memory for factor and inverse at once. Uses torch, as `dense_inverse` does.
+The exchange of all unknowns gives the inverse, in n^3 operations and 4 n^2 bytes of double precision; a library needs
+memory for both factor and inverse. The implementation uses torch, as `dense_inverse` does.
 """
 
 import time
@@ -21,18 +21,18 @@ TEMPORARY_ROWS = 3  # Temporary block rows, in addition to the matrix, during an
 
 @dataclass(frozen=True)
 class BlockInversion:
-    """Block size and limits of an exchange.
+    """Block size and limits for the exchange of unknowns.
 
     Parameters
     ----------
     block_size
-        Unknowns per block; temporary memory is proportional to it.
+        Number of unknowns per block; temporary memory is proportional to this number.
     memory_fraction
-        Fraction of the free memory that may be used.
+        Maximum fraction of the free memory that is used.
     max_seconds
-        Maximum duration [s].
+        Maximum duration of an exchange [s].
     trial_size
-        Size of the matrix product that measures the speed of a device.
+        Size of the matrix product by which the speed of a device is measured.
     """
 
     block_size: int = 4096
@@ -43,7 +43,7 @@ class BlockInversion:
 
 @cache
 def measure_matmul_rate(device: str, size: int = BlockInversion.trial_size) -> float:
-    """Measure multiply-adds per second in double precision, by the second of two matrix products of size `size`."""
+    """Return the measured multiply-adds per second in double precision, from the second of two products of `size`."""
     one, spent = torch.ones((size, size), dtype=torch.float64, device=device), 0.0
     for _ in range(2):
         begun = time.perf_counter()
@@ -53,12 +53,12 @@ def measure_matmul_rate(device: str, size: int = BlockInversion.trial_size) -> f
 
 
 def estimate_bytes(count: int, settings: BlockInversion = BlockInversion()) -> int:
-    """Estimate the memory of an exchange [bytes]: half the matrix in double precision, and temporary block rows."""
+    """Return the estimated memory [bytes] of an exchange: half a matrix in double precision, and temporary rows."""
     return 8 * (count * (count + settings.block_size) // 2 + TEMPORARY_ROWS * min(count, settings.block_size) * count)
 
 
 def can_invert(count: int, device: str, other_bytes: int = 0, settings: BlockInversion = BlockInversion()) -> bool:
-    """Return True if a GPU can exchange `count` unknowns in time, and has memory for that and `other_bytes` bytes."""
+    """Return True if a GPU can exchange `count` unknowns in time, with memory for this and `other_bytes` bytes."""
     if not torch.cuda.is_available():
         return False
     free, _ = torch.cuda.mem_get_info(device)
@@ -68,7 +68,7 @@ def can_invert(count: int, device: str, other_bytes: int = 0, settings: BlockInv
 
 
 def to_lower_block_rows(matrix: sp.csc_array, bounds: Sequence[int], device: str) -> list[torch.Tensor]:
-    """Split a symmetric matrix (n, n) into rows of blocks between the cuts, each up to its diagonal block."""
+    """Return the block rows of a symmetric matrix (n, n) between the `bounds`, each up to its diagonal block."""
     rows, out = sp.csr_array(matrix), []
     for first, stop in pairwise(bounds):
         part = sp.coo_array(rows[first:stop])
@@ -80,7 +80,7 @@ def to_lower_block_rows(matrix: sp.csc_array, bounds: Sequence[int], device: str
 
 
 def invert_in_place(rows: Sequence[torch.Tensor]) -> None:
-    """Replace A by -A^-1, in the rows of `to_lower_block_rows`.
+    """Replace A by -A^-1 in the block rows from `to_lower_block_rows`.
 
     Raises
     ------
@@ -105,14 +105,14 @@ def invert_in_place(rows: Sequence[torch.Tensor]) -> None:
 
 
 def compute_block_bounds(count: int, block_size: int = BlockInversion.block_size) -> list[int]:
-    """Return the bounds of the blocks of `count` unknowns."""
+    """Return the bounds of blocks of `count` unknowns."""
     return [*range(0, count, block_size), count]
 
 
 def eliminate_unknowns(
     matrix: sp.csc_array, border: sp.csc_array, device: str, block_size: int = BlockInversion.block_size
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute X = A^-1 B (n, m) in single precision and B^T X (m, m), of sparse A (n, n) and B (n, m).
+    """Return X = A^-1 B (n, m) in single precision, and B^T X (m, m), for sparse A (n, n) and B (n, m).
 
     Raises
     ------
@@ -134,7 +134,7 @@ def eliminate_unknowns(
 
 
 def _eliminate(row: torch.Tensor, below: Sequence[torch.Tensor]) -> None:
-    """Eliminate a block's unknowns from the rows below, which store the solution for them in its columns."""
+    """Eliminate the unknowns of a block from the rows below; the block's columns then store the solution."""
     stop = row.shape[1]
     own = slice(stop - len(row), stop)
     across = torch.cat([later[:, own].T for later in below], dim=1)
@@ -150,6 +150,6 @@ def _invert_block(block: torch.Tensor) -> torch.Tensor:
 
 
 def release_memory(device: str) -> None:
-    """Release cached GPU memory, which batches of loads need."""
+    """Release the GPU memory that torch has cached, since batches of loads need this memory."""
     if device != "cpu":
         torch.cuda.empty_cache()

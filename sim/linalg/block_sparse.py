@@ -1,4 +1,4 @@
-"""Product of a sparse matrix of small dense blocks with many columns."""
+"""Product of a sparse matrix of small dense blocks and an array of many columns."""
 
 from functools import cache
 
@@ -44,7 +44,7 @@ LANES = 4  # Scalars per vector register; WIDE is a multiple of it.
 
 @cache
 def build_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
-    """Build the CUDA kernel for blocks (rows, columns) of a device's scalar type, over block rows and columns."""
+    """Return the CUDA kernel for blocks (rows, columns) in the device's scalar type, over (block row, column of x)."""
     scalar = device.scalar
     mat, vec = wp.types.matrix((rows, columns), scalar), wp.types.vector(columns, scalar)
     wide = wp.types.vector(rows, scalar)
@@ -59,7 +59,7 @@ def build_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Add factor times sum over j of A_ij x_j to out_i."""
+        """Add factor x (sum over j of A_ij x_j) to out_i, for one column."""
         i, c = wp.tid()
         total = wide()
         for k in range(first[i], first[i + 1]):
@@ -75,7 +75,7 @@ def build_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
 
 @cache
 def build_host_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
-    """Build the CPU kernel for the same product, over block rows."""
+    """Return the CPU kernel for the same product, over block rows."""
     scalar, real = device.scalar, {"float32": "float", "float64": "double"}[device.precision]
     code = ROW_CODE.replace("real", real).replace("WIDE", str(-(-rows // LANES) * LANES))
 
@@ -100,7 +100,7 @@ def build_host_kernel(device: Device, rows: int, columns: int) -> wp.Kernel:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Add factor times sum over j of A_ij x_j to out_i, in all columns."""
+        """Add factor x (sum over j of A_ij x_j) to out_i, for all columns."""
         add_row(wp.tid(), first, column, block, factor, x, out)
 
     return add_product
@@ -121,13 +121,13 @@ class BlockSparse:
         self._entries = [*indices, blocks]
 
     def multiply(self, x: wp.array) -> wp.array:
-        """Compute A x (m, b) of x (n, b)."""
+        """Return A x (m, b) for x (n, b)."""
         out = self._device.allocate(self.rows, x.shape[1])
         self.add_product(out, 1.0, x)
         return out
 
     def add_product(self, out: wp.array, factor: float, x: wp.array) -> None:
-        """Add factor A x to out (m, b), with x (n, b)."""
+        """Add factor x (A x) to out (m, b), for x (n, b)."""
         inputs, count = [*self._entries, self._device.scalar(factor), x], self.rows // self._size[0]
         if self._device.on_cuda:
             self._device.launch(build_kernel(self._device, *self._size), (count, x.shape[1]), inputs, [out])

@@ -1,4 +1,4 @@
-"""Compliance of the undeformed mesh at some nodes: columns of its preconditioner, computed when needed."""
+"""Compliance of the undeformed mesh at selected nodes: columns of the preconditioner, computed when needed."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -14,14 +14,14 @@ from .pcg import Preconditioner
 
 @dataclass(frozen=True)
 class ColumnCache:
-    """Block size and cache of a compliance's columns.
+    """Block size and cache size of the columns of a compliance.
 
     Parameters
     ----------
     block_size
-        Nodes whose columns are computed together, always by the same arithmetic: the cache affects time, never values.
+        Number of nodes whose columns are computed together. The cache affects only the time, not the values.
     max_bytes, min_blocks
-        Maximum size of the cached columns [bytes]; minimum number of cached blocks, if these are larger.
+        Maximum size of the cached columns [bytes], and minimum number of cached blocks even if their size is larger.
     """
 
     block_size: int = 16
@@ -30,20 +30,20 @@ class ColumnCache:
 
 
 class Compliance:
-    """Compliance H (3N, 3N) [m/N], applied by a preconditioner; its columns at n nodes are kept on the device.
+    """Compliance H (3N, 3N) [m/N], applied by a preconditioner; the columns of n nodes are stored on the device.
 
     Parameters
     ----------
     problem
         Problem whose free motions are used.
     preconditioner
-        Preconditioner of the problem, the same at every state.
+        Preconditioner of the problem that does not depend on the state.
     nodes
-        (n,) node numbers.
+        Node numbers (n,).
     columns
-        Block size and cache of the columns.
+        Block size and cache size of the columns.
 
-    `rows` (3n,) are the rows of the nodes, and `places` is their copy on the device.
+    `rows` (3n,) are the rows of the nodes; `places` is a copy of `rows` on the device.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Compliance:
         self._block = lru_cache(self._kept)(self._compute_columns)
 
     def apply(self, force: Any) -> Any:
-        """Compute H force: displacements (3N, b) [m] under forces (3N, b) [N]."""
+        """Return the displacements H `force` (3N, b) [m] under forces (3N, b) [N]."""
         device, constraint = self._problem.device, self._problem.constraint
         pull, out = device.allocate(*force.shape), device.allocate(*force.shape)
         to_view(pull)[:] = force
@@ -71,7 +71,7 @@ class Compliance:
         return to_view(out)
 
     def compute_full_motion(self, force: Any) -> Any:
-        """Compute the displacements (3N, b) [m] of all nodes under forces (3n, b) [N] on the first n of `nodes`."""
+        """Return the displacements (3N, b) [m] of all nodes under forces (3n, b) [N] on the first n of `nodes`."""
         device, every = self._problem.device, -(-len(force) // self._width)
         out = to_view(device.allocate(self._problem.rows, force.shape[1]))
         force = cast_like(out, force)
@@ -83,19 +83,19 @@ class Compliance:
         return out
 
     def compute_motion(self, force: Any) -> Any:
-        """Compute the displacements (3n, b) [m] of `nodes` under forces (3m, b) [N] on the first m, all known."""
+        """Return displacements (3n, b) [m] of `nodes` under forces (3m, b) [N] on the first m, with known columns."""
         if self._problem.device.on_cuda:
             return self.columns[: len(force)].T @ to_double(force)
         acting = np.flatnonzero(to_host((force != 0.0).any(1)))
         return self.columns[acting].T @ to_double(force[acting])
 
     def build_matrix(self, loaded: np.ndarray) -> Any:
-        """Return H (3n, 3n) [m/N] between `nodes`; the columns at `loaded` (n,) bool nodes are valid."""
+        """Return H (3n, 3n) [m/N] between `nodes`; only the columns of nodes marked in `loaded` (n,) are valid."""
         self.ensure_columns(loaded)
         return self.columns.T
 
     def ensure_columns(self, loaded: np.ndarray) -> None:
-        """Compute the missing `columns` (stored as rows) at `loaded` (n,) nodes, and mark them in `known` (n,)."""
+        """Compute missing columns of nodes marked in `loaded` (n,), stored as rows, and mark them in `known` (n,)."""
         missing = loaded & ~self.known
         if missing.any() and isinstance(self._preconditioner, SparseFactor):
             self.columns[:], self.known[:] = self._preconditioner.compute_compliance(self.rows).T, True
@@ -103,14 +103,14 @@ class Compliance:
             self._block(block)
 
     def _find_blocks(self, rows: np.ndarray) -> list[int]:
-        """Return the blocks that some rows (3n,) bool belong to."""
+        """Return the numbers of the blocks that contain a marked row; `rows` (3n,) is a mask."""
         return np.unique(np.flatnonzero(rows) // self._width).tolist()
 
     def _get_rows(self, block: int) -> slice:
         return slice(self._width * block, self._width * (block + 1))
 
     def _compute_columns(self, block: int) -> Any:
-        """Compute a block's columns (3N, k) [m/N], and store their rows at the nodes in double precision."""
+        """Return the columns (3N, k) [m/N] of a block, and store the rows at the nodes in double precision."""
         own = self._get_rows(block)
         unit = np.zeros((self._problem.rows, self._width))
         unit[self.rows[own], np.arange(len(self.rows[own]))] = 1.0

@@ -1,10 +1,10 @@
 """Preconditioner on CUDA for meshes of a few thousand nodes: dense inverse of the undeformed stiffness.
 
-One matrix product serves a whole batch of load cases, where triangular solves would leave the GPU idle. In single
-precision the inverse is stored in half precision, which tensor cores multiply at their full rate. With a unit diagonal,
-and each column scaled to unit length, its values fit the range of half precision. Its eleven bits resolve the stiff
-modes (bfloat16's eight do not, at nu = 0.49). Of the preconditioners only this file uses torch, for the matrix product;
-only `preconditioner` imports it, where it is chosen.
+One matrix product solves a whole batch of load cases, while triangular solves would leave the GPU idle. In a
+single-precision solver the inverse is stored in half precision, which tensor cores multiply at full rate. After scaling
+the matrix to a unit diagonal and each right-hand side to unit length, values fit the range of half precision. Eleven
+bits resolve the stiff modes (the eight bits of bfloat16 do not, at nu = 0.49). Of the preconditioners only this module
+uses torch, for matrix products; only `preconditioner` imports this module, if the inverse is chosen.
 """
 
 from dataclasses import dataclass
@@ -34,13 +34,13 @@ def can_invert(rows: int, device: Device) -> bool:
 
 
 def estimate_inverse_bytes(rows: int, device: Device) -> int:
-    """Estimate the memory of the inverse of `rows` unknowns [bytes]."""
+    """Return the estimated memory of the inverse of `rows` unknowns [bytes]."""
     return wp.types.type_size_in_bytes(LOW_TYPES[device.precision]) * rows**2
 
 
 @cache
 def build_kernels(device: Device, dtype: Any, rows_per_thread: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """Build kernels that map to the matrix's unknowns, in type `dtype`, and back; `rows_per_thread` rows each."""
+    """Return two kernels that map to the unknowns of the matrix, in type `dtype`, and back to the mesh."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -92,7 +92,7 @@ def build_kernels(device: Device, dtype: Any, rows_per_thread: int) -> tuple[wp.
 
 @dataclass(frozen=True, eq=False)
 class SolveBuffers:
-    """Right-hand sides and solutions for one batch width, in the matrix's unknowns; squared norms (b,)."""
+    """Arrays for one batch width: right-hand sides and solutions in matrix unknowns, and squared norms (b,)."""
 
     right_side: wp.array
     solution: wp.array
@@ -100,14 +100,14 @@ class SolveBuffers:
 
 
 class DenseInverse:
-    """Inverse of an undeformed stiffness K over some motions L: L (L^T K L)^-1 L^T, computed in double precision.
+    """Inverse of an undeformed stiffness K over motions L: L (L^T K L)^-1 L^T, computed in double precision.
 
-    stiffness K (3N, 3N) [N/m]; motions L (3N, n), independent columns.
+    `stiffness` K (3N, 3N) [N/m]; `motions` L (3N, n) with independent columns.
 
     Raises
     ------
     RuntimeError
-        K is not positive definite over these motions: some part is not fixed.
+        K is not positive definite over these motions, since a part of the mesh is not fixed.
     """
 
     on_device = True
@@ -132,10 +132,10 @@ class DenseInverse:
         torch.cuda.synchronize(where)
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Do nothing: the undeformed stiffness is used at every state."""
+        """Do nothing, since the undeformed stiffness does not depend on the state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Multiply by the dense matrix, in Warp's stream."""
+        """Multiply r by the dense matrix, in the stream of Warp."""
         device, count = self._device, r.shape[1]
         room, some = self._get_buffers(count), ROWS_PER_THREAD if count > 1 else 1
         lower, raise_ = build_kernels(device, room.right_side.dtype, some)
@@ -153,11 +153,11 @@ class DenseInverse:
         device.launch(raise_, (-(-r.shape[0] // some), count), inputs, [out])
 
     def _is_half_read(self, count: int) -> bool:
-        """Return True if only half of the matrix is read: for one load case reading is the whole cost."""
+        """Return True if only half of the matrix is read: for one load case, reading determines the time."""
         return count == 1 and self._inverse.dtype == torch.float16
 
     def _get_buffers(self, count: int) -> SolveBuffers:
-        """Return the buffers for a batch width; those of workspace widths stay cached, and the latest other."""
+        """Return the buffers for a batch width, from a cache of workspace widths and the latest other width."""
         if count not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_workspace_width(width)}
             low, name = LOW_TYPES[self._device.precision], self._device.name
@@ -170,9 +170,9 @@ class DenseInverse:
 
 
 def _build_matrix(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torch.dtype) -> torch.Tensor:
-    """Build the scaled matrix (size, size) whose negative lower half is in `rows` of blocks.
+    """Return the scaled matrix (size, size), whose negative lower half is given by the block rows `rows`.
 
-    Empties `rows`, to free their memory.
+    The list `rows` is emptied to free its memory.
     """
     out = torch.zeros((size, size), dtype=kind, device=scale.device)
     while rows:

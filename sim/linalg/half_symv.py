@@ -1,6 +1,6 @@
-"""Product of a large symmetric matrix in half precision with one column on CUDA, reading its upper half only.
+"""Product of a large symmetric matrix in half precision and one column on CUDA, which reads only the upper half.
 
-For one column reading is the whole cost, so that half of the matrix takes half of the time.
+For one column, reading determines the time, so that half of the matrix takes half of the time.
 """
 
 import numpy as np
@@ -77,18 +77,18 @@ def _add_product(
     # outputs
     y: wp.array(dtype=wp.float32),
 ):
-    """Add A x to y: a tile on the diagonal adds to its rows, one above it also, transposed, to its columns."""
+    """Add A x to y. A tile adds its product to its rows; a tile above the diagonal also adds its transposed product."""
     tile = tiles[wp.tid() // TILE]
     _add_tile(tile[0], tile[1], matrix, x, y)
 
 
 def list_tiles(size: int, device: str) -> wp.array:
-    """List the tiles (n,) on and above the diagonal of a matrix with `size` rows."""
+    """Return the tiles (n,) on and above the diagonal of a matrix with `size` rows."""
     above = np.stack(np.triu_indices(-(-size // TILE)), axis=1).astype(np.int32)
     return wp.array(above, dtype=wp.vec2i, device=device)
 
 
 def add_product(tiles: wp.array, matrix: wp.array, x: wp.array, y: wp.array) -> None:
-    """Add A x (n,) to y (n,), in single precision, with A (n, n) symmetric in half precision and n a multiple of 64."""
+    """Add A x (n,) to y (n,), in single precision; A (n, n) is symmetric, in half precision, with n % 64 = 0."""
     dim, device = len(tiles) * TILE, matrix.device
     wp.launch(_add_product, dim, [tiles, matrix, x], [y], device=device, block_dim=TILE, record_tape=False)

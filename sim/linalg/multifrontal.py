@@ -1,8 +1,8 @@
-"""Undeformed stiffness, factorised once for many right-hand sides: multifrontal elimination in dense blocks.
+"""Undeformed stiffness, factorised once for many right-hand sides by multifrontal elimination in dense blocks.
 
-Each front stores one dense panel, so that each sweep of a solve is one product per front: limited by memory for one
-right-hand side, by arithmetic for many. SuperLU, with its small supernodes, takes three times as long for one and
-twenty times for 64.
+Each front stores one dense panel, so that a sweep of a solve has one product per front. Memory bandwidth limits the
+sweep for one right-hand side, arithmetic for many. SuperLU, with its small supernodes, takes three times as long for
+one right-hand side, and twenty times as long for 64.
 """
 
 from collections.abc import Sequence
@@ -32,16 +32,16 @@ Updates = dict[int, list[tuple[np.ndarray, np.ndarray]]]
 
 @dataclass(frozen=True)
 class FactorSettings:
-    """Settings of a factor and of its sweeps.
+    """Settings of a factor and of its triangular sweeps.
 
     Parameters
     ----------
     max_separate_sweeps
-        Right-hand sides up to which separate sweeps are faster than matrix products.
+        Maximum number of right-hand sides for which separate sweeps are faster than matrix products.
     strip_size
-        Right-hand sides of one sweep, so that they stay in a core's cache.
+        Number of right-hand sides of one sweep, so that the sweep stays in the cache of a CPU core.
     pivot_tolerance
-        A pivot below this fraction of its diagonal entry counts as zero: the remaining digits are round-off.
+        A pivot below this fraction of its diagonal entry counts as zero, since its remaining digits are round-off.
     fronts
         Sizes of the fronts.
     """
@@ -53,26 +53,26 @@ class FactorSettings:
 
 
 class SparseFactor:
-    """Stiffness K over some motions, L (L^T K L)^-1 L^T, factorised once on the host in double precision.
+    """Inverse L (L^T K L)^-1 L^T of a stiffness K over motions L, factorised once on the host in double precision.
 
     Parameters
     ----------
     stiffness
         K (3N, 3N) [N/m].
     motions
-        L (3N, n): independent motions as columns. Their own unknowns, three to a node, are numbered by `node` (n,).
+        L (3N, n), with independent motions as columns. `node` (n,) gives the node to which each motion belongs.
     device
         Device of the right-hand sides.
     precision
-        Precision of the stored factor; the result is symmetric and positive definite in both. Single precision halves
-        the bytes to read.
+        Precision of the stored factor. The inverse is symmetric and positive definite in both precisions. Single
+        precision halves the memory traffic.
     settings
-        Settings of the factor and of its sweeps.
+        Settings of the factor and of its triangular sweeps.
 
     Raises
     ------
     RuntimeError
-        K is singular over these motions: some part is not fixed.
+        K is singular over these motions, since a part of the mesh is not fixed.
     """
 
     on_device = False
@@ -98,10 +98,10 @@ class SparseFactor:
         self._sweep = TriangularSweeps(fronts, values, precision)
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Do nothing: the undeformed stiffness is used at every state."""
+        """Do nothing, since the undeformed stiffness does not depend on the state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Solve for the live load cases alone, by one sweep up and one down: the others would cost as much."""
+        """Solve for the live load cases only, by one forward and one backward sweep; other cases would cost as much."""
         values = r.numpy()
         solved = np.zeros_like(values)
         x = self._transposed @ values[:, live]
@@ -112,9 +112,9 @@ class SparseFactor:
         out.assign(solved)
 
     def compute_compliance(self, rows: np.ndarray) -> np.ndarray:
-        """Compute the compliance (m, m) [m/N] at some of the 3N rows (m,), in the factor's precision.
+        """Return the compliance (m, m) [m/N] at the given `rows` (m,) of the 3N rows, in the precision of the factor.
 
-        Only the fronts of these rows, and those that depend on them, are swept.
+        The sweeps include only the fronts of these rows and the fronts that depend on them.
         """
         chosen = self._motions[rows]
         unit = sp.csc_array(chosen.T)
@@ -147,13 +147,13 @@ class SparseFactor:
 
 
 def find_moved_nodes(basis: sp.csc_array) -> np.ndarray:
-    """Return the node (n,) that each column of a constraint's basis (3N, n) moves."""
+    """Return the node (n,) that is moved by each column of a constraint basis (3N, n)."""
     return np.asarray(basis.indices[basis.indptr[:-1]] // 3)
 
 
 @dataclass(frozen=True, eq=False)
 class FrontPanel:
-    """Stored part of a front of k own and m border unknowns: `values` (k, k + m) = R^-T [1, -R^-1 C^T].
+    """Stored part of a front with k own and m border unknowns: `values` (k, k + m) = R^-T [1, -R^-1 C^T].
 
     S = R R^T (k, k) and C (m, k) are the rows of the matrix at the front's own and border unknowns, after the earlier
     eliminations. `down` is the exact transpose of `up` despite rounding: the product stays symmetric and positive
@@ -176,7 +176,7 @@ class FrontPanel:
 
 
 def _apply_sweeps(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
-    """Apply both sweeps through these panels to x (n, b), in place."""
+    """Apply the forward and the backward sweep through the panels to x (n, b), in place."""
     for panel in panels:
         panel.substitute_forward(x)
     for panel in reversed(panels):
@@ -187,7 +187,7 @@ def _apply_sweeps(panels: Sequence[FrontPanel], x: np.ndarray) -> np.ndarray:
 def factorise_panels(
     matrix: sp.csc_array, fronts: Sequence[Sequence[Front]], precision: Precision, pivot_tolerance: float
 ) -> tuple[np.ndarray, list[FrontPanel]]:
-    """Factorise a matrix; return the values of all panels in one array, and the panels.
+    """Factorise a matrix, and return one array with the values of all panels, and the panels.
 
     Raises
     ------
@@ -217,7 +217,7 @@ def factorise_panels(
 
 
 class _Fronts:
-    """Elimination of the fronts of a sparse matrix; fronts of different parts may be eliminated at the same time."""
+    """Elimination of the fronts of a sparse matrix; fronts in different parts may be eliminated at the same time."""
 
     def __init__(self, matrix: sp.csc_array, panels: Sequence[FrontPanel], singular: float):
         self._matrix, self._panels = matrix, panels
@@ -226,7 +226,7 @@ class _Fronts:
         self._owner = np.repeat(np.arange(len(panels)), sizes)
 
     def eliminate(self, numbers: range, updates: Updates) -> None:
-        """Fill the panels of these fronts; `updates` holds their pending updates, and gains those of later fronts."""
+        """Fill the panels of fronts `numbers`, with their pending `updates`; add updates of later fronts."""
         for number in numbers:
             panel = self._panels[number]
             front, size = panel.front, len(panel.values)
@@ -244,7 +244,7 @@ class _Fronts:
                 panel.values[:, size:] = -trsm(1.0, root, across, side=1, lower=1).T
 
     def _assemble_rows(self, front: Front) -> np.ndarray:
-        """Assemble the matrix (k + m, k + m) at a front's unknowns from its own columns; the lower half."""
+        """Return the lower half of a front's matrix (k + m, k + m), assembled from the columns of its own unknowns."""
         start, rows, size = self._matrix.indptr, front.rows, front.stop - front.first
         whole = np.zeros((len(rows), len(rows)), order="F")
         entries = slice(start[front.first], start[front.stop])

@@ -1,9 +1,9 @@
 """Multigrid: Chebyshev smoothing on the undeformed stiffness, and a coarse solver for slowly varying errors.
 
-For quadratic tetrahedra the coarse motions are those of linear ones on the same corners (p-multigrid). Sundar, Stadler,
+For quadratic tetrahedra, the coarse level is linear tetrahedra with the same corners (p-multigrid): Sundar, Stadler,
 Biros 2015, "Comparison of multigrid algorithms for high-order continuous finite element discretizations", Numer. Linear
-Algebra Appl. 22:664-680. The smoother is Chebyshev's polynomial of block Jacobi: Adams et al. 2003, J. Comput. Phys.
-188:593-610. A coarse solver may have two levels too (`sim/linalg/amg.py`).
+Algebra Appl. 22:664-680. The smoother is a Chebyshev polynomial of block Jacobi: Adams et al. 2003, J. Comput. Phys.
+188:593-610. The coarse solver may itself have several levels (`sim/linalg/amg.py`).
 """
 
 from dataclasses import dataclass
@@ -23,18 +23,18 @@ from .pcg import Preconditioner
 
 @dataclass(frozen=True)
 class Chebyshev:
-    """Smoother of a level.
+    """Chebyshev smoother of a level.
 
     Parameters
     ----------
     degree
-        Degree of the polynomial: products with the stiffness before the coarse solver, and as many after it.
+        Degree of the polynomial: number of stiffness products before, and again after, the coarse solver.
     min_damped
-        Smallest damped eigenvalue, relative to the largest; the coarse solver handles the others.
+        Smallest damped eigenvalue, relative to the largest; the coarse solver reduces errors of smaller eigenvalues.
     power_iterations
-        Products in the estimate of the largest eigenvalue, which is computed once.
+        Number of iterations that estimate the largest eigenvalue, once.
     safety_factor
-        Factor on this estimate, which is from below.
+        Factor by which the estimate is increased, since it is a lower bound.
     """
 
     degree: int = 3
@@ -49,7 +49,7 @@ CHEBYSHEV = Chebyshev()
 
 @cache
 def build_kernel(device: Device, size: int) -> wp.Kernel:
-    """Build the kernel of the block-diagonal step, with blocks (size, size)."""
+    """Return the kernel of the block-diagonal step, with blocks (size, size)."""
     scalar = device.scalar
     mat, vec = wp.types.matrix((size, size), scalar), wp.types.vector(size, scalar)
 
@@ -63,7 +63,7 @@ def build_kernel(device: Device, size: int) -> wp.Kernel:
         d: wp.array2d(dtype=scalar),
         x: wp.array2d(dtype=scalar),
     ):
-        """Compute d_i = kept d_i + added D_i^-1 r_i, and add it to x_i."""
+        """Compute d_i = kept d_i + added D_i^-1 r_i, and add d_i to x_i."""
         i, c = wp.tid()
         part = vec()
         for k in range(size):
@@ -78,16 +78,16 @@ def build_kernel(device: Device, size: int) -> wp.Kernel:
 
 
 class TwoLevelCycle:
-    """Symmetric cycle: smooth, correct by the coarse solver, smooth.
+    """Symmetric two-level cycle: smoothing, correction by the coarse solver, smoothing.
 
     Parameters
     ----------
     coarse
-        L A^-1 L^T for some motions L, with A at least L^T K L.
+        Operator L A^-1 L^T for motions L, where A is at least L^T K L.
     stiffness
-        Undeformed K (n, n) [N/m] in square blocks, positive definite.
+        Positive definite undeformed stiffness K (n, n) [N/m] in square blocks.
     device
-        Device of its arrays.
+        Device of the arrays.
     name
         Name for messages.
     smoother
@@ -116,7 +116,7 @@ class TwoLevelCycle:
         """Do nothing: the undeformed stiffness is used at every state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Run one cycle, for the live load cases."""
+        """Compute `out` from `r` by one cycle, for the live load cases."""
         if live.all():
             wp.copy(out, self._run_cycle(r))
             return
@@ -133,7 +133,7 @@ class TwoLevelCycle:
         return x
 
     def _smooth(self, x: wp.array, r: wp.array) -> None:
-        """Add the smoothing polynomial applied to the residual r to x; r is overwritten. Saad 2003, algorithm 12.1."""
+        """Add the smoothing polynomial of the residual r to x, and overwrite r; Saad 2003, algorithm 12.1."""
         low = self._smoother.min_damped * self._largest
         centre, radius = (self._largest + low) / 2.0, (self._largest - low) / 2.0
         ratio = radius / centre
@@ -156,7 +156,7 @@ class TwoLevelCycle:
         self._device.launch(step, (r.shape[0] // self._size, r.shape[1]), inputs, [d, x])
 
     def _estimate_eigenvalue(self) -> float:
-        """Estimate the largest eigenvalue of D^-1 K by power iteration."""
+        """Return the largest eigenvalue of D^-1 K, estimated by power iteration."""
         device = self._device
         x = device.upload(np.random.default_rng(0).normal(size=(self._stiffness.rows, 1)))
         largest = 1.0
@@ -170,7 +170,7 @@ class TwoLevelCycle:
 
 
 class ReducedPreconditioner:
-    """L M L^T: a preconditioner M of fewer unknowns, prolonged by motions L (m, n), in blocks."""
+    """Preconditioner L M L^T: a preconditioner M with fewer unknowns, prolonged by motions L (m, n) in blocks."""
 
     on_device = False
 
@@ -182,7 +182,7 @@ class ReducedPreconditioner:
         """Do nothing: the undeformed stiffness is used at every state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Restrict, apply the coarse preconditioner, and prolong."""
+        """Compute out = L M L^T r: restrict r, apply the coarse preconditioner, and prolong the result."""
         right = self._down.multiply(r)
         solved = self._device.allocate(*right.shape)
         self.coarse.apply(right, live, solved)
@@ -190,7 +190,7 @@ class ReducedPreconditioner:
 
 
 def project_to_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_array:
-    """Compute P K P (3N, 3N) in blocks of nodes, P the projection to free unknowns; regularised at the others."""
+    """Return P K P (3N, 3N) in node blocks, with P the projection to free unknowns; fixed unknowns are regularised."""
     basis = constraint.build_basis()
     projection = sp.csr_array(basis @ basis.T)
     blocked = sp.eye_array(constraint.fixed.size) - projection
@@ -198,7 +198,7 @@ def project_to_free(stiffness: sp.csc_array, constraint: Constraint) -> sp.bsr_a
 
 
 def fill_diagonal(matrix: sp.csr_array, size: int) -> sp.bsr_array:
-    """Convert to blocks (size, size); zero diagonal entries, of unknowns without elements, become the mean."""
+    """Return a matrix in blocks (size, size); zero diagonal entries, of unknowns without elements, become the mean."""
     diagonal = matrix.diagonal()
     missing = np.where(diagonal == 0.0, diagonal.mean(), 0.0)
     return sp.bsr_array(sp.csr_array(matrix + sp.diags_array(missing)), blocksize=(size, size))

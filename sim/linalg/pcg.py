@@ -1,8 +1,8 @@
-"""Preconditioned conjugate gradients on a batch of load cases, and the protocol of preconditioners.
+"""Preconditioned conjugate gradients for a batch of load cases, and the interface of preconditioners.
 
 Steihaug 1983, "The conjugate gradient method and trust regions in large scale optimization", SIAM J. Numer. Anal.
-20:626-637. At negative curvature, or at the boundary of a ball in the preconditioner's norm, the iteration stops. The
-result is a descent direction; the shorter it is, the closer it is to the preconditioned gradient.
+20:626-637. The iteration stops at negative curvature, or at the boundary of a ball in the norm of the preconditioner.
+The result is a descent direction; a shorter result is closer to the direction of the preconditioned gradient.
 """
 
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ from ..runtime.device import Device, forward_kernel
 
 
 class Preconditioner(Protocol):
-    """Approximate inverse of the free stiffness, symmetric and positive definite."""
+    """Interface of preconditioners: symmetric positive definite approximations of the inverse of the free stiffness."""
 
     @property
     def on_device(self) -> bool:
-        """True if `apply` only launches kernels on the device, in the same arrays for all batches of one width.
+        """True if `apply` only launches kernels on the device, with the same arrays for all batches of one width.
 
-        A GPU can then replay `apply` for any `live`.
+        A GPU can then replay `apply` as part of a captured graph, for any `live`.
         """
         ...
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Prepare `apply` for the last linearisation, if it depends on that; `columns` is the width of the batch."""
+        """Prepare `apply` for the last linearisation, if needed; `columns` is the width of the batch."""
         ...
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
@@ -39,7 +39,7 @@ class Preconditioner(Protocol):
 
 @cache
 def build_block_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
-    """Build the kernels of the block-Jacobi preconditioner."""
+    """Return the two kernels of the block-Jacobi preconditioner: inversion and product."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
 
     @forward_kernel(module="unique")
@@ -47,7 +47,7 @@ def build_block_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
         # outputs
         blocks: wp.array2d(dtype=mat),
     ):
-        """Replace B by B^-1; by the identity over |B| where B is not positive definite."""
+        """Replace each block B by B^-1, or by the identity / |B| if B is not positive definite."""
         i, c = wp.tid()
         B = blocks[i, c]
         size = wp.abs(B[0, 0]) + wp.abs(B[1, 1]) + wp.abs(B[2, 2])
@@ -75,7 +75,7 @@ def build_block_kernels(device: Device) -> tuple[wp.Kernel, wp.Kernel]:
 
 
 class BlockJacobi:
-    """Inverse of the 3 x 3 diagonal blocks of the tangent stiffness: for meshes too large to factorise."""
+    """Block-Jacobi preconditioner: inverse of the 3 x 3 diagonal blocks of the tangent stiffness."""
 
     on_device = False
 
@@ -84,22 +84,22 @@ class BlockJacobi:
         self._blocks: wp.array | None = None
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Invert the blocks at the last linearisation."""
+        """Compute and invert the diagonal blocks at the last linearisation."""
         blocks = problem.compute_diagonal(columns)
         self._device.launch(build_block_kernels(self._device)[0], blocks.shape, [], [blocks])
         self._blocks = blocks
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Compute out = B^-1 r, node by node."""
+        """Compute out = B^-1 r with the diagonal blocks B."""
         assert self._blocks is not None
         self._device.launch(build_block_kernels(self._device)[1], self._blocks.shape, [self._blocks, r], [out])
 
 
 @dataclass(frozen=True, eq=False)
 class LinearSolution:
-    """Solution x (3N, b); True (b,) where it was truncated, at negative curvature or at the radius.
+    """Solution x (3N, b), and a mask (b,) of load cases truncated at negative curvature or at the radius.
 
-    norm (b,): the preconditioner's norm sqrt(x . M x) [J^1/2]; iterations of the batch.
+    `norm` (b,) is the norm sqrt(x . M x) [J^1/2] with the preconditioner M^-1; `iterations` counts those of the batch.
     """
 
     x: wp.array
@@ -116,19 +116,19 @@ def solve_conjugate_gradients(
     max_iterations: int,
     radius: np.ndarray | None = None,
 ) -> LinearSolution:
-    """Solve P K P x = r at the last linearisation, per load case until |r| <= tolerance (b,), or truncated.
+    """Return the solution of P K P x = r at the last linearisation, with |r| <= tolerance (b,) unless truncated.
 
     Parameters
     ----------
     r
-        (3N, b) [N], already projected; overwritten with the residual.
+        Projected right-hand side (3N, b) [N]; overwritten with the residual of the linear system.
     tolerance
-        (b,) [N], absolute.
+        Absolute tolerance (b,) [N] of the 2-norm of the linear residual.
     max_iterations
-        Largest number of iterations.
+        Maximum number of iterations.
     radius
-        (b,) [J^1/2]: bound of x in the preconditioner's norm; at negative curvature x is extended to it.
-        Without a radius, the iteration ends there with the present x, or with the first direction.
+        Bound (b,) [J^1/2] of x in the preconditioner's norm; at negative curvature, x is extended to this bound.
+        Without a radius, the iteration ends there with the current x or, in the first iteration, its direction.
     """
     device, columns = problem.device, r.shape[1]
     reach = np.full(columns, np.inf) if radius is None else radius

@@ -1,4 +1,4 @@
-"""Choice of a problem's preconditioner by its size, its element and its device."""
+"""Choice of the preconditioner of a problem, by size, element type and device."""
 
 import math
 from collections.abc import Callable
@@ -21,21 +21,21 @@ from .pcg import BlockJacobi, Preconditioner
 
 @dataclass(frozen=True)
 class Preconditioning:
-    """Sizes up to which each kind of preconditioner is fastest, and settings of multigrid.
+    """Sizes up to which each type of preconditioner is fastest, and settings of multigrid.
 
     Parameters
     ----------
     max_factorised
-        Unknowns above which multigrid is faster than a factor on the CPU. For 17,000 nodes, multigrid and factor:
-        set-up 6.8 and 7.1 s; application 16 and 11 ms for one load case, 51 and 83 ms for eight. CUDA inverts what
-        fits.
+        Number of unknowns above which multigrid is faster than a factor on the CPU. For 17,000 nodes, multigrid and
+        factor take: set-up 6.8 and 7.1 s; application 16 and 11 ms for one load case, 51 and 83 ms for eight. On CUDA,
+        all matrices that fit are inverted.
     max_smoothed_factorised
-        The same for smoothed and element-free strains, which couple neighbours of neighbours: their factor has more
-        entries.
+        Same limit for smoothed and element-free strains, whose factors have more entries, since they couple neighbours
+        of neighbours.
     max_coarsest_nodes
-        Maximum nodes, of six unknowns each, of the last level of algebraic multigrid, which is factorised.
+        Maximum number of nodes, with six unknowns each, on the coarsest level of algebraic multigrid.
     smoother
-        Smoother of every level.
+        Smoother of all levels.
     """
 
     max_factorised: int = 50_000
@@ -51,16 +51,16 @@ def choose_preconditioner(
     time_step: float = math.inf,
     settings: Preconditioning = Preconditioning(),
 ) -> Preconditioner:
-    """Build the preconditioner: undeformed stiffness, inverted (CUDA) or factorised if this is fast enough.
+    """Return the preconditioner: the undeformed stiffness, inverted (CUDA) or factorised if this is fast enough.
 
-    Two levels if it has too many entries; algebraic multigrid if even the coarse level is too large; block Jacobi if no
-    node is free. `assemble_linear` assembles the undeformed stiffness (3V, 3V) [N/m] of linear tetrahedra on the same
-    mesh, for a time step [s]; `time_step` is the time step of the stiffness.
+    If the stiffness has too many entries, a two-level cycle is used; if the coarse level is too large, algebraic
+    multigrid; if no node is free, block Jacobi. `assemble_linear` assembles the undeformed stiffness (3V, 3V) [N/m] of
+    linear tetrahedra on the same mesh for a time step [s]; `time_step` is the time step of the stiffness.
 
     Raises
     ------
     InputError
-        A free undeformed stiffness that is singular, or a device with too little memory.
+        The free undeformed stiffness is singular, or the device has too little memory.
     """
     device, constraint = problem.device, problem.constraint
     if constraint.build_basis().nnz == 0:
@@ -86,7 +86,7 @@ def choose_preconditioner(
 
 
 def explain_factor_failure(error: RuntimeError, device: str) -> str:
-    """Explain why there is no factor: a device without memory, or a mesh that is not fixed."""
+    """Return the reason why the factorisation failed: too little memory, or a mesh that is not fixed."""
     if "allocate" in str(error):
         return f"{device} has too little free memory for this mesh: end what else runs there, or choose --device cpu."
     return f"the undeformed stiffness cannot be factorised ({error}): fix or support every part."
@@ -106,12 +106,12 @@ def get_preconditioner_name(preconditioner: Preconditioner) -> str:
 
 
 def is_exact(preconditioner: Preconditioner) -> bool:
-    """Return True if a preconditioner is the inverse of the whole undeformed stiffness, up to rounding."""
+    """Return True if a preconditioner is the inverse of the whole undeformed stiffness, up to round-off."""
     return get_preconditioner_name(preconditioner) in ("sparse factor", "dense inverse")
 
 
 def build_rest_solver(problem: Problem) -> Preconditioner:
-    """Build the inverse or factor of the free undeformed stiffness, in the problem's own precision.
+    """Return the inverse or the factor of the free undeformed stiffness, in the precision of the problem.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def build_rest_solver(problem: Problem) -> Preconditioner:
 def _build_corner_preconditioner(
     stiffness: sp.csc_array, space: Discretisation, constraint: Constraint, device: Device, settings: Preconditioning
 ) -> ReducedPreconditioner:
-    """Build the coarse preconditioner on linear tetrahedra with the same corners, as far as their motion is free."""
+    """Return the coarse preconditioner: linear tetrahedra on the free corner nodes of the same mesh."""
     corner, free = np.unique(space.table[:, :4]), constraint.build_basis()
     every = sp.csc_array(free @ (free.T @ sp.kron(space.corner_interpolation, sp.eye_array(3))))
     own = Constraint(constraint.fixed[corner], constraint.normal[corner], device)
@@ -137,7 +137,7 @@ def _build_corner_preconditioner(
 def _build_solver(
     stiffness: sp.csc_array, constraint: Constraint, points: np.ndarray, device: Device, settings: Preconditioning
 ) -> Preconditioner:
-    """Build the solver of K (3N, 3N) over free nodes at points (N, 3): direct if fast enough, else multigrid."""
+    """Return a solver of K (3N, 3N) for the free nodes at points (N, 3): direct if fast enough, else multigrid."""
     basis = constraint.build_basis()
     count = len(basis.indptr) - 1
     if _can_invert(count, device) if device.on_cuda else count <= settings.max_factorised:
@@ -150,7 +150,7 @@ def _build_solver(
 
 
 def _can_invert(count: int, device: Device) -> bool:
-    """Return True if a GPU inverts `count` unknowns."""
+    """Return True if the device is a GPU that can invert `count` unknowns."""
     from .dense_inverse import can_invert
 
     return can_invert(count, device)
@@ -159,9 +159,9 @@ def _can_invert(count: int, device: Device) -> bool:
 def build_direct_solver(
     stiffness: sp.csc_array, motions: sp.csc_array, node: np.ndarray, device: Device, precision: Precision = "float32"
 ) -> Preconditioner:
-    """Build a direct solver of K (3N, 3N) over motions (3N, n), each of one `node` (n,): inverse if it fits, or factor.
+    """Return a direct solver, an inverse if it fits or a factor, of K (3N, 3N) over motions (3N, n) of the nodes (n,).
 
-    A factor is kept in `precision`.
+    A factor is stored in `precision`.
 
     Raises
     ------

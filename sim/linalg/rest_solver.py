@@ -1,4 +1,4 @@
-"""Solver with the undeformed stiffness alone, in the problem's precision, for power series."""
+"""Linear solver with the undeformed stiffness, in the precision of the problem, for power series."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,14 +22,14 @@ class RestStiffnessSolver:
     problem
         Problem whose stiffness is used.
     preconditioner
-        Preconditioner of the problem: for conjugate gradients, if there is no exact inverse.
+        Preconditioner of the problem, used in conjugate gradients if there is no exact inverse.
     max_iterations
         Maximum number of conjugate gradient iterations.
     tolerance
         Relative residual of the linear solves.
     max_factorised
-        Unknowns up to which the solves justify a factor of their own on the CPU. For 17,000 smoothed nodes it takes
-        12 s, and a solve 10 ms instead of 295 with two levels.
+        Maximum number of unknowns for which a separate factor on the CPU is worthwhile. For 17,000 smoothed nodes the
+        factor takes 12 s; then a solve takes 10 ms, instead of 295 ms with the two-level cycle.
     """
 
     problem: Problem
@@ -40,17 +40,17 @@ class RestStiffnessSolver:
 
     @cached_property
     def exact_inverse(self) -> Preconditioner | None:
-        """Inverse of the undeformed stiffness in the problem's precision, if available or worth it for many solves."""
+        """Inverse of the undeformed stiffness in the problem's precision; None if it is not worthwhile or available."""
         pays = not self.problem.device.on_cuda and self.problem.rows <= self.max_factorised
         return build_rest_solver(self.problem) if pays or is_exact(self.preconditioner) else None
 
     def solve(self, force: wp.array) -> wp.array:
-        """Solve for the displacements (3N, b) [m] under forces (3N, b) [N]; the forces are overwritten.
+        """Return the displacements (3N, b) [m] under forces (3N, b) [N]; the forces are overwritten.
 
         Raises
         ------
         InputError
-            Too few iterations.
+            The iteration limit is too small.
         """
         problem, columns = self.problem, force.shape[1]
         if self.exact_inverse is not None:

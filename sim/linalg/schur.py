@@ -1,4 +1,4 @@
-"""Static condensation: undeformed stiffness of the exterior of a part, and the motion of this exterior.
+"""Static condensation: stiffness of the undeformed exterior of a mesh part, and the motion of this exterior.
 
 Guyan 1965, "Reduction of stiffness and mass matrices", AIAA J. 3:380.
 """
@@ -17,14 +17,14 @@ from .preconditioner import build_direct_solver
 
 @dataclass(frozen=True)
 class Condensing:
-    """Settings of a condensation.
+    """Settings of the static condensation.
 
     Parameters
     ----------
     round_off
-        Entries up to this fraction of the largest are round-off of a subtraction, and count as zero.
+        Entries up to this fraction of the largest entry are round-off of a subtraction and are set to zero.
     strip_size
-        Columns solved together: bounds the memory.
+        Number of columns solved together, which limits memory.
     """
 
     round_off: float = 1e-9
@@ -33,10 +33,10 @@ class Condensing:
 
 @dataclass(frozen=True, eq=False)
 class Condensation:
-    """Exterior of a part of the mesh, condensed to the rows that both share.
+    """Exterior of a mesh part, condensed to the rows that the part and the exterior share.
 
-    rows (m,) are those of the part's 3n that touch the exterior. stiffness (m, m) [N/m] is the condensed stiffness of
-    the exterior. extension (3N, m) maps their motion to the whole mesh, zero in the part itself.
+    `rows` (m,) are the shared rows, among the 3n rows of the part. `stiffness` (m, m) [N/m] is the condensed stiffness
+    of the exterior. `extension` (3N, m) maps motions of the shared rows to the whole mesh; it is zero inside the part.
     """
 
     rows: np.ndarray
@@ -47,12 +47,12 @@ class Condensation:
 def condense_exterior(
     problem: Problem, nodes: np.ndarray, part_stiffness: sp.csc_array, settings: Condensing = Condensing()
 ) -> Condensation:
-    """Condense the exterior of the part of `nodes` (n,), of undeformed `part_stiffness` (3n, 3n) [N/m].
+    """Return the condensed exterior of the part with `nodes` (n,) and undeformed stiffness (3n, 3n) [N/m].
 
     Raises
     ------
     RuntimeError
-        The exterior is not fixed even if the part is.
+        The exterior is not fixed even if the part is fixed.
     """
     part = (3 * nodes[:, None] + np.arange(3)).ravel()
     whole, basis = sp.csr_array(problem.rest_curvature()), problem.constraint.build_basis()
@@ -69,9 +69,9 @@ def condense_exterior(
 def _compute_reduction(
     whole: sp.csr_array, far: sp.csc_array, coupling: sp.csc_array, device: Device, strip: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute -L (L^T K L)^-1 L^T B (3N, m) and the Schur reduction (m, m), of motions L and a coupling B (3N, m).
+    """Return -L (L^T K L)^-1 L^T B (3N, m) and the Schur reduction (m, m), for motions L and a coupling B (3N, m).
 
-    CUDA eliminates in blocks if these fit.
+    On CUDA, unknowns are eliminated in blocks if the memory suffices.
     """
     if device.on_cuda:
         from . import block_inverse

@@ -1,7 +1,7 @@
-"""Symbolic factorisation: elimination order of a sparse matrix, and its fronts.
+"""Symbolic factorisation: elimination order and fronts of a sparse matrix.
 
 Duff, Reid 1983, "The multifrontal solution of indefinite sparse symmetric linear equations", ACM Trans. Math. Softw.
-9:302-325; the elimination tree is Liu's: 1990, SIAM J. Matrix Anal. Appl. 11:134-172.
+9:302-325. Elimination tree: Liu 1990, SIAM J. Matrix Anal. Appl. 11:134-172.
 """
 
 from dataclasses import dataclass
@@ -13,16 +13,16 @@ import scipy.sparse as sp
 
 @dataclass(frozen=True)
 class FrontSizes:
-    """Sizes of fronts, and division of the work.
+    """Sizes of fronts, and division of the elimination into parts.
 
     Parameters
     ----------
     leaf_size
-        Whole subtrees with at most this number of unknowns are one front.
+        Maximum number of unknowns of a subtree that becomes one front.
     max_zeros
-        Two fronts are joined if that stores at most this number of zeros: another dense product costs as much.
+        Two fronts are joined if the joined front stores at most this number of zeros, the cost of a dense product.
     max_fronts_above
-        Division stops when this number of fronts is above the parts.
+        Division into parts stops when this number of fronts is in the last part, above the others.
     """
 
     leaf_size: int = 64
@@ -36,7 +36,7 @@ FRONT_SIZES = FrontSizes()
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """Unknowns first, ..., stop - 1, and the later ones (m,), ascending, that are coupled by their elimination."""
+    """Front: own unknowns first, ..., stop - 1, and the sorted later unknowns (m,) coupled by their elimination."""
 
     first: int
     stop: int
@@ -44,17 +44,17 @@ class Front:
 
     @property
     def rows(self) -> np.ndarray:
-        """Own unknowns of the front, then those of the border."""
+        """Own unknowns of the front, followed by its border unknowns."""
         return np.concatenate([np.arange(self.first, self.stop), self.border])
 
 
 def build_fronts(
     matrix: sp.csc_array, node: np.ndarray, parts: int = 1, settings: FrontSizes = FRONT_SIZES
 ) -> tuple[np.ndarray, list[list[Front]]]:
-    """Compute an order (n,) of a matrix's unknowns with little fill, and its fronts, each before those it touches.
+    """Return an order (n,) of the unknowns of a matrix with little fill-in, and the fronts in elimination order.
 
-    `node` (n,): unknowns of one node stay together. The fronts are in `parts` parts that do not touch one another, of
-    about equal work, and in a last one, which all of them touch.
+    Unknowns of one `node` (n,) stay together. The fronts are divided into `parts` independent parts of about equal
+    work, followed by a last part that is coupled to all others.
     """
     number, member, weight = np.unique(node, return_inverse=True, return_counts=True)
     entry = sp.coo_array(matrix)
@@ -84,9 +84,9 @@ def build_fronts(
 
 
 def order_by_dissection(graph: sp.csr_array) -> np.ndarray:
-    """Compute an order (N,) of a symmetric graph's nodes with little fill: nested dissection.
+    """Return an order (N,) of the nodes of a symmetric graph with little fill-in, by nested dissection.
 
-    By METIS: Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392.
+    Implementation: METIS, Karypis, Kumar 1998, SIAM J. Sci. Comput. 20:359-392.
     """
     if len(graph.indptr) == 1:  # METIS would divide by zero
         return np.zeros(0, int)
@@ -95,12 +95,12 @@ def order_by_dissection(graph: sp.csr_array) -> np.ndarray:
 
 
 def _spread(start: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Concatenate the ranges start, ..., start + count - 1."""
+    """Return the concatenated ranges start, ..., start + count - 1."""
     return np.repeat(start - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
 def _build_elimination_tree(graph: sp.csr_array) -> list[int]:
-    """Return the elimination tree (N,) of a graph in its order; -1 at roots. Liu 1990, algorithm 4.2."""
+    """Return the elimination tree of an ordered graph: parents (N,), -1 for roots. Liu 1990, algorithm 4.2."""
     count = len(graph.indptr) - 1
     parent, ancestor = [-1] * count, [-1] * count
     starts, neighbours = np.ravel(graph.indptr).tolist(), np.ravel(graph.indices).tolist()
@@ -115,9 +115,9 @@ def _build_elimination_tree(graph: sp.csr_array) -> list[int]:
 
 
 def _group_nodes(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> list[tuple[np.ndarray, np.ndarray]]:
-    """List groups of nodes that are eliminated together, each with the later nodes that it couples.
+    """Return groups of nodes that are eliminated together, each with the later nodes that its elimination couples.
 
-    graph (N, N) in its order; weight (N,) unknowns per node.
+    `graph` (N, N) is in elimination order; `weight` (N,) is the number of unknowns of each node.
     """
     parent, count = _build_elimination_tree(graph), len(weight)
     below, top = weight.tolist(), list(range(count))
@@ -164,10 +164,10 @@ def _group_nodes(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) 
 def _split_subtrees(
     groups: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, parts: int, most_above: int
 ) -> list[list[int]]:
-    """Divide whole subtrees of groups into `parts` parts, and what is above them into a last one; each in its order.
+    """Return whole subtrees of groups in `parts` parts, and the groups above in a last part, in elimination order.
 
-    The heaviest subtree is opened, and its top moved to the last part, as long as the total work becomes shorter. The
-    total is the last part plus the longest of the others.
+    The root of the heaviest subtree is moved to the last part as long as the total time decreases. The total is the
+    time of the last part plus the longest time of the other parts.
     """
     owner = np.zeros(len(weight), int)
     for number, (own, _) in enumerate(groups):
@@ -206,13 +206,13 @@ def _split_subtrees(
 
 
 def _encode_nodes(nodes: np.ndarray, count: int) -> int:
-    """Encode some of `count` nodes as the bits of an integer."""
+    """Return an integer whose bits mark `nodes`, out of `count` nodes."""
     flags = np.zeros(count, bool)
     flags[nodes] = True
     return int.from_bytes(np.packbits(flags, bitorder="little").tobytes(), "little")
 
 
 def _decode_nodes(bits: int, count: int) -> np.ndarray:
-    """Decode the nodes, ascending."""
+    """Return the sorted nodes marked by the bits of an integer."""
     packed = np.frombuffer(bits.to_bytes(-(-count // 8), "little"), np.uint8)
     return np.flatnonzero(np.unpackbits(packed, bitorder="little"))

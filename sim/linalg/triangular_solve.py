@@ -1,4 +1,4 @@
-"""Sweeps of one right-hand side through all fronts of a factor: native loops, limited by memory bandwidth."""
+"""Triangular sweeps of one right-hand side through all fronts of a factor, by native loops."""
 
 from collections.abc import Sequence
 from functools import cache, partial
@@ -66,7 +66,7 @@ BACKWARD_CODE = """
 
 @cache
 def build_kernel(device: Device, code: str) -> wp.Kernel:
-    """Build the kernel that eliminates (`FORWARD_CODE`) or back-substitutes (`BACKWARD_CODE`) rows of xs (b, n)."""
+    """Return the kernel that eliminates (`FORWARD_CODE`) or back-substitutes (`BACKWARD_CODE`) rows of xs (b, n)."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
 
@@ -89,7 +89,7 @@ def build_kernel(device: Device, code: str) -> wp.Kernel:
         work: wp.array2d(dtype=scalar),
         xs: wp.array2d(dtype=scalar),
     ):
-        """Sweep one row of xs."""
+        """Apply one sweep to one row of xs, a right-hand side."""
         sweep_row(wp.tid(), fronts, border, panel, work, xs)
 
     return sweep
@@ -116,23 +116,23 @@ def _add_part(
     # outputs
     whole: wp.array2d(dtype=wp.float64),
 ):
-    """Add the part; both arrays are transposed, so that columns are contiguous."""
+    """Add `part` to `whole` at the indices `place`; both are transposed, so that columns are contiguous."""
     _add(part, place, whole)
 
 
 def add_lower_block(block: np.ndarray, index: np.ndarray, matrix: np.ndarray) -> None:
-    """Add the lower half of `block` (m, m) to rows and columns `index` (m,), ascending, of `matrix`; both by columns.
+    """Add the lower half of `block` (m, m) to rows and columns `index` (m,), sorted, of `matrix`, in column order.
 
-    NumPy takes ten times as long.
+    This kernel is ten times as fast as NumPy.
     """
     views = [wp.array(array, device="cpu", copy=False) for array in (block.T, index, matrix.T)]
     Device("cpu", "float64").launch(_add_part, (1,), views[:2], views[2:])
 
 
 class TriangularSweeps:
-    """Sweeps through the fronts of a factor, part by part, with the values of all panels in one array.
+    """Triangular sweeps through the fronts of a factor, part by part, with the values of all panels in one array.
 
-    All parts but the last are swept at the same time, each on its own copy of the right-hand sides.
+    All parts except the last are swept at the same time, each with its own copy of the right-hand sides.
     """
 
     def __init__(self, fronts: Sequence[Sequence[Front]], values: np.ndarray, precision: Precision):
@@ -153,7 +153,7 @@ class TriangularSweeps:
         self._lower, self._upper = [slice(a, b) for a, b in pairwise(unknowns[:-1])], slice(*unknowns[-2:])
 
     def solve(self, x: np.ndarray) -> np.ndarray:
-        """Solve for x (n, b) by both sweeps, column by column."""
+        """Return the solution (n, b) by forward and backward sweep of x (n, b), column by column."""
         if not x.size:
             return x
         columns, parts = x.shape[1], len(self._lower)

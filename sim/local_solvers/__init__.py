@@ -1,1 +1,1 @@
-"""Local solvers for strongly strained or touched tissue: nonlinear elimination and contact."""
+"""Local solvers for tissue that is strongly strained or touched: nonlinear elimination and contact."""

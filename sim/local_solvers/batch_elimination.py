@@ -1,15 +1,15 @@
-"""Nonlinear elimination: the most strained part is a repeated local subproblem, which the remaining mesh follows.
+"""Nonlinear elimination: the most strained part is solved repeatedly as a local subproblem; the remaining mesh follows.
 
-Close to the tools tissue is far from its undeformed stiffness, elsewhere it is nearly linear. A descent from the
-undeformed stiffness spends most of its iterations on the near part, at the cost of the whole mesh. Here each cycle
-corrects the whole with the undeformed stiffness, then solves the near part within the linear far part. The far part
-follows: Gendre, Allix, Gosselet, Comte 2009, "Non-intrusive and exact global/local techniques for structural problems
-with local plasticity", Comput. Mech. 44:233-245. The outer loop is that of nonlinear elimination (`outer_loop.py`).
+Near the tools, the stiffness of tissue differs strongly from the undeformed stiffness; elsewhere tissue is nearly
+linear. A descent with the undeformed stiffness needs most of its iterations for the near part, at the cost of the whole
+mesh. Here each cycle corrects the whole mesh by the undeformed stiffness, then solves the near part within the linear
+far part, and moves the far part accordingly: Gendre, Allix, Gosselet, Comte 2009, "Non-intrusive and exact global/local
+techniques for structural problems with local plasticity", Comput. Mech. 44:233-245. See `outer_loop.py` for the loop.
 
 C is the inverse of the undeformed stiffness, r the gradient at u, and e = -C r the linear correction. The near part
-solves n(u + x) - n(u) + F x = (n' + F) e for x. Here n are its internal forces, n' its undeformed stiffness, and F that
-of the far part, condensed. The far part takes e + H (x - e), where H maps the shared rows to the far part. If n were
-linear, x would be e.
+solves n(u + x) - n(u) + F x = (n' + F) e for x. Here n are its internal forces, n' its undeformed stiffness, and F the
+condensed stiffness of the far part. The far part moves by e + H (x - e), where H maps shared rows to the far part. If n
+were linear, x would be e.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -36,14 +36,14 @@ from .outer_loop import DEFAULT_CYCLE_LIMITS, CycleLimits, run_cycles
 
 @dataclass(frozen=True)
 class NearPart:
-    """Extent of the near part, and limits of its solution.
+    """Size of the near part, and limits of its solution.
 
     Parameters
     ----------
     fraction, max_opening
-        Fraction of the tetrahedra; largest fraction of surface vertices that may be free.
+        Fraction of the tetrahedra in the near part; largest fraction of surface vertices that may be free.
     max_iterations, straggler_fraction
-        Maximum L-BFGS iterations in one cycle, which ends earlier if at most this fraction of the load cases is live.
+        Maximum L-BFGS iterations in one cycle; a cycle ends early if at most this fraction of load cases is unfinished.
     """
 
     fraction: float = 0.2
@@ -57,19 +57,19 @@ NEAR_PART = NearPart()  # Default.
 
 @dataclass(frozen=True, eq=False)
 class BatchElimination:
-    """Solver for problems that are nonlinear in a small region.
+    """Solver for problems that are strongly nonlinear only in a small part.
 
     problem, preconditioner
-        Whole problem, and its inverse undeformed stiffness.
+        Problem of the whole mesh, and the inverse of its undeformed stiffness.
     rows
-        (3n,) on the device: rows of the near part among the whole's 3N.
+        Rows (3n,) of the near part among the 3N rows of the whole mesh, on the device.
     part, lbfgs
-        Near part within the condensed far part, and the solver of this subproblem.
+        Subproblem of the near part within the condensed far part, and its solver.
     shared_rows, extend
-        (m,) rows of the near part shared with the far part, on the device; (x (m, b), out (3N, b)): the far part's
-        motion.
+        Rows (m,) that near and far part share, on the device; function that writes the motion of the far part to
+        out (3N, b), from the motion x (m, b) of the shared rows.
     limits, size
-        Limits of the cycles; extent and limits of the near part.
+        Limits of the cycles; size and limits of the near part.
     """
 
     problem: Problem
@@ -85,7 +85,7 @@ class BatchElimination:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, max_iter: int, warm_start: Mapping[str, np.ndarray] | None = None
     ) -> DescentResult:
-        """Solve as `Lbfgs.descend`, in at most `max_iter` cycles; returns no L-BFGS history."""
+        """Return the result as `Lbfgs.descend`, after at most `max_iter` cycles, without an L-BFGS history."""
 
         def cycle(judge: ResidualEvaluator, now: ResidualState, force: np.ndarray) -> ResidualState:
             return judge(self._run_cycle(now.u, now.g, force))
@@ -93,9 +93,9 @@ class BatchElimination:
         return run_cycles(self.problem, start, tolerance, max_iter, self.limits, cycle)
 
     def _run_cycle(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
-        """Run one cycle from residual g (3N, b) at u (3N, b); return the next state (3N, b).
+        """Return the next state (3N, b) after one cycle from u (3N, b) with the residual g (3N, b).
 
-        The near part is solved to a residual of `force` (b,) [N].
+        The near part is solved until its residual is below `force` (b,) [N].
         """
         device, count = self.problem.device, u.shape[1]
         every = np.ones(count, bool)
@@ -125,19 +125,19 @@ class BatchElimination:
 
 
 def has_small_opening(space: Discretisation, constraint: Constraint) -> bool:
-    """Return True if the free surface is a small part of the whole surface, and not empty."""
+    """Return True if the free surface is a small, not empty part of the whole surface."""
     return 0 < len(list_open_vertices(space, constraint)) <= NEAR_PART.max_opening * len(np.unique(space.mesh.surface))
 
 
 def find_near_tetrahedra(space: Discretisation, constraint: Constraint) -> np.ndarray:
-    """Mark (T,) bool the fraction `NearPart.fraction` of the tetrahedra that is nearest to the free surface."""
+    """Return a mask (T,) of the tetrahedra nearest to the free surface, a fraction `NearPart.fraction` of all."""
     mesh = space.mesh
     distance, _ = KDTree(mesh.nodes[list_open_vertices(space, constraint)]).query(mesh.nodes[mesh.tets].mean(axis=1))
     return distance <= np.quantile(distance, NEAR_PART.fraction)
 
 
 def list_open_vertices(space: Discretisation, constraint: Constraint) -> np.ndarray:
-    """List the surface vertices (n,) that are neither fixed nor slide."""
+    """Return the surface vertices (n,) that are neither fixed nor sliding."""
     surface = np.unique(space.mesh.surface)
     return surface[~constraint.fixed[surface].any(axis=1) & ~constraint.normal[surface].any(axis=1)]
 
@@ -145,9 +145,9 @@ def list_open_vertices(space: Discretisation, constraint: Constraint) -> np.ndar
 def build_batch_elimination(
     problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> BatchElimination | None:
-    """Build the solver for the tissue near the opening; None if that part is too close to singular to be condensed.
+    """Return the solver for tissue near the craniotomy, or None if this part is too close to singular to be condensed.
 
-    The preconditioner must be an exact inverse: multigrid would leave part of every correction to the next cycle.
+    The preconditioner must be an exact inverse; with multigrid, each cycle would leave a part of its correction.
     """
     device = problem.device
     chosen = find_near_tetrahedra(space, problem.constraint)

@@ -1,8 +1,8 @@
-"""Nonlinear elimination without an exact inverse: strained tissue reaches equilibrium before the other nodes move.
+"""Nonlinear elimination without an exact inverse: strained tissue is brought to equilibrium before other nodes move.
 
-With multigrid, which inverts the undeformed stiffness only approximately, the far part cannot be condensed. So the part
-near a load, clamped at its boundary (`clamped_part.py`), is solved as a local subproblem. L-BFGS minimises the
-remaining function of the surrounding nodes, whose curvature is close to the undeformed stiffness.
+Multigrid inverts the undeformed stiffness only approximately, so the far part cannot be condensed. Therefore the part
+near a load is clamped at its boundary (`clamped_part.py`) and solved as a local subproblem. L-BFGS minimises the energy
+as a function of the other nodes, whose curvature is close to the undeformed stiffness.
 """
 
 from collections.abc import Iterable, Mapping
@@ -28,18 +28,18 @@ from .outer_loop import CycleLimits, run_cycles
 
 @dataclass(frozen=True)
 class ClampedSize:
-    """Extent of the clamped part, and number of backtracking steps.
+    """Size of the clamped part, and number of backtracking steps.
 
     Parameters
     ----------
     min_strain, max_fraction
-        Norm of the displacement gradient of the linear solution above which tetrahedra belong to the part, the most
-        strained first, up to this fraction of all; and all tetrahedra that touch these.
+        Tetrahedra belong to the part if the displacement gradient of the linear solution has a larger norm than
+        `min_strain`; at most this fraction, the most strained first. Tetrahedra that touch these are added.
     residual_factor, max_added
-        If a cycle leaves more than this fraction of the residual, and at most this number of nodes have most of the
-        residual outside the part, these nodes and what touches them are added to it.
+        If a cycle leaves more than this fraction of the residual, and at most this number of nodes outside the part
+        have most of the residual, the tetrahedra that touch these nodes are added to the part.
     max_backtracks
-        Maximum backtracking steps of one step.
+        Maximum number of backtracking steps per step.
     """
 
     min_strain: float = 0.15
@@ -55,14 +55,14 @@ CLAMPED_CYCLE_LIMITS = CycleLimits(max_cycles=30, patience=8, max_rise=1e6, forc
 
 @dataclass(frozen=True, eq=False)
 class ClampedElimination:
-    """Solver of single loads for quadratic elements, whose undeformed stiffness is inverted by multigrid only.
+    """Solver of single loads for quadratic elements, whose undeformed stiffness multigrid inverts approximately.
 
     problem, preconditioner
-        Whole problem, and its preconditioner.
+        Problem of the whole mesh, and its preconditioner.
     effects, space
-        Effects and discretisation that the problem was compiled from.
+        Effects and discretisation from which the problem was compiled.
     limits, size
-        Limits of the cycles; extent of the clamped part.
+        Limits of the cycles; size of the clamped part.
     """
 
     problem: Problem
@@ -75,7 +75,7 @@ class ClampedElimination:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, max_iter: int, warm_start: Mapping[str, np.ndarray] | None = None
     ) -> DescentResult:
-        """Solve as `Lbfgs.descend`, for one load case, in at most `max_iter` cycles; returns no L-BFGS history."""
+        """Return the result as `Lbfgs.descend`, for one load case, after at most `max_iter` cycles; without history."""
         chosen, part, pairs = (
             np.zeros(len(self.space.table), bool),
             None,
@@ -116,9 +116,9 @@ class ClampedElimination:
     def _search_line(
         self, judge: ResidualEvaluator, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float
     ) -> ResidualState:
-        """Search along d (3N,) with the part solved to `force` [N] at each trial; return the accepted state.
+        """Return the state accepted by a line search along d (3N,), with the part solved to `force` [N] at each trial.
 
-        Its residual is not finite if no trial step is accepted.
+        The residual of the returned state is not finite if no trial step is accepted.
         """
         predicted, device = -float(_copy_to_host(now.g) @ d), self.problem.device
         way = device.upload(d[:, None])
@@ -132,14 +132,14 @@ class ClampedElimination:
         return replace(now, norm=np.full(1, np.inf))
 
     def _compute_response(self, g: wp.array) -> np.ndarray:
-        """Compute the linear response (3N,) [m] of the undeformed mesh to a force g (3N, 1) [N]."""
+        """Return the linear response (3N,) [m] of the undeformed mesh to a force g (3N, 1) [N]."""
         z = wp.zeros_like(g)
         self.preconditioner.apply(g, np.ones(1, bool), z)
         self.problem.constraint.project_nodes(z)
         return _copy_to_host(z)
 
     def _find_strained_nodes(self, u: np.ndarray) -> np.ndarray:
-        """Return the nodes (k,) of the tetrahedra that a displacement u (3N,) [m] strains most."""
+        """Return the nodes (k,) of the tetrahedra that are strained most at the displacement u (3N,) [m]."""
         table = self.space.table
         slope = np.einsum("tai,taj->tij", u.reshape(-1, 3)[table[:, :4]], self._slopes)
         strain = np.sqrt(np.einsum("tij,tij->t", slope, slope))
@@ -147,9 +147,9 @@ class ClampedElimination:
         return table[np.argsort(-strain)[:most]].ravel()
 
     def _find_residual_nodes(self, g: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Return the few nodes (k,) outside the part that have most of the residual g (3N,) there.
+        """Return the few nodes (k,) outside the part that have most of the residual g (3N,) outside the part.
 
-        Empty if it is spread over more nodes.
+        The result is empty if the residual is spread over more nodes.
         """
         square = (g.reshape(-1, 3).astype(np.float64) ** 2).sum(axis=1)
         square[nodes] = 0.0
@@ -157,7 +157,7 @@ class ClampedElimination:
         return most if 2.0 * square[most].sum() > square.sum() else most[:0]
 
     def _mark_touching(self, nodes: np.ndarray) -> np.ndarray:
-        """Mark (T,) bool the tetrahedra that contain any of these nodes (k,)."""
+        """Return a mask (T,) of the tetrahedra that contain any of the `nodes` (k,)."""
         touched = np.zeros(self.space.count, bool)
         touched[nodes] = True
         return touched[self.space.table].max(axis=1)
@@ -169,5 +169,5 @@ class ClampedElimination:
 
 
 def _copy_to_host(column: wp.array) -> np.ndarray:
-    """Copy a column (3N, 1) on the CPU to (3N,)."""
+    """Return a copy (3N,) of a column (3N, 1) on the CPU."""
     return column.numpy()[:, 0]

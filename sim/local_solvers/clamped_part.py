@@ -26,9 +26,9 @@ class PartLimits:
     Parameters
     ----------
     max_iterations, stale_iterations
-        Maximum L-BFGS iterations before Newton; iterations above which the factor is recomputed.
+        Maximum number of L-BFGS iterations before Newton's method; iterations after which the factor is recomputed.
     max_outer, max_inner
-        Limits of Newton, as in `Accuracy`.
+        Limits of Newton's method, as in `Accuracy`.
     """
 
     max_iterations: int = 400
@@ -38,20 +38,20 @@ class PartLimits:
 
 
 class ClampedPart:
-    """Part of the mesh under one load case, clamped at its boundary.
+    """Part of the mesh, clamped at its boundary, under one load case.
 
     Parameters
     ----------
     problem
-        Whole problem, which has begun this load case alone.
+        Problem of the whole mesh, which has begun with this load case only.
     effects, space
-        Effects and discretisation that it was compiled from.
+        Effects and discretisation from which the problem was compiled.
     chosen
-        (T,) bool: the part's tetrahedra, at least one.
+        Mask (T,) of the tetrahedra of the part, at least one.
     constant
-        (3N, 1) [N]: gradient of the loads, which do not depend on the displacements.
+        Gradient (3N, 1) [N] of the loads, which does not depend on the displacements.
     u
-        (3N, 1) [m]: approximate displacements, at which the stiffness is factorised.
+        Approximate displacements (3N, 1) [m], at which the stiffness is factorised.
     limits
         Iteration limits.
     """
@@ -77,9 +77,9 @@ class ClampedPart:
             self._begin_with(self._part.rest_curvature())
 
     def solve_part(self, u: wp.array, force_tolerance: float) -> wp.array:
-        """Return u (3N, 1) with the part in equilibrium, to a residual of about `force_tolerance` [N].
+        """Return u (3N, 1) with the part in equilibrium, up to a residual of about `force_tolerance` [N].
 
-        Return u unchanged if the part's forces are not finite.
+        If the forces in the part are not finite, u is returned unchanged.
         """
         part, device, values, limits = self._part, self._part.device, u.numpy().copy(), self._limits
         part.constraint.begin(values[self._rows], None, None)
@@ -99,7 +99,7 @@ class ClampedPart:
         return device.upload(values)
 
     def _begin_at(self, u: wp.array) -> bool:
-        """Use the tangent stiffness at u (3n, 1) as initial Hessian of L-BFGS; False if it is not positive definite."""
+        """Set the initial Hessian of L-BFGS to the tangent stiffness at u (3n, 1); return False if it is indefinite."""
         self._part.linearise(u, np.zeros(1, bool))
         try:
             self._begin_with(self._curvature())
@@ -108,7 +108,7 @@ class ClampedPart:
         return True
 
     def _begin_with(self, stiffness: sp.csc_array) -> None:
-        """Use a stiffness (3n, 3n) [N/m] as initial Hessian of L-BFGS."""
+        """Set the initial Hessian of L-BFGS to a `stiffness` (3n, 3n) [N/m]."""
         basis = self._part.constraint.build_basis()
         self._factor = SparseFactor(stiffness, basis, find_moved_nodes(basis), self._part.device)
         self._lbfgs = Lbfgs(self._part, self._factor)

@@ -1,4 +1,4 @@
-"""State of the load cases of a contact solve, with their models of the stiffness."""
+"""State of the load cases of a contact solve, with models of their stiffness."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .strained_part import StrainedModel
 
 @dataclass(frozen=True, eq=False)
 class ContactState:
-    """State u (3N, b) [m]; gradients (3N, b) [N] of the smooth terms, and of all, with 2-norms (b,); scales (b,)."""
+    """Displacements u (3N, b) [m]; gradients (3N, b) [N] of smooth and of all terms, their 2-norms and scales (b,)."""
 
     u: Any
     smooth_gradient: Any
@@ -24,21 +24,21 @@ class ContactState:
 
     @property
     def relative(self) -> np.ndarray:
-        """Relative residuals (b,)."""
+        """Relative residual (b,) of each load case."""
         return compute_relative_residual(self.norm, self.scale)
 
     @property
     def is_finite(self) -> np.ndarray:
-        """True (b,) where residual and scale are finite; forces may overflow."""
+        """Mask (b,) of load cases with finite residual and scale, since forces may overflow."""
         return np.isfinite(self.norm) & np.isfinite(self.scale)
 
     def select(self, columns: np.ndarray) -> ContactState:
-        """Return the state of some load cases (k,)."""
+        """Return the state of the load cases `columns` (k,)."""
         parts = (self.u[:, columns], self.smooth_gradient[:, columns], self.gradient[:, columns])
         return ContactState(*parts, self.norm[columns], self.scale[columns])
 
     def put_columns(self, columns: np.ndarray, index: Any, source: ContactState) -> None:
-        """Overwrite load cases (k,) with those of another state; `index` is the same selection for device arrays."""
+        """Overwrite load cases `columns` (k,) with those of `source`; `index` is the selection for device arrays."""
         for name in ("u", "smooth_gradient", "gradient"):
             getattr(self, name)[:, index] = getattr(source, name)[:, index]
         self.norm[columns], self.scale[columns] = source.norm[columns], source.scale[columns]
@@ -46,23 +46,23 @@ class ContactState:
 
 @dataclass(eq=False)
 class Batch:
-    """Live load cases, on the last axis of arrays (.., b); each has its own direction, step length and proximal term.
+    """Unfinished load cases, on the last axis of arrays (.., b); each has its own direction, step and proximal term.
 
     evaluator, state
-        Function that evaluates residuals, and the present state.
+        Function that evaluates residuals, and the current state.
     history, model
-        L-BFGS histories, or models of strained tissue that correct the undeformed compliance; `stale` (b,) bool marks
-        models to be recomputed.
+        L-BFGS histories, or models of strained tissue that correct the undeformed compliance. `stale` (b,) bool marks
+        models that must be recomputed.
     force, response, target_force
-        (3n, b) [N] forces of the tools; (3N, b) [m] linear response of the undeformed mesh to the residual with these
-        forces; (3n, b) [N] forces after the step, if there is a model.
+        Tool forces (3n, b) [N]; linear response (3N, b) [m] of the undeformed mesh to the residual with these forces;
+        tool forces (3n, b) [N] after the step, if there is a model.
     d, length, decrease
-        (3N, b) [m] direction, (b,) trial step length, and (b,) [J] predicted decrease.
+        Direction (3N, b) [m], trial step length (b,), and predicted decrease of the energy (b,) [J].
     proximal, stalls, steps
-        (b,) proximal coefficient, steps in a row with little progress, and number of steps.
+        Proximal coefficient (b,), number (b,) of successive steps with little progress, and number (b,) of steps.
     failures, waiting, ended
-        (b,) failures in a row to find the tools' forces; (b,) bool: to be tried again; (b,) bool: ended, but still in
-        the arrays.
+        Number (b,) of successive failures of the contact forces; mask (b,) of load cases to be tried again; mask (b,)
+        of load cases that have ended, but are still in the arrays.
     """
 
     evaluator: ResidualEvaluator
@@ -84,7 +84,7 @@ class Batch:
     ended: np.ndarray
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep these load cases (k,)."""
+        """Keep only the load cases `columns` (k,)."""
         self.evaluator, self.state = self.evaluator.select(columns), self.state.select(columns)
         if self.model is None:
             self.history.keep(columns)
@@ -97,11 +97,11 @@ class Batch:
 
     @property
     def is_updated(self) -> np.ndarray:
-        """True (b,) where a load case has a model that differs from the undeformed stiffness."""
+        """Mask (b,) of load cases with a model that differs from the undeformed stiffness."""
         return self.history.count > 0 if self.model is None else self.model.is_strained
 
     def reset_model(self, columns: np.ndarray) -> None:
-        """Reset the model of some load cases (k,) to the undeformed stiffness."""
+        """Reset the model of the load cases `columns` (k,) to the undeformed stiffness."""
         if not len(columns):
             return
         if self.model is None:

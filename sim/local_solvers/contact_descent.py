@@ -1,13 +1,13 @@
-"""Equilibrium of soft tissue with rigid tools that touch few nodes: tissue by a quadratic model, contact exactly.
+"""Equilibrium of tissue with rigid tools that touch few nodes: quadratic model of the tissue, exact contact energy.
 
 A proximal quasi-Newton method (Lee, Sun, Saunders 2014, "Proximal Newton-type methods for minimizing composite
 functions", SIAM J. Optim. 24:1420-1443). Each step minimises
 
     s'(u) x + x . B x / 2 + c(u + x),
 
-with s the potential of the smooth terms, B the undeformed stiffness with its L-BFGS or strain update, and c the barrier
-of the tools, not approximated. c depends on the few touchable nodes, and all others follow them. With H = B^-1 they
-move by x = -H (s'(u) + f), with the tools' forces f on them from `contact_forces`.
+where s is the energy of the smooth terms, B the undeformed stiffness with its L-BFGS or strain update, and c the
+barrier energy of the tools, without approximation. c depends only on the few touchable nodes. With H = B^-1, all nodes
+move by x = -H (s'(u) + f), where f are the tool forces from `contact_forces`.
 """
 
 from collections.abc import Callable
@@ -40,20 +40,20 @@ from .strained_part import STRAIN_LIMITS, StrainedPart, StrainLimits
 
 @dataclass(frozen=True, eq=False)
 class ContactDescent:
-    """Solver for a problem with one `LocalBarrier` barrier, whose constraints stay satisfied.
+    """Solver for a problem with one `LocalBarrier`; the start must satisfy the constraints.
 
     problem
         Problem to solve.
     preconditioner
-        Its inverse undeformed stiffness, the same at every state.
+        Inverse of the undeformed stiffness of the problem; it does not depend on the state.
     barrier
-        Its only barrier.
+        Only barrier of the problem.
     limits
-        Limits of the iteration.
+        Limits of the iterations.
     strains
-        Limits of strained tissue.
+        Limits of the models of strained tissue.
     uses_graphs
-        True if steps of single load cases are captured as GPU graphs.
+        True if steps of single load cases are captured as CUDA graphs.
     """
 
     problem: Problem
@@ -65,7 +65,7 @@ class ContactDescent:
 
     @cached_property
     def compliance(self) -> Compliance:
-        """Compliance at the touchable nodes, followed by those that a model of strained tissue may include."""
+        """Compliance at the touchable nodes, followed by other nodes that a model of strained tissue may include."""
         exact, own = is_exact(self.preconditioner), self.barrier.touchable_nodes
         nodes = self.barrier.select_nodes(self.strains.max_candidates) if exact else own
         compliance = Compliance(self.problem, self.preconditioner, nodes)
@@ -75,14 +75,14 @@ class ContactDescent:
 
     @cached_property
     def _strained(self) -> StrainedPart | None:
-        """Builder of models of strained tissue; None with multigrid, whose compliance is slow."""
+        """Builder of models of strained tissue; None with multigrid, where the compliance takes too long."""
         if not is_exact(self.preconditioner):
             return None
         return StrainedPart(self.problem, self.compliance, len(self.barrier.touchable_nodes), self.strains)
 
     @cached_property
     def captured_steps(self) -> ContactSteps | None:
-        """Captured steps for single load cases; None if steps are not captured."""
+        """Captured steps for single load cases, or None if steps are not captured."""
         if self._strained is None or not self.uses_graphs:
             return None
         self._strained.prepare()
@@ -96,16 +96,16 @@ class ContactDescent:
 
     @cached_property
     def _room(self) -> Callable[[int, int, int], Scratch]:
-        """Function `allocate_scratch` with a cache of its last two results, as allocation is slow."""
+        """Function `allocate_scratch` with a cache of the last two results, since allocation is slow."""
         return lru_cache(2)(partial(allocate_scratch, self._exact))
 
     @property
     def _exact(self) -> Device:
-        """Device with double precision."""
+        """Device of the problem, with double precision."""
         return replace(self.problem.device, precision="float64")
 
     def descend(self, start: wp.array, tolerance: np.ndarray, max_iter: int) -> DescentResult:
-        """Solve as `Lbfgs.descend`, in at most `max_iter` steps of each load case; returns no L-BFGS history."""
+        """Return the result as `Lbfgs.descend`, after at most `max_iter` steps per load case, without a history."""
         count, device, limits = start.shape[1], self.problem.device, self.limits
         result, live = wp.clone(start), np.arange(count)
         status, steps, residual = np.full(count, LIVE), np.zeros(count, int), np.full(count, np.inf)
@@ -154,7 +154,7 @@ class ContactDescent:
     def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:
         """Run captured steps of a single load case until it ends.
 
-        Return early if the load case needs more workspace for touched nodes, or Newton: captured steps have neither.
+        Return early if the load case needs a larger workspace or Newton's method, which captured steps do not include.
         """
         known, judge, limits = None, batch.evaluator, self.limits
         if batch.model is None or not steps.set_tools(judge.constant):
@@ -189,12 +189,12 @@ class ContactDescent:
                 known = None
 
     def _find_ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
-        """Return the load cases (b,) that have ended, in equilibrium or not."""
+        """Return a mask (b,) of load cases that have ended, in equilibrium or not."""
         lost = (batch.stalls >= self.limits.patience) | (batch.steps >= most) | ~batch.state.is_finite
         return lost | (batch.state.relative <= tolerance)
 
     def _rebuild_models(self, batch: Batch, wanted: np.ndarray) -> None:
-        """Recompute the stale models of the load cases `wanted` (b,) bool."""
+        """Recompute the stale models of the load cases in the mask `wanted` (b,)."""
         renewed = np.flatnonzero(wanted & batch.stale)
         if batch.model is not None and self._strained is not None and len(renewed):
             fresh = self._strained.build_model(from_view(self.problem.device, batch.state.u), renewed)
@@ -203,15 +203,15 @@ class ContactDescent:
                 batch.model = batch.model.merge_columns(renewed, fresh)
 
     def _compute_force_tolerance(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
-        """Return the relative tolerance (b,) of the tools' forces."""
+        """Return the relative tolerance (b,) of the tool forces."""
         limits = self.limits
         return np.maximum(limits.forcing * np.minimum(batch.state.relative, 1.0), limits.tolerance_factor * tolerance)
 
     def _compute_directions(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
-        """Compute directions of the load cases `wanted` (b,) bool; return which (b,) have failed finally.
+        """Compute directions of the load cases in the mask `wanted` (b,); return a mask (b,) of final failures.
 
-        A load case whose model has no equilibrium waits for the next call, with a larger proximal term; then its model
-        is reset; at last a model that is not convex is accepted. Other load cases do not wait for it.
+        A load case whose model has no equilibrium waits for the next call, with a larger proximal term. If this fails,
+        its model is reset; finally a nonconvex model is accepted. The other load cases continue without waiting.
         """
         self._rebuild_models(batch, wanted)
         force, found = batch.force + 0.0, np.zeros(len(wanted), bool)
@@ -227,11 +227,11 @@ class ContactDescent:
         return over
 
     def _find_nonconvex(self, batch: Batch) -> np.ndarray:
-        """Return the load cases (b,) whose model may be non-convex."""
+        """Return a mask (b,) of load cases for which a nonconvex model is accepted."""
         return batch.failures >= 2 * self.limits.max_failures
 
     def _increase_proximal_term(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
-        """Increase the proximal coefficient of `waiting` cases (b,), without forces; return those (b,) to give up."""
+        """Increase the proximal coefficient of the `waiting` cases (b,), and return a mask (b,) of cases to give up."""
         times = self.limits.max_failures
         batch.waiting = waiting
         batch.failures = np.where(waiting, batch.failures + 1, 0)
@@ -241,7 +241,7 @@ class ContactDescent:
         return batch.failures >= 3 * times
 
     def _compute_steps(self, batch: Batch, some: np.ndarray, force: Any) -> None:
-        """Compute directions, step lengths and predicted decreases of load cases (k,) under forces (3n, b)."""
+        """Compute directions, step lengths and predicted decreases of cases `some` (k,) under tool forces (3n, b)."""
         now, device = batch.state, self.problem.device
         on = select_columns(device, some, len(batch.proximal))
         if batch.model is None:
@@ -265,7 +265,7 @@ class ContactDescent:
     def _solve_forces(
         self, batch: Batch, some: np.ndarray, tolerance: np.ndarray, most: ForceLimits
     ) -> tuple[Any, np.ndarray]:
-        """Solve for the tools' forces (3n, k) on the model for load cases (k,); return which (k,) are solved."""
+        """Return the tool forces (3n, k) on the models of load cases `some` (k,), and a mask (k,) of solved cases."""
         rows, now = self._rows, batch.state
         on = select_columns(self.problem.device, some, len(batch.proximal))
         barrier, known = self.barrier.reduce(some), batch.force[:, on]
@@ -286,9 +286,9 @@ class ContactDescent:
         return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.proximal[some], most)
 
     def _compute_forces(self, batch: Batch, force: Any) -> tuple[Any, Any]:
-        """Compute additional forces (3N, b) [N] on the undeformed mesh: changes of contact forces, model corrections.
+        """Return additional forces (3N, b) [N] on the undeformed mesh: changes of tool forces, and model corrections.
 
-        Return also the motion (3n, b) [m] of the touchable nodes under the model's corrections.
+        Also return the motion (3n, b) [m] of the touchable nodes under the model corrections.
         """
         assert batch.model is not None
         device, compliance = self.problem.device, self.compliance
@@ -303,10 +303,10 @@ class ContactDescent:
         return np.maximum(self.limits.proximal, self.limits.growth * drag)
 
     def _try_steps(self, batch: Batch) -> np.ndarray:
-        """Evaluate the trial step of each load case that does not wait; return which (b,) need another direction.
+        """Evaluate the trial step of each case that does not wait; return a mask (b,) of cases that need a direction.
 
-        These accepted the step, because the energy still falls there, or nearly so; or backtracking left almost
-        no step: then the state is kept, and the model is reset.
+        A direction is needed if the step is accepted, because the energy still decreases there, or nearly so; or if
+        backtracking leaves almost no step: then the state is unchanged, and the model is reset.
         """
         now, going = batch.state, ~(batch.waiting | batch.ended)
         t = np.where(going, batch.length, 0.0)
@@ -325,9 +325,9 @@ class ContactDescent:
         return misled | there | (batch.waiting & ~batch.ended)
 
     def _take_steps(self, batch: Batch, t: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Accept steps of length t (b,), or shorten them; return which (b,) are accepted, and which reset their model.
+        """Accept or shorten steps of length t (b,); return masks (b,) of accepted steps and of models to be reset.
 
-        The decision uses the slopes `ahead` (b,) and the residuals `free` (b,) after the step.
+        The decision depends on the slopes `ahead` (b,) and the residuals `free` (b,) after the step.
         """
         limits, now, going = self.limits, batch.state, ~(batch.waiting | batch.ended)
         far = going & is_step_too_long(ahead, batch.decrease) & (t > limits.accepted_length)
@@ -348,7 +348,7 @@ class ContactDescent:
         return there, misled
 
     def _update_models(self, batch: Batch, new: ContactState, taken: np.ndarray, some: Any) -> None:
-        """Update the models with the accepted steps of load cases (k,); `some` is this selection for device arrays."""
+        """Update the models with the accepted steps of cases `taken`; `some` is this selection for device arrays."""
         now = batch.state
         if batch.model is not None:
             batch.force[:, some] = batch.target_force[:, some]
@@ -364,7 +364,7 @@ class ContactDescent:
             batch.history.update_history(taken[positive], moved[:, on], change[:, on], way[:, on])
 
     def _compute_balancing_forces(self, now: ContactState) -> Any:
-        """Return the forces (3n, b) at touched nodes that balance the smooth terms."""
+        """Return the forces (3n, b) at the touched nodes that balance the gradient of the smooth terms."""
         barrier, rows = self.barrier.reduce(np.arange(len(now.norm))), self._rows
         own = to_double(now.smooth_gradient[rows])
         if barrier is None:
@@ -375,13 +375,13 @@ class ContactDescent:
         return (-own.reshape(shape) * touched[:, None]).reshape(slope.shape)
 
     def _pull(self, smooth: Any, force: Any) -> Any:
-        """Add forces (3n, b) on the touchable nodes to smooth gradients (3N, b)."""
+        """Return smooth gradients (3N, b) plus the forces (3n, b) on the touchable nodes."""
         out = smooth + 0.0
         out[self._rows] += force
         return out
 
     def _evaluate_state(self, judge: ResidualEvaluator, u: Any) -> ContactState:
-        """Evaluate the states u (3N, b) as `Problem.residual` does."""
+        """Return the contact state at u (3N, b), with residuals as in `Problem.residual`."""
         problem, device = self.problem, self.problem.device
         place, pressed = device.allocate(*u.shape), device.allocate(*u.shape)
         to_view(place)[:] = u
@@ -392,7 +392,7 @@ class ContactDescent:
         return ContactState(to_view(place), whole - to_view(pressed), whole, found.norm, found.scale)
 
     def _compute_response(self, smooth: Any, force: Any) -> Any:
-        """Compute the linear response (3N, b) [m] of the undeformed mesh to the residual."""
+        """Return the linear response (3N, b) [m] of the undeformed mesh to the residual."""
         return self.compliance.apply(self._pull(smooth, force))
 
 

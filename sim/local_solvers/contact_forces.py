@@ -1,12 +1,12 @@
-"""Contact forces: equilibrium of the few touched nodes, with all others following a quadratic model.
+"""Contact forces: equilibrium of the few touched nodes; all other nodes follow by a quadratic model.
 
-With C (3n, 3n) the compliance of the model at these nodes and w0 their positions without contact, w minimises
+C (3n, 3n) is the compliance of the model at the touchable nodes, and w0 are positions without contact. w minimises
 
-    (w - w0) . C^-1 (w - w0) / 2 + c(w) + d |w - v|^2 / 2 over the touched,
+    (w - w0) . C^-1 (w - w0) / 2 + c(w) + d |w - v|^2 / 2 over touched nodes,
 
-c the barrier of the tools and d a proximal coefficient about the present positions v. Newton's method solves for the
-tools' forces f, with w = w0 - C f: these vanish except at touched nodes, so that C is never inverted. The input is the
-position under approximate forces, w1 = w0 - C f1, because differences from it have little round-off.
+where c is the barrier energy of the tools, and d a proximal coefficient about the current positions v. Newton's method
+solves for the tool forces f, with w = w0 - C f. The forces are zero except at touched nodes, so C is never inverted.
+The input is the position under approximate forces, w1 = w0 - C f1, since differences from w1 have little round-off.
 """
 
 from collections.abc import Callable
@@ -30,20 +30,20 @@ from .contact_structs import OPEN, SOLVED, TOO_MANY_TOUCHED, UNKNOWN, Compliance
 
 @dataclass(frozen=True)
 class ForceLimits:
-    """Limits of Newton's method for the tools' forces.
+    """Limits of Newton's method for the tool forces.
 
     Parameters
     ----------
     max_iterations, max_backtracks
-        Maximum iterations, and backtracking steps of one iteration.
+        Maximum number of iterations, and of backtracking steps in one iteration.
     first_capacity, max_capacity
-        Touched nodes: capacity of the first workspace, and of the largest.
+        Capacity of the first workspace and of the largest workspace [touched nodes].
     nonconvex_iterations
-        Iterations after which a model that is still not convex is given up.
+        Number of iterations after which a model that is still not convex is given up.
     diagonal_shift
-        Shift of the compliance matrix, relative to its mean diagonal, that makes it positive definite despite rounding.
+        Diagonal shift of the compliance matrix, relative to its mean diagonal, which compensates round-off.
     max_bytes
-        Memory of the matrices of all load cases solved at once [bytes].
+        Maximum memory of the matrices of all load cases solved together [bytes].
     """
 
     max_iterations: int = 60
@@ -57,15 +57,15 @@ class ForceLimits:
 
 FORCES = ForceLimits()  # Default.
 NONCONVEX = ForceLimits(nonconvex_iterations=FORCES.max_iterations)
-"""Limits for a model that need not be convex."""
+"""Limits for models that may be nonconvex."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContactCompliance:
-    """Compliance C at n nodes: that of the undeformed mesh, plus the updates of b load cases.
+    """Compliance C at n nodes: compliance of the undeformed mesh, plus updates for each of b load cases.
 
-    `history` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision are L-BFGS updates, None without history. `own`
-    (b, 3n, 3n) in single precision is the change by strained tissue. `get_scratch`: `allocate_scratch`, perhaps cached.
+    `history` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision are L-BFGS updates; None without history. `own`
+    (b, 3n, 3n) in single precision is the change by strained tissue. `get_scratch` is `allocate_scratch` or cached.
     """
 
     undeformed: Compliance
@@ -76,14 +76,14 @@ class ContactCompliance:
     own: Any = None
 
     def ensure_columns(self, force: Any) -> None:
-        """Compute the undeformed compliance, if missing, at the nodes on which forces (3n, b) act."""
+        """Compute missing columns of the undeformed compliance, for the nodes on which forces (3n, b) act."""
         every = self.undeformed.known.copy()
         if not every[: len(force) // 3].all():
             every[: len(force) // 3] = to_host((force != 0.0).any(1)).reshape(-1, 3).any(axis=1)
             self.undeformed.ensure_columns(every)
 
     def build_model(self, columns: np.ndarray, diagonal_shift: float) -> ComplianceModel:
-        """Return the compliance of some load cases (k,) for kernels."""
+        """Return the compliance of the load cases `columns` (k,) as a struct for kernels."""
         out, n, count = ComplianceModel(), len(self.undeformed.rows), len(columns)
         out.rest = from_view(self.device, self.undeformed.columns)
         out.known = self.device.upload(self.undeformed.known, wp.int32)
@@ -111,11 +111,11 @@ def solve_contact_forces(
     proximal: np.ndarray,
     limits: ForceLimits = FORCES,
 ) -> tuple[Any, np.ndarray]:
-    """Solve for the forces f (3n, b) [N]; return them, and which load cases (b,) are solved.
+    """Return the tool forces f (3n, b) [N], and a mask (b,) of load cases that are solved.
 
-    A load case fails if its model is not convex: the curvature of the tool exceeds the stiffness of the tissue, and the
-    step would be far too long. `positions` (3n, b) [m] are the present positions, w1 is `targets` and f1 `known_forces`
-    (3n, b). The forces have a relative `tolerance` (b,). `proximal` (b,) is d relative to a touched node's stiffness.
+    A load case fails if its model is not convex: the curvature of the tool exceeds the tissue stiffness, and the step
+    would be far too long. `positions` (3n, b) [m] are the current positions v; `targets` are w1, `known_forces` are f1.
+    `tolerance` (b,) is relative to the forces. `proximal` (b,) is d divided by the stiffness at a touched node.
     """
     out, status = known_forces + 0.0, np.full(positions.shape[1], OPEN)
     compliance.ensure_columns(known_forces)
@@ -148,9 +148,9 @@ def _solve_forces(
     limits: ForceLimits,
     room: int,
 ) -> tuple[Any, np.ndarray, Any]:
-    """Solve for forces (3n, k), status (k,) and places (n, k) of load cases (k,), for up to `room` touched nodes.
+    """Return forces (3n, k), status (k,) and node indices (n, k) of load cases (k,), for up to `room` touched nodes.
 
-    `own` are their here, there and known forces (3n, k), `asked` their tolerance and drag (k,).
+    `own` contains current positions, targets and known forces (3n, k); `asked` contains tolerance and proximal (k,).
     """
     device, count = soft.device, len(columns)
     nodes, functions = len(own[0]) // 3, barrier.functions
@@ -174,7 +174,7 @@ def _solve_forces(
 
 
 def build_kernel_limits(limits: ForceLimits, capacity: int) -> Limits:
-    """Return the limits for the kernel, with capacity for `capacity` touched nodes."""
+    """Return the limits as a struct for the kernel, with a capacity of `capacity` touched nodes."""
     ends = Limits()
     ends.max_iterations, ends.max_backtracks = limits.max_iterations, limits.max_backtracks
     ends.nonconvex_iterations, ends.capacity = limits.nonconvex_iterations, capacity
@@ -182,7 +182,7 @@ def build_kernel_limits(limits: ForceLimits, capacity: int) -> Limits:
 
 
 def allocate_scratch(device: Device, nodes: int, columns: int, capacity: int) -> Scratch:
-    """Allocate scratch arrays for numbers of nodes, load cases, and touched nodes (`capacity`)."""
+    """Return scratch arrays for the given numbers of nodes, load cases and touched nodes (`capacity`)."""
 
     def numbers(*shape: int) -> wp.array:
         return wp.empty(shape, dtype=wp.float64, device=device.name)

@@ -1,4 +1,4 @@
-"""Kernel of Newton's method for contact forces: one block of threads solves one load case completely."""
+"""Kernel of Newton's method for contact forces: one thread block solves one load case completely."""
 
 from functools import cache
 
@@ -18,7 +18,7 @@ TOUCHED, ACTING = wp.constant(0), wp.constant(1)  # Columns of `Scratch.counts`:
 
 @cache
 def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
-    """Build the kernel for a barrier, launched over (load case, thread)."""
+    """Return the kernel for a barrier, launched over (load case, thread)."""
     down, across = get_block_shape(device)
     threads, dense, Stage, Near = down * across, build_functions(device), barrier.barrier_struct, barrier.pairs_struct
     wide = wp.constant(CUDA_SUMS if device.on_cuda else CPU_SUMS)
@@ -31,7 +31,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def dot(x: wp.array2d(dtype=wp.float64), y: wp.array2d(dtype=wp.float64), c: int, me: int) -> wp.float64:
-        """Compute the inner product x . y of a load case, by all threads of the block."""
+        """Return the inner product x . y of a load case, computed by all threads of the block."""
         own = wp.float64(0.0)
         for r in range(me, x.shape[0], threads):
             own += x[r, c] * y[r, c]
@@ -39,13 +39,13 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def is_nonzero(x: wp.array2d(dtype=wp.float64), i: int, c: int) -> bool:
-        """Return True if x is not zero at a node."""
+        """Return True if x is not zero at node i."""
         zero = wp.float64(0.0)
         return x[3 * i, c] != zero or x[3 * i + 1, c] != zero or x[3 * i + 2, c] != zero
 
     @wp.func
     def has_same_nodes(x: wp.array2d(dtype=wp.float64), place: wp.array2d(dtype=wp.int32), c: int, me: int) -> bool:
-        """Return True if the nodes where x is not zero are exactly those that have a place."""
+        """Return True if x is nonzero at exactly those nodes whose index in `place` is not -1."""
         other = wp.float64(0.0)
         for i in range(me, place.shape[0], threads):
             if is_nonzero(x, i, c) != (place[i, c] >= 0):
@@ -62,7 +62,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         c: int,
         me: int,
     ) -> int:
-        """List the nodes where x is not zero, ascending, with their places (others: -1), and return their number."""
+        """List the nodes with nonzero x in ascending order, set `place` (-1 for others), and return their number."""
         n = place.shape[0]
         own = (n + threads - 1) // threads
         begin, end = wp.min(me * own, n), wp.min((me + 1) * own, n)
@@ -92,14 +92,14 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         c: int,
         me: int,
     ):
-        """Compute the gradient of barrier and proximal term at x."""
+        """Compute the gradient of the barrier and of the proximal term at x."""
         for r in range(me, x.shape[0], threads):
             s.slope[r, c] = s.held[r, c] * (x[r, c] - here[r, c])
         add_force(x, stage, near, c, me, s.slope)
 
     @wp.func
     def assemble_curvature(stage: Stage, near: Near, definite: int, m: int, s: Scratch, c: int, me: int):
-        """Assemble the curvature of barrier and proximal term at w between the m touched nodes."""
+        """Assemble the curvature matrix of the barrier and of the proximal term at w, for the m touched nodes."""
         for i in range(me // across, 3 * m, down):
             for j in range(me % across, 3 * m, across):
                 s.stiff[c, i, j] = wp.float64(0.0)
@@ -111,7 +111,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def get_change(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
-        """Return the change of the compliance by strained tissue."""
+        """Return an entry of the change of the compliance by strained tissue."""
         own = wp.float64(0.0)
         if model.own.shape[1] > 0:
             own = wp.float64(model.own[c, i, j])
@@ -119,12 +119,12 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def get_compliance(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
-        """Return the compliance between touched nodes, symmetrised: half precision may have rounded its columns."""
+        """Return a compliance entry of touched nodes, symmetrised, since half precision may round the columns."""
         return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + get_change(model, c, i, j)
 
     @wp.func
     def list_changes(model: ComplianceModel, s: Scratch, c: int, me: int) -> int:
-        """List the nodes on which the change acts, compute the L-BFGS weights of it, and return their number."""
+        """List the nodes on which the force change acts, compute its L-BFGS weights, and return the number of nodes."""
         m = list_nodes(s.change, s.acts, s.acting, s.counts, ACTING, c, me)
         pairs = model.history.shape[1]
         for p in range(me, pairs, threads):
@@ -144,7 +144,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def compute_motion(model: ComplianceModel, out: wp.array2d(dtype=wp.float64), s: Scratch, c: int, me: int):
-        """Compute the motion of all nodes under the negative change of the forces: out = -C change."""
+        """Compute the motion of all nodes under the negative force change: out = -C change."""
         m, size = list_changes(model, s, c, me), out.shape[0]
         for first in range(me, size, wide * threads):
             sums = Strip()
@@ -169,7 +169,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def compute_touched_motion(model: ComplianceModel, size: int, s: Scratch, c: int, me: int):
-        """Compute the motion of the touched nodes, `size` rows, under the change of the forces: at = C change."""
+        """Compute the motion of the touched nodes, `size` rows, under the force change: at = C change."""
         m = list_changes(model, s, c, me)
         for i in range(me, size, threads):
             row = 3 * s.touched[c, i // 3] + i % 3
@@ -184,7 +184,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def assemble_compliance(model: ComplianceModel, m: int, s: Scratch, c: int, me: int) -> wp.float64:
-        """Assemble the compliance between m touched nodes, and return its mean diagonal."""
+        """Assemble the compliance matrix of the m touched nodes, and return the mean of its diagonal."""
         pairs = model.history.shape[1]
         for j in range(me, 3 * m, threads):
             row = 3 * s.touched[c, j // 3] + j % 3
@@ -213,9 +213,9 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def apply_woodbury(m: int, s: Scratch, c: int, me: int) -> bool:
-        """Subtract D (1 + C D)^-1 a from the change, for the compliance C = L L' of `soft`; False if not convex.
+        """Subtract D (1 + C D)^-1 a from the force change, for the compliance C = L L'; return False if not convex.
 
-        It is D (a - L (1 + L' D L)^-1 L' D a): Woodbury 1950. a is `at` at the touched nodes.
+        This equals D (a - L (1 + L' D L)^-1 L' D a), Woodbury 1950, where a is `at` of the scratch arrays.
         """
         size = 3 * m
         for i in range(me // across, size, down):
@@ -269,7 +269,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def are_known(model: ComplianceModel, m: int, s: Scratch, c: int) -> bool:
-        """Return True if the compliance is available at all touched nodes."""
+        """Return True if the columns of the compliance are available for all touched nodes."""
         missing = wp.int32(0)
         for i in range(m):
             missing += 1 - model.known[s.touched[c, i]]
@@ -292,7 +292,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         out: wp.array2d(dtype=wp.float64),
         status: wp.array(dtype=wp.int32),
     ):
-        """Solve as `contact_forces.solve_contact_forces` for load cases with the status `OPEN`."""
+        """Solve for contact forces, as `contact_forces.solve_contact_forces`, in load cases with the status `OPEN`."""
         c, me = wp.tid()
         c = c + first
         if status[c] != OPEN:

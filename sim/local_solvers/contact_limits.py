@@ -5,28 +5,28 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ContactLimits:
-    """Limits of steps under tools: backtracking, proximal term, and hand-over to Newton.
+    """Limits of contact steps: backtracking, proximal term, and change to Newton's method.
 
     Parameters
     ----------
     forcing, tolerance_factor
-        Relative tolerance of the tools' forces: fraction of the relative residual, or of the tolerance if larger.
+        Relative tolerance of the tool forces: the larger of these fractions of the relative residual and the tolerance.
     residual_factor, min_good_step
-        A good step leaves at most this fraction of the residual, and is longer than this fraction of the direction.
+        A step is good if it leaves at most this fraction of the residual and exceeds this fraction of the direction.
     patience
-        Number of steps in a row that are not good, after which Newton takes over.
+        Number of successive steps that are not good, after which Newton's method continues.
     reset_length
-        Step length below which backtracking ends and the model is reset, if there is one.
+        Step length below which backtracking ends and the model, if any, is reset.
     accepted_length
-        Step length at or below which a step is accepted without test.
+        Step length at or below which a step is accepted without a test.
     stale_factor
         Remaining fraction of the residual above which the model of strained tissue is recomputed.
     min_curvature
-        [J] Product s . y at or below which a curvature pair is round-off, and not stored.
+        Product s . y [J] at or below which a curvature pair is round-off and not stored.
     proximal, growth, max_failures
-        First proximal coefficient; factor of its growth and reduction; failures in a row until the model is reset.
+        First proximal coefficient; factor of its growth and reduction; successive failures until the model is reset.
     ended_fraction
-        Fraction of ended load cases at which they leave the batch: this copies all arrays.
+        Fraction of ended load cases at which these are removed from the batch, which copies all arrays.
     """
 
     forcing: float = 0.03

@@ -2,7 +2,7 @@
 
     (K0 + E D E')^-1 = H - H E (1 + D C)^-1 D E' H,    H = K0^-1,  C = E' H E:
 
-Woodbury 1950, with D positive semi-definite. A factor of K0 alone lacks contact, which is a thousand times as stiff.
+Woodbury 1950, with D positive semi-definite. A factor of only K0 lacks contact, which is a thousand times as stiff.
 """
 
 import numpy as np
@@ -19,14 +19,14 @@ from .contact_forces import FORCES
 
 
 class ContactPreconditioner:
-    """Preconditioner with contact for a single load case; for larger batches it is that of the undeformed mesh.
+    """Preconditioner with contact for a single load case; larger batches use the undeformed preconditioner.
 
     Parameters
     ----------
     rest
-        Preconditioner of the undeformed problem.
+        Preconditioner of the undeformed mesh.
     compliance
-        Its compliance at the touchable nodes.
+        Compliance of the undeformed mesh at the touchable nodes.
     barrier
         Barrier of the tools.
     """
@@ -39,7 +39,7 @@ class ContactPreconditioner:
         self._felt: tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Compute D where the problem was last linearised."""
+        """Compute D, the curvature of the barrier, at the last linearisation."""
         self._rest.prepare(problem, columns)
         self._felt = None
         if columns == 1:
@@ -53,7 +53,7 @@ class ContactPreconditioner:
                     self._felt = nodes, curvature, lu_factor(whole)
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Apply the undeformed inverse, and subtract the Woodbury correction for the touched nodes."""
+        """Compute out by the undeformed inverse of r minus the Woodbury correction for the touched nodes."""
         self._rest.apply(r, live, out)
         if self._felt is not None:
             z, (nodes, curvature, whole) = out.numpy(), self._felt
@@ -67,9 +67,9 @@ class ContactPreconditioner:
 def build_contact_preconditioner(
     problem: Problem, rest: Preconditioner, contact: ContactDescent | None
 ) -> Preconditioner:
-    """Build a preconditioner with the contact of tools, from `contact`, or from a tool barrier next to another one.
+    """Return a preconditioner with tool contact, from `contact`, or from a tool barrier if there is another barrier.
 
-    If the skull can separate too, the undeformed stiffness includes half of its contact stiffness.
+    If the skull can also separate, the undeformed stiffness includes half of the skull's contact stiffness.
     """
     if contact is not None:
         return ContactPreconditioner(rest, contact.compliance, contact.barrier)

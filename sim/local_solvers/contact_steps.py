@@ -1,4 +1,4 @@
-"""Contact steps of single load cases in fixed arrays, which CUDA replays as captured graphs.
+"""Contact steps of single load cases with fixed arrays, which CUDA replays as captured graphs.
 
 The steps are those of `contact_descent.py`, which makes all decisions between them.
 """
@@ -39,7 +39,7 @@ STATUS, TRIED_LENGTH, PREDICTED_DECREASE, TRIAL_SLOPE, MAX_SQUARE_NORM, WHOLE_SU
 
 @dataclass(frozen=True)
 class ContactStepKernels:
-    """Kernels between the matrix products of a step, in one scalar type."""
+    """Kernels that run between the matrix products of a step, for one scalar type."""
 
     compute_positions: wp.Kernel
     compute_change: wp.Kernel
@@ -50,7 +50,7 @@ class ContactStepKernels:
 
 @cache
 def build_kernels(device: Device) -> ContactStepKernels:
-    """Build the kernels for a device's scalar type, for one load case."""
+    """Return the kernels for one load case, in the scalar type of a device."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -63,7 +63,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         here: wp.array2d(dtype=wp.float64),
         there: wp.array2d(dtype=wp.float64),
     ):
-        """Compute the present positions of nodes, and those under the known forces."""
+        """Compute the current positions of the nodes, and their positions under the known forces."""
         i = wp.tid()
         here[i, 0] = wp.float64(u[rows[i], 0])
         there[i, 0] = here[i, 0] - wp.float64(rest[rows[i], 0]) - wp.float64(more[i, 0])
@@ -75,7 +75,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Compute the change of the forces."""
+        """Compute the change of the tool forces."""
         i = wp.tid()
         out[i, 0] = scalar(found[i, 0] - force[i, 0])
 
@@ -95,7 +95,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Add forces to their rows: out_rows(i) += f_i."""
+        """Add the forces to selected rows: out_rows(i) += f_i."""
         i = wp.tid()
         out[rows[i], 0] += scalar(force[i, 0])
 
@@ -110,7 +110,7 @@ def build_kernels(device: Device) -> ContactStepKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """Write the results for the host to one array."""
+        """Write all results for the host to one array."""
         out[STATUS] = wp.float64(status[0])
         out[TRIED_LENGTH] = wp.float64(length[0])
         out[PREDICTED_DECREASE] = -predicted[0]
@@ -126,9 +126,9 @@ def build_kernels(device: Device) -> ContactStepKernels:
 
 
 def read_step_result(output: np.ndarray, norms: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return length, slope ahead [J], residual [N] and its scale [N] of a step, (1,) each, from `ContactSteps` output.
+    """Return length, slope at its end [J], residual [N] and residual scale [N] of a step, (1,) each, from the output.
 
-    `norms` (1,) is `ResidualEvaluator.square`.
+    `output` is from `ContactSteps`; `norms` (1,) is `ResidualEvaluator.square`.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         free = np.sqrt(output[[FREE_SUM]])
@@ -138,7 +138,7 @@ def read_step_result(output: np.ndarray, norms: np.ndarray) -> tuple[np.ndarray,
 
 
 class ContactSteps:
-    """Contact steps of one load case, in fixed arrays. The views of `hold` may be written to between steps.
+    """Contact steps of one load case with fixed arrays. The views from `load_state` may be changed between steps.
 
     Parameters
     ----------
@@ -147,9 +147,9 @@ class ContactSteps:
     barrier
         Tool barrier of the problem.
     compliance
-        Compliance at the touchable nodes, all computed, and at other nodes after them.
+        Compliance at the touchable nodes, with all columns computed, and then at other nodes.
     size
-        Rows 3k of the largest model of strained tissue.
+        Number of rows 3k of the largest model of strained tissue.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class ContactSteps:
         self._graphs: dict[str, wp.Graph] = {}
 
     def load_model(self, model: StrainedModel) -> None:
-        """Load a model of strained tissue for one load case."""
+        """Copy a model of strained tissue for one load case to the fixed arrays."""
         for array in (self._nodes, self._matrix, self._model.own):
             array.zero_()
         if model.has_strained_nodes:
@@ -200,26 +200,26 @@ class ContactSteps:
             to_view(self._model.own)[:] = model.change
 
     def compute_direction(self, tolerance: float, proximal: float, allow_nonconvex: bool = False) -> np.ndarray:
-        """Solve for the tools' forces with a proximal term, their direction and longest step: (`OUTPUT_SIZE`,) results.
+        """Solve for tool forces with a proximal term, direction and longest step; return results (`OUTPUT_SIZE`,).
 
-        With `allow_nonconvex` the model need not be convex. If the status is not `SOLVED`, the other results are
-        invalid. The returned array is overwritten by the next call.
+        If `allow_nonconvex`, the model may be nonconvex. If the status is not `SOLVED`, the other results are invalid.
+        The next call overwrites the returned array.
         """
         self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, proximal
         ends = build_kernel_limits(NONCONVEX if allow_nonconvex else FORCES, FORCES.first_capacity)
         return self._run("bent" if allow_nonconvex else "aim", lambda: self._compute_direction(ends))
 
     def shorten_step(self, length: float) -> np.ndarray:
-        """Evaluate a shorter step; return its results."""
+        """Evaluate a step with a shorter `length`, and return its results (`OUTPUT_SIZE`,)."""
         self._up.numpy()[LENGTH] = length
         return self._run("again", self._retry_shorter_step)
 
     def take_step(self) -> None:
-        """Accept the last step."""
+        """Accept the last trial step: its state becomes the current state."""
         self._run("accept", self._take_step)
 
     def set_tools(self, constant: wp.array) -> bool:
-        """Load the tools' poses from the problem, and constant gradients (3N, 1) [N]; False if there are no tools."""
+        """Load tool poses from the problem, and constant gradients (3N, 1) [N]; return False if there are no tools."""
         reduction = self._barrier.reduce(np.zeros(1, int))
         if reduction is None:
             return False
@@ -229,7 +229,7 @@ class ContactSteps:
         return True
 
     def load_state(self, state: ContactState, force: Any, response: Any) -> tuple[ContactState, Any, Any, Any]:
-        """Load a state, forces, and linear response; return views on them, and on the direction `x`."""
+        """Load a state, forces and linear response; return views of these arrays, and of the direction."""
         here = [to_view(array) for array in (self._u, self._smooth, self._whole, self._force, self._rest, self._x)]
         for mine, its in zip(here, (state.u, state.smooth_gradient, state.gradient, force, response), strict=False):
             mine[:] = its
@@ -289,7 +289,7 @@ class ContactSteps:
         self._try()
 
     def _try(self) -> None:
-        """Evaluate the trial step: its residual, and the linear response to it."""
+        """Evaluate the trial step: the residual there, and the linear response to this residual."""
         device, problem, k = self._device, self._problem, build_kernels(self._device)
         inputs = [self._u, self._length, self._x]
         device.launch(columns_kernels_of(device).combine, self._u.shape, inputs, [self._new_u])
@@ -318,7 +318,7 @@ class ContactSteps:
             wp.copy(to, new)
 
     def _press(self) -> None:
-        """Multiply the motions near the tools by the matrix of the model."""
+        """Multiply the motions of strained nodes by the matrix of the strained tissue model."""
         self._own.zero_()
         inputs = [self._matrix, self._nodes, self._near]
         dim = (ROW_THREADS, 1, self._matrix.shape[2])
@@ -327,7 +327,7 @@ class ContactSteps:
         )
 
     def _give(self, force: wp.array, out: wp.array, rows: int) -> None:
-        """Add the motion under forces to the first `rows` of `out`."""
+        """Add the motion of the undeformed mesh under `force` to the first `rows` of `out`."""
         inputs = [self._compliance, self._every, force]
         self._device.launch(
             build_gemv_kernel(self._device, wp.float64, wp.float64, ROW_THREADS), (ROW_THREADS, 1, rows), inputs, [out]
@@ -340,6 +340,6 @@ class ContactSteps:
         self._problem.constraint.project_nodes(out)
 
     def _allocate_pair(self, count: int) -> tuple[wp.array, wp.array]:
-        """Allocate `count` values on the device, and as many in pinned host memory for direct transfer."""
+        """Return arrays of `count` values on the device, and in pinned host memory for direct transfer."""
         there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
         return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)

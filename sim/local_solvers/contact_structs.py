@@ -3,16 +3,16 @@
 import warp as wp
 
 OPEN, SOLVED, NO_EQUILIBRIUM, TOO_MANY_TOUCHED, UNKNOWN = (wp.constant(number) for number in range(5))
-"""Status of a load case: open; solved; no equilibrium; too many touched nodes; compliance not yet computed."""
+"""Status of a load case: open; solved; no equilibrium; too many touched nodes; compliance columns missing."""
 
 
 @wp.struct
 class ComplianceModel:
-    """Compliance of nodes: that of the undeformed mesh, transposed (3n, 3n), and the updates of b load cases.
+    """Compliance of n nodes: compliance of the undeformed mesh, transposed (3n, 3n), and updates of b load cases.
 
-    `known` (n,): 1 if a node's column is computed. L-BFGS update: `history` (b, p, 3n), `middle` (b, p, p). `own`
-    (b, 3n, 3n) is the change by strained tissue, or (b, 0, 0). `diagonal_shift` is the shift of the matrix between
-    touched nodes, relative to its mean diagonal, that makes it positive definite.
+    `known` (n,) is 1 if the columns of a node are computed. `history` (b, p, 3n) and `middle` (b, p, p) are the L-BFGS
+    update. `own` (b, 3n, 3n) is the change by strained tissue, or (b, 0, 0). `diagonal_shift` is a shift of the matrix
+    of touched nodes, relative to its mean diagonal, which makes the matrix positive definite.
     """
 
     rest: wp.array2d(dtype=wp.float64)
@@ -25,7 +25,7 @@ class ComplianceModel:
 
 @wp.struct
 class Limits:
-    """Limits of the iteration, as `contact_forces.ForceLimits`; `capacity` is the capacity for touched nodes."""
+    """Limits of the iteration, as in `contact_forces.ForceLimits`; `capacity` is that for touched nodes."""
 
     max_iterations: wp.int32
     max_backtracks: wp.int32
@@ -35,10 +35,10 @@ class Limits:
 
 @wp.struct
 class Scratch:
-    """Scratch arrays of b load cases; n nodes, at most m touched ones.
+    """Scratch arrays of b load cases, with n nodes and at most m touched nodes.
 
-    `force`, .., `held`: (3n, b). `place`, `acts` (n, b): index of a node in `touched`, `acting` (b, n), or -1.
-    `counts` (b, 2): lengths of both lists. Matrices (b, 3m, 3m), vectors (b, 3m).
+    `force`, .., `held` have shape (3n, b). `place` and `acts` (n, b) are indices of a node in `touched` and `acting`
+    (b, n), or -1; `counts` (b, 2) are the lengths of these two lists. Matrices (b, 3m, 3m), vectors (b, 3m).
     """
 
     force: wp.array2d(dtype=wp.float64)

@@ -1,7 +1,7 @@
-"""Outer loop of nonlinear elimination: local subproblem and whole problem alternate until equilibrium.
+"""Outer loop of nonlinear elimination: solutions of local and whole problem alternate until equilibrium.
 
 Cai, Keyes 2002, "Nonlinearly preconditioned inexact Newton algorithms", SIAM J. Sci. Comput. 24:183-200. The local
-solver defines one cycle; this module decides for each load case of a batch when cycles end.
+solver defines one cycle; this module determines when the cycles of each load case end.
 """
 
 from collections.abc import Callable
@@ -26,11 +26,11 @@ class CycleLimits:
     max_cycles
         Maximum number of cycles.
     patience
-        Cycles within which the residual must be halved; otherwise another solver takes over.
+        Number of cycles within which the residual must be halved; otherwise another solver continues.
     max_rise
-        Largest residual relative to the start's. Strong loads pass through large residuals; beyond this they diverge.
+        Maximum residual relative to the initial residual. Strong loads cause large residuals; above it they diverge.
     forcing, tolerance_factor
-        Residual of the local solution: fraction of the whole residual, or of the tolerance if larger.
+        Residual of the local solution: the larger of these fractions of the whole residual and of the tolerance.
     """
 
     max_cycles: int = 20
@@ -42,16 +42,16 @@ class CycleLimits:
 
 DEFAULT_CYCLE_LIMITS = CycleLimits()  # Default.
 Cycle = Callable[[ResidualEvaluator, ResidualState, np.ndarray], ResidualState]
-"""Function that returns the next states of b load cases; the local solution may keep residuals (b,) [N]. A load case
-without an accepted step gets a residual that is not finite."""
+"""Function (evaluator, states, local tolerance (b,) [N]) that returns the next states of b load cases. A load case
+without an accepted step has a residual that is not finite."""
 
 
 def run_cycles(
     problem: Problem, start: wp.array, tolerance: np.ndarray, max_cycles: int, limits: CycleLimits, cycle: Cycle
 ) -> DescentResult:
-    """Iterate from start (3N, b) [m], as `Lbfgs.descend`, in at most `max_cycles` cycles; returns no L-BFGS history.
+    """Return the result, as `Lbfgs.descend`, after at most `max_cycles` cycles from `start` (3N, b) [m]; no history.
 
-    Each load case ends in the state with its smallest residual, or within its tolerance (b,).
+    The final state of each load case is within its tolerance (b,), or has the smallest residual of all cycles.
     """
     device, count = problem.device, start.shape[1]
     judge = build_evaluator(problem, start)

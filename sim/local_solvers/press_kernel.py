@@ -1,4 +1,4 @@
-"""Kernel that multiplies motions of some nodes by a symmetric matrix between them."""
+"""Kernel that multiplies the motions of selected nodes by a symmetric matrix."""
 
 from functools import cache
 from typing import Any
@@ -10,9 +10,9 @@ from ..runtime.device import Device, forward_kernel
 
 @cache
 def build_gemv_kernel(device: Device, matrix_type: Any, sum_type: Any, threads_per_row: int = 1) -> wp.Kernel:
-    """Build the kernel that multiplies by each load case's matrix, over (part, load case, row).
+    """Return the kernel that multiplies by the matrix of each load case, over (part, load case, row).
 
-    `matrix_type` and `sum_type` are the types of the matrix and of its products; `threads_per_row` threads share a row.
+    `matrix_type` and `sum_type` are the types of matrix and products; `threads_per_row` threads compute a row together.
     """
     scalar = device.scalar
 
@@ -24,7 +24,7 @@ def build_gemv_kernel(device: Device, matrix_type: Any, sum_type: Any, threads_p
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Add E M E' motion to out; M is symmetric, and read along its columns."""
+        """Add E M E' motion to out; the symmetric matrix M is read along its columns."""
         part, c, i = wp.tid()
         count = matrix.shape[2]
         chunk = (count + threads_per_row - 1) // threads_per_row

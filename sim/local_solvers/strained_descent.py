@@ -1,9 +1,9 @@
-"""L-BFGS for single loads on the CPU, from a stiffness that includes the strain stiffening of tissue.
+"""L-BFGS for single loads on the CPU; the initial stiffness includes the strain stiffening of tissue.
 
     (K0 + E D E')^-1 g = z - H E (1 + D C)^-1 D E' z,    z = H g,    H = K0^-1,  C = E' H E
 
-Woodbury 1950, with D as in `strained_part.py`. From the undeformed stiffness L-BFGS takes four times as many steps.
-Most tissue that is strained in one frame is strained in the next, whose descent begins with the same D.
+Woodbury 1950, with D as in `strained_part.py`. With the undeformed stiffness, L-BFGS takes four times as many steps.
+Strained tissue changes little between two frames, so the next descent begins with the same D.
 """
 
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ from .batch_elimination import list_open_vertices
 from .strained_part import StrainedPart, StrainLimits
 
 SINGLE_LIMITS = StrainLimits(max_nodes=320, max_omitted=np.inf)
-"""Limits for a single model, which has all the memory, and may be incomplete: L-BFGS corrects the remainder."""
+"""Limits for a single model, which may use all memory and be incomplete: L-BFGS corrects the remainder."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class Renewal:
     Parameters
     ----------
     max_reused_steps
-        Maximum steps of a descent whose model is handed on to the next.
+        Maximum number of steps of a descent whose model is reused in the next descent.
     max_evaluations
-        L-BFGS evaluations without convergence, after which the model is recomputed at the present state.
+        Number of L-BFGS evaluations without convergence after which the model is recomputed at the current state.
     """
 
     max_reused_steps: int = 4
@@ -48,10 +48,10 @@ class Renewal:
 
 @dataclass(frozen=True, eq=False)
 class StiffnessUpdate:
-    """Stiffness of strained tissue in excess of the undeformed one.
+    """Tangent stiffness of strained tissue minus its undeformed stiffness.
 
-    rows (n,) of the 3N; added (n, n) D [N/m]; factor (n, n) and pivots (n,) of 1 + D C, from LAPACK. Matrices are in
-    single precision.
+    `rows` (n,) of the 3N rows; `added` (n, n) is D [N/m]; `factor` (n, n) and `pivots` (n,) of 1 + D C are from LAPACK.
+    Matrices are in single precision.
     """
 
     rows: np.ndarray
@@ -60,12 +60,12 @@ class StiffnessUpdate:
     pivots: np.ndarray
 
     def compute_force(self, motion: np.ndarray) -> np.ndarray:
-        """Compute the correcting forces (n,) [N] for a linear response (3N,) [m] of the undeformed mesh."""
+        """Return the correction forces (n,) [N] for a linear response `motion` (3N,) [m] of the undeformed mesh."""
         return -lu_solve((self.factor, self.pivots), self.added @ motion[self.rows], check_finite=False)
 
     @property
     def warm_start(self) -> dict[str, np.ndarray]:
-        """Entries for the `warm` data of a solution."""
+        """Entries, by name, for the `warm` data of a solution."""
         return {name: getattr(self, field)[None] for field, name in UPDATE_KEYS.items()}
 
 
@@ -74,7 +74,7 @@ UPDATE_KEYS = {field: f"stiffening's {field}" for field in ("rows", "added", "fa
 
 
 class StiffenedPreconditioner:
-    """Preconditioner of single load cases: factor of the undeformed stiffness, with the update of strained tissue."""
+    """Preconditioner of single load cases: factor of the undeformed stiffness, with an update for strained tissue."""
 
     on_device = False
 
@@ -83,10 +83,10 @@ class StiffenedPreconditioner:
         self.stiffening: StiffnessUpdate | None = None
 
     def prepare(self, problem: Problem, columns: int) -> None:
-        """Do nothing: factor and update are valid for every state."""
+        """Do nothing, since factor and update do not depend on the state."""
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Apply the factor, then the Woodbury correction, unless this would not give a descent direction."""
+        """Apply the factor and the Woodbury correction; omit the correction if the result is no descent direction."""
         self._rest.apply(r, live, out)
         if self.stiffening is None:
             return
@@ -102,14 +102,14 @@ class StiffenedPreconditioner:
 
 
 class StrainedDescent:
-    """Solver for single loads on one problem, on the CPU.
+    """Solver for single loads of one problem on the CPU.
 
     Parameters
     ----------
     problem, factor
-        Whole problem, and the factor of its undeformed stiffness.
+        Problem of the whole mesh, and the factor of its undeformed stiffness.
     part
-        Finder of strained tissue.
+        Object that finds the strained tissue.
     renewal
         Limits after which a model is recomputed.
     """
@@ -122,7 +122,7 @@ class StrainedDescent:
     def descend(
         self, start: wp.array, tolerance: np.ndarray, max_iter: int, warm_start: Mapping[str, np.ndarray] | None = None
     ) -> DescentResult:
-        """Solve as `Lbfgs.descend`, for one load case; `warm_start` is the model. The first call takes 0.5 s more."""
+        """Return the result as `Lbfgs.descend`, for one load case, from a model. The first call takes 0.5 s more."""
         self._part.prepare()
         u, left, steps = start, max_iter, 0
         self._preconditioner.stiffening = self.get_warm_start(warm_start) or self._build_stiffness_update(u)
@@ -140,7 +140,7 @@ class StrainedDescent:
         return replace(found, steps=np.array([steps]), warm_start=kept)
 
     def _build_stiffness_update(self, u: wp.array) -> StiffnessUpdate | None:
-        """Compute the update at u (3N, 1) [m]; None if no tissue is strained."""
+        """Return the stiffness update at u (3N, 1) [m], or None if no tissue is strained."""
         found = self._part.find_stiffening(u, np.arange(1))
         if found is None or not found[0].shape[1]:
             return None
@@ -156,7 +156,7 @@ class StrainedDescent:
             return StiffnessUpdate(compliance.rows[place], added, *lu_factor(system, True, check_finite=False))
 
     def get_warm_start(self, warm_start: Mapping[str, np.ndarray] | None) -> StiffnessUpdate | None:
-        """Read the update of an earlier descent of this problem from warm-start data; None if it does not fit."""
+        """Return the update of an earlier descent from warm-start data, or None if it does not fit this problem."""
         if warm_start is None or any(name not in warm_start for name in UPDATE_KEYS.values()):
             return None
         rows, added, factor, pivots = (np.asarray(warm_start[name]) for name in UPDATE_KEYS.values())
@@ -176,7 +176,7 @@ class StrainedDescent:
 def build_strained_part(
     problem: Problem, preconditioner: Preconditioner, space: Discretisation, limits: StrainLimits = SINGLE_LIMITS
 ) -> StrainedPart:
-    """Build the finder of strained tissue for a mesh with a small opening: models use the nodes nearest to it."""
+    """Return the object that finds strained tissue, for a mesh with a small craniotomy; models use near nodes."""
     distance, _ = KDTree(space.nodes[list_open_vertices(space, problem.constraint)]).query(space.nodes)
     near = np.sort(np.argsort(distance, kind="stable")[: limits.max_candidates])
     return StrainedPart(problem, Compliance(problem, preconditioner, near), 0, limits)

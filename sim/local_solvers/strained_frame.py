@@ -1,6 +1,6 @@
-"""Model of strained tissue for live frames on a device: fixed arrays, recomputed between frames.
+"""Model of strained tissue for live frames on a device, with fixed arrays and recomputed between frames.
 
-It is that of `strained_descent.py`, with the matrix M = -(1 + D C)^-1 D explicit: a captured graph multiplies by it.
+The model is that of `strained_descent.py`, but with an explicit matrix M = -(1 + D C)^-1 D for a captured graph.
 """
 
 from collections.abc import Mapping
@@ -26,9 +26,9 @@ ROW_THREADS = 16
 
 @dataclass(frozen=True, eq=False)
 class UpdatedModel:
-    """Model on the device, never modified: nodes (1, n) of the mesh, matrix (1, 3n, 3n) float32 M [N/m].
+    """Immutable model on the device: `nodes` (1, n) of the mesh, and `matrix` M (1, 3n, 3n) float32 [N/m].
 
-    Unused entries are zero.
+    Unused entries of the matrix are zero.
     """
 
     nodes: wp.array
@@ -36,14 +36,14 @@ class UpdatedModel:
 
     @property
     def warm_start(self) -> dict[str, np.ndarray]:
-        """Entries for the `warm` data of a solution."""
+        """Entries, by name, for the `warm` data of a solution."""
         return {NODES_KEY: self.nodes.numpy(), MATRIX_KEY: self.matrix.numpy()}
 
 
 def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel | None:
-    """Compute the model at u (3N, 1) [m], which the problem has begun, of a prepared part.
+    """Return the model of a prepared part at u (3N, 1) [m], for the load case with which the problem has begun.
 
-    None if strained tissue does not fit. The host does not wait for the GPU.
+    Return None if the strained tissue exceeds the size of the model. The host does not wait for the GPU.
     """
     with run_in_order(device):
         found = part.find_stiffening(u, np.arange(1), fixed_size=True)
@@ -67,7 +67,7 @@ def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedM
 
 
 def restore_updated_model(warm: Mapping[str, np.ndarray], device: Device, count: int, size: int) -> UpdatedModel | None:
-    """Read a model for `count` nodes from warm-start data; None if there is none, or it does not have 3n = `size`."""
+    """Return the model for `count` nodes from warm-start data; None if missing or not of size 3n = `size`."""
     if NODES_KEY not in warm or MATRIX_KEY not in warm:
         return None
     nodes, matrix = np.asarray(warm[NODES_KEY]), np.asarray(warm[MATRIX_KEY])
@@ -79,7 +79,7 @@ def restore_updated_model(warm: Mapping[str, np.ndarray], device: Device, count:
 
 
 class UpdatedPreconditioner:
-    """Preconditioner of single load cases: that of the undeformed mesh, with the update of the loaded model.
+    """Preconditioner of single load cases: inverse of the undeformed stiffness, updated by the loaded model.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class UpdatedPreconditioner:
     problem
         Problem of this stiffness.
     size
-        Rows 3n of the models.
+        Number of rows 3n of the models.
     """
 
     def __init__(self, rest: Preconditioner, problem: Problem, size: int):
@@ -99,7 +99,7 @@ class UpdatedPreconditioner:
         self._pull, self._more = (problem.device.allocate(problem.rows, 1) for _ in range(2))
 
     def load_model(self, model: UpdatedModel | None) -> None:
-        """Load another model, or none."""
+        """Load another model; None: use the undeformed stiffness."""
         if model is None:
             self._matrix.zero_()
         else:
@@ -111,7 +111,7 @@ class UpdatedPreconditioner:
         self._rest.prepare(problem, columns)
 
     def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Apply the undeformed inverse to r, and again to the forces that the model adds."""
+        """Apply the undeformed inverse to r, then to the forces that the model adds."""
         device = self._problem.device
         self._rest.apply(r, live, out)
         self._pull.zero_()

@@ -1,9 +1,9 @@
-"""Model of the inverse stiffness with strained tissue: tangent stiffness there, undeformed stiffness elsewhere.
+"""Model of the inverse stiffness with strained tissue: tangent stiffness in strained tissue, else undeformed stiffness.
 
     (K0 + E D E')^-1 = H + H E M E' H,    M = -(1 + D C)^-1 D,    H = K0^-1,  C = E' H E:
 
-Woodbury 1950. D is the excess of the tangent stiffness of strained elements over the undeformed one, on their nodes
-alone. Under a deep press K0 has a third of the true stiffness, and a step with K0 is three times too long.
+Woodbury 1950. D is the tangent stiffness minus the undeformed stiffness of strained elements, on their nodes only.
+Under a deep press, K0 is a third of the actual stiffness, and a step with K0 is three times too long.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ class StrainLimits:
     Parameters
     ----------
     min_strain
-        |H|, H the displacement gradient: below it the undeformed stiffness is used.
+        Norm |H| of the displacement gradient below which the undeformed stiffness is used.
     max_nodes
-        Maximum number of nodes of a model, those with the largest |H| first.
+        Maximum number of nodes of a model; nodes with the largest |H| have priority.
     max_omitted
-        If nodes beyond this number are strained more than this, there is no model: it would be incomplete.
+        If nodes beyond the maximum number have a larger |H| than this, no model is used, since it would be incomplete.
     max_candidates
-        Maximum number of candidate nodes: the touchable ones, and the nearest to them. Their compliance has three times
-        as many rows.
+        Maximum number of candidate nodes: the touchable nodes and the nearest nodes to these. The compliance has three
+        rows per candidate node.
     max_cases
-        Largest batch with models; larger ones use L-BFGS pairs. Models would not be faster there: a launch lasts as
-        long as its slowest load case, and the better model makes contact forces harder to solve for.
+        Largest batch with models; larger batches use L-BFGS pairs. Models would not be faster there: a launch lasts as
+        long as its slowest load case, and a better model makes the contact forces harder to solve.
     max_bytes
-        Memory of the matrices inverted at once [bytes].
+        Maximum memory of the matrices inverted together [bytes].
     """
 
     min_strain: float = 0.15
@@ -64,15 +64,15 @@ class StrainLimits:
 
 STRAIN_LIMITS = StrainLimits()  # Default.
 CUDA_STRAIN_LIMITS = StrainLimits(min_strain=0.1, max_nodes=480, max_omitted=0.5, max_candidates=1600)
-"""Limits on a GPU, which inverts a larger model in less time than the saved steps take."""
+"""Limits on a GPU, where a larger model saves more time than its inversion takes."""
 
 
 @dataclass(frozen=True, eq=False)
 class StrainedModel:
-    """Models of b load cases, as updates of the undeformed compliance: arrays of `views.get_library`.
+    """Models of b load cases as updates of the undeformed compliance, in arrays of `views.get_library`.
 
-    nodes (b, k) are indices into the compliance, matrix (b, 3k, 3k) is M [N/m], zero where a load case has fewer nodes.
-    own (b, 3n, 3n) [m/N] is the change of the compliance between the n touchable nodes.
+    `nodes` (b, k) are indices into the compliance. `matrix` (b, 3k, 3k) is M [N/m], with zeros if a load case has fewer
+    nodes. `own` (b, 3n, 3n) [m/N] is the change of the compliance between the n touchable nodes.
     """
 
     nodes: Any
@@ -86,19 +86,19 @@ class StrainedModel:
 
     @property
     def is_strained(self) -> np.ndarray:
-        """True (b,) where a load case has strained nodes."""
+        """Mask (b,) of the load cases with strained nodes."""
         return to_host((self.matrix != 0.0).any(-1).any(-1))
 
     def select(self, columns: np.ndarray) -> StrainedModel:
-        """Return the models of some load cases (k,)."""
+        """Return the models of the load cases `columns` (k,)."""
         return StrainedModel(self.nodes[columns], self.matrix[columns], self.change[columns])
 
     def reset_columns(self, columns: np.ndarray) -> None:
-        """Reset the models of some load cases (k,) to the undeformed stiffness."""
+        """Reset the models of the load cases `columns` (k,) to the undeformed stiffness."""
         self.matrix[columns], self.change[columns] = 0.0, 0.0
 
     def merge_columns(self, columns: np.ndarray, other: StrainedModel) -> StrainedModel:
-        """Return the models with those of some load cases (k,) replaced by another's."""
+        """Return the models, with those of the load cases `columns` (k,) replaced by `other`."""
         most = max(self.nodes.shape[1], other.nodes.shape[1])
         mine, its = self._pad_nodes(most), other._pad_nodes(most)
         for one, two in ((mine.nodes, its.nodes), (mine.matrix, its.matrix), (mine.change, its.change)):
@@ -106,13 +106,13 @@ class StrainedModel:
         return mine
 
     def _pad_nodes(self, most: int) -> StrainedModel:
-        """Return the models with capacity for `most` nodes."""
+        """Return the models padded to `most` nodes."""
         missing = most - self.nodes.shape[1]
         nodes, matrix = pad_zeros(self.nodes, (missing,)), pad_zeros(self.matrix, (3 * missing, 3 * missing))
         return StrainedModel(nodes, matrix, self.change)
 
     def apply_stiffness(self, device: Device, motion: wp.array) -> wp.array:
-        """Compute E M E' motion (3n, b) [N] of motions (3n, b) [m] of the compliance's nodes."""
+        """Return E M E' motion (3n, b) [N], for motions (3n, b) [m] of the nodes of the compliance."""
         out, (count, size) = wp.zeros_like(motion), self.matrix.shape[:2]
         inputs = [from_view(device, self.matrix), from_view(device, self.nodes), motion]
         device.launch(build_gemv_kernel(device, wp.float64, wp.float64), (1, count, size), inputs, [out])
@@ -120,9 +120,9 @@ class StrainedModel:
 
 
 def choose_strained_rows(device: Device, strain: Any, min_strain: float, max_rows: int) -> tuple[Any, Any, Any]:
-    """Choose `max_rows` rows of each load case with the largest strains (n, b) above `min_strain`: ascending, (m, b).
+    """Return up to `max_rows` rows with the largest strains (n, b) above `min_strain` per load case, sorted: (m, b).
 
-    n marks unused places. Return also the strain (b,) above which rows are chosen, and their number (b,).
+    The value n marks unused entries. Also return the strain (b,) above which rows are chosen, and their number (b,).
     """
     lib, count = get_library(device), len(strain)
     columns, order = to_library(device, np.arange(strain.shape[1])), rank_rows(strain)
@@ -141,18 +141,18 @@ class StrainedPart:
     problem
         Problem of the tissue.
     compliance
-        Compliance at the touchable nodes, followed by the nearest others.
+        Compliance at the touchable nodes, followed by the nearest other nodes.
     touchable
         Number of touchable nodes.
     strains
-        Limits of a model.
+        Limits of the models.
     """
 
     def __init__(self, problem: Problem, compliance: Compliance, touchable: int, strains: StrainLimits = STRAIN_LIMITS):
         device, nodes = problem.device, compliance.nodes
         self._problem, self.compliance, self._touchable, self._strains = problem, compliance, touchable, strains
         self.size = 3 * min(strains.max_nodes, len(nodes))
-        """Rows of the largest model."""
+        """Number of rows of the largest model."""
         self._near = device.upload(nodes, wp.int32)
         near = np.zeros(problem.rows // 3, bool)
         near[nodes] = True
@@ -160,19 +160,19 @@ class StrainedPart:
         self._elements = [(term, device.upload(some, wp.int32)) for term, some in found]
 
     def build_model(self, u: wp.array, columns: np.ndarray) -> StrainedModel | None:
-        """Build models of load cases (k,) of the begun batch at u (3N, b) [m]; None if strained tissue does not fit."""
+        """Return models of the load cases `columns` (k,) at u (3N, b) [m], or None if strained tissue does not fit."""
         found = self.find_stiffening(u, columns)
         return None if found is None else self._build_models(*found)
 
     def prepare(self) -> None:
-        """Compute the compliance at all nodes, unless that is done."""
+        """Compute the compliance at all nodes, unless already computed."""
         self.compliance.ensure_columns(np.ones(len(self.compliance.nodes), bool))
 
     def find_stiffening(self, u: wp.array, columns: np.ndarray, fixed_size: bool = False) -> tuple[Any, Any] | None:
-        """Select the most strained nodes, as indices into the compliance (k, n); assemble their D (k, 3n, 3n) [N/m].
+        """Return the most strained nodes as indices (k, n) into the compliance, and their matrices D (k, 3n, 3n) [N/m].
 
-        D is zero where a load case has fewer nodes. With `fixed_size`, n is the maximum, and the host does not wait for
-        the GPU. None if tissue that does not fit is strained more than `cut`.
+        D has zeros if a load case has fewer nodes. If `fixed_size`, n is the maximum, and the host does not wait for
+        the GPU. Return None if tissue that does not fit is strained more than `max_omitted`.
         """
         device, count, strains = self._problem.device, len(columns), self._strains
         picked = device.upload(columns, wp.int32)
@@ -197,12 +197,12 @@ class StrainedPart:
         return cast_like(ranks, nodes[:wide].T.clip(max=near - 1)), to_view(stiffer)
 
     def build_compliance(self, rows: Any) -> Any:
-        """Return C (b, n, n) [m/N] between some computed rows (b, n) of the compliance, symmetrised."""
+        """Return the symmetrised compliance C (b, n, n) [m/N] between computed `rows` (b, n)."""
         between = self.compliance.columns[rows[:, :, None], rows[:, None, :]]
         return 0.5 * (between + between.mT)
 
     def _build_models(self, nodes: Any, stiffer: Any) -> StrainedModel:
-        """Build models from D (b, 3k, 3k) [N/m] on some nodes (b, k) of the compliance."""
+        """Return the models from matrices D (b, 3k, 3k) [N/m] on `nodes` (b, k) of the compliance."""
         self.prepare()
         device, count, size = self._problem.device, len(nodes), stiffer.shape[1]
         # One more row and column collect the entries of nodes that cannot be touched.

@@ -1,1 +1,1 @@
-"""Newton-CG, L-BFGS, line search, residuals and power series, independent of particular terms."""
+"""Minimisers for any terms: Newton-CG, L-BFGS, line search, residuals and power series."""

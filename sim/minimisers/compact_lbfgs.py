@@ -2,7 +2,7 @@
 
     H = H0 + [S, H0 Y] M [S, H0 Y]',    M = [[R^-T (D + Y' H0 Y) R^-1, -R^-T], [-R^-1, 0]],
 
-with steps S and gradient changes Y as columns, R the upper triangle of S' Y and D its diagonal. Byrd, Nocedal,
+with steps S and gradient changes Y as columns; R is the upper triangle of S' Y and D its diagonal. Byrd, Nocedal,
 Schnabel 1994, "Representations of quasi-Newton matrices and their use in limited memory methods", Math. Program.
 63:129-156, theorem 2.2.
 """
@@ -22,7 +22,7 @@ from .lbfgs_kernels import PAIRS
 
 @dataclass(frozen=True, eq=False)
 class CurvaturePairs:
-    """Curvature pairs of one load case: s, w = H0 y (m, 3N), oldest first; products s_i . y_j and y_i . w_j (m, m)."""
+    """Curvature pairs of one load case: s, w = H0 y (m, 3N), oldest first; products s_i . y_j, y_i . w_j (m, m)."""
 
     s: np.ndarray
     w: np.ndarray
@@ -35,17 +35,17 @@ class CurvaturePairs:
         return compute_middle_matrix(self.sy, self.yw)
 
     def compute_weights(self, force: np.ndarray) -> np.ndarray:
-        """Compute the coefficients M [S, W]' force (2m,) for a force (3N,)."""
+        """Return the coefficients M [S, W]' force (2m,) for a force (3N,)."""
         force = force.astype(self.s.dtype)
         return self.middle_matrix @ np.concatenate([self.s @ force, self.w @ force])
 
     def compute_motion(self, weights: np.ndarray) -> np.ndarray:
-        """Compute the displacement [S, W] weights (3N,)."""
+        """Return the displacement [S, W] weights (3N,)."""
         some, others = np.split(weights.astype(self.s.dtype), 2)
         return some @ self.s + others @ self.w
 
     def add_pair(self, s: np.ndarray, y: np.ndarray, w: np.ndarray) -> CurvaturePairs:
-        """Return the history with a newer pair (3N,) added; drop the oldest pair if there are more than `PAIRS`."""
+        """Return the history with the new pair (3N,) added, without the oldest pair if there are more than `PAIRS`."""
         some = slice(max(0, len(self.s) - PAIRS + 1), None)
         steps, ways = (np.vstack([old[some], new.astype(old.dtype)]) for old, new in ((self.s, s), (self.w, w)))
         sy, yw = np.zeros((2, len(steps), len(steps)))
@@ -57,12 +57,12 @@ class CurvaturePairs:
 
 
 def build_empty_history(rows: int, dtype: str) -> CurvaturePairs:
-    """Build an empty L-BFGS history for one load case of `rows` unknowns, dtype `dtype`."""
+    """Return an empty L-BFGS history for one load case with `rows` unknowns, in the type `dtype`."""
     return CurvaturePairs(*np.zeros((2, 0, rows), dtype), *np.zeros((2, 0, 0)))
 
 
 def compute_middle_matrix(sy: np.ndarray, yw: np.ndarray) -> np.ndarray:
-    """Compute the middle matrix M (..., 2m, 2m) from s_i . y_j and y_i . w_j (..., m, m); zero pairs have no effect."""
+    """Return the middle matrix M (..., 2m, 2m) from s_i . y_j and y_i . w_j (..., m, m); zero pairs have no effect."""
     upper, eye = np.triu(sy), np.eye(sy.shape[-1])
     own = np.diagonal(upper, axis1=-2, axis2=-1)[..., None] * eye
     inverse = np.linalg.inv(upper + np.where(own == 0.0, eye, 0.0))
@@ -90,23 +90,23 @@ class BatchHistory:
         self._asked: tuple[np.ndarray, LbfgsHistory] | None = None
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep these load cases (k,): the others have left the batch."""
+        """Keep only the load cases `columns` (k,) of the batch."""
         self._asked = None
         self._sw = self._sw[columns]
         self._sy, self._yw, self.count = self._sy[columns], self._yw[columns], self.count[columns]
 
     def clear(self, columns: np.ndarray) -> None:
-        """Clear the history of some load cases (k,)."""
+        """Clear the histories of the load cases `columns` (k,)."""
         self._asked = None
         self._sw[columns], self._sy[columns], self._yw[columns], self.count[columns] = 0.0, 0.0, 0.0, 0
 
     @property
     def max_pairs(self) -> int:
-        """Largest number of pairs of any load case."""
+        """Largest number of pairs of all load cases."""
         return min(int(self.count.max(initial=0)), PAIRS)
 
     def get_history(self, columns: np.ndarray) -> LbfgsHistory:
-        """Return the history of some load cases (k,); a repeated call with the same ones returns the cached result."""
+        """Return the history of the load cases `columns` (k,); the result is cached for the same columns."""
         if self._asked is not None and np.array_equal(self._asked[0], columns):
             return self._asked[1]
         order = (self.count[columns, None] + np.arange(PAIRS)) % PAIRS  # oldest first
@@ -121,7 +121,7 @@ class BatchHistory:
         return history
 
     def update_history(self, columns: np.ndarray, s: Any, y: Any, w: Any) -> None:
-        """Add a newer pair s, y, w (3N, k) of some load cases (k,), and drop the oldest pair beyond `PAIRS`."""
+        """Add a new pair s, y, w (3N, k) to the load cases `columns` (k,), and drop the oldest pair beyond `PAIRS`."""
         self._asked = None
         place, some = self.count[columns] % PAIRS, select_columns(self._device, columns, len(self.count))
         own, at = to_library(self._device, columns), to_library(self._device, place)
@@ -143,9 +143,9 @@ class LbfgsHistory:
     middle_matrix: Any
 
     def compute_weights(self, force: Any) -> Any:
-        """Compute the coefficients M [S, W]' force (k, 2m, 1) for forces (3N, k) [N]."""
+        """Return the coefficients M [S, W]' force (k, 2m, 1) for forces (3N, k) [N]."""
         return self.middle_matrix @ (self.sw @ force.T[:, :, None])
 
     def compute_motion(self, weights: Any) -> Any:
-        """Compute the displacements [S, W] weights (3N, k) [m]."""
+        """Return the displacements [S, W] weights (3N, k) [m]."""
         return (weights.mT @ self.sw)[:, 0].T

@@ -1,8 +1,8 @@
-"""L-BFGS on a batch of load cases, with the undeformed stiffness as initial Hessian; decisions are made on the device.
+"""L-BFGS for a batch of load cases, with the undeformed stiffness as initial Hessian, and decisions on the device.
 
 One iteration evaluates the gradient of each load case at its own trial step, accepts the step or backtracks, applies
-the preconditioner and computes the next direction. The launches are always the same, so that a GPU replays them as one
-captured graph. Between iterations the host removes the load cases that have ended.
+the preconditioner and computes the next direction. All iterations have the same launches, so that a GPU replays a
+captured graph. Between iterations, the host removes load cases that have ended.
 """
 
 from collections.abc import Mapping
@@ -27,14 +27,14 @@ MAX_CARRIED = MAX_EXACT  # Largest batch [load cases] that hands its history on:
 
 @dataclass(frozen=True)
 class CheckSchedule:
-    """Interval of the host's checks, and when live load cases move to a narrower workspace.
+    """Interval between checks by the host, and criterion to move unfinished load cases to a narrower workspace.
 
     Parameters
     ----------
     check_interval
-        Iterations between two checks.
+        Number of iterations between two checks.
     width_ratio
-        They move if the narrower width is at most this fraction of the present one.
+        Load cases move if the narrower width is at most this fraction of the current width.
     """
 
     check_interval: int = 1
@@ -46,7 +46,7 @@ CUDA_SCHEDULE = CheckSchedule(check_interval=2, width_ratio=0.75)  # A check sta
 
 @dataclass(frozen=True, eq=False)
 class DescentResult:
-    """End of a descent: u (3N, b) [m] on the device; status, steps, relative residuals (b,) on the host; history."""
+    """Result of a descent: u (3N, b) [m] on the device; status, steps, relative residuals (b,) on the host; history."""
 
     u: wp.array
     status: np.ndarray
@@ -56,21 +56,21 @@ class DescentResult:
 
     @property
     def unfinished(self) -> np.ndarray:
-        """Load cases (k,) that did not end, so that another method can continue them."""
+        """Numbers (k,) of the load cases that did not end; another method can continue these."""
         return np.flatnonzero((self.status == LIVE) | (self.status == STOPPED))
 
 
 class Lbfgs:
-    """L-BFGS on one problem. The memory of the widest batch is kept for later ones.
+    """L-BFGS solver for one problem. The memory of the widest batch is kept for later batches.
 
     Parameters
     ----------
     problem
         Problem whose potential is minimised.
     preconditioner
-        Preconditioner of this problem in the undeformed configuration.
+        Preconditioner of the problem in the undeformed configuration.
     schedule
-        Checks by the host; None: default of the device.
+        Schedule of the checks by the host; None: a device-dependent default.
     """
 
     def __init__(self, problem: Problem, preconditioner: Preconditioner, schedule: CheckSchedule | None = None):
@@ -82,7 +82,7 @@ class Lbfgs:
 
     @property
     def kept_bytes(self) -> int:
-        """Size of the memory that is kept [bytes]."""
+        """Size of the memory that is kept between batches [bytes]."""
         return sum(array.capacity for array in self._ground.values())
 
     def descend(
@@ -95,14 +95,14 @@ class Lbfgs:
         straggler_fraction: float = 0.0,
         initial_residual: tuple[wp.array, wp.array] | None = None,
     ) -> DescentResult:
-        """Minimise the potential of the begun batch, from start (3N, b) [m], in at most `max_iter` iterations.
+        """Minimise the energy of the current batch from `start` (3N, b) [m], in at most `max_iter` iterations.
 
-        The start satisfies the constraints, and no footprint moves. A load case ends at its tolerance (b,), relative as
-        in `Problem.residual`, or where the 2-norm of the residual is at most force_tolerance (b,) [N]. `history` is
-        that of an earlier descent of the same problem near this state, if any; with None this descent returns no
-        history either. The descent stops when at most the fraction `straggler_fraction` of all load cases is live.
-        `initial_residual` holds the residual at the start and its preconditioned form (3N, b), if they are available.
-        Each returned u is the last accepted state of its load case.
+        The start must satisfy the constraints, and no footprint may have a prescribed motion. A load case ends if its
+        relative residual, as in `Problem.residual`, is at most `tolerance` (b,), or its 2-norm at most
+        `force_tolerance` (b,) [N]. `history` is from an earlier descent of the problem near this state, or empty; None:
+        no history is returned. The descent stops if at most the fraction `straggler_fraction` of the load cases is
+        unfinished. `initial_residual` is the residual at the start and its preconditioned form, both (3N, b), if
+        available. The returned u is the last accepted state of each load case.
         """
         device, count = self._problem.device, start.shape[1]
         u, place = wp.clone(start), np.arange(count)
@@ -160,9 +160,9 @@ def to_rows_first(array: wp.array) -> np.ndarray:
 
 
 def restore_history(cases: Cases, rows: int) -> dict[str, np.ndarray]:
-    """Read the L-BFGS history of an earlier descent on `rows` = 3N unknowns; empty if it does not fit these cases.
+    """Return the L-BFGS history of an earlier descent with `rows` = 3N unknowns; empty if it does not fit the cases.
 
-    The history only saves iterations, so one with values that are not finite is dropped.
+    A history with values that are not finite is dropped, since it only saves iterations.
     """
     if any(name not in cases.warm for name in HISTORY_KEYS):
         return {}

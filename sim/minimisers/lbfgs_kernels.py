@@ -1,8 +1,8 @@
-"""Kernels of L-BFGS on many load cases; each kernel thread decides the next action of its load case on the device.
+"""Kernels of L-BFGS for many load cases; the next action of each load case is determined on the device.
 
-Each curvature pair (s, y), a step and the change of the gradient along it, is stored as s and w = M^-1 y, with M^-1
-the preconditioner. The two-loop recursion of Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4 then needs
-inner products with s and w alone, and the direction is a linear combination of these: one pass over the pairs for each.
+A curvature pair (s, y) of a step and the change of the gradient along the step is stored as s and w = M^-1 y, where
+M^-1 is the preconditioner. The two-loop recursion, Nocedal, Wright 2006, "Numerical Optimization", algorithm 7.4, then
+needs only inner products with s and w, and the direction is a linear combination of s and w.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from ..runtime.columns import CHUNK
 from ..runtime.device import Device, forward_kernel
 
 LIVE, DONE, STOPPED, NOT_FINITE = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
-"""Status of a load case: iterating; converged; stopped without convergence; start not finite."""
+"""Status of a load case: iterating; converged; stopped without convergence; values at the start not finite."""
 PAIRS = 8  # Curvature pairs (s, y) that each load case keeps.
 OVERSHOOT = 0.5  # A step is accepted if phi'(t) <= OVERSHOOT |phi'(0)|, with phi the energy along the direction.
 MIN_BACKTRACK = 0.1  # Backtracking factor: lower bound.
@@ -34,7 +34,7 @@ PRODUCTS = 3  # Number of these rows.
 
 @dataclass(frozen=True)
 class LbfgsKernels:
-    """L-BFGS kernels for one scalar type and number of pairs."""
+    """L-BFGS kernels for one scalar type and one number of curvature pairs."""
 
     add_gradient: wp.Kernel
     multiply: wp.Kernel
@@ -45,13 +45,13 @@ class LbfgsKernels:
 
 
 def get_rows_per_thread(device: Device) -> int:
-    """Return the rows per thread of a kernel that keeps several values of each row."""
+    """Return the number of rows per thread, for kernels that need several values per row."""
     return 1 if device.on_cuda else 4
 
 
 @cache
 def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
-    """Build the kernels for a device's scalar type and the number of pairs of a load case."""
+    """Return the kernels for the scalar type of a device, and `pairs` curvature pairs per load case."""
     scalar = device.scalar
     several, few_scalars = (
         wp.types.vector(length=length, dtype=scalar) for length in (ROWS_PER_THREAD, get_rows_per_thread(device))
@@ -71,7 +71,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         total: wp.array2d(dtype=scalar),
         square: wp.array(dtype=wp.float64),
     ):
-        """Add `own` to `total`, set it to zero, and add its squared norm to `square`."""
+        """Add `own` to `total`, add the squared norm of `own` to `square`, and set `own` to zero."""
         block, c = wp.tid()
         squares = wp.float64(0.0)
         for r in range(block * chunk, wp.min((block + 1) * chunk, own.shape[0])):
@@ -93,7 +93,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         # outputs
         products: wp.array2d(dtype=wp.float64),
     ):
-        """Compute inner products: of the new gradient g' with each s and w, with z' and z (z = M^-1 g); y . w."""
+        """Compute inner products: new gradient g' with each s and w, and with z' and z, where z = M^-1 g; and y . w."""
         block, c = wp.tid()
         last = g.shape[0] - 1
         own = several()
@@ -136,7 +136,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         slot: wp.array(dtype=wp.int32),
         aiming: wp.array(dtype=wp.int32),
     ):
-        """Accept the trial step, or backtrack; the first trial is the start. `aiming` marks a due direction."""
+        """Accept the trial step, or backtrack; the first trial is the start. `aiming`: a direction is required."""
         c = wp.tid()
         accepted[c] = 0
         slot[c] = -1
@@ -201,10 +201,10 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         along_s: wp.array2d(dtype=scalar),
         along_w: wp.array2d(dtype=scalar),
     ):
-        """Add the pair of the accepted step, and run the two-loop recursion: d = -M^-1 g + sum of (a_i s_i + b_i w_i).
+        """Add the pair of the accepted step; two-loop recursion for d = -M^-1 g + sum of (a_i s_i + b_i w_i).
 
         The first `known` slots are filled; slot 0 follows slot m - 1. The first trial length is the secant step of the
-        last line search: where tissue stiffens, unit steps would all be shortened.
+        previous line search, since every unit step would be shortened where tissue stiffens.
         """
         c = wp.tid()
         if aiming[c] == 0:
@@ -300,7 +300,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         s: wp.array3d(dtype=scalar),
         w: wp.array3d(dtype=scalar),
     ):
-        """Update load cases with an accepted step: u += t d, store the pair, g = g', z = z', and the new d."""
+        """Update load cases with an accepted step: u += t d, g = g', z = z'; store the pair and the new direction d."""
         block, c = wp.tid()
         if accepted[c] == 0:
             return
@@ -335,7 +335,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         bound: wp.array(dtype=scalar),
         t: wp.array(dtype=wp.float64),
     ):
-        """Limit t to `bound`, and reset the bound to 1."""
+        """Limit the step length t to `bound`, and reset the bound to 1."""
         c = wp.tid()
         t[c] = wp.min(t[c], wp.float64(bound[c]))
         bound[c] = scalar(1.0)

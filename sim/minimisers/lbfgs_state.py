@@ -1,4 +1,4 @@
-"""State of the load cases of a batch between L-BFGS iterations, and the iteration itself."""
+"""State of the load cases of a batch between L-BFGS iterations, and the iteration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Shapes = Mapping[str, tuple[int, ...]]  # Array shapes by name, without the axis
 
 
 def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
-    """Return, by number type, the dtype, the shapes of arrays that move with load cases, and of recomputed ones."""
+    """Return by number type: dtype, shapes of arrays that move with load cases, shapes of recomputed arrays."""
     vector, pairs, terms = (problem.rows,), (PAIRS, problem.rows), (len(problem.terms),)
     return {
         "scalar": (
@@ -53,7 +53,7 @@ def describe_layout(problem: Problem) -> dict[str, tuple[Any, Shapes, Shapes]]:
 
 
 def allocate_memory(problem: Problem, width: int) -> dict[str, wp.array]:
-    """Allocate memory, by number type, that workspaces of at most this width share: only one is in use at a time."""
+    """Return memory, by number type, shared by workspaces of at most this width, of which one is in use at a time."""
     return {
         kind: wp.zeros((_count_values(moved) + _count_values(written), width), dtype=dtype, device=problem.device.name)
         for kind, (dtype, moved, written) in describe_layout(problem).items()
@@ -62,7 +62,7 @@ def allocate_memory(problem: Problem, width: int) -> dict[str, wp.array]:
 
 @dataclass(frozen=True, eq=False)
 class LbfgsState:
-    """L-BFGS arrays of `width` load cases by name; those that move with load cases, by number type; the memory."""
+    """L-BFGS arrays of `width` load cases, by name; arrays that move with load cases, by number type; memory."""
 
     columns: Mapping[str, wp.array]
     movable: Mapping[str, wp.array]
@@ -70,7 +70,7 @@ class LbfgsState:
 
 
 def allocate_state(problem: Problem, width: int, memory: Mapping[str, wp.array]) -> LbfgsState:
-    """Build the state of `width` load cases on memory that `allocate_memory` made for at least this width."""
+    """Return the state of `width` load cases in `memory`, allocated by `allocate_memory` for at least this width."""
     columns: dict[str, wp.array] = {}
     together: dict[str, wp.array] = {}
     for kind, (_, moved, written) in describe_layout(problem).items():
@@ -83,16 +83,16 @@ def allocate_state(problem: Problem, width: int, memory: Mapping[str, wp.array])
 
 
 class LbfgsWorkspace:
-    """Workspace of L-BFGS, load cases last, on shared memory. On a GPU the iteration is captured once as a graph.
+    """Workspace of L-BFGS in shared memory; load cases are the last axis. A GPU captures the iteration as a graph.
 
     Parameters
     ----------
     problem, preconditioner
         Problem to solve, and its preconditioner.
     width
-        Capacity [load cases].
+        Maximum number of load cases.
     ground
-        Memory from `allocate_memory`, for at least this width.
+        Memory from `allocate_memory` for at least this width.
     """
 
     def __init__(self, problem: Problem, preconditioner: Preconditioner, width: int, ground: Mapping[str, wp.array]):
@@ -108,7 +108,7 @@ class LbfgsWorkspace:
     def begin(
         self, start: wp.array, tolerance: np.ndarray, force_tolerance: np.ndarray, history: Mapping[str, np.ndarray]
     ) -> None:
-        """Load a batch of at most `width` load cases; the first iteration evaluates its start (3N, b)."""
+        """Load a batch of at most `width` load cases; the first iteration evaluates the start (3N, b) [m]."""
         a, device, spare = self.columns, self._problem.device, self.width - start.shape[1]
         for array in (a["d"], a["g"], a["z"], self.state.movable["double"], self.state.movable["whole"]):
             array.zero_()
@@ -131,7 +131,7 @@ class LbfgsWorkspace:
         self.prepare()
 
     def set_direction(self, g: wp.array, z: wp.array) -> None:
-        """Set the first direction to -z (3N, b), from a start with residual g (3N, b)."""
+        """Set the first direction to -z (3N, b), for a start with residual g (3N, b)."""
         a, device, count = self.columns, self._problem.device, g.shape[1]
         index = device.upload(self._pad_indices(np.arange(count)), wp.int32)
         gather_columns(device, g, index, a["g"])
@@ -143,7 +143,7 @@ class LbfgsWorkspace:
         self._limit_steps()
 
     def take_columns(self, source: LbfgsWorkspace, columns: np.ndarray) -> None:
-        """Continue with these load cases (k,) of another workspace's batch."""
+        """Load the state of the load cases `columns` (k,) of another workspace, to continue these cases."""
         index = self._pad_indices(columns)
         self._problem.keep(index)
         there = self._problem.device.upload(index, wp.int32)
@@ -154,11 +154,11 @@ class LbfgsWorkspace:
         self.prepare()
 
     def _pad_indices(self, stay: np.ndarray) -> np.ndarray:
-        """Repeat the last index until the workspace is full."""
+        """Return the indices padded to the width of the workspace by repeating the last index."""
         return np.append(stay, np.full(self.width - len(stay), stay[-1]))
 
     def prepare(self) -> None:
-        """Clear temporary arrays, and prepare a preconditioner on the host for the present batch."""
+        """Clear temporary arrays, and prepare a preconditioner that runs on the host for the current batch."""
         self.columns["part"].zero_()
         self.columns["bound"].fill_(1.0)
         if self._preconditioner.on_device:
@@ -168,7 +168,7 @@ class LbfgsWorkspace:
         self._preconditioner.prepare(self._problem, u.shape[1])
 
     def iterate(self, count: int) -> None:
-        """Run this number of L-BFGS iterations."""
+        """Run `count` L-BFGS iterations."""
         device = self._problem.device
         if not (device.on_cuda and self._preconditioner.on_device):
             for _ in range(count):
@@ -186,7 +186,7 @@ class LbfgsWorkspace:
             wp.capture_launch(self._graph)
 
     def run_iteration(self) -> None:
-        """Run one iteration; a GPU captures it unless the preconditioner runs on the host."""
+        """Run one iteration; a GPU captures the iteration as a graph unless the preconditioner runs on the host."""
         a, k = self.columns, self._kernels
         problem, device = self._problem, self._problem.device
         rows, count = a["u"].shape
@@ -209,7 +209,7 @@ class LbfgsWorkspace:
         self._limit_steps()
 
     def _compute_directions(self) -> None:
-        """Compute the next direction of the load cases whose step was accepted, from their new gradients."""
+        """Compute the next direction, from the new gradient, of each load case with an accepted step."""
         a, k = self.columns, self._kernels
         problem, device, g = self._problem, self._problem.device, self._trial.g
         rows, count = a["u"].shape
@@ -239,7 +239,7 @@ class LbfgsWorkspace:
 
 
 def _view_memory(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
-    """View the memory from element `first` on with a shape: slices of Warp arrays cannot skip 2^31 elements."""
+    """Return a view of memory from element `first` with a `shape`; Warp slices cannot skip 2^31 elements."""
     address = ground.ptr + first * wp.types.type_size_in_bytes(ground.dtype)
     return wp.array(ptr=address, dtype=ground.dtype, shape=shape, device=ground.device)
 

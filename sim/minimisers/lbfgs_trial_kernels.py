@@ -1,7 +1,7 @@
 """Kernels of a trial step of L-BFGS: the trial point and its projected gradient.
 
-With many load cases, neighbouring threads take neighbouring load cases, and each a few rows. With one load case that
-would leave a GPU idle and its few threads far apart in memory, so neighbouring threads take neighbouring rows, and sum
+With many load cases, adjacent threads compute adjacent load cases, each with a few rows. With one load case, this would
+use few threads with memory accesses far apart; so adjacent threads compute adjacent rows, and their values are summed
 before the atomic addition.
 """
 
@@ -20,18 +20,18 @@ ROWS_PER_CPU_THREAD = 1024  # The same on the CPU.
 
 @dataclass(frozen=True)
 class ThreadSpread:
-    """Distribution of rows, or nodes: groups of `lanes` neighbouring threads, `rows_per_thread` rows per thread."""
+    """Distribution of rows or nodes to threads: groups of `lanes` adjacent threads, `rows_per_thread` rows each."""
 
     lanes: int
     rows_per_thread: int
 
     def count_threads(self, count: int) -> int:
-        """Return the number of threads for `count` rows, or nodes."""
+        """Return the number of threads for `count` rows or nodes."""
         return -(-count // (self.lanes * self.rows_per_thread)) * self.lanes
 
 
 def choose_thread_spread(device: Device, columns: int) -> ThreadSpread:
-    """Choose how the threads of a device share the rows of a batch of this many load cases."""
+    """Return the distribution of rows to threads for a device and a batch of `columns` load cases."""
     if columns > 1:
         return ThreadSpread(1, ROWS_PER_THREAD)
     return ThreadSpread(get_warp_width(device), ROWS_PER_CUDA_THREAD if device.on_cuda else ROWS_PER_CPU_THREAD)
@@ -39,19 +39,19 @@ def choose_thread_spread(device: Device, columns: int) -> ThreadSpread:
 
 @wp.func
 def get_first_row(thread: int, lanes: int, each: int):
-    """Return the first row of a thread; its next rows follow at intervals of `lanes`."""
+    """Return the first row of a thread; the next rows of the thread follow at intervals of `lanes`."""
     return thread // lanes * lanes * each + thread % lanes
 
 
 @wp.func
 def return_value(value: wp.float64) -> wp.float64:
-    """Return the value itself: replaces `sum_warp` where no neighbouring thread has part of the same sum."""
+    """Return the value itself; this replaces `sum_warp` if no other thread has a part of the same sum."""
     return value
 
 
 @dataclass(frozen=True)
 class LbfgsTrialKernels:
-    """Trial kernels for one scalar type and spread, launched over (threads of rows or nodes, load cases)."""
+    """Trial step kernels for one scalar type and distribution, launched over (threads of rows or nodes, load cases)."""
 
     step: wp.Kernel
     finish: wp.Kernel
@@ -59,7 +59,7 @@ class LbfgsTrialKernels:
 
 @cache
 def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
-    """Build the trial kernels for a device's scalar type."""
+    """Return the trial step kernels for the scalar type of a device."""
     scalar, vec = device.scalar, device.vector
     lanes, each = spread.lanes, spread.rows_per_thread
     together = sum_warp if lanes > 1 else return_value
@@ -91,7 +91,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
         total: wp.array2d(dtype=scalar),
         sums: wp.array2d(dtype=wp.float64),
     ):
-        """Project the gradient; add to sums: |total - constant|^2, |total|^2, |free|^2, free . d."""
+        """Project the gradient `total` to `free`; add |total - constant|^2, |total|^2, |free|^2, free . d to sums."""
         thread, c = wp.tid()
         own, whole, free, slope = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         first = get_first_row(thread, lanes, each)
@@ -119,7 +119,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
 
 @cache
 def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
-    """Build the kernel `multiply` for a single load case, launched over (products, threads of rows)."""
+    """Return the kernel `multiply` for a single load case, launched over (products, threads of rows)."""
     scalar, m, spread = device.scalar, pairs, choose_thread_spread(device, 1)
     lanes, each = spread.lanes, spread.rows_per_thread
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GZ_OLD, 2 * m + YW

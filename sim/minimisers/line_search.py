@@ -1,6 +1,6 @@
-"""Line search on the directional derivative.
+"""Line search that uses directional derivatives.
 
-Energies are not compared: in single precision round-off hides their differences long before those of the gradient.
+Energies are not compared, since in single precision their differences reach round-off much earlier than gradients.
 """
 
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ class LineSearch:
     Parameters
     ----------
     undershoot, max_refinements
-        A shortened step whose slope is still steeper than this fraction of the initial one is lengthened again, at most
-        this number of times.
+        A shortened step whose slope is still steeper than this fraction of the initial slope is lengthened again, at
+        most this number of times.
     max_trials
         Maximum number of trial lengths.
     min_length
-        Smallest accepted step length; a shorter one counts as failure.
+        Minimum step length; a shorter step counts as a failure.
     """
 
     undershoot: float = 0.5
@@ -37,12 +37,12 @@ class LineSearch:
 
 
 def is_step_too_long(slope: Any, predicted: Any) -> Any:
-    """Return True for steps whose slope `slope` exceeds `OVERSHOOT` times the predicted decrease, or is not finite."""
+    """Return True for steps whose slope exceeds `OVERSHOOT` times the predicted decrease, or is not finite."""
     return ~(np.asarray(slope) <= OVERSHOOT * np.abs(predicted))
 
 
 def backtrack_by_slopes(slope: Any, predicted: Any) -> Any:
-    """Return the backtracking factors of rejected steps: zero of the secant through both slopes, within bounds."""
+    """Return the backtracking factors of rejected steps: zero of the secant through both end slopes, within bounds."""
     with np.errstate(invalid="ignore", divide="ignore"):
         kept = np.divide(predicted, np.add(predicted, slope))
     known = np.greater(predicted, 0.0) & np.isfinite(slope)
@@ -50,11 +50,11 @@ def backtrack_by_slopes(slope: Any, predicted: Any) -> Any:
 
 
 def search_line(problem: Problem, u: wp.array, direction: Direction, settings: LineSearch = LineSearch()) -> np.ndarray:
-    """Find step lengths (b,) in (0, 1] along a direction from u (3N, b); zero if none is found.
+    """Return step lengths (b,) in (0, 1] along a direction from u (3N, b); 0 if no length is accepted.
 
-    A length is accepted when phi'(t) <= 0.5 x the predicted decrease: the energy still falls, or its minimum along the
-    line is close behind. The search keeps the longest such length and the shortest rejected one; the secant through the
-    slopes at both gives the next trial.
+    A length t is accepted if phi'(t) <= 0.5 x the predicted decrease: the energy still decreases, or its minimum along
+    the line was just passed. The search keeps the longest accepted and the shortest rejected length; the secant through
+    the slopes at these two lengths gives the next trial.
     """
     t = problem.longest_step(u, direction.d)
     predicted = direction.decrease

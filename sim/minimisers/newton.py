@@ -1,6 +1,6 @@
-"""Newton iteration: search direction and line search, until the tolerance or the iteration limit is reached.
+"""Newton's method: search direction and line search, until the tolerance or the iteration limit is reached.
 
-It uses terms only through their protocol. Load cases that have ended leave the batch, to save time.
+Terms are used only through the interface `Term`. Load cases that have ended are removed from the batch to save time.
 """
 
 from dataclasses import dataclass
@@ -20,22 +20,22 @@ from .residual import compute_relative_residual
 
 @dataclass(frozen=True)
 class Newton:
-    """Accuracy of the linear solves, and criteria for stalling and round-off.
+    """Settings of Newton's method: accuracy of the linear solves, and criteria for stalling and round-off.
 
     Parameters
     ----------
     max_forcing
-        Inexact Newton: upper bound of the relative linear residual.
+        Upper bound of the relative linear residual of the inexact Newton method.
     patience
-        If the residual has not fallen by a tenth in this number of iterations, it is compared with round-off.
+        If the residual has not decreased by 10 % in this number of iterations, the residual is compared with round-off.
     max_stalled
-        A load case stalls after this number of such iterations in a row with steps below the last digit of u. Fewer may
-        come from a trust radius that a short step made small, and that doubles again.
+        A load case stalls after this number of successive iterations with steps below the last digit of u. Fewer such
+        iterations may be due to a small trust radius after a short step, which then doubles again.
     round_off
-        Factor on the change of the residual by the last digit of every displacement: below it, the residual is
-        round-off.
+        The residual is round-off if it is below this factor times its change by the last digit of every
+        displacement.
     stress_free
-        Factor on the change of nodal forces by that digit: with each term's forces below it, the model is stress-free.
+        The model is stress-free if the nodal forces of each term are below this factor times that change of forces.
     """
 
     max_forcing: float = 0.25
@@ -47,7 +47,7 @@ class Newton:
 
 @dataclass(frozen=True, eq=False)
 class Equilibrium:
-    """Final states u (3N, B) [m] on the device; outcomes, outer iterations, relative residuals (B,)."""
+    """Final states: u (3N, B) [m] on the device; outcomes, outer iterations and relative residuals (B,)."""
 
     u: wp.array
     outcome: np.ndarray
@@ -59,10 +59,10 @@ class Equilibrium:
 def find_equilibrium(
     problem: Problem, descent: DescentMethod, start: wp.array, accuracy: Accuracy, settings: Newton = Newton()
 ) -> Equilibrium:
-    """Minimise the potential of a problem that has begun a batch, from start (3N, B) [m].
+    """Minimise the energy of the current batch of a problem, from `start` (3N, B) [m].
 
-    The last finite, accepted state of every load case is returned, whatever its outcome. A load case whose forces all
-    vanish compared with those of its start counts as converged: its relative residual is undefined.
+    The result has the last finite, accepted state of every load case, for any outcome. A load case counts as converged
+    if all its forces vanish compared with the initial forces, since the relative residual is then undefined.
     """
     device, count = problem.device, start.shape[1]
     outcome = np.full(count, Outcome.BUDGET, object)
@@ -126,9 +126,9 @@ def find_equilibrium(
 
 
 def compute_round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
-    """Compute the change (b,) [N] of the residual g (3N, b) at u (3N, b) by the last digit of every displacement.
+    """Return the change (b,) [N] of the residual g (3N, b) at u (3N, b) by the last digit of every displacement.
 
-    The residual cannot fall below this: the required displacements are not representable in the floating-point type.
+    The residual cannot be smaller, since the required displacements are not representable in the floating-point type.
     """
     device = problem.device
     near = problem.gradient(_perturb_last_digit(device, u))
@@ -137,10 +137,10 @@ def compute_round_off(problem: Problem, u: wp.array, g: wp.array) -> np.ndarray:
 
 
 def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
-    """Return the load cases (b,) bool in which the forces of each term at each node are round-off at u (3N, b).
+    """Return a mask (b,) of load cases in which the forces of each term at each node are round-off at u (3N, b).
 
-    Round-off is `factor` times the force change by the last digit of every displacement, at that node or at the median
-    node, whichever is larger: the large round-off of a sliver counts at its own nodes alone.
+    Round-off is `factor` times the force change by the last digit of every displacement, at this node or at the median
+    node, whichever is larger; so the large round-off of a sliver counts only at its own nodes.
     """
 
     def at_nodes(force: wp.array) -> np.ndarray:
@@ -160,7 +160,7 @@ def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
 
 
 def _perturb_last_digit(device: Device, u: wp.array) -> wp.array:
-    """Return displacements u (3N, b) with the last digit of each changed, up or down at random."""
+    """Return the displacements u (3N, b) with the last digit of each value changed, up or down at random."""
     values = u.numpy()
     sign = np.random.default_rng(0).choice([-1.0, 1.0], (len(values), 1))
     return device.upload(values * (1.0 + sign * np.finfo(device.precision).eps))

@@ -1,4 +1,4 @@
-"""Search directions of the Newton iteration, which runs on the host."""
+"""Search directions of Newton's method, which runs on the host."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,7 +14,7 @@ from ..runtime.device import Device
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """Search direction d (3N, b) [m]; decrease (b,) [J] that the linear model predicts along it; linear iterations."""
+    """Search direction d (3N, b) [m]; predicted energy decrease (b,) [J] along d; number of linear iterations."""
 
     d: wp.array
     decrease: np.ndarray
@@ -22,34 +22,34 @@ class Direction:
 
 
 class DescentMethod(Protocol):
-    """Method that computes search directions of b load cases at once; it may keep a state for the batch."""
+    """Interface of methods that compute search directions of b load cases, and may keep a state for the batch."""
 
     def begin(self) -> None:
-        """Reset the state: another batch begins."""
+        """Reset the state for another batch."""
         ...
 
     def keep(self, device: Device, columns: np.ndarray) -> None:
-        """Keep these load cases (k,): the others have left the batch."""
+        """Keep only the load cases `columns` (k,) of the batch."""
         ...
 
     def find_direction(
         self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, length: np.ndarray
     ) -> Direction:
-        """Compute the direction at u (3N, b) with residual g (3N, b) [N].
+        """Return the search direction at u (3N, b) with residual g (3N, b) [N].
 
-        `gap` (3N, b) [m], if any, is the motion that closes the constraints; the free nodes follow it. `forcing` (b,):
-        allowed linear residual, relative to the right-hand side. `length` (b,): accepted length of the last direction;
-        where it is zero, the undeformed stiffness replaces the tangent stiffness, whose direction failed. The caller
-        changes neither g nor d afterwards.
+        `gap` (3N, b) [m], if any, is the motion that satisfies the constraints; the free nodes follow this motion.
+        `forcing` (b,) is the maximum linear residual, relative to the right-hand side. `length` (b,) is the accepted
+        length of the last direction; if it is zero, the undeformed stiffness replaces the tangent stiffness. The caller
+        must not change g or d afterwards.
         """
         ...
 
 
 class NewtonCG:
-    """Inexact Newton: K d = -g by truncated conjugate gradients, with a trust radius that follows the accepted steps.
+    """Inexact Newton directions: K d = -g by truncated conjugate gradients, with a trust radius from accepted steps.
 
-    The radius is in the preconditioner's norm, and infinite until a step has been shortened: Steihaug 1983. The next
-    step may be `growth` times as long as the accepted one.
+    The radius is in the norm of the preconditioner, and infinite until a step has been shortened (Steihaug 1983). The
+    next step may be `growth` times as long as the last accepted step.
     """
 
     def __init__(self, preconditioner: Preconditioner, most: int, growth: float = 2.0):
@@ -57,12 +57,12 @@ class NewtonCG:
         self.begin()
 
     def begin(self) -> None:
-        """Remove the trust radius."""
+        """Remove the trust radii, for another batch."""
         self._radius: np.ndarray | None = None
         self._size, self._truncated = np.zeros(0), np.zeros(0, bool)
 
     def keep(self, device: Device, columns: np.ndarray) -> None:
-        """Keep the trust radii of these load cases (k,)."""
+        """Keep only the trust radii of the load cases `columns` (k,)."""
         if self._radius is not None:
             self._radius, self._size = self._radius[columns], self._size[columns]
             self._truncated = self._truncated[columns]
@@ -70,7 +70,7 @@ class NewtonCG:
     def find_direction(
         self, problem: Problem, u: wp.array, g: wp.array, gap: wp.array | None, forcing: np.ndarray, length: np.ndarray
     ) -> Direction:
-        """Compute the direction; see `DescentMethod.find_direction`."""
+        """Return the search direction; see `DescentMethod.find_direction`."""
         device, columns = problem.device, u.shape[1]
         definite = length == 0.0
         problem.linearise(u, definite)
@@ -96,7 +96,7 @@ class NewtonCG:
 
 
 def compute_right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None) -> tuple[wp.array, np.ndarray]:
-    """Compute -P (g + K gap) (3N, b) [N] at the last linearisation, and which load cases (b,) have a gap to close."""
+    """Return -P (g + K gap) (3N, b) [N] at the last linearisation, and a mask (b,) of load cases with a nonzero gap."""
     device, columns = problem.device, g.shape[1]
     rhs = combine_columns(device, device.allocate(*g.shape), -1.0, g, wp.empty_like(g))
     if gap is None:

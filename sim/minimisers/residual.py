@@ -1,4 +1,4 @@
-"""Residual: the gradient of the potential at the free unknowns, and the force scale that it is relative to."""
+"""Residual: gradient of the energy at the free unknowns, and the force scale for relative residuals."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from .lbfgs_kernels import FREE, OWN, PAIRS, SUMS, WHOLE, build_kernels
 
 @dataclass(frozen=True, eq=False)
 class ResidualArrays:
-    """Residual g (3N, b) [N] on the device, and the `sums` (SUMS, b) that L-BFGS decides by.
+    """Residual g (3N, b) [N] on the device, and the `sums` (SUMS, b) on which the decisions of L-BFGS depend.
 
-    `term_norms` holds square norms (terms, b) of the gradients of the terms that are not constant. `scratch` (3N, b) is
-    workspace, zero between calls.
+    `term_norms` (terms, b) are squared norms of the gradients of all terms that are not constant. `scratch` (3N, b) is
+    a workspace that is zero between calls.
     """
 
     g: wp.array
@@ -29,7 +29,7 @@ class ResidualArrays:
 
 
 def allocate_residual_arrays(problem: Problem, count: int) -> ResidualArrays:
-    """Allocate the arrays of a `ResidualArrays` for `count` load cases."""
+    """Return allocated `ResidualArrays` for `count` load cases."""
     device = problem.device
     sums, own = (wp.zeros((rows, count), dtype=wp.float64, device=device.name) for rows in (SUMS, len(problem.terms)))
     return ResidualArrays(device.allocate(problem.rows, count), device.allocate(problem.rows, count), sums, own)
@@ -42,7 +42,7 @@ def compute_residual_arrays(
     d: wp.array | None = None,
     workspace: ResidualArrays | None = None,
 ) -> ResidualArrays:
-    """Compute the residual at v (3N, b) [m] of a batch with `constant` gradients (3N, b) [N], and its product with d.
+    """Return the residual at v (3N, b) [m] with `constant` gradients (3N, b) [N], and its inner products with d.
 
     The result is written to `workspace`, if it is given.
     """
@@ -73,7 +73,7 @@ def compute_residual_arrays(
 
 
 def compute_constant_gradients(problem: Problem, u: wp.array) -> tuple[wp.array, wp.array]:
-    """Sum the gradients (3N, b) [N] of the constant terms, and compute the square norm (terms, b) of each."""
+    """Return the sum (3N, b) [N] of the gradients of constant terms, and their squared norms (terms, b)."""
     device = problem.device
     total = device.allocate(*u.shape)
     square = wp.zeros((len(problem.terms), u.shape[1]), dtype=wp.float64, device=device.name)
@@ -88,9 +88,9 @@ def compute_constant_gradients(problem: Problem, u: wp.array) -> tuple[wp.array,
 
 @dataclass(frozen=True, eq=False)
 class ResidualState:
-    """State of b load cases: u (3N, b) [m], residuals g (3N, b) [N], their 2-norms `norm` (b,), and `scale` (b,).
+    """State of b load cases: u (3N, b) [m], residual g (3N, b) [N], its 2-norm `norm` (b,), and its `scale` (b,).
 
-    The scale [N] is the largest 2-norm of a term's own gradient or of the reaction at constrained nodes.
+    The scale [N] is the largest 2-norm among the gradients of all terms and the reaction at constrained nodes.
     """
 
     u: wp.array
@@ -100,25 +100,25 @@ class ResidualState:
 
     @property
     def relative(self) -> np.ndarray:
-        """Relative residuals (b,)."""
+        """Relative residual (b,) of each load case."""
         return compute_relative_residual(self.norm, self.scale)
 
     @property
     def is_finite(self) -> np.ndarray:
-        """True (b,) where residual and scale are finite; forces may overflow."""
+        """Mask (b,) of load cases with finite residual and scale, since forces may overflow."""
         return np.isfinite(self.norm) & np.isfinite(self.scale)
 
     def select(self, device: Device, columns: np.ndarray) -> ResidualState:
-        """Return the state of some load cases (k,)."""
+        """Return the state of the load cases `columns` (k,)."""
         u, g = (gather_columns(device, array, columns) for array in (self.u, self.g))
         return ResidualState(u, g, self.norm[columns], self.scale[columns])
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualEvaluator:
-    """Callable that evaluates the residuals of the batch that a problem has begun.
+    """Callable that evaluates the residuals of the current batch of a problem.
 
-    `constant` (3N, b) [N] is the summed gradient of the constant terms, `norms` (b,) the largest square norm of one.
+    `constant` (3N, b) [N] is the summed gradient of the constant terms; `norms` (b,) are their largest squared norms.
     """
 
     problem: Problem
@@ -126,7 +126,7 @@ class ResidualEvaluator:
     norms: np.ndarray
 
     def __call__(self, u: wp.array) -> ResidualState:
-        """Return the residuals of states u (3N, b) [m]."""
+        """Return the state with the residuals at u (3N, b) [m]."""
         found = compute_residual_arrays(self.problem, u, self.constant)
         sums = found.sums.numpy()
         with np.errstate(invalid="ignore", over="ignore"):
@@ -135,7 +135,7 @@ class ResidualEvaluator:
             return ResidualState(u, found.g, np.sqrt(sums[FREE]), np.sqrt(largest))
 
     def select(self, columns: np.ndarray) -> ResidualEvaluator:
-        """Keep only some load cases (k,), in the problem too, and return their evaluator."""
+        """Keep only the load cases `columns` (k,), also in the problem, and return their evaluator."""
         self.problem.keep(columns)
         return ResidualEvaluator(
             self.problem, gather_columns(self.problem.device, self.constant, columns), self.norms[columns]
@@ -143,19 +143,19 @@ class ResidualEvaluator:
 
 
 def build_evaluator(problem: Problem, u: wp.array) -> ResidualEvaluator:
-    """Build the evaluator of the batch that the problem has begun, with start u (3N, b) [m]."""
+    """Return the evaluator of the current batch of a problem, with start u (3N, b) [m]."""
     constant, loud = compute_constant_gradients(problem, u)
     return ResidualEvaluator(problem, constant, loud.numpy().max(axis=0, initial=0.0))
 
 
 def compute_relative_residual(norm: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Divide residual norms (b,) [N] by their scales (b,) [N]; zero where no force acts."""
+    """Return residual norms (b,) [N] divided by their scales (b,) [N]; zero if no force acts."""
     with np.errstate(invalid="ignore"):  # forces that overflowed
         return np.divide(norm, scale, out=np.zeros_like(norm), where=scale != 0.0)
 
 
 def measure_residual(problem: Problem, u: wp.array) -> np.ndarray:
-    """Compute the relative residual (b,) of u (3N, b) under the full load, or the relative constraint gap if larger."""
+    """Return the relative residual (b,) of u (3N, b) under the full load, or the relative constraint gap if larger."""
     _, free, scale = problem.residual(u)
     gap, size = problem.constraint.close_gap(u)
     largest = np.abs(u.numpy() + gap.numpy()).max(axis=0, initial=0.0)

@@ -1,9 +1,9 @@
-"""Second-order response of a model to nodal forces, for each pair of components, exact to rounding.
+"""Second-order response of a model to nodal forces, for each pair of components, exact up to round-off.
 
 With internal forces f(u) = K u + Q(u, u) + ..., Q(u, v) = integral of B^T P2(Bu, Bv), forces F displace the model by
-K^-1 F - K^-1 Q(K^-1 F, K^-1 F) + ... P2 is half the second derivative of the stress in the undeformed state. This
-module computes the second term for pairs of unit forces, element by element. `power_series` computes it for one load
-only.
+K^-1 F - K^-1 Q(K^-1 F, K^-1 F) + ... P2 is half of the second derivative of the stress in the undeformed state. This
+module computes the second term for pairs of unit forces, element by element; `power_series` computes this term for
+one load only.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ CUDA_BATCH = 4096  # The same on CUDA: they fill a GPU.
 
 @dataclass(frozen=True, eq=False)
 class _Some:
-    """Batch of elements of one tissue: indices (k,), and P2 (9, 81) float32 that maps a strain to a stiffness."""
+    """Batch of elements of one tissue: indices (k,), and P2 (9, 81) float32, which maps a strain to a stiffness."""
 
     elements: Elements
     chosen: np.ndarray
@@ -41,22 +41,22 @@ def compute_second_order(
     pair_mask: np.ndarray,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """List pairs (P, 2) of force components p <= q, and compute the response (P, r) float32 [1/N^2] to each.
+    """Return pairs (P, 2) of force components p <= q, and the second-order response (P, r) float32 to each pair.
 
-    Under forces F (3m,) the second order is the sum over pairs (p, q) of F_p F_q times their row.
+    Under forces F (3m,), the second order is the sum over pairs (p, q) of F_p F_q times the row (r,) of the pair.
 
     Parameters
     ----------
     problem
         Problem whose elastic terms are used.
     unit_motions
-        (3m, 3N) [m/N]: undeformed compliance, displacements under unit forces on m nodes.
+        Displacements (3m, 3N) [m/N] under unit forces on m nodes: rows of the undeformed compliance.
     functionals
-        (r, 3N): as `OutputFunctionals.solutions`, of the requested functionals.
+        Products (r, 3N) of compliance and weights of the functionals, as `OutputFunctionals.solutions`.
     pair_mask
-        (m, m) bool, symmetric: nodes whose pairs are requested.
+        Symmetric mask (m, m) of the node pairs for which the response is requested.
     progress
-        Called with the number of finished batches of elements, and with their total.
+        Function called with the number of finished batches of elements and the total number.
     """
     device = problem.device
     first, second = np.nonzero(np.triu(np.repeat(np.repeat(pair_mask, 3, axis=0), 3, axis=1)))
@@ -96,7 +96,7 @@ def compute_second_order(
 
 
 def _list_batches(elements: Elements, tensors: np.ndarray, kind: np.ndarray, most: int) -> list[_Some]:
-    """List all elements of a term by tissue, in batches of at most `most`."""
+    """Return all elements of a term, in batches of one tissue and at most `most` elements."""
     found = []
     for each, tensor in enumerate(tensors):
         chosen = np.flatnonzero(kind == each)
@@ -106,7 +106,7 @@ def _list_batches(elements: Elements, tensors: np.ndarray, kind: np.ndarray, mos
 
 
 def _build_gradient_matrix(elements: Elements, chosen: np.ndarray) -> sp.csr_array:
-    """Build the matrix from displacements (3N,) to gradients (9 k q,) in some elements (k,), row by row."""
+    """Return the matrix from displacements (3N,) to gradients (9 k q,), row by row, in elements `chosen` (k,)."""
     table, slope = elements.table[chosen], elements.gradient[chosen]
     count, points, most = slope.shape[:3]
     row = np.arange(9 * count * points).reshape(count, points, 1, 3, 3)

@@ -1,1 +1,1 @@
-"""Common infrastructure without mechanics: devices, batch arithmetic, threads, memory, time, files."""
+"""Common infrastructure without mechanics: devices, batch arithmetic, threads, memory, timing and files."""

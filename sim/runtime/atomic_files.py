@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders: they appear complete or not at all."""
+"""Atomic writing: a file or folder appears completely or not at all."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from .partial_files import STALE_SECONDS, list_partials, remove_partial_files, t
 
 
 def explain_error(error: OSError) -> str:
-    """Return the reason of an OSError in the system's words, not those of a library."""
+    """Return the reason of an OSError in the words of the operating system, not those of a library."""
     return os.strerror(error.errno) if error.errno else "the library that writes it failed"
 
 
 def check_output(path: str | Path, suffix: str, max_age: float = STALE_SECONDS, clean: bool = True) -> Path:
-    """Return a path that can be written, with its folder created; called before long work, so that no result is lost.
+    """Return a writable path, whose folder is created; call this before long work, so that no result is lost.
 
-    Left-overs of killed runs with the same output are removed; `clean` False saves listing a folder with very many
-    files. Another machine's unfinished file counts as a left-over after `max_age` seconds.
+    Unfinished files of killed runs with the same output are removed, unless `clean` is False, which saves time in very
+    large folders. Unfinished files of other machines are removed after `max_age` seconds.
 
     Raises
     ------
     InputError
-        A name that does not end in `suffix`, or a folder that cannot be written to.
+        The name does not end in `suffix`, or the folder is not writable.
     """
     path = Path(path)
     if path.suffix != suffix:
@@ -54,14 +54,14 @@ def check_output(path: str | Path, suffix: str, max_age: float = STALE_SECONDS, 
 
 @contextmanager
 def write_atomically(path: str | Path, suffix: str, clean: bool = True) -> Iterator[Path]:
-    """Yield a temporary name next to `path`, of the same suffix, which is renamed to `path` when the block succeeds.
+    """Yield a temporary path next to `path`, with the same suffix, which is renamed to `path` if the block succeeds.
 
-    `clean` is that of `check_output`.
+    `clean` has the same meaning as in `check_output`.
 
     Raises
     ------
     InputError
-        See `check_output`; and if writing fails.
+        See `check_output`; also if writing fails.
     """
     path = check_output(path, suffix, clean=clean)
     partial = to_partial_path(path)
@@ -78,21 +78,21 @@ def write_atomically(path: str | Path, suffix: str, clean: bool = True) -> Itera
 
 @contextmanager
 def write_folder_atomically(path: Path, size: int = 0, is_kept: Callable[[Path], bool] | None = None) -> Iterator[Path]:
-    """Yield a hidden folder next to `path`, which is renamed to it when the block succeeds, and removed otherwise.
+    """Yield a hidden folder next to `path`, which is renamed to `path` if the block succeeds, and else removed.
 
     Parameters
     ----------
     size
-        Expected size of its content [bytes].
+        Expected size of the content [bytes].
     is_kept
-        Function that returns True if a hidden folder stays after a failure, so that the same work can resume from it.
-        Then several processes may write one folder, and the first to finish renames it. Without `is_kept` a second
-        process is rejected.
+        Function that returns True if a hidden folder is kept after a failure, so that the same work can be resumed.
+        Then several processes may write one folder, and the process that finishes first renames the folder. Without
+        `is_kept`, a second process is rejected.
 
     Raises
     ------
     InputError
-        A file, or a folder that is not empty; a full disk; a place that cannot be written; another process.
+        `path` is a file or a folder that is not empty, is not writable, or is in use; or the disk is full.
     """
     target = path.resolve()
     partial = to_partial_path(target)
@@ -125,7 +125,7 @@ def write_folder_atomically(path: Path, size: int = 0, is_kept: Callable[[Path],
 
 @contextmanager
 def remove_empty_parents(path: Path) -> Iterator[None]:
-    """Remove the folders above `path` that the block created and left empty."""
+    """Remove the folders above `path` that the block created and that are empty at its end."""
     missing = [folder for folder in path.parents if not folder.exists()]
     try:
         yield
@@ -137,7 +137,7 @@ def remove_empty_parents(path: Path) -> Iterator[None]:
 
 @contextmanager
 def write_stream_atomically(path: str | Path, suffix: str, clean: bool = True) -> Iterator[Stream]:
-    """Yield an open binary file, else as `write_atomically`; for HDF5, which ends the process if its own write fails.
+    """Yield an open binary file, as `write_atomically`, for HDF5, which would end the process if its own write failed.
 
     Raises
     ------
@@ -156,14 +156,14 @@ def write_stream_atomically(path: str | Path, suffix: str, clean: bool = True) -
 
 
 class Stream:
-    """Binary file that keeps its first write failure in `failure`, to be raised at the end."""
+    """Binary file that stores its first write error in `failure`, to be raised at the end."""
 
     def __init__(self, raw: BinaryIO) -> None:
         self.failure: OSError | None = None
         self._raw = raw
 
     def write(self, data: bytes) -> int:
-        """Write all of the data; after a failure, do nothing."""
+        """Write all data and return its size; after a failure, write nothing."""
         left = memoryview(data).cast("B")
         try:
             while self.failure is None and len(left):
@@ -196,16 +196,16 @@ class Stream:
         return self._raw.tell()
 
     def flush(self) -> None:
-        """Do nothing: the file is not buffered."""
+        """Do nothing, since the file is not buffered."""
 
 
 def check_disk_space(path: str | Path, size: int, largest_file: int | None = None) -> None:
-    """Check that `size` bytes fit next to `path`, in files of at most `largest_file` bytes.
+    """Reject a path if `size` bytes, in files of at most `largest_file` bytes, do not fit next to `path`.
 
     Raises
     ------
     InputError
-        Too little free space, or a limit on the file size below `largest_file`.
+        There is too little free space, or the file size limit is below `largest_file`.
     """
     path = Path(path)
     existing = next(folder for folder in (path.parent, *path.absolute().parents) if folder.is_dir())
@@ -223,7 +223,7 @@ def check_disk_space(path: str | Path, size: int, largest_file: int | None = Non
 
 
 def _get_max_file_size() -> int | None:
-    """Return the maximum size of a file of this process [bytes]; None: no limit."""
+    """Return the maximum size of a file that this process may write [bytes]; None without a limit."""
     try:
         import resource
     except ImportError:  # a system without such limits

@@ -1,4 +1,4 @@
-"""Collective operations of a block of threads that shares one load case. On the CPU a block is one thread."""
+"""Collective operations of the threads of a block, which compute one load case together; one thread on the CPU."""
 
 from typing import Any
 
@@ -15,12 +15,12 @@ from .device import Device
 """
 )
 def wait():
-    """Wait until all threads of the block have arrived, and their writes are visible."""
+    """Wait until all threads of the block have arrived here, and their writes are visible."""
     ...
 
 
 def write_fold(fold: str) -> str:
-    """Return C++ code of a reduction over the threads, bitwise equal in each: `fold` combines `value` and `other`."""
+    """Return C++ code of a reduction over the threads, with equal bits in all; `fold` combines `value` and `other`."""
     return f"""
 #if defined(__CUDA_ARCH__)
     __shared__ double shares[32];
@@ -43,13 +43,13 @@ def write_fold(fold: str) -> str:
 
 @wp.func_native(snippet=write_fold("value + other"))
 def get_sum(value: wp.float64) -> wp.float64:
-    """Return the sum over the threads."""
+    """Return the sum of the values of all threads."""
     ...
 
 
 @wp.func_native(snippet=write_fold("fmax(value, other)"))
 def get_max(value: wp.float64) -> wp.float64:
-    """Return the largest of the threads' values."""
+    """Return the maximum of the values of all threads."""
     ...
 
 
@@ -74,16 +74,16 @@ def get_max(value: wp.float64) -> wp.float64:
 """
 )
 def get_prefix(value: wp.int32) -> wp.int32:
-    """Return the sum over the threads before this one."""
+    """Return the sum of the values of all preceding threads."""
     ...
 
 
 def get_block_shape(device: Device) -> tuple[int, int]:
-    """Return the number of threads of a block, as rows and columns: on a GPU whole warps."""
+    """Return the number of threads of a block as (rows, columns); on a GPU, whole warps."""
     return (16, 32) if device.on_cuda else (1, 1)
 
 
 def launch(device: Device, kernel: wp.Kernel, columns: int, inputs: list[Any], outputs: list[Any]) -> None:
-    """Launch a kernel over (load case, thread)."""
+    """Launch a kernel over (load case, thread), for `columns` load cases."""
     rows, along = get_block_shape(device)
     device.launch(kernel, (columns, rows * along), inputs, outputs, rows * along)

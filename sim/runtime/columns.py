@@ -1,4 +1,4 @@
-"""Arithmetic on batches: arrays (rows, b) on the device, one column per load case; also on selected rows."""
+"""Arithmetic on batches: device arrays (rows, b) with one column per load case, and selected rows of these."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ CHUNK = 64  # Rows that one thread sums before its atomic addition to the column
 
 @dataclass(frozen=True)
 class ColumnKernels:
-    """Kernels of column arithmetic, and of row copies, for one scalar type."""
+    """Kernels for column arithmetic and row copies, for one scalar type."""
 
     dot: wp.Kernel
     dot_alone: wp.Kernel
@@ -32,7 +32,7 @@ class ColumnKernels:
 
 @cache
 def build_kernels(device: Device) -> ColumnKernels:
-    """Build the kernels for a device's scalar type."""
+    """Return the kernels for the scalar type of a device."""
     scalar = device.scalar
     chunk, lanes = CHUNK, get_warp_width(device)
 
@@ -57,7 +57,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
-        """Add x . y to out for a single column, with one row per thread."""
+        """Add the inner product x . y of single columns to out, with one row per thread."""
         r = wp.tid()
         total = wp.float64(0.0)
         if r < x.shape[0]:
@@ -97,7 +97,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """Copy vectors at nodes: out_cnk = x_(3 node(n) + k)c."""
+        """Copy the vectors at nodes: out_cnk = x_(3 node(n) + k)c."""
         c, n = wp.tid()
         for k in range(3):
             out[c, n, k] = wp.float64(x[3 * nodes[n] + k, c])
@@ -140,7 +140,7 @@ def build_kernels(device: Device) -> ColumnKernels:
 
 @cache
 def build_copy_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
-    """Build the kernels that copy columns out of arrays of a type, and back."""
+    """Return two kernels, for arrays of the type `dtype`: copy selected columns, and copy to selected columns."""
 
     @forward_kernel(module="unique")
     def gather(
@@ -176,26 +176,26 @@ def find_workspace_width(device: Device, count: int) -> int:
 
 
 def find_widest_workspace(device: Device, count: int) -> int:
-    """Return the largest workspace width of at most `count` load cases; 0 if there is none."""
+    """Return the largest workspace width that does not exceed `count` load cases; 0 if there is none."""
     if not device.on_cuda or count < 1:
         return count
     return max(count // WIDTHS[-1] * WIDTHS[-1], *(width for width in WIDTHS if width <= count))
 
 
 def is_workspace_width(width: int) -> bool:
-    """Return True if a workspace may have this width."""
+    """Return True if a workspace may have this width [load cases]."""
     return width in WIDTHS or width % WIDTHS[-1] == 0
 
 
 class Workspaces:
-    """Arrays by number of columns; for workspace widths always the same array, as captured graphs require."""
+    """Arrays by number of columns; a workspace width always has the same array, as captured graphs require."""
 
     def __init__(self, make: Callable[[int], wp.array], device: Device):
         self._make, self._device = make, device
         self._arrays: dict[int, wp.array] = {}
 
     def get_array(self, columns: int) -> wp.array:
-        """Return the array of this width, to be overwritten by the caller. On the CPU only the last one is kept."""
+        """Return the array with this width, which the caller may overwrite. On the CPU, only the last array is kept."""
         if columns not in self._arrays:
             graphs = self._device.on_cuda
             self._arrays = {
@@ -206,7 +206,7 @@ class Workspaces:
 
 
 def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:
-    """Add the columns' inner products of x and y (rows, b) to out (b,) float64, on the device."""
+    """Add the inner products of the columns of x and y (rows, b) to out (b,) float64, on the device."""
     k, (rows, count) = build_kernels(device), x.shape
     if device.on_cuda and count == 1:
         lanes = get_warp_width(device)
@@ -216,19 +216,19 @@ def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:
 
 
 def compute_dots(device: Device, x: wp.array, y: wp.array) -> np.ndarray:
-    """Return the columns' inner products (b,) of x and y (rows, b), on the host."""
+    """Return the inner products (b,) of the columns of x and y (rows, b), on the host."""
     out = wp.zeros(x.shape[1], dtype=wp.float64, device=device.name)
     add_dots(device, x, y, out)
     return out.numpy()
 
 
 def compute_norms(device: Device, x: wp.array) -> np.ndarray:
-    """Return the columns' 2-norms (b,) of x (rows, b), on the host."""
+    """Return the 2-norms (b,) of the columns of x (rows, b), on the host."""
     return np.sqrt(compute_dots(device, x, x))
 
 
 def combine_columns(device: Device, x: wp.array, factor: np.ndarray | float, y: wp.array, out: wp.array) -> wp.array:
-    """Compute out = x + factor y; factor (b,) from the host, or one for all columns; out may be x."""
+    """Compute and return out = x + factor y; `factor` is (b,) on the host, or a scalar. `out` may be x."""
     kernels = build_kernels(device)
     if isinstance(factor, (int, float)):
         device.launch(kernels.add_multiple, x.shape, [x, factor, y], [out])
@@ -240,7 +240,7 @@ def combine_columns(device: Device, x: wp.array, factor: np.ndarray | float, y: 
 def gather_columns(
     device: Device, x: wp.array, columns: np.ndarray | wp.array, out: wp.array | None = None
 ) -> wp.array:
-    """Return a copy (..., k) of some columns (k,) of x (..., b); in `out`, if it is given."""
+    """Return a copy (..., k) of the given columns (k,) of x (..., b), in `out` if given."""
     index = _index(device, columns)
     if out is None:
         out = wp.empty((*x.shape[:-1], len(index)), dtype=x.dtype, device=device.name)
@@ -252,7 +252,7 @@ def gather_columns(
 def scatter_columns(
     device: Device, x: wp.array, columns: np.ndarray, out: wp.array, source_columns: np.ndarray | None = None
 ) -> None:
-    """Copy x (..., k), or `source_columns` (k,) columns of it, to some columns (k,) of out (..., b)."""
+    """Copy x (..., k), or its columns `source_columns` (k,), to the columns `columns` (k,) of out (..., b)."""
     _, scatter = build_copy_kernels(x.dtype)
     source_columns = np.arange(x.shape[-1]) if source_columns is None else source_columns
     inputs = [_flatten_rows(x), _index(device, source_columns), _index(device, columns)]
@@ -260,7 +260,7 @@ def scatter_columns(
 
 
 def unstack_columns(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:
-    """Return the vectors (b, n, 3) at nodes (n,) of x (3N, b), in double precision on the host."""
+    """Return the vectors (b, n, 3) of x (3N, b) at `nodes` (n,), in double precision on the host."""
     out = wp.empty((x.shape[1], len(nodes), 3), dtype=wp.float64, device=device.name)
     device.launch(build_kernels(device).unstack, out.shape[:2], [x, device.upload(nodes, wp.int32)], [out])
     return out.numpy()
@@ -276,7 +276,7 @@ def _flatten_rows(x: wp.array) -> wp.array:
 
 
 def take_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array | None = None) -> wp.array:
-    """Return a copy (m, b) of some rows of x (n, b); in `out`, if it is given."""
+    """Return a copy (m, b) of the given rows (m,) of x (n, b), in `out` if given."""
     if out is None:
         out = wp.empty((len(rows), x.shape[1]), dtype=x.dtype, device=device.name)
     device.launch(build_kernels(device).take, (len(rows), x.shape[1]), [x, rows], [out])
@@ -284,12 +284,12 @@ def take_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array | None 
 
 
 def put_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
-    """Copy x (m, b) to some rows of out (n, b)."""
+    """Copy x (m, b) to the given rows (m,) of out (n, b)."""
     device.launch(build_kernels(device).put, x.shape, [x, rows], [out])
 
 
 def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
-    """Add x (m, b) to some rows of out (n, b), each of them once."""
+    """Add x (m, b) to the given rows (m,) of out (n, b); the rows must be unique."""
     device.launch(build_kernels(device).add, x.shape, [x, rows], [out])
 
 
@@ -302,9 +302,9 @@ def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None
 """
 )
 def sum_warp(value: wp.float64) -> wp.float64:
-    """Return the sum over the threads of a warp, valid in the first of them; on the CPU the value itself.
+    """Return the sum over the threads of a warp, valid only in the first thread; on the CPU, the value itself.
 
-    All of them must take part, which a launch over a multiple of `get_warp_width` guarantees.
+    All threads of the warp must call the function; a launch over a multiple of `get_warp_width` guarantees this.
     """
     ...
 

@@ -1,4 +1,4 @@
-"""Product of a dense matrix with columns, by the fastest library: torch on CUDA, NumPy's BLAS on the CPU."""
+"""Product of a dense matrix and columns by the fastest library: torch on CUDA, BLAS of NumPy on the CPU."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ from .threads import limit_to_one_thread
 
 
 def build_product(matrix: np.ndarray, device: Device, reduced: bool = False) -> Callable[[wp.array, wp.array], None]:
-    """Build (x, out) -> out (m, b) = matrix (m, n) x (n, b); `reduced` lets CUDA round values to eight bits."""
+    """Return a function (x, out): out (m, b) = matrix (m, n) x (n, b). `reduced` lets CUDA round values to 8 bits."""
     return _build_cuda_product(matrix, device, reduced) if device.on_cuda else _build_cpu_product(matrix, device)
 
 

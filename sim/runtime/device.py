@@ -1,4 +1,4 @@
-"""Device and precision of arrays."""
+"""Device and precision of Warp arrays."""
 
 import ctypes
 import os
@@ -18,35 +18,35 @@ from .kernel_cache import ensure_writable_cache
 from .threads import wait_for_foreground
 
 forward_kernel = partial(wp.kernel, enable_backward=False, grid_stride=False)
-"""`wp.kernel` without adjoint, which is not used, and launched without grid-stride loop, which saves registers."""
+"""Decorator `wp.kernel` without the unused adjoint, and without a grid-stride loop, which saves registers."""
 
 STDERR = 2  # File descriptor of the error output.
 ALL_GPUS = "all"
-"""Name of all GPUs in a list of devices."""
+"""Name that means all GPUs in a list of devices."""
 
 SCALARS: dict[Precision, Any] = {"float32": wp.float32, "float64": wp.float64}  # Warp's scalar types.
 
 
 @dataclass(frozen=True)
 class Device:
-    """Warp device by name, and the scalar type of the arrays on it."""
+    """Warp device, by name, and precision of the arrays on this device."""
 
     name: str
     precision: Precision
 
     @property
     def scalar(self) -> Any:
-        """Warp's scalar type."""
+        """Scalar type of Warp."""
         return SCALARS[self.precision]
 
     @property
     def matrix(self) -> Any:
-        """Warp's 3 x 3 matrix of the scalar type."""
+        """3 x 3 matrix type of Warp, with the scalar type."""
         return wp.types.matrix((3, 3), self.scalar)
 
     @property
     def vector(self) -> Any:
-        """Warp's 3-vector of the scalar type."""
+        """3-vector type of Warp, with the scalar type."""
         return wp.types.vector(3, self.scalar)
 
     @property
@@ -59,7 +59,7 @@ class Device:
         return wp.zeros(shape, dtype=self.scalar, device=self.name)
 
     def upload(self, values: np.ndarray, dtype: Any = None) -> wp.array:
-        """Return a copy of `values` on the device, of the scalar type unless `dtype` is given."""
+        """Return a copy of `values` on the device, with the scalar type unless `dtype` is given."""
         return wp.array(np.ascontiguousarray(values), dtype=dtype or self.scalar, device=self.name)
 
     def launch(
@@ -80,9 +80,9 @@ _loading, _loaded = Lock(), set[wp.Module]()  # Lock of compilation; modules tha
 
 
 def load_module(module: wp.Module) -> None:
-    """Load a kernel's module on the CPU; if Warp has not cached it, it is compiled.
+    """Load the module of a kernel on the CPU; a module that is not in the cache of Warp is compiled.
 
-    One thread at a time loads, and others wait: Warp alone would compile a module once for each thread.
+    Only one thread loads at a time, since Warp would otherwise compile a module once for each thread.
     """
     if module not in _loaded:
         with _loading:
@@ -91,14 +91,14 @@ def load_module(module: wp.Module) -> None:
 
 
 def find_device(name: str, precision: Precision) -> Device:
-    """Return the device called "cpu", "cuda", "cuda:1", or "auto": CUDA if there is one.
+    """Return the device with the name "cpu", "cuda", "cuda:1" or the like; "auto" is CUDA if available, else the CPU.
 
-    Starts Warp, and suppresses its default notes.
+    Warp is initialised, without its default notes.
 
     Raises
     ------
     InputError
-        A device that this machine does not have, or several of them.
+        The machine does not have the device, or the name means several devices.
     """
     if "," in name or name == ALL_GPUS:
         raise InputError(
@@ -116,15 +116,15 @@ def find_device(name: str, precision: Precision) -> Device:
 
 
 def parse_device_names(text: str) -> tuple[str, ...]:
-    """Parse a list of devices into Warp's names: "cuda:0,cuda:1", "cpu,cpu", "all", or a single one.
+    """Return the device names in a text such as "cuda:0,cuda:1", "cpu,cpu", "all" or "cuda".
 
-    "all" are the GPUs. A device that occurs twice is shared by two processes.
+    "all" means all GPUs. A device that occurs twice is shared by two processes.
 
     Raises
     ------
     InputError
-        A device that this machine does not have, "all" without GPUs or with other names, an empty name, CPU and GPUs
-        together.
+        The machine does not have a device, "all" is used without GPUs or with other names, a name is empty, or CPU and
+        GPUs are mixed.
     """
     if text.strip() == ALL_GPUS:
         cards = tuple(name for name in _list_devices() if name.startswith("cuda"))
@@ -156,7 +156,7 @@ def _list_devices() -> list[str]:
 
 @cache
 def _start_warp() -> None:
-    """Start Warp; where no CUDA driver can be loaded, one line replaces the warning of its native code."""
+    """Initialise Warp; if no CUDA driver is available, one line replaces the warning of the native code."""
     if wp.config.log_level == wp.LOG_INFO:  # its start-up notes would mix with a command's output
         wp.config.log_level = wp.LOG_ERROR
     if wp.config.kernel_cache_dir is None:

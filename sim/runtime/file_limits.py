@@ -1,4 +1,4 @@
-"""Size limits of files from outside, so that a malicious or damaged file cannot exhaust the memory."""
+"""Size limits for untrusted files, so that a malicious or damaged file cannot exhaust the memory."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,16 +26,16 @@ MAX_VOXELS = 2**29  # Maximum number of voxels of a volume: that of a head of 20
 
 @dataclass(frozen=True)
 class MeshSizeLimits:
-    """Limits of the inflated size of a mesh file's arrays.
+    """Limits of the decompressed size of the arrays in a mesh file.
 
     Parameters
     ----------
     max_bytes
         Maximum size of all arrays together [bytes]: nodes, cells, and a few fields.
     max_ratio
-        Maximum ratio to the file's size; a mesh does not inflate further, because its coordinates hardly repeat.
+        Maximum ratio of decompressed size to file size; coordinates of a mesh do not compress better.
     min_limit
-        Size that every file may inflate to [bytes].
+        Decompressed size that is permitted for every file [bytes].
     """
 
     max_bytes: int = 4 * 1024**3
@@ -43,12 +43,12 @@ class MeshSizeLimits:
     min_limit: int = 2**28
 
     def limit_bytes(self, size: int) -> int:
-        """Return the inflated size [bytes] that is allowed for a file of `size` bytes.
+        """Return the maximum decompressed size [bytes] for a file of `size` bytes.
 
         Raises
         ------
         InputError
-            A file that is larger than the limit itself.
+            The file itself is larger than the limit.
         """
         if size > self.max_bytes:
             raise InputError(
@@ -58,11 +58,11 @@ class MeshSizeLimits:
 
 
 MESH_BYTES = MeshSizeLimits()
-"""Default limits: four gigabytes, and a hundred times a file's size."""
+"""Default limits: four gigabytes, and a hundred times the file size."""
 
 
 def build_too_large_error(max_bytes: int) -> InputError:
-    """Build the error for a mesh file whose arrays take more than `max_bytes` bytes."""
+    """Return the error for a mesh file whose arrays need more than `max_bytes` bytes."""
     return InputError(
         f"its arrays take more than {max_bytes / 1e9:.3g} GB: too much for a brain mesh in a file of this size. "
         "Write it again, or use a coarser mesh."
@@ -71,15 +71,15 @@ def build_too_large_error(max_bytes: int) -> InputError:
 
 @contextmanager
 def limit_memory(max_bytes: int) -> Iterator[None]:
-    """Limit the memory that a block may take in addition, to `max_bytes` bytes, where the system supports it.
+    """Limit the additional memory that a block may allocate to `max_bytes` bytes, if the system supports this.
 
-    For reading with libraries, which trust sizes in a file's header. The limit applies to the whole process, so other
-    threads should allocate little meanwhile.
+    Use this around libraries that trust the sizes in the header of a file. The limit applies to the whole process, so
+    other threads should allocate little memory in the meantime.
 
     Raises
     ------
     InputError
-        The block asked for more.
+        The block requested more memory.
     """
     try:
         import resource  # on Unix only

@@ -1,8 +1,8 @@
-"""Journal of a run: records are appended to a file that stays valid after a kill or damage.
+"""Journal of a run: a file to which records are appended, and which stays valid after a kill or damage.
 
-A run that resumes its rows or batches does so from this file (docs/architecture.md).
-Each record has a digest keyed with the run's description, so that torn, damaged or foreign records are detected.
-Records follow each other; after an invalid one, the next is found by its mark.
+A run resumes its rows or batches from this file (docs/architecture.md). The digest of each record is keyed with the
+description of the run, so that incomplete, damaged or foreign records are detected. After an invalid record, the
+next record is found by its mark.
 """
 
 import hashlib
@@ -33,11 +33,11 @@ MAX_DESCRIPTION_BYTES = 1 << 16
 
 
 class DamageWarning(UserWarning):
-    """Warning that finished work was lost to damage, and is repeated."""
+    """Warning that finished work was lost because of damage and is repeated."""
 
 
 class Journal:
-    """Valid records of one run, by group and first row, open during the run."""
+    """Open journal with the valid records of one run, by group and first row."""
 
     def __init__(self, path: Path, file: BinaryIO, key: bytes, places: dict[Batch, tuple[int, int]]) -> None:
         self._path, self._file, self._key, self._places = path, file, key, places
@@ -49,12 +49,12 @@ class Journal:
         return len(self._places)
 
     def add(self, batch: Batch, payload: bytes) -> None:
-        """Append a record, which then survives a kill of this process.
+        """Append the record of a batch, which then survives a kill of this process.
 
         Raises
         ------
         InputError
-            A full disk; earlier records stay.
+            The disk is full; earlier records remain valid.
         """
         try:
             start = self._file.seek(0, os.SEEK_END)
@@ -68,12 +68,12 @@ class Journal:
         self._places[batch] = start, RECORD_HEADER.size + len(payload)
 
     def read(self, batch: Batch) -> bytes:
-        """Return the payload of a record.
+        """Return the payload of the record of a batch.
 
         Raises
         ------
         InputError
-            A record that was damaged since.
+            The record was damaged after the journal was opened.
         """
         start, size = self._places[batch]
         self._file.seek(start)
@@ -86,28 +86,28 @@ class Journal:
         return record[RECORD_HEADER.size :]
 
     def append(self, row: Any) -> None:
-        """Append a dataclass of plain numbers and texts as the next row; InputError as `add`."""
+        """Append a dataclass of plain numbers and texts as the next row; raise InputError as `add`."""
         _, last = next(reversed(self._places), ("row", -1))
         self.add(("row", last + 1), json.dumps(asdict(row)).encode())
 
     def read_rows(self, kind: type[R]) -> list[R]:
-        """Return the appended rows, as dataclasses of one kind; InputError as `read`."""
+        """Return the appended rows as dataclasses of the type `kind`; raise InputError as `read`."""
         return [kind(**json.loads(self.read(batch))) for batch in sorted(self._places)]
 
 
 @contextmanager
 def open_journal(path: Path, description: Mapping[str, str]) -> Iterator[Journal]:
-    """Yield the journal of the run that `description` describes, new or resumed; the file stays.
+    """Yield the new or resumed journal of the run with this `description`; the file is not removed.
 
     Raises
     ------
     InputError
-        A file that another run is writing, that is of another run, or no journal; a folder that cannot be written to.
+        The file is in use by another run, belongs to another run or is not a journal, or the folder is not writable.
 
     Warns
     -----
     DamageWarning
-        Damaged records, which are left out.
+        Damaged records are omitted.
     """
     opening = _record((RUN_GROUP, 0), json.dumps(dict(description)).encode(), b"")
     key = hashlib.sha256(opening).digest()
@@ -124,7 +124,7 @@ def open_journal(path: Path, description: Mapping[str, str]) -> Iterator[Journal
 
 
 def read_description(path: Path) -> dict[str, str]:
-    """Return the description of the run that a journal belongs to; empty if it cannot be read."""
+    """Return the description of the run of a journal; empty if it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         head = file.read(MAX_DESCRIPTION_BYTES)
         if _verify_record(head, 0, b"") == (RUN_GROUP, 0):
@@ -140,7 +140,7 @@ def _get_payload(held: Held) -> bytes:
 def _restore_records(
     path: Path, file: BinaryIO, opening: bytes, key: bytes, stated: Mapping[str, str]
 ) -> dict[Batch, tuple[int, int]]:
-    """Return start and size of the valid records, and truncate the file after the last."""
+    """Return start and size of the valid records, by batch, and truncate the file after the last valid record."""
     foreign = f"{path}: is not an unfinished run, or its beginning is damaged: delete it, and run the command again."
     if not file.seek(0, os.SEEK_END):
         raise InputError(foreign)
@@ -173,12 +173,12 @@ def check_same_description(
     verb: str = "begun",
     remedy: str = "delete it, ",
 ) -> None:
-    """Reject a file whose description `stored` differs from the present one, `description`.
+    """Reject a file whose description `stored` differs from the current `description`.
 
     Raises
     ------
     InputError
-        The first name with another text; for a finished file the `verb` is "made", and there is no `remedy`.
+        The descriptions differ; the message gives the first difference. `verb` and `remedy` are parts of the message.
     """
     for name, wanted in description.items():
         found = stored.get(name, "nothing")
@@ -190,7 +190,7 @@ def check_same_description(
 
 
 def _find_records(held: Held, start: int, key: bytes) -> tuple[dict[Batch, tuple[int, int]], list[tuple[int, str]]]:
-    """Return start and size of the valid records from `start` on; start and name of the invalid ones."""
+    """Return start and size of the valid records from position `start`, and start and name of the invalid records."""
     places: dict[Batch, tuple[int, int]] = {}
     damaged: list[tuple[int, str]] = []
     while start < len(held):
@@ -212,7 +212,7 @@ def _record(batch: Batch, payload: bytes, key: bytes) -> bytes:
 
 
 def _verify_record(held: Held, start: int, key: bytes) -> Batch | None:
-    """Return the batch of the record at `start`, or None if there is no valid record with this key."""
+    """Return the batch of the record at position `start`, or None if there is no valid record with this key."""
     head = held[start : start + RECORD_HEADER.size]
     if len(head) < RECORD_HEADER.size:
         return None
@@ -226,7 +226,7 @@ def _verify_record(held: Held, start: int, key: bytes) -> Batch | None:
 
 
 def _name(held: Held, start: int) -> str:
-    """Return the name of a damaged record, if it can be read."""
+    """Return the name of a damaged record at position `start`, if it can be read."""
     head = held[start : start + RECORD_HEADER.size]
     if len(head) == RECORD_HEADER.size and head.startswith(RECORD_MARK):
         _, group, first, _, _ = RECORD_HEADER.unpack(head)
@@ -242,7 +242,7 @@ def _compute_digest(head: bytes, payload: bytes, key: bytes) -> bytes:
 
 
 def _lock(path: Path, file: BinaryIO) -> None:
-    """Lock the file against other runs until it is closed, where the system can."""
+    """Lock the file against other runs until it is closed, if the system supports this."""
     try:
         import fcntl
     except ImportError:

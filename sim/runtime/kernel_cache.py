@@ -1,4 +1,4 @@
-"""Folder in which Warp compiles kernels: a private temporary one if the user's cannot be written."""
+"""Folder in which Warp compiles kernels: a private temporary folder if the default folder is not writable."""
 
 import os
 import stat
@@ -17,14 +17,14 @@ REMEDY = f"Set {CACHE_VARIABLE} to a folder that can be written."  # Ends the me
 
 
 def ensure_writable_cache() -> None:
-    """Set `WARP_CACHE_PATH` to a private temporary folder, with a warning, if Warp's own choice cannot be written.
+    """Set `WARP_CACHE_PATH` to a private temporary folder, with a warning, if the default of Warp is not writable.
 
-    Child processes inherit it. Warp reads it when it is first used.
+    Child processes inherit this variable. Warp reads the variable when it is first used.
 
     Raises
     ------
     InputError
-        No temporary folder can be written either.
+        No temporary folder is writable either.
     """
     usual = _get_default_folder()
     if _is_writable(usual):
@@ -38,7 +38,7 @@ def ensure_writable_cache() -> None:
 
 
 def _get_default_folder() -> Path:
-    """Return Warp's default folder."""
+    """Return the default cache folder of Warp."""
     number = version("warp-lang")
     if chosen := os.environ.get(CACHE_VARIABLE):
         return Path(chosen).absolute() / number
@@ -50,7 +50,7 @@ def _get_default_folder() -> Path:
 
 
 def _is_writable(folder: Path) -> bool:
-    """Return True if a file can be written in a folder, which is created; False for an unknown home folder."""
+    """Return True if a file can be written in a folder, which is created if necessary; False without a home folder."""
     try:
         if not folder.is_absolute():
             return False
@@ -63,7 +63,7 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _create_private_folder() -> Path:
-    """Create a folder that only this user can access: the same in later runs, unless another user took its name.
+    """Return a created folder that only this user can access; later runs use the same folder if its name is free.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Memory estimates of a batch, and a check before it is solved that names the batch that fits."""
+"""Memory estimates for a batch, and a check before its solution that reports the size of a batch that fits."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,18 +19,18 @@ MESH_REMEDY = "take a coarser mesh, or a larger machine."  # Remedy if not even 
 
 @dataclass(frozen=True)
 class MemoryBudget:
-    """Part of a machine's memory that a solver may use.
+    """Limits of the memory of a machine that a solver may use.
 
     Parameters
     ----------
     fraction
-        Fraction of the free memory: the remainder is for other programs.
+        Fraction of the free memory that may be used; the remainder is for other programs.
     batch_fraction
         Fraction of the free memory for a batch of automatic size; the remainder is for results and other programs.
     max_cases, max_cases_on_cuda
-        Maximum load cases solved together: more do not use the processor better.
+        Maximum number of load cases solved together; more cases do not use the processor better.
     cgroup
-        Linux folder with the memory limit and use of a control group, such as a container.
+        Linux folder with the memory limit and the memory use of a control group, such as a container.
     """
 
     fraction: float = 0.9
@@ -41,14 +41,14 @@ class MemoryBudget:
 
 
 def measure_free_bytes(device: Device, budget: MemoryBudget = MemoryBudget()) -> int:
-    """Measure free memory [bytes]: of the GPU, or of the host and its control group."""
+    """Return the free memory [bytes] of the GPU, or of the host and its control group."""
     if device.on_cuda:
         return int(wp.get_device(device.name).free_memory)
     return measure_host_bytes(budget)
 
 
 def measure_host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
-    """Measure free memory of the host and its control group [bytes]; unlimited if neither reports it."""
+    """Return the free memory of the host and its control group [bytes]; unlimited if both do not report it."""
     found = [2**62]
     for line in _read_lines(Path("/proc/meminfo")):
         if line.startswith("MemAvailable:"):
@@ -62,7 +62,7 @@ def measure_host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
 
 
 def choose_batch_size(rows: int, device: Device, free: int, budget: MemoryBudget = MemoryBudget()) -> int:
-    """Choose the number of load cases of `rows` = 3N unknowns to solve together within `free` bytes."""
+    """Return the number of load cases of `rows` = 3N unknowns that are solved together within `free` bytes."""
     widest = budget.max_cases_on_cuda if device.on_cuda else budget.max_cases
     fitting = int(budget.batch_fraction * free / max(estimate_column_bytes(rows, device), 1))
     return int(np.clip(find_widest_workspace(device, fitting), 1, widest))
@@ -71,14 +71,14 @@ def choose_batch_size(rows: int, device: Device, free: int, budget: MemoryBudget
 def check_fits(
     rows: int, batch: int, count: int, device: Device, used_bytes: int = 0, budget: MemoryBudget = MemoryBudget()
 ) -> None:
-    """Reject `count` load cases of `rows` = 3N unknowns, `batch` of them together, that do not fit.
+    """Reject `count` load cases of `rows` = 3N unknowns, solved in batches of `batch`, if they do not fit.
 
-    `used_bytes` bytes already belong to the solver.
+    The solver already uses `used_bytes` bytes.
 
     Raises
     ------
     InputError
-        With the demand, the free memory, and what would fit. The cause is a MemoryError, as memory may be free later.
+        The memory does not suffice; the message gives demand, free memory and a fitting size. Its cause: MemoryError.
     """
     column = estimate_column_bytes(rows, device)
     free = measure_host_bytes(budget)  # read once: Linux takes almost a millisecond to count
@@ -105,12 +105,12 @@ def check_fits(
 
 
 def estimate_column_bytes(rows: int, device: Device) -> int:
-    """Estimate the memory of one load case while it is solved [bytes]."""
+    """Return the estimated memory of one load case during its solution [bytes]."""
     return WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
 
 
 def format_gigabytes(amount: float) -> str:
-    """Format an amount of memory in GiB."""
+    """Return a text with an amount of memory in GiB."""
     return f"{amount / 2**30:.3g} GiB"
 
 

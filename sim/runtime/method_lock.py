@@ -1,4 +1,4 @@
-"""Mutual exclusion of threads in methods that work on their object's arrays."""
+"""Mutual exclusion of threads in methods that change the arrays of their object."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -10,13 +10,13 @@ R = TypeVar("R")
 
 
 class Locked(Protocol):
-    """Object with a reentrant lock."""
+    """Interface of objects with a reentrant lock."""
 
     lock: RLock
 
 
 def lock_method(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
-    """Return a method of a `Locked` that holds its lock: other threads wait until it returns."""
+    """Return a method of a `Locked` object that holds the lock; other threads wait until the method returns."""
 
     @wraps(method)
     def held(self: Locked, *args: P.args, **kwargs: P.kwargs) -> R:

@@ -1,4 +1,4 @@
-"""Import of optional packages, with a one-line error that names the missing one."""
+"""Import of optional packages, with a one-line error that names a missing package."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,18 +7,18 @@ from ..errors import InputError
 
 
 def install_hint(extra: str) -> str:
-    """Return a sentence on how to install an extra of this package: from its checkout, as no index has it."""
+    """Return a sentence that explains how to install an extra of this package, from a checkout of its repository."""
     return f"Install it in the checkout: pip install -e '.[{extra}]'."
 
 
 @contextmanager
 def require_extra(extra: str, what: str) -> Iterator[None]:
-    """Import packages of an extra in a block; `what` needs them: "these environments need".
+    """Run a block that imports packages of an extra; `what` is the start of the message, as "these environments need".
 
     Raises
     ------
     InputError
-        Replaces ModuleNotFoundError: names the missing package, and how to install the extra.
+        A package is missing; the message names this package and explains how to install the extra.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Reading of files from outside: every failure becomes an error message of one sentence."""
+"""Reading of files from the user: every failure becomes an error message of one sentence."""
 
 import json
 import os
@@ -13,19 +13,19 @@ import numpy as np
 from ..errors import InputError
 
 LOCK_REMEDY = "Close it there, then give the same command again."
-"""Remedy for a file that another program has open."""
+"""Text of the remedy for a file that another program has open."""
 
 TRUNCATION_PATTERN = re.compile(r"truncated file: eof = (\d+),.* stored_eof = (\d+)")
-"""Pattern of HDF5's message on a truncated file: its size, and the size it should have [bytes]."""
+"""Pattern of the HDF5 message on a truncated file: actual size, and expected size [bytes]."""
 
 
 def to_path(path: object) -> Path:
-    """Convert text or a path to a Path.
+    """Return a text or a path as a `Path`.
 
     Raises
     ------
     InputError
-        Any other type.
+        `path` is of another type.
     """
     if not isinstance(path, str | os.PathLike):
         raise InputError(f"{path!r} names no file: give its path as text, or as a pathlib.Path.")
@@ -34,19 +34,19 @@ def to_path(path: object) -> Path:
 
 @contextmanager
 def wrap_errors(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
-    """Turn any exception of a block that reads `path` into an InputError of one sentence.
+    """Convert any exception of a block that reads `path` to an InputError of one sentence.
 
     Parameters
     ----------
     kind
-        Expected kind of file, with its article: "a mesh".
+        Expected kind of file, with its article, such as "a mesh".
     remedy
         Sentence with the remedy.
 
     Raises
     ------
     InputError
-        Replaces every exception but an interruption; an InputError that already begins with the path is unchanged.
+        Any exception except an interruption occurs; an InputError that already begins with the path is not changed.
     """
     try:
         with np.errstate(all="ignore"):  # damaged numbers
@@ -62,12 +62,12 @@ def wrap_errors(path: str | Path, kind: str, remedy: str) -> Iterator[None]:
 
 
 def parse_json(path: Path, version: str, remedy: str) -> Any:
-    """Parse a JSON file that states its `format`; call it in a block of `wrap_errors`.
+    """Return the content of a JSON file with an entry `format`; call this in a block of `wrap_errors`.
 
     Raises
     ------
     InputError
-        Another format than `version`.
+        The format is not `version`.
     """
     stored = json.loads(path.read_text(encoding="utf-8-sig"))
     if stored.get("format") != version:
@@ -76,7 +76,7 @@ def parse_json(path: Path, version: str, remedy: str) -> Any:
 
 
 def _describe_reason(error: BaseException) -> str:
-    """Return the reason in plain words, not those of a library."""
+    """Return the reason of an error in plain words, not in those of a library."""
     match error:
         case MemoryError():
             return "it asks for more memory than there is"

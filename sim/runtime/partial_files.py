@@ -1,4 +1,4 @@
-"""Hidden names of files and folders during writing, and removal of those left by killed processes."""
+"""Hidden names of files and folders during writing, and removal of files left by killed processes."""
 
 import glob
 import os
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 STALE_SECONDS = 24 * 3600.0
-"""Age [s] after which another machine's unfinished file is a left-over: active runs write every few minutes."""
+"""Age [s] after which an unfinished file of another machine is removed; active runs write every few minutes."""
 
 
 def remove_partial_files(
@@ -20,16 +20,16 @@ def remove_partial_files(
     max_age: float = STALE_SECONDS,
     is_kept: Callable[[str], bool] = lambda wanted: False,
 ) -> None:
-    """Remove unfinished files of dead processes of this machine in a folder, and old ones of other machines.
+    """Remove unfinished files in a folder: those of ended processes of this machine, and old ones of other machines.
 
     Parameters
     ----------
     name
-        Name of the file whose left-overs are removed; None: all files.
+        Name of the file whose unfinished versions are removed; None: all files.
     max_age
-        Age at which those of other machines are removed [s].
+        Age at which unfinished files of other machines are removed [s].
     is_kept
-        Function that returns True if the unfinished file for a name stays, because a run may resume from it.
+        Function that returns True if the unfinished file for a name is kept, because a run may resume from it.
     """
     form = _build_name_pattern(name)
     try:
@@ -51,7 +51,7 @@ def remove_partial_files(
 
 
 def _compute_host_id() -> str:
-    """Return an identifier of 8 characters for the machine: process numbers are valid on one machine only."""
+    """Return an identifier of 8 characters for this machine, since process numbers are valid only on one machine."""
     return f"{zlib.crc32(platform.node().encode()):08x}"
 
 
@@ -61,23 +61,23 @@ def to_unfinished_path(path: Path) -> Path:
 
 
 def to_partial_path(path: Path) -> Path:
-    """Return the hidden name under which this process writes `path`, a file or a folder; see `remove_partial_files`."""
+    """Return the hidden path at which this process writes the file or folder `path`; see `remove_partial_files`."""
     return path.with_name(f".sulcus-{_compute_host_id()}-{os.getpid()}-{path.name}")
 
 
 def list_partials(path: Path) -> list[Path]:
-    """List the hidden names under which any process of any machine writes `path`, or has left it unfinished."""
+    """Return the hidden paths at which any process of any machine writes `path` or has left it unfinished."""
     form = _build_name_pattern(path.name)
     return sorted(left for left in path.parent.glob(f".sulcus-*-{glob.escape(path.name)}") if form.fullmatch(left.name))
 
 
 def _build_name_pattern(name: str | None) -> re.Pattern[str]:
-    """Build the pattern of hidden names: machine, process, and final name; None: any name."""
+    """Return the pattern of hidden names: machine, process, and final name; None: any final name."""
     return re.compile(rf"\.sulcus-([0-9a-f]{{8}})-(\d{{1,9}})-({'.+' if name is None else re.escape(name)})")
 
 
 def _is_process_alive(process: int) -> bool:
-    """Return True if a process with this number runs, or if that cannot be determined."""
+    """Return True if a process with this number runs, or if this cannot be determined."""
     if os.name != "posix" or process == os.getpid():
         return True
     try:

@@ -1,4 +1,4 @@
-"""Spawned processes: a single one that runs a function, and a pool with one per device that runs tasks."""
+"""Spawned processes: a single process that runs a function, and a pool that runs tasks, one process per device."""
 
 import os
 import signal
@@ -17,16 +17,16 @@ from ..errors import InputError
 Task = TypeVar("Task")
 EXIT_TIMEOUT = 5.0  # Maximum time for a process to end after it has closed its pipe [s].
 VISIBLE_VARIABLE = "CUDA_VISIBLE_DEVICES"
-"""Environment variable with the GPUs that a process can use."""
+"""Name of the environment variable that lists the GPUs a process can use."""
 
 
 class LostProcessError(InputError):
-    """Process that was killed, or whose GPU failed; results of the other processes are kept."""
+    """Error if a process was killed or its GPU failed; results of the other processes are kept."""
 
 
 @dataclass(frozen=True, eq=False)
 class ChildProcess:
-    """Process that works on a device, and the pipe to it."""
+    """Process that uses a device, and the pipe to this process."""
 
     device: str
     process: BaseProcess
@@ -36,10 +36,10 @@ class ChildProcess:
 def start_process(
     target: Callable[..., object], *args: Any, name: str, variables: Mapping[str, str] | None = None
 ) -> BaseProcess:
-    """Start a spawned process that calls `target(*given)`, a function of a module.
+    """Return a started process that calls `target(*args)`, where `target` is a function of a module.
 
-    The child ends with this process. It ignores Ctrl-C, which the terminal sends to both: this process ends it.
-    The `variables` are set in its environment before its first import.
+    The child process ends with this process, and ignores Ctrl-C, which the terminal sends to both processes. The
+    `variables` are set in its environment before its first import.
     """
     process = get_context("spawn").Process(target=_run, args=(target, args), name=name, daemon=True)
     with _set_environment(variables or {}), _ignore_interrupts():
@@ -49,15 +49,15 @@ def start_process(
 
 @contextmanager
 def process_pool(devices: Sequence[str], build: Callable[..., Any], *args: Any) -> Iterator[tuple[ChildProcess, ...]]:
-    """Start a process on each device, which calls `make(device, *given)`; all are killed at the end.
+    """Yield a process for each device, which calls `build(device, *args)`; all processes are killed at the end.
 
-    Each can use its own GPU alone, as "cuda:0". `build` is a function of a module.
+    Each process can use only its own GPU, as "cuda:0". `build` is a function of a module.
 
     Raises
     ------
     InputError
         Raised by `build`.
-    LostError
+    LostProcessError
         A process that was killed.
     """
     with ExitStack() as closing:
@@ -68,11 +68,11 @@ def process_pool(devices: Sequence[str], build: Callable[..., Any], *args: Any) 
 
 
 def map_parallel(function: Callable[[Task], Any], tasks: Sequence[Task], count: int = 1) -> Iterator[tuple[Task, Any]]:
-    """Yield each task with its result, in order of completion, from at most `count` processes, killed at the end.
+    """Yield each task and its result, in order of completion, from up to `count` processes, killed at the end.
 
     Raises
     ------
-    InputError, LostError
+    InputError, LostProcessError
         See `map_unordered`.
     """
     with process_pool(["cpu"] * min(count, len(tasks)), _return_given, function) as children:
@@ -82,13 +82,13 @@ def map_parallel(function: Callable[[Task], Any], tasks: Sequence[Task], count: 
 def map_unordered(
     children: Sequence[ChildProcess], work: Callable[[Any, Task], Any], tasks: Iterable[Task]
 ) -> Iterator[tuple[Task, Any]]:
-    """Yield each task with `work(made, task)`, in order of completion: the next task goes to the next idle process.
+    """Yield each task with its result `work(made, task)`, in order of completion; idle processes take the next task.
 
     Raises
     ------
     InputError
         Raised by `work`.
-    LostError
+    LostProcessError
         A process that was killed. Finished results of the others are yielded first.
     """
     waiting, busy = iter(tasks), {}
@@ -122,11 +122,11 @@ def map_unordered(
 
 
 def run_on_each(children: Sequence[ChildProcess], work: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
-    """Return the result of each process for its own task; all tasks begin together.
+    """Return the results of one task per process; all tasks start at the same time.
 
     Raises
     ------
-    InputError, LostError
+    InputError, LostProcessError
         See `map_unordered`.
     """
     for child, task in zip(children, tasks, strict=True):
@@ -144,12 +144,12 @@ def run_on_each(children: Sequence[ChildProcess], work: Callable[[Any, Task], An
 
 
 def _receive(child: ChildProcess) -> Any:
-    """Receive the next result of a process.
+    """Return the next result of a process.
 
     Raises
     ------
-    LostError
-        A process that was killed, or a GPU that failed.
+    LostProcessError
+        The process was killed, or its GPU failed.
     """
     try:
         answer = child.pipe.recv()
@@ -170,7 +170,7 @@ def _receive(child: ChildProcess) -> Any:
 
 
 def build_gpu_environment(device: str) -> dict[str, str]:
-    """Return the environment in which a process can use the GPU of a device alone, as "cuda:0"; empty for the CPU."""
+    """Return environment variables with which a process can use only the GPU `device`, as "cuda:0"; empty for a CPU."""
     kind, _, number = device.partition(":")
     if kind != "cuda":
         return {}
@@ -206,7 +206,7 @@ def _set_environment(more: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _ignore_interrupts() -> Iterator[None]:
-    """Ignore Ctrl-C during the block: a process started in it inherits this."""
+    """Ignore Ctrl-C during the block; a process that starts in the block inherits this."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -224,7 +224,7 @@ def _end(child: ChildProcess) -> None:
 
 
 def _serve(pipe: Any, device: str, make: Callable[..., Any], given: tuple[Any, ...]) -> None:
-    """Call `make`, then run tasks until the pipe closes; exceptions are sent as results."""
+    """Call `make`, then run tasks from the pipe until it closes; exceptions are sent as results."""
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         made = _try_call(make, device, *given)
         pipe.send(made if isinstance(made, Exception) else None)
@@ -242,7 +242,7 @@ def _call(function: Callable[[Task], Any], task: Task) -> Any:
 
 
 def _try_call(function: Callable[..., Any], *given: Any) -> Any:
-    """Return the result of a function, or the exception that it raises, with its traceback as a note."""
+    """Return the result of a function or, if the function raises an exception, this exception with a traceback note."""
     try:
         return function(*given)
     except Exception as error:
@@ -256,7 +256,7 @@ def _run(target: Callable[..., object], given: tuple[Any, ...]) -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that started it ends."""
+    """End this process when its parent process ends."""
     parent = parent_process()
     if parent is not None:
         wait([parent.sentinel])
@@ -264,7 +264,7 @@ def _end_with_parent() -> None:
 
 
 def _note_exit(code: int | None) -> str:
-    """Return how a process ended, in brackets."""
+    """Return a note in brackets on the exit code of a process."""
     if code is None or code == 0:
         return ""
     if code > 0:

@@ -1,4 +1,4 @@
-"""Control of threads: BLAS limited to one, where several would wait for one another; native loops on several cores."""
+"""Control of threads: BLAS limited to one thread if several would wait for each other; native loops on several."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -16,16 +16,16 @@ _lock, _inside = Lock(), []
 
 @cache
 def _get_controller() -> ThreadpoolController:
-    """Return the controller of the loaded libraries, cached: finding them takes 1 ms, limiting them 0.01 ms."""
+    """Return the cached controller of the loaded libraries; the search takes 1 ms, a limit 0.01 ms."""
     return ThreadpoolController()
 
 
 @contextmanager
 def limit_to_one_thread() -> Iterator[None]:
-    """Limit BLAS to one thread while any block is active, in the libraries loaded when this was first called.
+    """Limit BLAS to one thread during the block, in the libraries loaded at the first call of this function.
 
-    The first block sets the limit, and the last restores the previous one: results inside are bitwise the same,
-    whatever other threads do.
+    The first active block sets the limit, and the last block restores the previous limit. Results inside a block are
+    bitwise the same, independent of other threads.
     """
     with _lock:
         _inside.append(_inside[0] if _inside else _get_controller().limit(limits=1, user_api="blas"))
@@ -45,7 +45,7 @@ _is_idle.set()
 
 @contextmanager
 def run_in_foreground() -> Iterator[None]:
-    """Pause the kernels of background threads: two threads that run Python code delay each other at each call."""
+    """Pause the kernels of background threads during the block, since Python threads delay each other at each call."""
     _is_idle.clear()
     try:
         yield
@@ -54,12 +54,12 @@ def run_in_foreground() -> Iterator[None]:
 
 
 def enter_background() -> None:
-    """Let the kernels of this thread wait while another thread is inside `run_in_foreground`."""
+    """Mark this thread as background: its kernels wait while another thread is inside `run_in_foreground`."""
     _thread.background = True
 
 
 def wait_for_foreground() -> None:
-    """Pause a background thread while another one is in the foreground."""
+    """Pause a background thread while another thread is in the foreground."""
     if getattr(_thread, "background", False):
         _is_idle.wait(MAX_PAUSE)
 
@@ -69,14 +69,14 @@ Task = Callable[[], object]  # Function to run on a thread.
 
 @dataclass(frozen=True)
 class ThreadLimits:
-    """Limits for dividing native loops among threads.
+    """Limits for the distribution of native loops to threads.
 
     Parameters
     ----------
     max_threads
-        Maximum threads; more share the memory bandwidth, and were not measured.
+        Maximum number of threads; more threads would share the memory bandwidth, and were not measured.
     min_size
-        Minimum elements or unknowns: with fewer, the hand-over (0.1 ms) takes longer than the loop.
+        Minimum number of elements or unknowns: for fewer, the start of threads (0.1 ms) takes longer than the loop.
     """
 
     max_threads: int = 2
@@ -84,7 +84,7 @@ class ThreadLimits:
 
 
 def choose_threads(size: int, limits: ThreadLimits = ThreadLimits()) -> int:
-    """Choose the number of threads for a native loop over `size` elements or unknowns."""
+    """Return the number of threads for a native loop over `size` elements or unknowns."""
     if size < limits.min_size:
         return 1
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -92,9 +92,9 @@ def choose_threads(size: int, limits: ThreadLimits = ThreadLimits()) -> int:
 
 
 def run_concurrently(tasks: Sequence[Task]) -> None:
-    """Run tasks at the same time, the first on this thread, and wait for all. No task may call this function.
+    """Run tasks at the same time, the first task on this thread, and wait for all. No task may call this function.
 
-    Threads wait at a queue for reuse: the futures of a pool cost four times as long, which matters for tasks of 1 ms.
+    Reused threads wait at a queue; the futures of a pool would take four times as long, too long for tasks of 1 ms.
     """
     ended: SimpleQueue[BaseException | None] = SimpleQueue()
     for number, task in enumerate(tasks[1:]):

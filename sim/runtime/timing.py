@@ -1,4 +1,4 @@
-"""Wall time by stage, for active listeners."""
+"""Wall time of stages, reported to active listeners."""
 
 import time
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ def time_stage(name: str) -> Iterator[None]:
 
 @contextmanager
 def listen_to_stages() -> Iterator[dict[str, float]]:
-    """Yield the seconds of the stages inside the block, in the order in which they first end."""
+    """Yield a dictionary of the seconds of each stage inside the block, in the order in which stages first end."""
     seconds: dict[str, float] = {}
     _listening.append(seconds)
     try:

@@ -1,4 +1,4 @@
-"""Execution of a user's Python file with the user's rights; failures become one-sentence errors."""
+"""Execution of a Python file of the user, with the rights of the user; failures become errors of one sentence."""
 
 import hashlib
 import sys
@@ -10,14 +10,14 @@ from ..errors import InputError
 
 
 def run_script(path: str | Path) -> ModuleType:
-    """Run a Python file and return its module; it can import modules from its folder.
+    """Run a Python file and return its module; the file can import modules from its folder.
 
-    The same text at the same path runs once per process, so that its classes are the same for all callers.
+    The same text at the same path runs only once per process, so that all callers get the same classes.
 
     Raises
     ------
     InputError
-        A file that is missing, is not valid Python, or raises an exception: with the line.
+        The file is missing, is not valid Python, or raises an exception; the message gives the line.
     """
     path = Path(path).absolute()
     try:
@@ -52,7 +52,7 @@ def run_script(path: str | Path) -> ModuleType:
 
 
 def format_script_error(path: Path, error: BaseException) -> str:
-    """Describe the exception that a user's file raised, with its last line in that file."""
+    """Return a description of the exception that a user's file raised, with the last line in this file."""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
     where = f"{path}, line {lines[-1]}" if lines else str(path)
     if isinstance(error, InputError):

@@ -1,4 +1,4 @@
-"""Versions of installed packages, and this package's name on package indexes."""
+"""Versions of installed packages, and the name of this package on package indexes."""
 
 import tomllib
 from functools import cache
@@ -6,12 +6,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 DISTRIBUTION = "sulcus-ar"
-"""The `name` in pyproject.toml: another project owns `sulcus` on the Python Package Index."""
+"""Name in pyproject.toml; on the Python Package Index, `sulcus` belongs to another project."""
 
 
 @cache
 def get_version(package: str) -> str:
-    """Return the version of a package; "sulcus" is this one, which may be a checkout that is not installed."""
+    """Return the version of a package; "sulcus" is this package, which may be a checkout that is not installed."""
     if package != "sulcus":
         return version(package)
     try:

@@ -1,4 +1,4 @@
-"""Warp arrays as arrays of the library for their device: NumPy on the CPU, torch on a GPU."""
+"""Warp arrays as arrays of another library: NumPy on the CPU, torch on a GPU."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +12,7 @@ from .threads import limit_to_one_thread
 
 
 def get_library(device: Device) -> Any:
-    """Return the library, NumPy or torch: `linalg.solve` and array methods have the same meaning in both."""
+    """Return the array library of a device, NumPy or torch; `linalg.solve` and array methods are the same in both."""
     if device.on_cuda:
         import torch
 
@@ -21,28 +21,28 @@ def get_library(device: Device) -> Any:
 
 
 def to_view(array: wp.array) -> Any:
-    """Return the array as the library's, without a copy."""
+    """Return a Warp array as an array of the library, without a copy."""
     return wp.to_torch(array) if array.device.is_cuda else array.numpy()
 
 
 def from_view(device: Device, values: Any) -> wp.array:
-    """Return the library's array as Warp's, without a copy unless it is not contiguous."""
+    """Return an array of the library as a Warp array; only arrays that are not contiguous are copied."""
     values = values if device.on_cuda else np.ascontiguousarray(values)
     return wp.from_torch(values.contiguous()) if device.on_cuda else wp.array(values, device=device.name, copy=False)
 
 
 def to_double(values: Any) -> Any:
-    """Convert to double precision."""
+    """Return an array of the library in double precision."""
     return values.astype(np.float64) if isinstance(values, np.ndarray) else values.double()
 
 
 def cast_like(template: Any, values: Any) -> Any:
-    """Convert to another array's precision."""
+    """Return `values` in the precision of the array `template`."""
     return values.astype(template.dtype) if isinstance(values, np.ndarray) else values.to(template.dtype)
 
 
 def pad_zeros(values: Any, counts: tuple[int, ...]) -> Any:
-    """Append this many zeros at the end of each of the last axes."""
+    """Return an array with the given numbers of zeros appended to each of the last axes."""
     shape = (
         *values.shape[: -len(counts)],
         *(old + new for old, new in zip(values.shape[-len(counts) :], counts, strict=True)),
@@ -60,12 +60,12 @@ def rank_rows(values: Any) -> Any:
 
 
 def sort_columns(values: Any) -> Any:
-    """Sort each column of values (n, b) in ascending order."""
+    """Return values (n, b) with each column sorted in ascending order."""
     return np.sort(values, axis=0) if isinstance(values, np.ndarray) else values.sort(dim=0).values
 
 
 def solve_dense(matrix: Any, right_side: Any) -> Any:
-    """Solve matrix x = right; not finite where the matrix is singular. The host does not wait for the GPU."""
+    """Return the solution of matrix x = right_side, not finite for a singular matrix; the host does not wait."""
     if not isinstance(matrix, np.ndarray):
         import torch
 
@@ -77,28 +77,28 @@ def solve_dense(matrix: Any, right_side: Any) -> Any:
 
 
 def to_library(device: Device, values: np.ndarray) -> Any:
-    """Copy a NumPy array to the library's; on the CPU, return the array itself."""
+    """Return a NumPy array as an array of the library; on the CPU, the array itself."""
     return wp.to_torch(wp.array(np.ascontiguousarray(values), device=device.name)) if device.on_cuda else values
 
 
 def select_columns(device: Device, columns: np.ndarray, count: int) -> Any:
-    """Return an index of columns (k,), ascending, of `count`: a slice for all of them, so that nothing is copied.
+    """Return an index for sorted columns (k,) out of `count`; for all columns a slice, so that nothing is copied.
 
-    On a GPU it is uploaded once for use with several arrays; NumPy indices would be uploaded each time.
+    On a GPU the index is uploaded once for several arrays; a NumPy index would be uploaded at each use.
     """
     return slice(None) if len(columns) == count else to_library(device, columns)
 
 
 def to_host(values: Any) -> np.ndarray:
-    """Return the library's array as NumPy's."""
+    """Return an array of the library as a NumPy array."""
     return values if isinstance(values, np.ndarray) else values.cpu().numpy()
 
 
 @contextmanager
 def run_in_order(device: Device) -> Iterator[None]:
-    """Run the library's work in Warp's stream, and on the CPU with BLAS limited to one thread.
+    """Run a block of library calls in the stream of Warp or, on the CPU, with BLAS limited to one thread.
 
-    BLAS threads wait for one another, very long where other processes use their cores.
+    BLAS threads wait for each other, very long if other processes use the same cores.
     """
     if device.on_cuda:
         import torch

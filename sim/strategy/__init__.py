@@ -1,1 +1,1 @@
-"""Solver selection, load steps, time steps and live frames."""
+"""Selection of solvers, load steps, time steps, and frames of a live tool."""

@@ -1,4 +1,4 @@
-"""Load cases whose tools overlap bone: they are not solved, and the mesh keeps its start."""
+"""Treatment of load cases whose tools overlap bone: these are not solved, and the mesh keeps its initial values."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,9 +12,9 @@ from .time_steps import NoMotionStep
 
 
 def solve_free_of_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
-    """Solve as `Strategy.solve` the cases whose tools overlap no bone; the others stay at the last of their guesses.
+    """Return the result of `Strategy.solve` for cases whose tools do not overlap bone; others keep their last guess.
 
-    Bone does not yield: a solution would depend on the barrier stiffness alone, and take long.
+    Bone does not deform: a solution would depend only on the barrier stiffness, and take long.
     """
     problem, device, count = strategy.problem, strategy.problem.device, len(cases.loads)
     if isinstance(strategy, NoMotionStep) or not problem.barriers:

@@ -1,7 +1,7 @@
-"""One frame of a live tool on the device: a push, its footprint, and L-BFGS from the state of the last frame.
+"""One frame of a live tool on the device: footprint of a push, and L-BFGS from the state of the last frame.
 
-All arrays are fixed, so that CUDA replays the frame as one captured graph. A few values are uploaded and the result is
-downloaded; all other arrays, the start included, stay on the device.
+All arrays are fixed, so that CUDA replays the frame as one captured graph. Only a few values are uploaded, and only the
+result is downloaded; all other arrays, including the start, stay on the device.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ HEADER_SIZE = 8  # Number of these slots.
 
 @dataclass(frozen=True)
 class FrameKernels:
-    """Kernels before, between and after the L-BFGS iterations of a frame, in one scalar type."""
+    """Kernels that run before, between and after the L-BFGS iterations of a frame, for one scalar type."""
 
     apply_push: wp.Kernel
     extrapolate: wp.Kernel
@@ -44,7 +44,7 @@ class FrameKernels:
 
 @cache
 def build_kernels(device: Device) -> FrameKernels:
-    """Build the kernels for a device's scalar type, for one load case."""
+    """Return the kernels for one load case, in the scalar type of a device."""
     scalar, most, m, head, lanes = device.scalar, MAX_FRAME_EVALUATIONS, PAIRS, HEADER_SIZE, get_warp_width(device)
 
     @forward_kernel(module="unique")
@@ -57,7 +57,7 @@ def build_kernels(device: Device) -> FrameKernels:
         constant: wp.array2d(dtype=scalar),
         loud: wp.array2d(dtype=wp.float64),
     ):
-        """Write the gradient -w_i / (sum of w) F of the push, and add its square norm."""
+        """Write the gradient -w_i / (sum of w) F of the push, and add its squared norm."""
         i = wp.tid()
         square = wp.float64(0.0)
         if i < nodes.shape[0]:
@@ -80,7 +80,7 @@ def build_kernels(device: Device) -> FrameKernels:
         g: wp.array2d(dtype=scalar),
         z: wp.array2d(dtype=scalar),
     ):
-        """Extrapolate u += a (u - past), store the old u as past, and clear direction and gradients."""
+        """Extrapolate u += a (u - past), store the old u in `past`, and clear direction and gradients."""
         r = wp.tid()
         last = u[r, 0]
         u[r, 0] = last + scalar(given[7]) * (last - past[r, 0])
@@ -105,7 +105,7 @@ def build_kernels(device: Device) -> FrameKernels:
         going: wp.array(dtype=wp.int32),
         inverted: wp.array(dtype=wp.int32),
     ):
-        """Reset the iteration, so that it evaluates the start first; the L-BFGS history stays."""
+        """Reset the iteration so that the start is evaluated first; the L-BFGS history does not change."""
         t[0] = wp.float64(0.0)
         predicted[0] = wp.float64(wp.inf)
         residual[0] = wp.float64(wp.inf)
@@ -127,7 +127,7 @@ def build_kernels(device: Device) -> FrameKernels:
         tried: wp.array(dtype=wp.int32),
         going: wp.array(dtype=wp.int32),
     ):
-        """Count the evaluation, and clear `going` if the descent has ended."""
+        """Increase the number of evaluations, and clear `going` if the descent has ended."""
         tried[0] = tried[0] + 1
         going[0] = wp.where(status[0] == LIVE and tried[0] < most, 1, 0)
 
@@ -157,20 +157,20 @@ def build_kernels(device: Device) -> FrameKernels:
 
 
 class CapturedFrame:
-    """Solver of one push from the state on the device, which it replaces with the solution.
+    """Solver of one push that starts from the state on the device and replaces this state by the solution.
 
     Parameters
     ----------
     problem, preconditioner
-        Problem with pushes as the only loads. The preconditioner is valid for every state.
+        Problem with pushes as the only loads, and a preconditioner that does not depend on the state.
     inversion
-        Inverted-element check of the same discretisation.
+        Counter of inverted elements for the same discretisation.
     skin
         Surface on which tools push.
     tolerance
-        Relative residual, as in `Accuracy`.
+        Tolerance of the relative residual, as in `Accuracy`.
     part
-        Finder of strained tissue, for updates of the preconditioner; None: no updates.
+        Object that finds strained tissue, for updates of the preconditioner; None: no updates.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class CapturedFrame:
 
     @property
     def previous_state(self) -> LbfgsState:
-        """State that the last solution started from."""
+        """State from which the last solution started."""
         return self._before
 
     def load_state(
@@ -223,7 +223,7 @@ class CapturedFrame:
         history: Mapping[str, np.ndarray],
         model: UpdatedModel | None = None,
     ) -> None:
-        """Load another state: displacements u (3N, 1) [m], the ones before them, and the L-BFGS history, if any."""
+        """Load another state: displacements u (3N, 1) [m], previous displacements and, if any, the L-BFGS history."""
         columns = self._workspace.columns
         self._load_updated_model(model)
         columns["u"].assign(u)
@@ -235,7 +235,7 @@ class CapturedFrame:
             columns[name].assign(np.moveaxis(rows_first, 0, -1).reshape(columns[name].shape))
 
     def update_model(self, steps: float) -> None:
-        """Recompute the model of strained tissue at the solution, if this took more than `MAX_SERVED_STEPS` steps."""
+        """Recompute the model of strained tissue if the last solution took more than `MAX_SERVED_STEPS` steps."""
         if self.part is not None and steps > MAX_SERVED_STEPS:
             self._load_updated_model(update_model_at(self.part, self._device, self._workspace.columns["u"]))
             self._workspace.columns["known"].zero_()  # curvature pairs are valid for their own model only
@@ -246,12 +246,12 @@ class CapturedFrame:
             self._knowing.load_model(bent)
 
     def solve_push(self, point: np.ndarray, radius: float, force: np.ndarray, extrapolation: float) -> np.ndarray:
-        """Solve for a push at point (3,) with a footprint's radius [m] and a force (3,) [N].
+        """Return the result of a push at `point` (3,) [m] with a footprint `radius` [m] and a `force` (3,) [N].
 
-        Return (HEADER_SIZE + 3N,).
+        The result (HEADER_SIZE + 3N,) has a header, and then the displacements.
 
-        The start is the present state, extrapolated by `extrapolation` times its change from the one before. The
-        returned array is overwritten by the next frame.
+        The start is the current state plus `extrapolation` times its change since the previous state. The next frame
+        overwrites the returned array.
         """
         self._up.numpy()[:] = (*point, radius, *force, extrapolation)
         device = self._device
@@ -294,6 +294,6 @@ class CapturedFrame:
         self._device.launch(build_kernels(self._device).check_ended, (1,), inputs, [self._tried, self._going])
 
     def _allocate_pair(self, count: int) -> tuple[wp.array, wp.array]:
-        """Allocate `count` values on the device, and as many in pinned host memory for direct transfer."""
+        """Return arrays of `count` values on the device, and in pinned host memory for direct transfer."""
         there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
         return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)

@@ -1,8 +1,8 @@
-"""Extrapolated starts of frames: the last solution plus a multiple of its change from the one before.
+"""Extrapolated starts of frames: the last solution plus a multiple of its change from the previous solution.
 
-Between neighbouring loads the solution is nearly linear in them. Loads q, p with the solutions v, u are followed by p'
-from u + a (u - v), a = (p' - p) . (p - q) / |p - q|^2: the component of the new load step along the last one. It is
-zero if the load stays the same or turns at a right angle, and negative if the load returns.
+Between similar loads, the solution is nearly linear in the load. After loads q, p with solutions v, u, the solution for
+p' starts from u + a (u - v), a = (p' - p) . (p - q) / |p - q|^2, the component of the new load step along the last load
+step. a is zero if the load does not change or turns by 90 degrees, and negative if the load returns.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ MAX_FACTOR = 2.0  # Upper bound of a: twice the last step.
 
 
 def as_pushes(loads: Loads) -> np.ndarray | None:
-    """Return point [m], force [N] and footprint [m] (B, 7) of each load; None if anything but a push acts."""
+    """Return point [m], force [N] and footprint [m] of each load (B, 7); None unless a push is the only cause."""
     push = loads.get_only(Pushed)
     if push is None:
         return None
@@ -28,9 +28,9 @@ def as_pushes(loads: Loads) -> np.ndarray | None:
 
 
 def compute_factors(push: np.ndarray, last: np.ndarray, previous: np.ndarray) -> np.ndarray:
-    """Compute the factors a (B,) of three successive pushes (B, 7); zero without force, or if the last two are equal.
+    """Return the factors a (B,) of three successive pushes (B, 7); 0 without force, or if the last two are equal.
 
-    Lengths are measured against the last footprint, forces against the last force.
+    Lengths are divided by the last footprint radius, forces by the last force.
     """
     forces = np.stack([push, last, previous])[:, :, 3:6]
     size = np.sqrt((forces * forces).sum(axis=2))
@@ -45,7 +45,7 @@ def compute_factors(push: np.ndarray, last: np.ndarray, previous: np.ndarray) ->
 
 
 def has_warm_state(warm: Mapping[str, Any], last: np.ndarray) -> bool:
-    """Return True if the warm-start data hold the state before the solutions (3N, B), with finite values."""
+    """Return True if the warm-start data contain finite values of the state before the solutions `last` (3N, B)."""
     if BEFORE_KEY not in warm or PUSHES_KEY not in warm:
         return False
     fits = warm[BEFORE_KEY].shape == last.T.shape and warm[PUSHES_KEY].shape == (last.shape[1], 2, 7)
@@ -53,7 +53,7 @@ def has_warm_state(warm: Mapping[str, Any], last: np.ndarray) -> bool:
 
 
 def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -> np.ndarray:
-    """Extrapolate starts (3N, B) [m] from the last solutions (3N, B); return these if there is no direction."""
+    """Return extrapolated starts (3N, B) [m], or the last solutions (3N, B) without data for an extrapolation."""
     now = as_pushes(loads)
     if now is None or not has_warm_state(warm, last):
         return last
@@ -64,7 +64,7 @@ def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -
 def compute_directions(
     push: np.ndarray | None, last: np.ndarray | None, warm: Mapping[str, Any]
 ) -> dict[str, np.ndarray]:
-    """Collect the warm-start entries of solutions to pushes (B, 7); they started from the solutions `last` (3N, B)."""
+    """Return the warm-start entries of solutions to pushes (B, 7) that started from the solutions `last` (3N, B)."""
     if push is None:
         return {}
     if last is None or PUSHES_KEY not in warm or warm[PUSHES_KEY].shape != (len(push), 2, 7):

@@ -1,7 +1,7 @@
-"""Sequence of pushes, each started from the solution of the last one, which is still on the device.
+"""Sequence of pushes; each push starts from the solution of the last push, which is still on the device.
 
-A start that must be uploaded from the host gives the same solution. Loads that are not solved well return None, for
-the caller to solve otherwise.
+A start that must be uploaded from the host gives the same solution. For a load without a good solution, the result is
+None, and the caller must use another solver.
 """
 
 import time
@@ -34,10 +34,10 @@ YZX, ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 class DeviceWarmStart(Mapping[str, Any]):
-    """Warm-start data of a solution, whose L-BFGS history stays on the device until it is read or overwritten.
+    """Warm-start data of a solution; its L-BFGS history stays on the device until it is read or overwritten.
 
-    `bent` is the next frame's model of strained tissue. `lock` is that of the `FrameSequence`: another thread may read
-    while the next frame begins.
+    `bent` is the model of strained tissue for the next frame. `lock` is the lock of the `FrameSequence`, since another
+    thread may read the data while the next frame begins.
     """
 
     def __init__(self, own: Mapping[str, np.ndarray], state: LbfgsState, lock: RLock, bent: UpdatedModel | None = None):
@@ -47,7 +47,7 @@ class DeviceWarmStart(Mapping[str, Any]):
         self.bent = bent
 
     def copy_to_host(self) -> None:
-        """Copy to the host what is still on the device."""
+        """Copy data that is still on the device to the host."""
         with self._lock:
             if self.state is not None:
                 self._own |= {name: to_rows_first(self.state.columns[name]) for name in HISTORY_KEYS}
@@ -69,18 +69,18 @@ class DeviceWarmStart(Mapping[str, Any]):
 
 
 class FrameSequence:
-    """Solver of single pushes that have a start, on meshes whose vertices are the discretisation's nodes.
+    """Solver of single pushes with a start, for discretisations whose nodes are the mesh vertices.
 
     Parameters
     ----------
     problem, inversion
-        Problem of the frames, and its inverted-element check.
+        Problem of the frames, and counter of its inverted elements.
     frame
         Solver on the device.
     diagnostics
-        Check of the equilibria for excessive strain.
+        Diagnostics that check equilibria for excessive strain.
     lock
-        Lock that the caller of `result` holds.
+        Lock that the caller of `solve_frame` holds.
     source
         Name of the solver in the results.
     """
@@ -104,12 +104,12 @@ class FrameSequence:
         self._there: Callable[[], DeviceWarmStart | None] = _return_none
 
     def solve_frame(self, loads: Loads, start: Deformation, guess: Callable[[], np.ndarray]) -> Deformation | None:
-        """Solve for a push from a start.
+        """Return the deformation under a push, from a `start`, or None.
 
-        `guess` checks the start and returns its displacements (3N, 1) [m].
+        The function `guess` checks the start and returns its displacements (3N, 1) [m].
 
-        Return None if this solver does not apply or fails: anything but one push with some force, a start that violates
-        the constraints or has inverted elements, a descent that does not converge.
+        The result is None if this solver does not apply or fails: the load is not one push with a nonzero force, the
+        start violates the constraints or has inverted elements, or the descent does not converge.
         """
         clock = time.perf_counter()
         now = as_pushes(loads)
@@ -160,7 +160,7 @@ class FrameSequence:
         return result
 
     def _take(self, loads: Loads, start: Deformation, last: np.ndarray) -> bool:
-        """Load a start onto the device; return False if it is not usable."""
+        """Load a start to the device; return False if the start is not usable."""
         cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
         u = self._problem.device.upload(last)
@@ -181,7 +181,7 @@ class FrameSequence:
         return None if part is None else restore_updated_model(warm, self._problem.device, len(self._nodes), part.size)
 
     def _make_way(self) -> None:
-        """Update warm-start data before the next frame: the present state will become the one that it starts from."""
+        """Update the warm-start data before the next frame, which starts from the current state."""
         there, here = self._there(), self._here()
         if there is not None:
             there.copy_to_host()
@@ -198,7 +198,7 @@ def build_frame_sequence(
     lock: RLock,
     source: str,
 ) -> FrameSequence:
-    """Build the frame solver from the strategy of a plan that follows frames, for pushes on a surface."""
+    """Return the frame solver for pushes on a surface, from the strategy of a plan that captures frames."""
     problem, preconditioner, inversion = strategy.problem, strategy.preconditioner, strategy.inversion
     part = build_strained_part(problem, preconditioner, space) if strategy.plan.updates_model else None
     frame = CapturedFrame(problem, preconditioner, inversion, surface, strategy.accuracy.tolerance, part)
@@ -206,4 +206,4 @@ def build_frame_sequence(
 
 
 def _return_none() -> None:
-    """Return None: no solution is on the device."""
+    """Return None, since no solution is on the device."""

@@ -1,4 +1,4 @@
-"""GPU memory that FEM will need, estimated from the mesh before anything is allocated."""
+"""Estimate of the GPU memory that `Fem` needs, from the mesh, before any allocation."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from ..runtime.memory import (
 )
 
 BYTES_PER_NODE = {"p1": 2_200, "smoothed": 5_800, "p2": 2_900, "element-free": 9_000}
-"""Memory per node in single precision [bytes]: element tables and multigrid levels. The
-arrays were counted on the CPU, on 49,239 nodes (p1, smoothed) and 123,508 (p2), 2026-11-24. Element-free: sizes of the
-tables and of the stiffness on 5,312 nodes."""
+"""Memory per node in single precision [bytes]: element tables and multigrid levels. The arrays were counted on the
+CPU, for 49,239 nodes (p1, smoothed) and 123,508 nodes (p2), 2026-11-24. Element-free: sizes of the tables and of
+the stiffness for 5,312 nodes."""
 FIXED_BYTES = 2**30
-"""Memory of library buffers, kernels and the last multigrid level [bytes], approximate."""
+"""Approximate memory of library buffers, kernels and the coarsest multigrid level [bytes]."""
 BUDGET = MemoryBudget()
-"""Default share of a GPU's memory."""
+"""Default limits for the use of GPU memory."""
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """Device memory for a number of loads [bytes].
+    """Estimate of the device memory for a number of loads [bytes].
 
     Parameters
     ----------
@@ -43,11 +43,11 @@ class MemoryEstimate:
     device
         Device of the FEM.
     setup, constant, per_load
-        Peak during set-up; constant part afterwards; further part per load of a batch.
+        Peak memory during set-up; constant memory afterwards; additional memory per load of a batch.
     batch
-        Loads solved together.
+        Number of loads solved together.
     free
-        Free memory of the device for one process.
+        Free memory of the device that one process may use.
     """
 
     nodes: int
@@ -61,7 +61,7 @@ class MemoryEstimate:
 
     @property
     def peak(self) -> int:
-        """Peak memory [bytes]; the workspace of a batch may be wider than the batch."""
+        """Peak memory [bytes]; this includes that the workspace of a batch may be wider than the batch."""
         return max(self.setup, self.constant + find_workspace_width(self.device, self.batch) * self.per_load)
 
     def __str__(self) -> str:
@@ -75,7 +75,7 @@ class MemoryEstimate:
         Raises
         ------
         InputError
-            Too little free memory; the message names the demand, the free memory, and what would fit.
+            There is too little free memory; the message gives the demand, the free memory, and a size that fits.
         """
         room = budget.fraction * self.free
         if self.peak <= room:
@@ -94,14 +94,14 @@ def estimate_fem_memory(
     loads: int,
     processes: int = 1,
 ) -> MemoryEstimate | None:
-    """Estimate the GPU memory of `Fem` for a number of loads; None on the CPU, where each batch is checked instead.
+    """Return the estimated GPU memory of `Fem` for a number of loads; None on the CPU, where each batch is checked.
 
-    Without a `batch`, the largest one that fits is taken. `processes` processes share the GPU equally.
+    If `batch` is None, the largest batch that fits is assumed. `processes` processes share the GPU equally.
 
     Raises
     ------
     InputError
-        Unknown element, or a device that is not available.
+        The element is unknown, or the device is not available.
     """
     where = find_device(device, accuracy.precision)
     if not where.on_cuda:
@@ -121,7 +121,7 @@ def compute_memory(
     free: int,
     budget: MemoryBudget = BUDGET,
 ) -> MemoryEstimate:
-    """Compute the memory if the preconditioner inverts `inverted_rows` unknowns; `free` is the free memory [bytes]."""
+    """Return the memory if the preconditioner inverts `inverted_rows` unknowns; `free` is the free memory [bytes]."""
     rows, width = 3 * space.count, wp.types.type_size_in_bytes(device.scalar)
     tables = FIXED_BYTES + BYTES_PER_NODE[space.element] * space.count * width // 4
     taken, left = _estimate_inverse_bytes(inverted_rows, device)
@@ -134,13 +134,13 @@ def compute_memory(
 
 
 def _list_unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
-    """List the numbers of unknowns that a preconditioner may invert, largest first: of all nodes, or of the corners."""
+    """Return the numbers of unknowns that a preconditioner may invert: those of all nodes, then of the corners."""
     corners = int((~anatomy.fixed).sum())
     return (int((~space.extend_fixed(anatomy.fixed)).sum()), corners) if space.element == "p2" else (corners,)
 
 
 def _find_invertible(unknowns: tuple[int, ...], device: Device) -> int:
-    """Return the first of these sizes whose inverse fits the GPU, else the size of the last multigrid level."""
+    """Return the first number in `unknowns` whose inverse fits the GPU, else that of the coarsest multigrid level."""
     from ..linalg.dense_inverse import can_invert
 
     last = 6 * Preconditioning().max_coarsest_nodes
@@ -148,7 +148,7 @@ def _find_invertible(unknowns: tuple[int, ...], device: Device) -> int:
 
 
 def _estimate_inverse_bytes(unknowns: int, device: Device) -> tuple[int, int]:
-    """Estimate the memory of a dense inverse [bytes]: peak during construction, and afterwards."""
+    """Return the estimated memory of a dense inverse [bytes]: peak during construction, and afterwards."""
     from ..linalg.block_inverse import estimate_bytes
     from ..linalg.dense_inverse import estimate_inverse_bytes
 

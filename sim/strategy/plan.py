@@ -1,4 +1,4 @@
-"""Selection and order of solvers for a load: one table, with a description in sentences."""
+"""Selection and order of the solvers for a load, with a description in sentences."""
 
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ from ..local_solvers.strained_descent import StrainedDescent, build_strained_par
 from .captured_frame import MAX_FRAME_EVALUATIONS
 
 Alone = ClampedElimination | StrainedDescent
-"""Local solver for a single load."""
+"""Type of the local solvers for a single load."""
 
 
 @dataclass(frozen=True)
 class PlanLimits:
-    """Limits at which the choice of solvers changes."""
+    """Limits on which the choice of solvers depends."""
 
     min_shared_cases: int = 16  # Load cases from which the set-up of a shared local subproblem pays.
     max_evaluations: int = 60  # Maximum residual evaluations before Newton-CG on the CPU.
@@ -41,7 +41,7 @@ PLAN_LIMITS = PlanLimits()
 
 
 class SolverStep(Enum):
-    """Solvers that may be tried for a load, with their descriptions."""
+    """Solvers that may be tried for a load; the value of each member is its description."""
 
     NEAR = "nonlinear elimination: the tissue near the opening, shared by all loads, is a local subproblem"
     STRAINED = "L-BFGS from a stiffness that is updated at the few hundred nodes with the largest strain"
@@ -54,23 +54,23 @@ class SolverStep(Enum):
 
 @dataclass(frozen=True)
 class SolverPlan:
-    """Solvers for the loads on one mesh, and their limits.
+    """Plan of the solvers for all loads on one mesh, with their limits.
 
     Parameters
     ----------
     preconditioner
         Name of the preconditioner, from `get_preconditioner_name`.
     batched, single
-        Local solver that is tried first for `PLAN_LIMITS.min_shared_cases` loads or more, and for one; or None.
+        Local solver that is tried first for `PLAN_LIMITS.min_shared_cases` loads or more, and for one load; or None.
     contact_solver
-        Solver that is tried first for loads with tools moved by pose; None without such tools.
+        Solver that is tried first for loads with tools of prescribed pose; None without such tools.
     uses_lbfgs
         True if L-BFGS is tried before Newton-CG.
     captures_frames, updates_model
-        True if a load that follows another is solved by a captured graph on the GPU; True if this graph updates the
-        stiffness of strained tissue.
+        True if a load that starts from a previous solution is solved by a captured graph on the GPU; True if this graph
+        updates the stiffness of strained tissue.
     max_evaluations, max_outer, max_load_steps
-        Limits: residual evaluations before Newton-CG, Newton iterations, load steps.
+        Maximum number of residual evaluations before Newton-CG, of Newton iterations, and of load steps.
     batch
         Maximum number of loads solved together.
     """
@@ -88,18 +88,18 @@ class SolverPlan:
     batch: int
 
     def choose_local(self, count: int) -> SolverStep | None:
-        """Return the local solver that is tried first for `count` loads together, if any."""
+        """Return the local solver that is tried first for `count` loads together, or None."""
         return self.batched if count >= PLAN_LIMITS.min_shared_cases else self.single if count == 1 else None
 
     def list_steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
-        """List the solvers for `count` loads together, in order; `imposed` if the loads prescribe motion."""
+        """Return the solvers for `count` loads together, in order; `imposed` is True if loads prescribe motion."""
         if imposed or not self.uses_lbfgs:
             return (SolverStep.NEWTON,)
         first = self.choose_local(count)
         return (*([] if first is None else [first]), SolverStep.LBFGS, SolverStep.NEWTON)
 
     def explain(self) -> tuple[str, ...]:
-        """Describe the plan in sentences."""
+        """Return a description of the plan in sentences."""
         lines = [f"The undeformed stiffness is prepared once ({self.preconditioner}); every solver starts from it."]
         if self.captures_frames:
             knows = ". It updates the stiffness of the tissue that the last load strained" if self.updates_model else ""
@@ -138,10 +138,10 @@ def choose_plan(
     live: bool = False,
     excluded: Collection[SolverStep] = (),
 ) -> SolverPlan:
-    """Choose the solvers of a problem; no other place decides this.
+    """Return the solver plan of a problem; solvers are chosen only here.
 
-    `batch` loads are solved together unless a solver takes them one by one; `live` loads come one at a time. Solvers in
-    `excluded` are not used, except Newton-CG, which always remains.
+    `batch` loads are solved together unless a solver handles loads one by one; `live` loads arrive one at a time.
+    Solvers in `excluded` are not used, except Newton-CG, which cannot be excluded.
     """
     cuda, exact = problem.device.on_cuda, is_exact(preconditioner)
     elastic = problem.can_accelerate  # local solvers handle elastic terms only
@@ -180,14 +180,14 @@ def choose_plan(
 
 
 def can_capture(space: Discretisation, accuracy: Accuracy) -> bool:
-    """Return True if frames can be captured: nodes are mesh vertices, and the iteration budget admits L-BFGS."""
+    """Return True if frames can be captured: all nodes are mesh vertices, and the iteration limits permit L-BFGS."""
     return not len(space.edges) and accuracy.outer >= PLAN_LIMITS.min_outer_iterations
 
 
 def build_local_solvers(
     plan: SolverPlan, problem: Problem, preconditioner: Preconditioner, effects: Iterable[Effect], space: Discretisation
 ) -> tuple[Callable[[], BatchElimination | None], Alone | None]:
-    """Build a plan's local solvers: a function that builds the one for many loads at its first call; that for one."""
+    """Return the local solvers of a plan: a function that builds the solver for many loads; the solver for one load."""
     build = partial(build_batch_elimination, problem, preconditioner, effects, space)
     near = cache(build if plan.batched else lambda: None)
     if plan.single is SolverStep.CLAMPED:

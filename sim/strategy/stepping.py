@@ -1,4 +1,4 @@
-"""Control of load steps, and of the gap of tools on a long path."""
+"""Control of load steps, and of the contact gap while tools move along a long path."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -13,11 +13,11 @@ class LoadStepping:
     Parameters
     ----------
     first_step, min_step, failure_factor
-        Fractions of the load: first step, smallest step; factor on a step that failed.
+        First step and smallest step, as fractions of the load; factor on a step that failed.
     target_iterations, max_iterations
-        Outer iterations per step: target that sets the length of the next step; maximum.
+        Outer iterations per step: target, which determines the length of the next step, and maximum.
     patience
-        Steps end when the batch has spent this number of times `Accuracy.inner` linear iterations per successful step.
+        Stepping ends if the batch needs more than this factor times `Accuracy.inner` linear iterations per good step.
     """
 
     first_step: float = 1.0 / 4.0
@@ -33,19 +33,19 @@ LOAD_STEPPING = LoadStepping()  # Default.
 
 @dataclass(frozen=True)
 class GapContinuation:
-    """Control of the tools' gap, which is widened for a long path and closed again.
+    """Control of the contact gap, which is widened for a long tool path and closed again.
 
     Parameters
     ----------
     max_gaps, closing_factor
-        Tools that move more than this number of gaps at once start with a gap widened by a power of `closing_factor`.
+        If tools move more than this number of gaps at once, the gap is first widened by a power of `closing_factor`.
     tolerance
-        Relative residual until the gap has its own width.
+        Tolerance of the relative residual while the gap is widened.
     failure_factor
-        Factor on the gap after a step that failed, which is tried again, shorter.
+        Factor on the gap after a failed step, which is repeated with a shorter length.
     max_contact_iterations, newton_residual
-        Maximum iterations of the contact solver before Newton. If it ends with a residual of at most
-        `newton_residual`, Newton continues from there with the same maximum.
+        Maximum iterations of the contact solver. If the contact solver ends with a residual of at most
+        `newton_residual`, Newton's method continues from there with the same maximum.
     """
 
     max_gaps: float = 8.0
@@ -61,14 +61,14 @@ GAP_CONTINUATION = GapContinuation()  # Default.
 
 @dataclass(frozen=True, eq=False)
 class LoadProgress:
-    """Progress of cases whose load, or whose tools' motion, is applied in steps; all arrays are changed in place.
+    """Progress of load cases whose load or tool motion is applied in steps; all arrays are changed in place.
 
     Parameters
     ----------
     reached, step
-        (b,) fractions: last equilibrium, and length of the next step.
+        Fraction (b,) of the load at the last equilibrium, and length (b,) of the next step.
     gaps
-        (b,) length of the tools' whole path [gaps], at least.
+        Length (b,) of the whole tool path, in units of the gap.
     """
 
     reached: np.ndarray
@@ -77,26 +77,26 @@ class LoadProgress:
 
     @classmethod
     def start(cls, first: float, gaps: np.ndarray) -> Self:
-        """Return cases at the fraction 0, with a `first` step of this length."""
+        """Return the progress at fraction 0, with a next step of length `first`."""
         return cls(np.zeros(len(gaps)), np.full(len(gaps), first), gaps)
 
     def limit_steps(self, max_steps: np.ndarray, stepping: LoadStepping) -> tuple[np.ndarray, np.ndarray]:
-        """Limit steps to the `max_steps` (b,); return which (b,) bool were shorter, and which cases continue."""
+        """Limit steps to `max_steps` (b,); return masks (b,) of cases with shorter steps and of cases to continue."""
         shorter = self.step < max_steps
         np.minimum(self.step, max_steps, out=self.step)
         long_enough = self.step >= stepping.min_step * np.minimum(1.0, 4.0 * max_steps)
         return shorter, (self.reached < 1.0) & long_enough
 
     def propose_shares(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
-        """Propose the next fractions (k,) of some rows (k,); return them and the longest path of their tools [gaps]."""
+        """Return the next fractions (k,) of the cases `rows` (k,), and the longest path of their tools [gaps]."""
         aim = np.minimum(self.reached[rows] + self.step[rows], 1.0)
         return aim, float(((aim - self.reached[rows]) * self.gaps[rows]).max())
 
     def take_steps(self, rows: np.ndarray, target: np.ndarray, good: np.ndarray) -> None:
-        """Accept the steps of those rows (k,) that are `good`: they reach their target (k,)."""
+        """Accept the steps of those cases `rows` (k,) that are `good`, and set their fraction to `target` (k,)."""
         self.reached[rows[good]] = target[good]
 
     def resize_steps(self, rows: np.ndarray, good: np.ndarray, growth: np.ndarray, shrink: float, widen: float) -> None:
-        """Grow the steps of rows (k,) that are `good`; multiply the others by `shrink`, and their gaps by `widen`."""
+        """Increase the steps of `good` cases in `rows` (k,); multiply other steps by `shrink`, and gaps by `widen`."""
         self.gaps[rows] *= np.where(good, 1.0, widen)
         self.step[rows] *= np.where(good, np.clip(growth, 0.5, 2.0), shrink)

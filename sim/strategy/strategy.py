@@ -1,4 +1,4 @@
-"""Execution of a plan (`plan.py`): its solvers in order, from the start, from the undeformed state, in load steps."""
+"""Execution of a plan (`plan.py`): solvers in order, from the start, from the undeformed state, and in load steps."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ EMPTY_HISTORY: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS h
 
 @dataclass(frozen=True, eq=False)
 class SolverResult:
-    """Solution u (3N, B) [m] on the device; (B,): outcomes, outer steps, residuals, load fractions, inverted elements.
+    """Solution u (3N, B) [m] on the device; (B,) outcomes, outer steps, residuals, load fractions, inverted elements.
 
-    Also warm-start data of the next load; with moving tools `path_fraction` (B,), the path fraction reached, and
-    `restarted` (B,) bool: from the undeformed state.
+    `warm_start` is data for the next load. With moving tools, `path_fraction` (B,) is the path fraction
+    reached, and `restarted` (B,) marks cases that started from the undeformed state.
     """
 
     u: wp.array
@@ -55,11 +55,11 @@ class SolverResult:
 
     @property
     def good(self) -> np.ndarray:
-        """True (B,) for good outcomes."""
+        """Mask (B,) of load cases with a good outcome."""
         return np.array([outcome.good for outcome in self.outcome], bool)
 
     def put_cases(self, index: np.ndarray, other: SolverResult, device: Device) -> None:
-        """Overwrite the results of some cases (k,) with those of `other`; outer steps add up."""
+        """Overwrite the results of the cases `index` (k,) with those of `other`; outer steps are added."""
         scatter_columns(device, other.u, index, self.u)
         self.iterations[index] += other.iterations
         for name in ("outcome", "residual", "reached", "inverted"):
@@ -68,24 +68,24 @@ class SolverResult:
 
 @dataclass(frozen=True, eq=False)
 class Strategy:
-    """Solvers of a plan in order: each continues with the cases that the one before did not bring to equilibrium.
+    """Solvers of a plan in order; each solver continues with the cases that previous solvers did not solve.
 
     problem
         Problem of the cases.
     preconditioner
         Initial inverse Hessian of L-BFGS, and preconditioner of Newton's linear systems.
     inversion
-        Inverted-element check of the problem's discretisation.
+        Counter of inverted elements for the discretisation of the problem.
     accuracy
         Tolerance and iteration limits.
     plan
         Solvers to try, in order.
     build_batch_solver
-        Function that returns the plan's local solver for many loads, built at the first call.
+        Function that returns the local solver for many loads; the solver is built at the first call.
     single_solver
-        Local solver for one load.
+        Local solver for one load, or None.
     stepping, gaps
-        Control of load steps, and of the tools' gaps.
+        Control of load steps, and of the contact gap.
     """
 
     problem: Problem
@@ -100,12 +100,12 @@ class Strategy:
 
     @cached_property
     def lbfgs(self) -> Lbfgs:
-        """L-BFGS on the whole mesh; its memory is kept from batch to batch."""
+        """L-BFGS solver for the whole mesh; its memory is kept between batches."""
         return Lbfgs(self.problem, self.preconditioner)
 
     @cached_property
     def contact(self) -> ContactDescent | None:
-        """Solver that treats nodes in contact separately from the tissue; None if the plan has none."""
+        """Solver that treats nodes in contact separately from the tissue; None if the plan does not include it."""
         if self.plan.contact_solver is not SolverStep.CONTACT:
             return None
         (barrier,) = self.problem.barriers
@@ -114,13 +114,13 @@ class Strategy:
         return replace(found, strains=CUDA_STRAIN_LIMITS, uses_graphs=True) if self.problem.device.on_cuda else found
 
     def get_local_solver(self, count: int) -> BatchElimination | Alone | None:
-        """Return the local solver for `count` loads, if there is one."""
+        """Return the local solver for `count` loads, or None."""
         step = self.plan.choose_local(count)
         return None if step is None else self.build_batch_solver() if step is SolverStep.NEAR else self.single_solver
 
     @cached_property
     def _touched(self) -> Preconditioner:
-        """Preconditioner that includes contact; not on CUDA, where half precision is coarser than contact is stiff."""
+        """Preconditioner that includes contact; not on CUDA, where half precision does not resolve contact."""
         if self.problem.device.on_cuda:
             return self.preconditioner
         return build_contact_preconditioner(self.problem, self.preconditioner, self.contact)
@@ -131,11 +131,11 @@ class Strategy:
         return self.lbfgs.kept_bytes
 
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
-        """Solve for the equilibria of B cases, each from its first usable guess (3N, B) [m], or undeformed.
+        """Return the equilibria of B cases, each from its first usable guess (3N, B) [m] or from the undeformed state.
 
-        A start with too many inverted elements is not used, and a solution with them that came from a start is
-        discarded: a mesh that is turned over or collapsed may be in equilibrium too. From the undeformed state such a
-        solution is accepted as an effect of the load. Cases without any load have a solution of exactly zero.
+        A start with too many inverted elements is not used. A solution with inverted elements is discarded if it came
+        from a guess, since an inverted or collapsed mesh may also be in equilibrium. A solution from the undeformed
+        state is accepted, as the load inverts the elements. The solution of cases without a load is exactly zero.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         problem.begin(cases)
@@ -166,7 +166,7 @@ class Strategy:
         return replace(result, path_fraction=result.reached, restarted=astray) if problem.barriers else result
 
     def _find_loaded_cases(self, count: int) -> np.ndarray:
-        """Return the cases (b,) of the begun batch on which a force or imposed motion acts in the undeformed state."""
+        """Return a mask (b,) of cases in the current batch with a force or imposed motion in the undeformed state."""
         rest = self.problem.device.allocate(self.problem.rows, count)
         loud = wp.zeros_like(rest)
         for term in self.problem.terms:
@@ -179,7 +179,7 @@ class Strategy:
         return acts | self.problem.compute_gap(rest)[1] if self.problem.constraint.has_motion else acts
 
     def _mask_idle(self, start: wp.array) -> wp.array:
-        """Return the start (3N, b) [m], zero where no load acts: a float32 descent would not reach zero."""
+        """Return the start (3N, b) [m] with zeros in cases without a load, which a float32 descent would not reach."""
         acts = self._find_loaded_cases(start.shape[1])
         if not acts.all():
             with run_in_order(self.problem.device):
@@ -187,7 +187,7 @@ class Strategy:
         return start
 
     def _select_guesses(self, guesses: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Select each case's first guess (3N, B) [m] with the fewest inverted elements; which cases (B,) have none."""
+        """Return the guess (3N, B) [m] with the fewest inverted elements, and a mask (B,) of cases without a guess."""
         device = self.problem.device
         guess, inverted = guesses[0], self.inversion.count(device.upload(guesses[0]))
         for other in guesses[1:]:
@@ -197,16 +197,16 @@ class Strategy:
         return guess, self.inversion.find_suspect(inverted)
 
     def _find_unsolved(self, result: SolverResult) -> np.ndarray:
-        """Return the cases (B,) that another solver may solve; at round-off none comes closer to equilibrium."""
+        """Return a mask (B,) of cases that another solver may solve; at round-off, no solver improves the result."""
         return ~result.good & (result.outcome != Outcome.ROUND_OFF) & (self.accuracy.steps > 0)
 
     def _solve_whole_load(
         self, cases: Cases, start: wp.array | None = None, history: Mapping[str, np.ndarray] | None = EMPTY_HISTORY
     ) -> SolverResult:
-        """Solve for the whole load of the begun batch: local solvers, L-BFGS, Newton, each from the last one's end.
+        """Return the result for the whole load of the current batch, by local solvers, L-BFGS and Newton in sequence.
 
-        Without a start it begins undeformed; `history` is the L-BFGS history of the start, if any. Imposed motions and
-        steep terms are left to Newton, which moves the free nodes with them.
+        Without a start, the initial state is undeformed. `history` is the L-BFGS history of the start, if any. Imposed
+        motions and steep terms are solved by Newton's method, which moves the free nodes accordingly.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         # The undeformed state satisfies the constraints, unless the batch imposes motion.
@@ -243,9 +243,9 @@ class Strategy:
         return replace(result, warm_start=gained)
 
     def _solve_contact(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
-        """Solve for cases whose tools have moved by `gaps` times their gap: separate contact solver, then Newton.
+        """Return the result for cases whose tools have moved by `gaps` gaps, by the contact solver and Newton's method.
 
-        On the CPU Newton takes them one by one, because the contact preconditioner is for a single case.
+        On the CPU, Newton's method solves the cases one by one, since the contact preconditioner is for a single case.
         """
         problem, touch, device = self.problem, self.contact, self.problem.device
         problem.begin(cases)
@@ -271,9 +271,9 @@ class Strategy:
         return result
 
     def _close_gaps(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
-        """Solve by Newton for cases whose tools have moved by `gaps` times their gap, which is widened, then closed.
+        """Return the result for cases whose tools have moved by `gaps` gaps, by Newton's method with a widened gap.
 
-        In a narrow gap nodes would be pushed out of the tool, and enter it again, one by one; a wide gap guides them.
+        The gap is then closed in steps. In a narrow gap, nodes would leave and enter the tool one by one.
         """
         iterations, linear = np.zeros(start.shape[1], int), 0
         widest = int(np.ceil(np.log(max(gaps / self.gaps.max_gaps, 1.0)) / np.log(self.gaps.closing_factor)))
@@ -289,7 +289,7 @@ class Strategy:
         return replace(found, iterations=iterations + found.iterations, linear_iterations=linear)
 
     def _run_newton(self, start: wp.array, outer: int, tolerance: float | None = None) -> SolverResult:
-        """Solve the begun batch by Newton, in at most `outer` iterations."""
+        """Return the result for the current batch by Newton's method, in at most `outer` iterations."""
         accuracy = replace(self.accuracy, outer=outer, tolerance=tolerance or self.accuracy.tolerance)
         found = find_equilibrium(self.problem, NewtonCG(self._touched, accuracy.inner), start, accuracy)
         return self._build_result(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
@@ -301,9 +301,9 @@ class Strategy:
         return SolverResult(u, outcome, steps, residual, reached, self.inversion.count(u), linear_iterations)
 
     def _raise_load(self, cases: Cases, failed: SolverResult, index: np.ndarray) -> SolverResult:
-        """Raise the load from the undeformed state in adaptive steps; return the equilibrium at the largest fraction.
+        """Return the equilibrium at the largest load fraction found by adaptive load steps from the undeformed state.
 
-        The cases are the rows `index` (k,) of `failed`, whose result stays where no larger fraction is found.
+        The cases are the rows `index` (k,) of `failed`, whose result is kept if no larger fraction is found.
         """
         problem, device = self.problem, self.problem.device
         cases = replace(cases, restarted=np.ones(len(index), bool))
@@ -321,9 +321,9 @@ class Strategy:
         return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
     def _move_tools(self, cases: Cases, start: wp.array) -> SolverResult:
-        """Move the tools from start (3N, b), where they were, in steps of the allowed length.
+        """Return the result after moving the tools from the state `start` (3N, b), in steps of the allowed length.
 
-        If nothing acts on the undeformed mesh at the end of the path, it is the solution, regardless of contact before.
+        If no force acts on the undeformed mesh at the end of the path, the undeformed mesh is the solution.
         """
 
         def moved(part: Cases, share: np.ndarray) -> Cases:
@@ -345,11 +345,11 @@ class Strategy:
     def _solve_in_steps(
         self, cases: Cases, start: wp.array, aimed: Callable[[Cases, np.ndarray], Cases], first: float, most: int
     ) -> SolverResult:
-        """Solve for cases at growing fractions from start (3N, b); return the equilibrium at the largest one found.
+        """Solve for cases at growing fractions from `start` (3N, b); return the equilibrium at the largest fraction.
 
-        `aimed` builds cases at fractions (b,). Steps begin with the length `first`, and are limited to what tools may
-        move at once; at most `most` of them may be shorter than that limit. A good outcome requires the fraction 1; on
-        the way round-off is accepted as well.
+        The function `aimed` builds cases at fractions (b,). The first step has the length `first`; steps are limited by
+        the motion that tools may make at once, and at most `most` steps may be shorter than this limit. A good outcome
+        requires the fraction 1; at smaller fractions, a residual at round-off is also accepted.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         gaps = np.maximum.reduce([np.zeros(count), *(term.compute_path_in_gaps(cases) for term in problem.barriers)])
@@ -383,7 +383,7 @@ class Strategy:
         return self._finish(cases, aimed, result)
 
     def _finish(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], result: SolverResult) -> SolverResult:
-        """Finish cases in place after their last step: mark those pierced by a tool, and those below the whole load."""
+        """Return the result after the last step, with marks for cases pierced by a tool or below the whole load."""
         problem, u, outcome, reached = self.problem, result.u, result.outcome, result.reached
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]

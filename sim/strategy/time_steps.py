@@ -1,4 +1,4 @@
-"""Time steps: choice of their preconditioner, and the step of zero length."""
+"""Time steps: grouping by length for preconditioners, and steps of zero length."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ from .strategy import SolverResult
 
 @dataclass(frozen=True, eq=False)
 class NoMotionStep:
-    """Replacement of a `Strategy` for time steps of zero length: neither masses nor tools move, whatever acts."""
+    """Replacement of a `Strategy` for time steps of zero length, in which neither tissue nor tools move."""
 
     problem: Problem
     inversion: InversionCounter
 
     def solve(self, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
-        """Return the last of the guesses (3N, B) [m] unchanged; undeformed without guesses."""
+        """Return the last guess (3N, B) [m] unchanged, or the undeformed state without guesses."""
         device, count = self.problem.device, len(cases.loads)
         u = device.upload(guesses[-1]) if guesses else device.allocate(self.problem.rows, count)
         outcome, none = np.full(count, Outcome.CONVERGED, object), np.zeros(count, int)
@@ -36,9 +36,9 @@ MAX_PRECONDITIONERS = 3  # Preconditioners that are cached; each is as large as 
 
 
 def quantise_time_steps(steps: np.ndarray) -> np.ndarray:
-    """Return the powers of two (B,) [s] nearest to steps (B,) [s], by ratio.
+    """Return, for each step (B,) [s], the power of two [s] with the ratio nearest to 1.
 
-    Steps of `MAX_DYNAMIC_STEP` or more become infinite; zero steps stay zero.
+    Steps of `MAX_DYNAMIC_STEP` or more become infinite; steps of zero remain zero.
     """
     within = (steps > 0.0) & (steps < MAX_DYNAMIC_STEP)
     powers = np.exp2(np.round(np.log2(np.where(within, steps, 1.0))))
@@ -46,7 +46,7 @@ def quantise_time_steps(steps: np.ndarray) -> np.ndarray:
 
 
 def group_time_steps(steps: np.ndarray, max_size: int) -> list[tuple[float, np.ndarray]]:
-    """Group about equal steps (B,) [s] into batches of at most `max_size`: the step and the rows (k,) of each."""
+    """Return batches of at most `max_size` cases with about equal steps (B,) [s]: the step, and the cases (k,)."""
     paces = quantise_time_steps(steps)
     return [
         (float(pace), rows[first : first + max_size])

@@ -1,1 +1,1 @@
-"""Energy terms, one file per effect or material law: Warp functions, kernels and host class."""
+"""Energy terms, one module per effect or material law, with Warp functions, kernels and a host class."""

@@ -1,4 +1,4 @@
-"""Dead loads, constant in magnitude and direction under deformation: nodal forces, and tractions on a footprint."""
+"""Dead loads, whose magnitude and direction do not change with deformation: nodal forces, and footprint tractions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from ..runtime.device import Device, forward_kernel
 
 @dataclass(frozen=True)
 class DeadForceKernels:
-    """Kernels on loaded nodes for one scalar type."""
+    """Kernels over loaded nodes, for one scalar type."""
 
     spread: wp.Kernel
     subtract: wp.Kernel
@@ -25,7 +25,7 @@ class DeadForceKernels:
 
 @cache
 def build_kernels(device: Device) -> DeadForceKernels:
-    """Build the kernels for a device's scalar type."""
+    """Return the kernels for the scalar type of a device."""
     scalar = device.scalar
     chunk = CHUNK
 
@@ -49,7 +49,7 @@ def build_kernels(device: Device) -> DeadForceKernels:
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Subtract the loads from the gradient: g -= f."""
+        """Subtract the nodal forces from the gradient: g -= f."""
         i, c = wp.tid()
         for k in range(3):
             out[3 * nodes[i] + k, c] -= force[3 * i + k, c]
@@ -75,19 +75,19 @@ def build_kernels(device: Device) -> DeadForceKernels:
 
 @dataclass(frozen=True, eq=False)
 class NodalForces:
-    """Nodal forces on the device: nodes (k,) int32, unique, and force (3k, b) [N]."""
+    """Nodal forces on the device: unique `nodes` (k,) int32, and `force` (3k, b) [N]."""
 
     nodes: wp.array
     force: wp.array
 
 
 def build_pushed_forces(surface: ContactSurface, device: Device, loads: Loads) -> NodalForces | None:
-    """Return the nodal forces of pushing tools on a body's surface; None if no tool pushes.
+    """Return the nodal forces of pushing tools on a surface, or None if no tool pushes.
 
     Raises
     ------
     InputError
-        A footprint that does not touch the surface.
+        A footprint does not touch the surface.
     """
     causes = loads.get_all(Pushed)
     if not causes:
@@ -101,12 +101,12 @@ def build_pushed_forces(surface: ContactSurface, device: Device, loads: Loads) -
 
 
 def build_nodal_forces(vertex_count: int, device: Device, loads: Loads) -> NodalForces | None:
-    """Return the forces prescribed at mesh vertices, on loaded vertices only; None if there are none.
+    """Return the forces prescribed at mesh vertices, only at loaded vertices; None without `Nodal` loads.
 
     Raises
     ------
     InputError
-        Forces of another mesh.
+        The number of vertices differs from that of the mesh.
     """
     cause = loads.get(Nodal)
     if cause is None:
@@ -118,14 +118,14 @@ def build_nodal_forces(vertex_count: int, device: Device, loads: Loads) -> Nodal
 
 
 class DeadForce:
-    """Term for dead loads: E = -f . u, with f assembled from the loads once per batch.
+    """Energy term of dead loads: E = -f . u, with forces f assembled from the loads once per batch.
 
     Parameters
     ----------
     name
-        Name, unique in the problem.
+        Unique name in the problem.
     assemble
-        Function Loads -> `NodalForces`, or None without forces: then no kernel is launched.
+        Function that returns the `NodalForces` of loads, or None without forces; then no kernel is launched.
     device
         Device of the arrays.
     """
@@ -143,11 +143,11 @@ class DeadForce:
         self.set_forces(self._assemble(cases.loads))
 
     def set_forces(self, forces: NodalForces | None) -> None:
-        """Set the forces of the batch."""
+        """Set the nodal forces of the batch."""
         self._forces = forces
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep the forces of these load cases only."""
+        """Keep only the forces of the load cases `columns`."""
         if self._forces is not None:
             self._forces = NodalForces(self._forces.nodes, gather_columns(self._device, self._forces.force, columns))
 
@@ -178,7 +178,7 @@ class DeadForce:
         """Return None: a dead load has no tangent stiffness."""
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Do nothing: a dead load does not limit the step."""
+        """Do nothing, since a dead load does not limit the step."""
 
     def end(self, u: wp.array) -> None:
         """Return None: a dead load has no history."""

@@ -1,4 +1,4 @@
-"""Elastic energy of one region: integral of psi(H) over the undeformed volume, for any law and element."""
+"""Elastic energy: integral of psi(H) over the undeformed volume, for any law and element type."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ GRADIENT_STEP = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Block of elements: first index and count; sizes, node numbers and shape gradients; weights; coefficients."""
+    """Block of elements: first index and number; sizes, node numbers, shape gradients, weights, and coefficients."""
 
     first: int
     count: int
@@ -35,14 +35,14 @@ class _Part:
 
 
 class ElasticTerm:
-    """Term for the hyperelastic energy of a set of elements.
+    """Energy term of hyperelastic elements.
 
     Parameters
     ----------
     name
-        Name, unique in the problem.
+        Unique name in the problem.
     law
-        Energy density.
+        Material law, which defines the energy density.
     elements
         Set of T elements.
     coefficients
@@ -52,8 +52,8 @@ class ElasticTerm:
     device
         Device of the arrays.
     sources
-        Sources of further coefficients per quadrature point and load case, from the innermost law to the outermost.
-        At most one has a memory.
+        Sources of additional coefficients per quadrature point and load case, from the innermost law to the outermost
+        law. At most one source has history variables.
     """
 
     constant, steep = False, False
@@ -109,23 +109,23 @@ class ElasticTerm:
 
     @property
     def keys(self) -> np.ndarray:
-        """Unique key (T q, k) of each quadrature point: key of its element, and index in it."""
+        """Unique key (T q, k) of each quadrature point: key of the element, and index of the point in the element."""
         elements = self._rest[0]
         count, points = elements.weight.shape
         return np.column_stack([np.repeat(elements.keys, points, axis=0), np.tile(np.arange(points), count)])
 
     @property
     def width(self) -> int:
-        """Values per point in a source's memory."""
+        """Number of history variables per quadrature point."""
         return max((source.width for source in self._sources), default=0)
 
     @property
     def prevents_inversion(self) -> bool:
-        """Return True if the law requires J > 0."""
+        """True if the law requires J > 0."""
         return self._kernels.bound_step is not None
 
     def begin(self, cases: Cases) -> None:
-        """Compute the varying coefficients, if there are any sources."""
+        """Compute the varying coefficients of the load cases, if there are sources."""
         if self._sources:
             self._cases, numbers = cases, self._numbers.get_array(len(cases.loads))
             points, own = numbers.shape[:2], self._tissue[1].shape[1]
@@ -136,7 +136,7 @@ class ElasticTerm:
                 own += source.count
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep the varying coefficients of these load cases only."""
+        """Keep only the varying coefficients of the load cases `columns`."""
         if self._cases is not None:
             self.begin(self._cases.select(columns))
 
@@ -165,7 +165,7 @@ class ElasticTerm:
         return assemble_hooke_stiffness(*self._rest)
 
     def assemble_stiffness(self) -> sp.csc_array:
-        """Assemble K(u) (3N, 3N) [N/m] of one load case from element stiffnesses."""
+        """Return K(u) (3N, 3N) [N/m] of one load case, assembled from element stiffnesses."""
         assert self._at is not None
         elements = self._rest[0]
         count, size = len(elements.table), 3 * elements.table.shape[1]
@@ -180,14 +180,14 @@ class ElasticTerm:
 
     @cached_property
     def _apart(self) -> "ElasticTerm":
-        """Copy of the term whose elements share no nodes."""
+        """Copy of the term with separate nodes for each element."""
         elements, law, coefficients = self._rest[0], *self._tissue
         table = np.arange(elements.table.size, dtype=np.int32).reshape(elements.table.shape)
         apart = replace(elements, table=table, node_count=table.size)
         return ElasticTerm(self.name, law, apart, coefficients, np.column_stack(self._rest[1:]), self._device)
 
     def compute_second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
-        """Return tensors as `StrainTerm.compute_second_order`, by fourth-order central differences of the stress."""
+        """Return the data of `StrainTerm.compute_second_order`, by fourth-order central differences of the stress."""
         elements, (law, coefficients) = self._rest[0], self._tissue
         tissues, kind = np.unique(coefficients, axis=0, return_inverse=True)
         one = _build_unit_element(elements)
@@ -211,7 +211,7 @@ class ElasticTerm:
         return elements, np.array(tensors), kind.ravel()
 
     def find_elements_on(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the elements (k,) whose nodes are all marked in `nodes` (N,) bool."""
+        """Return the elements (k,) all of whose nodes are marked in `nodes` (N,) bool."""
         elements = self._rest[0]
         places = np.arange(elements.table.shape[1])
         used = places < (len(places) if elements.sizes is None else elements.sizes[:, None])
@@ -224,20 +224,20 @@ class ElasticTerm:
         return build_kernels(*self._of)
 
     def update_max_strain(self, elements: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
-        """Raise `out` to the elements' strain, as `StrainTerm.update_max_strain`."""
+        """Raise `out` to the strain of the elements, as `StrainTerm.update_max_strain`."""
         inputs = [u, columns, *self._shape]
         self._launch_on_some(self._strain_kernels.strain, elements, inputs, out, np.maximum)
 
     def add_stiffening(
         self, elements: wp.array, u: wp.array, columns: wp.array, min_strain: wp.array, index: wp.array, out: wp.array
     ) -> None:
-        """Add the elements' stiffness increments, as `StrainTerm.add_stiffening`."""
+        """Add the stiffness increments of the elements to `out`, as `StrainTerm.add_stiffening`."""
         coefficients = self._numbers.get_array(u.shape[1]) if self._sources else self._constants
         inputs = [u, columns, min_strain, index, *self._shape, self._weight, coefficients]
         self._launch_on_some(self._strain_kernels.stiffen, elements, inputs, out, np.add)
 
     def _launch_on_some(self, kernel: wp.Kernel, some: wp.array, inputs: list, out: wp.array, joined: np.ufunc) -> None:
-        """Launch a kernel on some elements (k,) in parallel blocks with separate outputs, and combine these."""
+        """Launch a kernel on elements `some` (k,) in parallel blocks with separate outputs, and combine the outputs."""
         if not len(some):
             return
         ends = np.linspace(0, len(some), len(self._parts) + 1).astype(int).tolist()
@@ -254,7 +254,7 @@ class ElasticTerm:
             joined(out.numpy(), other.numpy(), out=out.numpy())
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Bound the step by the fraction at which the law still has J > 0."""
+        """Reduce `out` to the fraction of the step up to which J > 0, if the law requires this."""
         kernel = self._kernels.bound_step
         if kernel is not None:
             bounds = [out, *(wp.clone(out) for _ in self._parts[1:])]
@@ -263,7 +263,7 @@ class ElasticTerm:
                 np.minimum(out.numpy(), bound.numpy(), out=out.numpy())
 
     def end(self, u: wp.array) -> np.ndarray | None:
-        """Return the new memory of a source; elasticity alone has none."""
+        """Return the new history variables of the source that has any; None without such a source."""
         if self._cases is None or not self.width:
             return None
         strains = self._strains.get_array(u.shape[1])
@@ -298,7 +298,7 @@ class ElasticTerm:
 
 
 def _build_unit_element(elements: Elements) -> Elements:
-    """Return one element of unit volume, with node and point counts as these and unit edge vectors from node 0."""
+    """Return one element of unit volume with unit edges at node 0, and the node and point counts of `elements`."""
     points, most = elements.gradient.shape[1:3]
     slope = np.zeros((1, points, most, 3))
     slope[:, :, :4] = np.vstack([-np.ones(3), np.eye(3)])
@@ -309,5 +309,5 @@ def _build_unit_element(elements: Elements) -> Elements:
 
 
 def _slice_rows(array: wp.array, first: int, stop: int) -> wp.array:
-    """Return a view of some rows; an empty array unchanged."""
+    """Return a view of the rows from `first` to `stop`; an empty array is returned unchanged."""
     return array[first:stop] if len(array) else array

@@ -1,4 +1,4 @@
-"""Warp functions common to element kernels: displacement gradient of any element, and coefficients of its law."""
+"""Warp functions of all element kernels: displacement gradient of any element, and coefficients of its law."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -12,7 +12,7 @@ from .laws.law import Law
 
 @dataclass(frozen=True)
 class ElementFunctions:
-    """Displacement gradient; coefficients at a point and in the undeformed state, and the type of their array."""
+    """Warp functions for displacement gradient and coefficients at a point, undeformed coefficients, and array type."""
 
     gradient: wp.Function
     get_coefficients: wp.Function
@@ -22,18 +22,18 @@ class ElementFunctions:
 
 @cache
 def build_functions(law: Law, device: Device, size: int, count: int) -> ElementFunctions:
-    """Build the functions for elements of `size` nodes and laws of `count` coefficients, see `build_kernels`."""
+    """Return the functions for elements with `size` nodes and laws with `count` coefficients; see `build_kernels`."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
 
     @wp.func
     def of_element(coefficients: wp.array(dtype=constants), e: int, q: int, c: int):
-        """Return the coefficients of an element, equal at all points and in all load cases."""
+        """Return the coefficients of an element, which are equal at all points and in all load cases."""
         return coefficients[e]
 
     @wp.func
     def of_point(coefficients: wp.array4d(dtype=scalar), e: int, q: int, c: int):
-        """Return the coefficients at one point in one load case."""
+        """Return the coefficients at a point in a load case."""
         k = constants()
         for i in range(count):
             k[i] = coefficients[e, q, i, c]

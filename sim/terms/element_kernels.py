@@ -1,4 +1,4 @@
-"""Warp kernels over elements: energy, forces, tangent stiffness and step bounds of any law on any element."""
+"""Warp kernels over elements: energy, forces, tangent stiffness and step bounds, for any law and element type."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +16,7 @@ MIN_VOLUME_RATIO = 0.1
 
 @dataclass(frozen=True)
 class ElementKernels:
-    """Kernels over the elements of one law."""
+    """Kernels over elements with the same law."""
 
     add_energy: wp.Kernel
     add_gradient: wp.Kernel
@@ -28,7 +28,7 @@ class ElementKernels:
 
 @cache
 def build_spreading_kernel(device: Device) -> wp.Kernel:
-    """Build the kernel that copies each element's coefficients to every point and load case."""
+    """Return the kernel that copies the coefficients of each element to all its points and load cases."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -46,10 +46,10 @@ def build_spreading_kernel(device: Device) -> wp.Kernel:
 
 @cache
 def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKernels:
-    """Build kernels for elements of `size` nodes and laws of `count` coefficients.
+    """Return the kernels for elements with `size` nodes and laws with `count` coefficients.
 
-    Each launches over (element, load case). If `size` is 0, the number of nodes per element is in `sizes`.
-    Coefficients are per element (T,), or if they vary numbers (T, q, count, b) per point and load case.
+    Each kernel is launched over (element, load case). If `size` is 0, the array `sizes` has the number of nodes of each
+    element. Coefficients are given per element (T,) or, if they vary, per point and load case (T, q, count, b).
     """
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
@@ -70,7 +70,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         c: int,
         out: wp.array2d(dtype=scalar),
     ):
-        """Add element forces f_a += P grad N_a, whose sum is zero."""
+        """Add the element forces f_a += P grad N_a; the sum of these forces is zero."""
         total = vec()
         for a in range(1, size if size else sizes[e]):
             i = 3 * table[e, a]
@@ -130,7 +130,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Add K D: f_a += sum over points of w dP(H; D) grad N_a; `definite` columns use the undeformed tangent."""
+        """Add f_a += sum over points of w dP(H; D) grad N_a; `definite` load cases use the undeformed tangent."""
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
             k = at(coefficients, e, q, c)
@@ -163,9 +163,9 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array2d(dtype=mat),
     ):
-        """Add the diagonal blocks K_aa += sum over points of w dP(H; e_j (x) grad N_a) grad N_a, column j of the block.
+        """Add the diagonal blocks; column j of K_aa is the sum over points of w dP(H; e_j (x) grad N_a) grad N_a.
 
-        Nine stress changes serve all nodes of a point.
+        Nine stress changes are computed per point and used for all nodes.
         """
         e, c = wp.tid()
         for q in range(gradient.shape[1]):
@@ -197,7 +197,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         # outputs
         out: wp.array(dtype=scalar),
     ):
-        """Halve t until J(t) = det(F + t D) >= kept J(0) on all of [0, t]; J is a cubic in t."""
+        """Halve t until J = det(F + s D) >= kept det F for all s in [0, t]; J is a cubic polynomial of s."""
         e, c = wp.tid()
         one = scalar(1.0)
         for q in range(gradient.shape[1]):

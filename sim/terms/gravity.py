@@ -1,4 +1,4 @@
-"""Change of weight since the scan, due to another posture or another fluid level around the brain."""
+"""Change of weight since the scan, due to another posture or another fluid level."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -19,20 +19,20 @@ STANDARD_GRAVITY = 9.80665  # [m/s^2]
 
 
 def build_gravity_term(effect: Gravity, space: Discretisation, device: Device) -> DeadForce:
-    """Return the term of `Gravity` on the nodes of `space`: dead loads, current weight minus weight in the scan."""
+    """Return the term of `Gravity` on the nodes of `space`: dead loads, the current weight minus that in the scan."""
     return DeadForce("gravity", build_weight_change(effect, space, device), device)
 
 
 def build_weight_change(
     effect: Gravity, space: Discretisation, device: Device, cache_size: int = 64
 ) -> Callable[[Loads], NodalForces | None]:
-    """Return a function loads -> nodal forces f_a = s (w_a(now) - w_a(scan)), or None without a `Posture`.
+    """Return a function that returns nodal forces f_a = s (w_a(now) - w_a(scan)) of loads, or None without a `Posture`.
 
-    w_a = g d integral of (rho - rho_csf [x is below the level]) N_a(x) dV in the undeformed configuration, with the
-    shape functions N_a. The part of an element below the level is cut out exactly: the total is
-    g d (rho V - rho_csf V_under). Forces are continuous in the level. (A curved element is cut as if its
-    edges were straight.) The weights of the last `cache_size` postures are cached, since a solver uses the same loads
-    several times.
+    s is the share of the posture, and w_a = g d integral of (rho - rho_csf [x is below the level]) N_a(x) dV, with
+    gravity direction d and shape functions N_a in the undeformed configuration. The part of an element below the level
+    is cut out exactly: the total is g d (rho V - rho_csf V_under), and forces are continuous in the level. Curved
+    elements are cut as if their edges were straight. The weights of the last `cache_size` postures are cached, since a
+    solver uses the same loads several times.
     """
     table, count = space.table, space.count
     ones = np.broadcast_to(np.eye(4), (len(table), 4, 4))
@@ -41,7 +41,7 @@ def build_weight_change(
 
     @lru_cache(cache_size)
     def weights(*posture: float) -> np.ndarray:
-        """Return the weight (N, 3) [N] of each node in a posture: direction, then level [m]."""
+        """Return the weight (N, 3) [N] of each node in a posture, given by the direction and the level [m]."""
         direction, level = np.array(posture[:3]), posture[3]
         height = (-space.nodes @ direction - level)[table[:, :4]]
         corners_under = (height < 0.0).sum(axis=1)
@@ -65,15 +65,15 @@ def build_weight_change(
 
 
 def normalise_gravity(direction: np.ndarray) -> np.ndarray:
-    """Normalise nonzero directions (B, 3) to unit length."""
+    """Return nonzero directions (B, 3), normalised to unit length."""
     return normalise_vectors(direction / np.abs(direction).max(axis=1, keepdims=True))
 
 
 def integrate_nodal_volumes(space: Discretisation, owner: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Integrate the shape functions of tetrahedra `owner` (m,) over a part of each: (m, n) [m^3].
+    """Return integrals (m, n) [m^3] of the shape functions of the tetrahedra `owner` (m,) over parts of these.
 
-    parts (m, 4, 4): barycentric coordinates of the part's corners. Eight points of degree 3: exact for straight
-    elements, and for the volume of curved ones.
+    `parts` (m, 4, 4) are barycentric coordinates of the corners of each part. The eight-point rule of degree 3 is exact
+    for straight elements, and for the volume of curved elements.
     """
     points = EIGHT_POINTS @ parts
     weight = np.abs(np.linalg.det(parts))[:, None] * EIGHT_WEIGHTS
@@ -86,7 +86,7 @@ def integrate_nodal_volumes(space: Discretisation, owner: np.ndarray, parts: np.
 
 
 def sum_by_node(table: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    """Sum values (m, n) of the nodes in `table` (m, n) by node: (N,)."""
+    """Return the sums (N,) by node of `values` (m, n) at the nodes in `table` (m, n)."""
     return np.bincount(table.ravel(), values.ravel(), count)
 
 
@@ -103,10 +103,10 @@ PART_TETS = {1: np.array([[0, 1, 2, 3]]), 2: PRISM, 3: PRISM}  # tetrahedra of t
 
 
 def cut_below_plane(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split the part of each tetrahedron below a plane into disjoint tetrahedra; return their owners and corners.
+    """Return disjoint tetrahedra that fill the part of each tetrahedron below a plane: owners and corners.
 
-    height (n, 4) [m] of the corners of n tetrahedra above the plane; one to three of them are negative. Returns the
-    tetrahedron (m,) that each part belongs to, and the barycentric coordinates (m, 4, 4) of the part's corners. The
+    `height` (n, 4) [m] of the corners of n tetrahedra above the plane; one to three heights are negative. Return the
+    original tetrahedron (m,) of each part, and the barycentric coordinates (m, 4, 4) of the corners of the part. The
     volume fraction of a part is |determinant|, which is continuous in the position of the plane.
     """
     order = np.argsort(height, axis=1)

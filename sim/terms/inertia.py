@@ -21,7 +21,7 @@ MIDPOINT_SHARE = 4.0 / 27.0  # each midpoint
 
 @dataclass(frozen=True)
 class InertiaKernels:
-    """Kernels of lumped masses for one scalar type."""
+    """Kernels for lumped masses, for one scalar type."""
 
     add_energy: wp.Kernel
     add_force: wp.Kernel
@@ -30,7 +30,7 @@ class InertiaKernels:
 
 @cache
 def build_kernels(device: Device) -> InertiaKernels:
-    """Build the kernels for a device's scalar type."""
+    """Return the kernels for the scalar type of a device."""
     scalar, mat = device.scalar, device.matrix
     chunk = CHUNK
 
@@ -82,9 +82,9 @@ def build_kernels(device: Device) -> InertiaKernels:
 
 
 def compute_lumped_mass(density: float, space: Discretisation) -> np.ndarray:
-    """Return the positive mass (N,) [kg] of every node; the sum is density x volume.
+    """Return the positive mass (N,) [kg] of each node; the sum of all masses is density x volume.
 
-    Linear tetrahedra: a quarter per node. Quadratic: Hinton, Rock, Zienkiewicz 1976, "A note on mass
+    A node of a linear tetrahedron has a quarter of its mass. Quadratic: Hinton, Rock, Zienkiewicz 1976, "A note on mass
     lumping and related processes in the finite element method", Earthq. Eng. Struct. Dyn. 4:245-249.
     """
     every = np.ones(len(space.table), bool)
@@ -99,9 +99,9 @@ def compute_lumped_mass(density: float, space: Discretisation) -> np.ndarray:
 class InertiaTerm:
     """Inertia term: E = w/2 |u - a|^2_M, lumped mass M, w = (1/dt + damping) / dt, a = u_n + dt v_n / (1 + damping dt).
 
-    Its gradient is M ((v - v_n) / dt + damping v) with v = (u - u_n) / dt: backward Euler (Martin, Thomaszewski,
-    Grinspun, Gross 2011, "Example-Based Elastic Materials", ACM Trans. Graph. 30(4), section 4). History: velocities
-    (B, N, 3) [m/s]. In load cases without elapsed time, w = 0 and velocities are unchanged.
+    The gradient is M ((v - v_n) / dt + damping v) with v = (u - u_n) / dt: backward Euler (Martin, Thomaszewski,
+    Grinspun, Gross 2011, "Example-Based Elastic Materials", ACM Trans. Graph. 30(4), section 4). The history variables
+    are velocities (B, N, 3) [m/s]. In load cases without elapsed time, w = 0 and velocities do not change.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class InertiaTerm:
     damping
         Mass-proportional damping [1/s].
     keys
-        Unique key (N, k) of each node, unchanged by cuts.
+        Unique key (N, k) of each node, also after a resection.
     device
         Device of the arrays.
     """
@@ -128,12 +128,12 @@ class InertiaTerm:
         self._cases: Cases | None = None
 
     def begin(self, cases: Cases) -> None:
-        """Compute weight and predicted position a of every load case.
+        """Compute the weight w and the predicted displacement a of every load case.
 
         Raises
         ------
         InputError
-            Loads before their start; a memory of another body.
+            The time of a load is before its start, or history variables belong to another mesh.
         """
         steps, count = cases.steps, len(cases.loads)
         self._cases = cases
@@ -144,7 +144,7 @@ class InertiaTerm:
         self._aim.get_array(count).assign(np.ascontiguousarray(aim.reshape(count, 3 * len(self._masses)).T))
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep the weights and positions of these load cases only."""
+        """Keep only the weights and predictions of the load cases `columns`."""
         assert self._cases is not None
         self.begin(self._cases.select(columns))
 
@@ -158,7 +158,7 @@ class InertiaTerm:
         self._add_force(u, self._aim.get_array(u.shape[1]), 1.0, out)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """Do nothing: the tangent is constant."""
+        """Do nothing, since the tangent stiffness is constant."""
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
         """Add the tangent stiffness times p: f += w M p."""
@@ -171,7 +171,7 @@ class InertiaTerm:
         )
 
     def rest_curvature(self) -> None:
-        """Return None, the limit of an infinite step; see `compute_step_stiffness` for finite ones."""
+        """Return None, the limit of an infinite time step; see `compute_step_stiffness` for finite steps."""
 
     def compute_step_stiffness(self, time_step: float) -> sp.csc_array:
         """Return the tangent stiffness w M (3N, 3N) [N/m] for a time step [s]."""
@@ -179,10 +179,10 @@ class InertiaTerm:
         return sp.csc_array(sp.diags_array(np.repeat(weight * self._masses, 3)))
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Do nothing: inertia does not limit the step."""
+        """Do nothing, since inertia does not limit the step."""
 
     def end(self, u: wp.array) -> np.ndarray:
-        """Return the velocities (B, N, 3) [m/s] at the end of the step."""
+        """Return the velocities (B, N, 3) [m/s] at the end of the time step."""
         assert self._cases is not None
         now = u.numpy().astype(np.float64).T.reshape(u.shape[1], len(self._masses), 3)
         steps = self._cases.steps[:, None, None]
@@ -190,12 +190,12 @@ class InertiaTerm:
         return np.where(steps > 0.0, (now - self._start(self._cases)) / passes, self._get_velocities(self._cases))
 
     def _start(self, cases: Cases) -> np.ndarray:
-        """Return the displacement (B, N, 3) [m] at the start of the step."""
+        """Return the displacement (B, N, 3) [m] at the start of the time step."""
         still = np.zeros((len(cases.loads), len(self._masses), 3))
         return still if cases.displacement is None else cases.displacement
 
     def _get_velocities(self, cases: Cases) -> np.ndarray:
-        """Return the velocities (B, N, 3) [m/s] at the start of the step."""
+        """Return the velocities (B, N, 3) [m/s] at the start of the time step."""
         return cases.get_past(self.name, (len(self._masses), 3))
 
     def _add_force(self, x: wp.array, aim: wp.array, aimed: float, out: wp.array) -> None:

@@ -1,4 +1,4 @@
-"""Static condensation of the surrounding body: undeformed Schur complement stiffness on the shared nodes."""
+"""Energy term of a condensed exterior: Schur complement of its undeformed stiffness on the shared nodes."""
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,12 +11,12 @@ from ..runtime.device import Device
 
 
 class Exterior:
-    """Term for a linear surrounding body: u . F u / 2 on some rows of u.
+    """Energy term of the linear exterior of a mesh part: u . F u / 2 on selected rows of u.
 
     Parameters
     ----------
     rows
-        Rows (m,) of the part's 3N unknowns, unique.
+        Unique rows (m,) among the 3N unknowns of the part.
     stiffness
         Symmetric stiffness F (m, m) [N/m].
     count
@@ -36,10 +36,10 @@ class Exterior:
         self._rooms: dict[int, tuple[wp.array, wp.array]] = {}
 
     def begin(self, cases: Cases) -> None:
-        """Do nothing: the exterior has no history."""
+        """Do nothing, since the exterior has no history variables."""
 
     def keep(self, columns: np.ndarray) -> None:
-        """Do nothing: F is the same in all load cases."""
+        """Do nothing, since F is the same in all load cases."""
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """Add the energy: E += u . F u / 2."""
@@ -52,7 +52,7 @@ class Exterior:
         add_rows(self._device, force, self._rows, out)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """Do nothing: the term is linear."""
+        """Do nothing, since the tangent stiffness F is constant."""
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
         """Add the tangent stiffness times p: f += F p."""
@@ -68,19 +68,19 @@ class Exterior:
         out.assign(out.numpy() + blocks[:, None])
 
     def rest_curvature(self) -> sp.csc_array:
-        """Return F on all rows (3N, 3N)."""
+        """Return F as a matrix on all rows (3N, 3N)."""
         rows, stiffness, count = self._rest
         place = np.repeat(rows, len(rows)), np.tile(rows, len(rows))
         return sp.csc_array(sp.coo_array((stiffness.ravel(), place), shape=(count, count)))
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Do nothing: a linear term does not limit the step."""
+        """Do nothing, since the exterior does not limit the step."""
 
     def end(self, u: wp.array) -> None:
-        """Return None: the exterior has no history."""
+        """Return None, since the exterior has no history variables."""
 
     def _multiply_rows(self, u: wp.array) -> tuple[wp.array, wp.array]:
-        """Return rows (m, b) of u and F times them, in a workspace reused for batches of the same width."""
+        """Return the rows (m, b) of u, and F times these rows, in a workspace reused for the same batch width."""
         shape = (len(self._rows), u.shape[1])
         if u.shape[1] not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_workspace_width(width)}

@@ -1,4 +1,4 @@
-"""Interface of coefficients that a law takes per quadrature point and load case."""
+"""Interface of sources of law coefficients that vary between quadrature points and load cases."""
 
 from typing import Protocol
 
@@ -10,9 +10,9 @@ from .laws.law import Law
 
 
 class StateSource(Protocol):
-    """Source of coefficients that vary between points and load cases, and of the law that uses them.
+    """Interface of sources of coefficients that vary between points and load cases, and of the law that uses these.
 
-    Coefficients are a Warp array (T, q, n, b) in the device's scalar type: element, point, coefficient, load case.
+    Coefficients are in a Warp array (T, q, n, b) of the device's scalar type: element, point, coefficient, load case.
     """
 
     @property
@@ -22,20 +22,20 @@ class StateSource(Protocol):
 
     @property
     def width(self) -> int:
-        """Number of values per point in the memory that `end` returns."""
+        """Number of history variables per point that `end` returns."""
         ...
 
     def build_law(self, inner: Law, count: int) -> Law:
-        """Wrap `inner`, a law of `count` coefficients, in a law that takes these first and then the source's."""
+        """Return a law based on `inner`, with the `count` coefficients of `inner` followed by those of the source."""
         ...
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
-        """Write the coefficients of these cases to out (T, q, n, b), from index `first`."""
+        """Write the coefficients of the load cases to out (T, q, n, b), from the coefficient index `first`."""
         ...
 
     def end(self, cases: Cases, strains: wp.array) -> np.ndarray | None:
-        """Return the memory (B, ...) for the next call, or None; strains (T, q, b) are current displacement gradients.
+        """Return the history variables (B, ...), or None; `strains` (T, q, b) are the current displacement gradients.
 
-        A source that explains a part of the strains removes it in place, before the sources inside it see them.
+        A source that causes a part of the strains removes this part in place, before inner sources use the strains.
         """
         ...

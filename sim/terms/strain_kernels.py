@@ -1,4 +1,4 @@
-"""Warp kernels over strained elements: magnitude of the displacement gradient, and stiffness increment."""
+"""Warp kernels over strained elements: norm of the displacement gradient, and stiffness increment."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -12,7 +12,7 @@ from .laws.law import Law
 
 @dataclass(frozen=True)
 class StrainKernels:
-    """Kernels over a subset of the elements of one law."""
+    """Kernels over a subset of the elements with one law."""
 
     strain: wp.Kernel
     stiffen: wp.Kernel
@@ -20,7 +20,7 @@ class StrainKernels:
 
 @cache
 def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKernels:
-    """Build kernels like `element_kernels.build_kernels`; each launches over (index in `some`, index in `columns`)."""
+    """Return kernels, arguments as `element_kernels.build_kernels`, launched over (index in `some`, in `columns`)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
     stress_change = law.stress_change
@@ -72,7 +72,7 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKern
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """Add K_ab += w grad N_a . (dP(H) - dP(0)) . grad N_b of points with |H| > least, at indices `place`."""
+        """Add w grad N_a . (dP(H) - dP(0)) . grad N_b of points with |H| > least to K_ab, at the indices `place`."""
         i, c = wp.tid()
         e, of = some[i], columns[c]
         nodes = wp.int32(size)

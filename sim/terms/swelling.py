@@ -1,4 +1,4 @@
-"""Tissue swelling due to blood volume: any law in F / (1 + theta)^(1/3), stress-free under pure swelling.
+"""Tissue swelling by blood volume: any law, applied to F / (1 + theta)^(1/3); pure swelling causes no stress.
 
 Rodriguez, Hoger, McCulloch 1994, "Stress-dependent finite growth in soft elastic tissues", J. Biomech. 27:455-467, with
 isotropic growth: psi per undeformed volume is (1 + theta) psi(F_e), F = (1 + theta)^(1/3) F_e.
@@ -18,7 +18,7 @@ from .laws.law import Law
 
 @cache
 def build_swollen_law(law: Law, device: Device, count: int) -> Law:
-    """Return the law on `count` coefficients that also takes r = (1 + theta)^(1/3) - 1."""
+    """Return the law, based on `law` with `count` coefficients, that also takes r = (1 + theta)^(1/3) - 1."""
     scalar, mat = device.scalar, device.matrix
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1))
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
@@ -62,7 +62,7 @@ def build_swollen_law(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def at_rest(c: whole):
-        """Return coefficients with r = 0 and those of the wrapped law in the undeformed state."""
+        """Return the coefficients in the undeformed state: those of the wrapped law, and r = 0."""
         k, own = whole(), own_rest(of_law(c))
         for i in range(count):
             k[i] = own[i]
@@ -73,7 +73,7 @@ def build_swollen_law(law: Law, device: Device, count: int) -> Law:
 
 @dataclass(frozen=True)
 class SwellingKernels:
-    """Kernels of the swelling ratio; each launches over (element, point, column)."""
+    """Kernels for the swelling ratio, launched over (element, point, load case)."""
 
     fill: wp.Kernel
     shrink: wp.Kernel
@@ -81,7 +81,7 @@ class SwellingKernels:
 
 @cache
 def build_kernels(device: Device) -> SwellingKernels:
-    """Build the kernels for a device's scalar type."""
+    """Return the kernels for the scalar type of a device."""
     scalar, mat = device.scalar, device.matrix
 
     @forward_kernel(module="unique")
@@ -103,7 +103,7 @@ def build_kernels(device: Device) -> SwellingKernels:
         # outputs
         strain: wp.array3d(dtype=mat),
     ):
-        """Replace H by its elastic part F_e - I = (H - r I) / (1 + r)."""
+        """Replace H by the elastic part F_e - I = (H - r I) / (1 + r)."""
         e, q, c = wp.tid()
         r = swells[e] * wider[c]
         strain[e, q, c] = (strain[e, q, c] - r * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + r)
@@ -112,7 +112,7 @@ def build_kernels(device: Device) -> SwellingKernels:
 
 
 class Swelling:
-    """StateSource for the relative volume change theta of swelling tissue, without history.
+    """Source of the relative volume change theta of swelling tissue, without history variables.
 
     Parameters
     ----------
@@ -131,19 +131,19 @@ class Swelling:
         self._swells = device.upload(swells.astype(np.float64))
 
     def build_law(self, inner: Law, count: int) -> Law:
-        """Return the law of the elastic part of the deformation."""
+        """Return the law that applies `inner` to the elastic part of the deformation."""
         return build_swollen_law(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
-        """Write r at every point."""
+        """Write the ratio r at every point."""
         inputs = [self._swells, self._compute_linear_strain(cases), first]
         self._device.launch(build_kernels(self._device).fill, (*out.shape[:2], out.shape[3]), inputs, [out])
 
     def end(self, cases: Cases, strains: wp.array) -> None:
-        """Replace strains by their elastic part, for the memory of inner sources; swelling has none."""
+        """Replace strains by their elastic part for inner sources; return None, since there is no history."""
         inputs = [self._swells, self._compute_linear_strain(cases)]
         self._device.launch(build_kernels(self._device).shrink, strains.shape, inputs, [strains])
 
     def _compute_linear_strain(self, cases: Cases) -> wp.array:
-        """Return r (b,), accurate for small theta too."""
+        """Return the ratio r (b,), also accurate for small theta."""
         return self._device.upload(np.expm1(np.log1p(self._theta(cases.loads.times)) / 3.0))

@@ -7,14 +7,14 @@ section 6.10. The step is the derivative of an incremental potential: with Fb = 
     f psi(F) + (1 - f) psi(J^(1/3) I) + Cb : A / 2,  f = 1 - sum_i g_i (1 - exp(-dt / (2 tau_i))),
     A = sum_i (exp(-dt / tau_i) H_i - g_i exp(-dt / (2 tau_i)) S),
 
-S the deviatoric stress of the law, pulled back by the last step's Fb, and H_i the overstresses of the Prony terms. If
-the law splits into deviatoric and volumetric parts, as Ogden's, psi(F) - psi(J^(1/3) I) is psi(Fb), as in the papers.
-For other laws, psi(Fb) must not be subtracted from psi(F): it grows faster under compression, so tissue collapses.
+where S is the deviatoric stress of the law, pulled back by Fb of the last step, and H_i are the overstresses of Prony
+terms. If a law splits into deviatoric and volumetric parts, as Ogden's law, psi(F) - psi(J^(1/3) I) is psi(Fb), as in
+the papers. For other laws psi(Fb) must not be used: it grows faster than psi(F) under compression; tissue collapses.
 
-The stable neo-Hookean law is finite at J = 0, but Cb is not: any load on Cb makes it collapse. It has a
-separate split (`build_own_split`): mu relaxes, K does not. The step's potential is psi - (1 - f) psi_shape + C : A / 2,
-and S acts on C = F^T F, as in finite linear viscoelasticity. Source: Christensen 1980, "A Nonlinear Theory of
-Viscoelasticity for Application to Elastomers", J. Appl. Mech. 47:762-768.
+The stable neo-Hookean law is finite at J = 0, but Cb is not, so any load on Cb causes collapse. This law has its own
+split (`build_own_split`): mu relaxes, K does not. The potential of a step is psi - (1 - f) psi_shape + C : A / 2, and S
+acts on C = F^T F, as in finite linear viscoelasticity: Christensen 1980, "A Nonlinear Theory of Viscoelasticity for
+Application to Elastomers", J. Appl. Mech. 47:762-768.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ TENSOR_COMPONENTS = 6
 
 @cache
 def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
-    """Return the law on `count` coefficients that also takes f - 1 and components xx, yy, zz, yz, zx, xy of A [Pa]."""
+    """Return the law, based on `law` of `count` coefficients, that also takes f - 1 and xx, yy, zz, yz, zx, xy of A."""
     scalar, mat = device.scalar, device.matrix
     parts = build_law_split(law, device)
     inner, whole = (wp.types.vector(length=n, dtype=scalar) for n in (count, count + 1 + TENSOR_COMPONENTS))
@@ -59,22 +59,22 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
 
     @wp.func
     def energy(H: mat, c: whole):
-        """Return the step's energy density psi + (f - 1) psi_shape + A : E [Pa]."""
+        """Return the energy density of the step, psi + (f - 1) psi_shape + A : E [Pa]."""
         return own_energy(H, of_law(c), c[count], pull(c))
 
     @wp.func
     def stress(H: mat, c: whole):
-        """Return the stress P + (f - 1) P_shape + the derivative of A : E."""
+        """Return the stress [Pa]: P + (f - 1) P_shape + the derivative of A : E."""
         return own_stress(H, of_law(c), c[count], pull(c))
 
     @wp.func
     def stress_change(H: mat, D: mat, c: whole):
-        """Return dP for dF = D, the derivative of `stress`."""
+        """Return dP [Pa] for dF = D, the derivative of `stress`."""
         return own_change(H, D, of_law(c), c[count], pull(c))
 
     @wp.func
     def at_rest(c: whole):
-        """Return coefficients without relaxation or overstress."""
+        """Return the coefficients without relaxation and overstress."""
         k = c
         for i in range(count, count + 1 + TENSOR_COMPONENTS):
             k[i] = scalar(0.0)
@@ -85,7 +85,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
 
 @dataclass(frozen=True)
 class ViscoelasticKernels:
-    """Kernels of one step of the Prony series at every point."""
+    """Kernels for one time step of the Prony series at every point."""
 
     fade: wp.Kernel
     advance: wp.Kernel
@@ -93,7 +93,7 @@ class ViscoelasticKernels:
 
 @cache
 def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
-    """Build kernels for a law of `count` coefficients; each launches over (element, point, column)."""
+    """Return the kernels for a law with `count` coefficients, launched over (element, point, load case)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
     overstress = build_law_split(law, device).overstress
@@ -109,7 +109,7 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
         # outputs
         out: wp.array4d(dtype=scalar),
     ):
-        """Compute f - 1 and A; past (b, points, 6 (n + 1)): S, then each H_i."""
+        """Compute f - 1 and A; `past` (b, points, 6 (n + 1)) contains S, then each H_i."""
         e, q, c = wp.tid()
         p = e * out.shape[1] + q
         less = scalar(0.0)
@@ -134,7 +134,7 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
         # outputs
         out: wp.array3d(dtype=scalar),
     ):
-        """Update the history: S at H, and H_i <- exp(-dt / tau) H_i + g exp(-dt / (2 tau)) (S - its last value)."""
+        """Update the history: S at H, and H_i <- exp(-dt / tau) H_i + g exp(-dt / (2 tau)) (S - last S)."""
         e, q, c = wp.tid()
         p = e * strain.shape[1] + q
         S = overstress(strain[e, q, c], coefficients[e])
@@ -150,14 +150,14 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
 
 
 class Prony:
-    """StateSource for a Prony series. History: S, then each H_i, (B, points, 6 (n + 1)) [Pa].
+    """Source for a Prony series; its history variables are S, then each H_i, (B, points, 6 (n + 1)) [Pa].
 
     Parameters
     ----------
     name
-        Key of its memory.
+        Key of the history variables.
     law
-        Relaxing law, with `coefficients` (T, k).
+        Law that relaxes, and its `coefficients` (T, k).
     pairs
         Series (g, tau [s]) of the tissue of each of T elements; lengths may differ.
     points
@@ -183,7 +183,7 @@ class Prony:
         self._shape = len(coefficients) * points, self.width
 
     def build_law(self, inner: Law, count: int) -> Law:
-        """Return the law with a relaxing deviatoric part."""
+        """Return the law `inner` with a relaxing deviatoric part."""
         return build_relaxing_law(inner, self._device, count)
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:

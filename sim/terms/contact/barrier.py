@@ -1,10 +1,10 @@
-"""Contact barrier between two surfaces: its pressure increases as their gap closes.
+"""Contact barrier between two surfaces, with a pressure that increases as the gap closes.
 
     b(d) = -k (d - g)^2 ln(d / g) for 0 < d < g, 0 beyond: Li et al. 2020, "Incremental Potential Contact", eq. 6.
 
-Below g / 100 it continues as the parabola with the same value, slope and curvature (relaxed barrier: Feller, Ebenbauer
+Below g / 100, b continues as the parabola with the same value, slope and curvature (relaxed barrier: Feller, Ebenbauer
 2017, IEEE Trans. Autom. Control 62:1223-1238), so penetrating tools push tissue out and any initial state is feasible.
-With k = mu / g, mu the tissue's shear modulus, the pressure there is 107 mu: lower pressures leave a gap.
+With k = mu / g and the shear modulus mu of the tissue, the pressure at g / 100 is 107 mu: lower pressures leave a gap.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ def barrier(d: Any, g: Any):
 
 @wp.func
 def barrier_slope(d: Any, g: Any):
-    """Return the first derivative b'(d) / k [m], never positive: contact is purely repulsive."""
+    """Return the first derivative b'(d) / k [m], which is never positive, since contact is purely repulsive."""
     if d >= g:
         return type(d)(0.0)
     low = type(d)(PARABOLA_FRACTION) * g
@@ -44,7 +44,7 @@ def barrier_slope(d: Any, g: Any):
 
 @wp.func
 def barrier_curvature(d: Any, g: Any):
-    """Return the second derivative b''(d) / k, never negative."""
+    """Return the second derivative b''(d) / k, which is never negative."""
     if d >= g:
         return type(d)(0.0)
     e = wp.max(d, type(d)(PARABOLA_FRACTION) * g)

@@ -1,6 +1,6 @@
-"""Point-in-surface test for a batch of deformed bodies.
+"""Test if points are inside a closed surface, for a batch of deformed surfaces.
 
-Based on the solid angle of the surface: van Oosterom, Strackee 1983, "The solid angle of a plane triangle", IEEE Trans.
+The test uses solid angles: van Oosterom, Strackee 1983, "The solid angle of a plane triangle", IEEE Trans.
 Biomed. Eng. 30:125-126, equation 8.
 """
 
@@ -14,7 +14,7 @@ from ...runtime.device import Device, forward_kernel
 
 @cache
 def build_kernel(device: Device) -> wp.Kernel:
-    """Build the solid angle kernel, launched over (triangle, column)."""
+    """Return the solid angle kernel, launched over (triangle, load case)."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
@@ -26,7 +26,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """Add half the solid angle [sr] of a triangle seen from points (p, b)."""
+        """Add half of the solid angle [sr] of a triangle, as seen from points (p, b)."""
         s, c = wp.tid()
         corners = wp.mat33d()
         for row in range(3):

@@ -13,24 +13,24 @@ from .tool_blocks import ContactStruct, NearPairs, build_functions
 
 
 class DenseTerm(Term, Protocol):
-    """Term on few nodes, whose tangent stiffness is a small dense matrix."""
+    """Interface of terms on few nodes, whose tangent stiffness is a small dense matrix."""
 
     def build_structs(self, columns: np.ndarray) -> tuple[ContactStruct, NearPairs]:
-        """Return surface and tools of some load cases (k,), and the workspace for near pairs."""
+        """Return surface and tools of the load cases `columns` (k,), and the workspace for near pairs."""
         ...
 
     def add_matrix(self, u: wp.array, definite: wp.array, index: wp.array, out: wp.array) -> None:
-        """Add K(u) (3N, b) to out (b, 3m, 3m), float64, between nodes with index `index` (N, b) >= 0."""
+        """Add the stiffness K at u (3N, b) to out (b, 3m, 3m), float64, between nodes with `index` (N, b) >= 0."""
         ...
 
 
 class ReducedToolBarrier:
-    """Reduced barrier, a `ReducedBarrier`.
+    """Tool contact barrier on the touchable nodes, a `ReducedBarrier`.
 
     Parameters
     ----------
     term
-        Barrier of these n nodes alone, in double precision.
+        Barrier term on only these n nodes, in double precision.
     count, nodes
         Number of nodes n, and nodes per surface triangle.
     device
@@ -44,15 +44,15 @@ class ReducedToolBarrier:
 
     @property
     def functions(self) -> BlockFunctions:
-        """Warp functions as `ReducedBarrier.functions`."""
+        """Warp functions of the barrier; see `ReducedBarrier.functions`."""
         return build_functions(self._device, self._nodes)
 
     def build_structs(self, columns: np.ndarray) -> tuple[ContactStruct, NearPairs]:
-        """Return the structs as `ReducedBarrier.build_stage`."""
+        """Return the structs; see `ReducedBarrier.build_structs`."""
         return self._term.build_structs(columns)
 
     def compute_gradient(self, w: Any) -> Any:
-        """Return the gradient as `ReducedBarrier.slope`."""
+        """Return the gradient; see `ReducedBarrier.compute_gradient`."""
         at, force = self._arrays(w.shape[1])[:2]
         to_view(at)[:] = w
         force.zero_()
@@ -60,7 +60,7 @@ class ReducedToolBarrier:
         return to_view(force) + 0.0  # a copy
 
     def compute_stiffness(self, w: Any, index: Any, size: int, definite: np.ndarray) -> Any:
-        """Return the tangent stiffness as `ReducedBarrier.curvature`."""
+        """Return the tangent stiffness; see `ReducedBarrier.compute_stiffness`."""
         at, _, numbers = self._arrays(w.shape[1])
         to_view(at)[:], to_view(numbers)[:] = w, index
         out = wp.zeros((w.shape[1], 3 * size, 3 * size), dtype=wp.float64, device=self._device.name)
@@ -68,6 +68,6 @@ class ReducedToolBarrier:
         return to_view(out)
 
     def _allocate_buffers(self, columns: int) -> tuple[wp.array, wp.array, wp.array]:
-        """Allocate displacements and forces (3n, b), and node indices (n, b)."""
+        """Return arrays for displacements and forces (3n, b), and node indices (n, b)."""
         at, force = (self._device.allocate(3 * self._count, columns) for _ in range(2))
         return at, force, wp.zeros((self._count, columns), dtype=wp.int32, device=self._device.name)

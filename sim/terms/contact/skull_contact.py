@@ -1,10 +1,10 @@
-"""Unilateral contact of brain and skull: each node has its own curved bone surface, which ends at the craniotomy.
+"""Unilateral contact of brain and skull: each node has a curved bone surface, which ends at the craniotomy.
 
     h = g - n . u - u . H u / 2,    r = r_0 + e . u,    d = |max((h + R, r + R), 0)| - R,
 
-h is the distance to bone, r the distance inside the craniotomy. With the normal n and its derivative H along the skull,
-a rotating brain slides along the curved skull, not along tangent planes. With the direction e into the craniotomy,
-exposed cortex can rise through it, but not through its edge, of radius R.
+h is the distance to bone, and r the distance inside the craniotomy. With the normal n and its derivative H along the
+skull, a rotating brain slides along the curved skull, not along tangent planes. With the direction e into the
+craniotomy, exposed cortex can rise through the craniotomy, but not through its edge with radius R.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ MAX_STEP_FRACTION = wp.constant(0.9)
 
 @dataclass(frozen=True)
 class SkullBarrier:
-    """Contact stiffness in preconditioners, and initial width of the skull barrier.
+    """Options of the skull barrier: contact stiffness in preconditioners, and initial width.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class SkullBarrier:
 
 @dataclass(frozen=True)
 class SkullKernels:
-    """Kernels over (skull node, load case)."""
+    """Kernels of skull contact, launched over (skull node, load case)."""
 
     add_energy: wp.Kernel
     add_gradient: wp.Kernel
@@ -57,10 +57,10 @@ class SkullKernels:
 
 @wp.struct
 class Wall:
-    """Node numbers, bone normals and curvatures [1/m], directions into the craniotomy, distances inside it [m].
+    """Bone data: node numbers, normals, curvatures [1/m], directions into the craniotomy and distances inside it [m].
 
-    Activation distances [m] and their current factor; areas [m^2]; gap and radius of the bone's edge [m];
-    shear modulus [Pa].
+    Further data: activation distances [m] and their current factor, areas [m^2], gap [m], radius of the bone's edge
+    [m], and shear modulus [Pa].
     """
 
     nodes: wp.array(dtype=wp.int32)
@@ -78,7 +78,7 @@ class Wall:
 
 @wp.func
 def to_bone(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
-    """Return (h + R, r + R) of node s at displacement x; a widened barrier makes the bone recede by as much."""
+    """Return (h + R, r + R) of node s at displacement x; the bone recedes by the added width of a widened barrier."""
     gap = wall.gap + (wall.widening - wp.float64(1.0)) * wall.activation[s]
     h = gap - wp.dot(wall.normal[s], x) - wp.float64(0.5) * wp.dot(x, wall.curvature[s] * x)
     return wp.vec2d(h + wall.edge, wall.inside_distance[s] + wp.dot(wall.inward[s], x) + wall.edge)
@@ -102,7 +102,7 @@ def distance(wall: Wall, p: wp.vec2d) -> wp.float64:
 
 @wp.func
 def to_displacement(wall: Wall, s: int, x: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.vec3d:
-    """Return the displacement direction that reduces h by `along` and increases r by `across`."""
+    """Return the displacement vector that reduces h by `along` and increases r by `across`."""
     return along * (wall.normal[s] + wall.curvature[s] * x) + across * wall.inward[s]
 
 
@@ -137,7 +137,7 @@ def stiffness_block(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d
 def step_fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.float64:
     """Return the largest t <= 1 with distance - t falls - t^2 bends / 2 >= (1 - MAX_STEP_FRACTION) distance.
 
-    Bends >= 0.
+    The curvature `bends` must be >= 0.
     """
     lost = wp.float64(MAX_STEP_FRACTION) * distance
     root = falls + wp.sqrt(falls * falls + wp.float64(2.0) * lost * bends)
@@ -148,7 +148,7 @@ def step_fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) ->
 
 @cache
 def build_kernels(device: Device) -> SkullKernels:
-    """Build kernels for a device's scalar type; distances are in double precision."""
+    """Return kernels for the scalar type of a device; distances are in double precision."""
     scalar, mat = device.scalar, device.matrix
 
     @wp.func
@@ -225,7 +225,7 @@ def build_kernels(device: Device) -> SkullKernels:
         # outputs
         out: wp.array(dtype=scalar),
     ):
-        """Bound t by d(u + t du) >= (1 - kept) d: no node crosses the bone; d is convex in h and r."""
+        """Limit t so that d(u + t du) >= (1 - kept) d and no node crosses the bone; d is convex in h and r."""
         s, c = wp.tid()
         x, along = motion(u, wall.nodes[s], c), motion(du, wall.nodes[s], c)
         p = to_bone(wall, s, x)
@@ -238,7 +238,7 @@ def build_kernels(device: Device) -> SkullKernels:
 
 
 class Skull:
-    """Skull contact as a Term: the barrier of `barrier.py` between nodes and the bone that covers them.
+    """Energy term of skull contact: barrier of `barrier.py` between nodes and the bone that covers these nodes.
 
     Parameters
     ----------
@@ -276,11 +276,11 @@ class Skull:
         self._rest = sp.csc_array(sp.coo_array((blocks.ravel(), place), shape=(3 * count, 3 * count)))
 
     def compute_stride(self, cases: Cases, u: wp.array) -> np.ndarray:
-        """Return 1 for every load case: the skull does not move."""
+        """Return 1 for every load case, since the skull does not move."""
         return np.ones(len(cases.loads))
 
     def compute_path_in_gaps(self, cases: Cases) -> np.ndarray:
-        """Return the initial barrier width in units of its normal width (b,): larger if the start is undeformed."""
+        """Return the initial barrier width (b,) in units of its normal width; larger if the start is undeformed."""
         known = np.zeros(len(cases.loads), bool)
         if cases.displacement is not None:
             known |= cases.displacement.any(axis=(1, 2))
@@ -289,27 +289,27 @@ class Skull:
         return np.where(known, self._settings.next_width, self._settings.first_width) / self._bone.activation.min()
 
     def find_penetrating(self, u: wp.array) -> np.ndarray:
-        """Return False for every load case: the skull never penetrates the body."""
+        """Return False for every load case, since the skull is not a tool."""
         return np.zeros(u.shape[1], bool)
 
     def find_overlaps(self, u: wp.array) -> np.ndarray:
-        """Return False for every load case: the skull is not a tool."""
+        """Return False for every load case and both masks, since the skull is not a tool."""
         return np.zeros((2, u.shape[1]), bool)
 
     def widen_gap(self, factor: float) -> None:
-        """Widen the barrier by a factor and soften it by the same factor; the bone recedes by the added width."""
+        """Multiply the barrier width, and divide the stiffness, by `factor`; the bone recedes by the added width."""
         self._wall.widening = factor
 
     def compute_reaction(self, u: wp.array) -> np.ndarray:
-        """Return an empty array (b, 0, 6): there are no tools."""
+        """Return an empty array (b, 0, 6), since there are no tools."""
         return np.zeros((u.shape[1], 0, 6))
 
     def begin(self, cases: Cases) -> None:
-        """Reset the barrier to its own width."""
+        """Reset the barrier to its normal width."""
         self.widen_gap(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
-        """Do nothing: the skull is the same in all load cases."""
+        """Do nothing, since the skull is the same in all load cases."""
 
     def energy(self, u: wp.array, out: wp.array) -> None:
         """Add the barrier energies."""
@@ -320,7 +320,7 @@ class Skull:
         self._launch(self._kernels.add_gradient, [u], out)
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """Set the linearisation point u; in `definite` load cases the bone's edge counts as straight."""
+        """Set the linearisation point u; in `definite` load cases the curvature of the bone's edge is ignored."""
         self._at = [wp.clone(u), definite]
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
@@ -332,15 +332,15 @@ class Skull:
         self._launch(self._kernels.add_diagonal, self._at, out)
 
     def rest_curvature(self) -> sp.csc_array:
-        """Return the half-closed contact stiffness (3N, 3N) for preconditioners: under load, some nodes touch."""
+        """Return a partial contact stiffness (3N, 3N) [N/m] for preconditioners, since some nodes touch under load."""
         return self._rest
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Bound the step so that no node crosses the bone; penetrating nodes do not limit it."""
+        """Limit the step so that no node crosses the bone; nodes that already penetrate do not limit the step."""
         self._launch(self._kernels.bound_step, [u, du], out)
 
     def end(self, u: wp.array) -> None:
-        """Return None: the skull has no history."""
+        """Return None, since the skull has no history variables."""
 
     def _launch(self, kernel: wp.Kernel, inputs: list, out: wp.array) -> None:
         self._device.launch(kernel, (len(self._bone.nodes), out.shape[-1]), [*inputs, self._wall], [out])
@@ -355,5 +355,5 @@ def build_skull(
     bone: BoneSettings = BONE_SETTINGS,
     settings: SkullBarrier = SkullBarrier(),
 ) -> Skull:
-    """Return the term of `SkullContact` on tissue with a shear modulus [Pa]."""
+    """Return the term of `SkullContact` on tissue with the shear modulus `shear` [Pa]."""
     return Skull(build_bone(anatomy, space, effect.gap, bone), space.count, shear, device, settings)

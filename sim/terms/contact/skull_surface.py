@@ -1,4 +1,4 @@
-"""Bone over the nodes of a brain surface, and its edge at the craniotomy."""
+"""Bone surface over the nodes of a brain surface, and its edge at the craniotomy."""
 
 from dataclasses import dataclass
 
@@ -33,15 +33,15 @@ class BoneSettings:
     activation
         Maximum activation distance [m]; smaller if the gap is narrower.
     edge_activation
-        Activation distance at the craniotomy's edge, as a fraction of its radius, which depends on the mesh size. At a
-        sharp or stiff edge, nodes would snap from above it to below.
+        Activation distance at the craniotomy's edge, as a fraction of the edge radius, which depends on the mesh size.
+        At a sharp or stiff edge, nodes would snap from one side to the other.
     blur
         Standard deviation of the blur that extends the bone normals over the craniotomy [edge radii].
     neighbours, min_normal_cosine
         Number of nearest nodes for the bone's curvature at a node, and minimum cosine between their
         normals.
     max_edge_distance
-        Distance from the edge beyond which its direction is unreliable [standard deviations of the blur].
+        Distance from the edge beyond which the direction to the edge is unreliable [standard deviations of the blur].
     """
 
     activation: float = 1e-4
@@ -65,10 +65,10 @@ class Bone:
     nodes
         Node numbers (k,).
     normal, curvature
-        Unit vectors (k, 3) towards the bone; their derivatives (k, 3, 3) [1/m] along it, positive semi-definite.
+        Unit vectors (k, 3) towards the bone, and their positive semi-definite derivatives (k, 3, 3) [1/m] along it.
     inside_distance, inward
-        Distances (k,) [m] inside the craniotomy, negative under bone; unit vectors (k, 3) into it, zero if too
-        far.
+        Distances (k,) [m] inside the craniotomy, negative under bone; unit vectors (k, 3) into the craniotomy, or zero
+        far from its edge.
     activation, area
         Activation distances (k,) [m], and tributary areas (k,) [m^2].
     gap
@@ -89,12 +89,12 @@ class Bone:
 
 
 def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneSettings = BONE_SETTINGS) -> Bone:
-    """Return the bone over covered nodes and over those of the craniotomy near its edge; fixed nodes have none.
+    """Return the bone over all covered nodes and over craniotomy nodes near the edge, except fixed nodes.
 
     Raises
     ------
     InputError
-        An anatomy without nodes that can touch the skull.
+        The anatomy has no nodes that can touch the skull.
     """
     fixed = space.extend_fixed(anatomy.fixed).all(axis=1)
     normal = space.extend_normals(anatomy.slide_normal, anatomy.fixed)
@@ -137,10 +137,10 @@ def _compute_nodal_areas(space: Discretisation) -> np.ndarray:
 
 
 def compute_curvature(points: np.ndarray, normal: np.ndarray, settings: BoneSettings = BONE_SETTINGS) -> np.ndarray:
-    """Estimate derivatives (k, 3, 3) [1/m], symmetric, of unit normals (k, 3) along a wall at points (k, 3) [m].
+    """Return estimated symmetric derivatives (k, 3, 3) [1/m] of unit normals (k, 3) along a wall, at points (k, 3) [m].
 
-    Least-squares fit of n_j - n_i = H (x_j - x_i) in the tangent plane, to the nearest points with similar
-    normals. Negative (concave) principal curvatures are set to 0.
+    The derivative H is a least-squares fit of n_j - n_i = H (x_j - x_i) in the tangent plane, to the nearest points
+    with similar normals. Negative (concave) principal curvatures are set to 0.
     """
     count = min(settings.neighbours, len(points))
     near = KDTree(points).query(points, count)[1].reshape(len(points), count)
@@ -162,14 +162,14 @@ def compute_curvature(points: np.ndarray, normal: np.ndarray, settings: BoneSett
 
 
 def find_opening_edge(anatomy: Anatomy) -> np.ndarray:
-    """Return surface triangles (R, 3) that cross the craniotomy's edge: some corners open, some under bone."""
+    """Return the surface triangles (R, 3) at the craniotomy's edge, with corners in the craniotomy and under bone."""
     around = anatomy.mesh.surface[find_triangles_about_opening(anatomy)]
     opened = anatomy.craniotomy[around]
     return around[opened.any(axis=1) & ~opened.all(axis=1)]
 
 
 def compute_edge_radius(nodes: np.ndarray, rim: np.ndarray) -> float:
-    """Return the edge radius [m] that triangles (R, 3) of nodes (V, 3) [m] resolve: their mean edge length."""
+    """Return the edge radius [m] that the triangles `rim` (R, 3) resolve: their mean edge length."""
     return float(compute_edge_lengths(nodes[rim]).mean())
 
 
@@ -185,8 +185,8 @@ def measure_inside_opening(
     Distances are negative under bone. Directions are unit vectors perpendicular to the unit normals (n, 3), or zero
     more than `cutoff` blurs from the edge.
 
-    A Gaussian of standard deviation `blur` [m] at distance r inside a straight edge sees an open fraction
-    Phi(r / blur), which is inverted.
+    A Gaussian of standard deviation `blur` [m], at a distance r inside a straight edge, has the fraction Phi(r / blur)
+    in the craniotomy; r follows by inversion.
     """
     mesh, opened = anatomy.mesh, anatomy.craniotomy
     triangles = mesh.surface[find_triangles_about_opening(anatomy)]
@@ -207,6 +207,6 @@ def measure_inside_opening(
 
 
 def find_triangles_about_opening(anatomy: Anatomy) -> np.ndarray:
-    """Return a mask (S,) of surface triangles whose corners all lie in the craniotomy or under bone."""
+    """Return a mask (S,) of the surface triangles all of whose corners are in the craniotomy or under bone."""
     covered = np.logical_or(anatomy.slide_normal.any(axis=1), anatomy.fixed.all(axis=1))
     return np.all(np.logical_or(anatomy.craniotomy, covered)[anatomy.mesh.surface], axis=1)

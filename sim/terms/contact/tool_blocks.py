@@ -1,4 +1,4 @@
-"""Tool contact by one thread block per load case: forces, tangent stiffness and step bounds."""
+"""Tool contact with one thread block per load case: forces, tangent stiffness and step bounds."""
 
 from functools import cache
 
@@ -13,7 +13,7 @@ from .tool_functions import build_functions as at_triangles
 
 @wp.struct
 class ContactStruct:
-    """Surface, tools and barrier, and the maximum number of sample rows per triangle."""
+    """Arguments of contact functions: surface, tools, barrier, and maximum number of sample rows per triangle."""
 
     surface: Surface
     tools: Tools
@@ -23,7 +23,7 @@ class ContactStruct:
 
 @wp.struct
 class NearPairs:
-    """Workspace for near triangle-tool pairs: all pairs (b, S T), their number (b,), and a scalar (b,)."""
+    """Workspace for near pairs of triangle and tool: pairs (b, S T), their number (b,), and a scalar (b,)."""
 
     pairs: wp.array2d(dtype=wp.int32)
     count: wp.array(dtype=wp.int32)
@@ -32,7 +32,7 @@ class NearPairs:
 
 @cache
 def build_functions(device: Device, size: int) -> BlockFunctions:
-    """Build functions for surface triangles of `size` nodes, 3 or 6."""
+    """Return the functions for surface triangles with `size` nodes, 3 or 6."""
     down, across = get_block_shape(device)
     threads, one = down * across, at_triangles(device, size)
 
@@ -45,7 +45,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
     def look(
         x: wp.array2d(dtype=wp.float64), reach: wp.float64, stage: ContactStruct, near: NearPairs, c: int, me: int
     ) -> int:
-        """Find the pairs within `reach`; return the maximum number of their sample rows."""
+        """Find the pairs within the distance `reach`; return the maximum number of their sample rows."""
         if me == 0:
             near.count[c] = 0
         wait()
@@ -68,7 +68,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """Add forces f_a += sum over points of w k b'(d) n N_a; stores the near pairs at x."""
+        """Add forces f_a += sum over points of w k b'(d) n N_a, and store the near pairs at x."""
         tools, gap = stage.tools.radius.shape[0], stage.scale.gap
         for item in range(me, look(x, gap, stage, near, c, me), threads):
             pair, i = near.pairs[c, item // stage.rows], item % stage.rows
@@ -94,7 +94,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """Add K_ab += sum over points of w k H N_a N_b between nodes with `place` >= 0, over the stored near pairs."""
+        """Add K_ab += sum over points of w k H N_a N_b between nodes with `place` >= 0, for the stored near pairs."""
         tools = stage.tools.radius.shape[0]
         for item in range(me, stage.rows * near.count[c], threads):
             pair, i = near.pairs[c, item // stage.rows], item % stage.rows
@@ -113,7 +113,7 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         c: int,
         me: int,
     ) -> wp.float64:
-        """Return the fraction of a step from x, at most 1, that is allowed; overwrites the near pairs."""
+        """Return the allowed fraction, at most 1, of the step `way` from x; overwrite the near pairs."""
         far = wp.float64(0.0)
         for i in range(me, x.shape[0] // 3, threads):
             far = wp.max(far, wp.length(wp.vec3d(way[3 * i, c], way[3 * i + 1, c], way[3 * i + 2, c])))

@@ -1,4 +1,4 @@
-"""Frictionless contact of a body's surface with rigid tools of prescribed pose."""
+"""Frictionless contact of a tissue surface with rigid tools of prescribed pose."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,24 +29,24 @@ MAX_SAMPLE_DISTANCE = 2.0 / 3.0
 
 
 class ToolContactTerm:
-    """Tool contact as a Term: barrier between a body's surface and rigid tools, integrated over the undeformed surface.
+    """Energy term of tool contact: barrier between tissue and rigid tools, integrated over the undeformed surface.
 
     Parameters
     ----------
     name
-        Name, unique in the problem.
+        Unique name in the problem.
     tools
         Shapes of the tools.
     way
-        Function Cases -> tool path; None if there is no tool.
+        Function that returns the `ToolPath` of `Cases`, or None if there is no tool.
     nodes, triangles
-        Undeformed nodes (N, 3) [m]; triangles (S, 3) or (S, 6) of the surface that can be touched.
+        Undeformed nodes (N, 3) [m], and triangles (S, 3) or (S, 6) of the surface that tools can touch.
     whole
-        Corners (W, 3) of the whole surface, outwards.
+        Corners (W, 3) of the outward triangles of the whole surface.
     bone
-        Triangles (K, 3) or (K, 6) of the surface that is fixed or under the skull: no tool can be there.
+        Triangles (K, 3) or (K, 6) of the surface that is fixed or under the skull, where tools cannot be.
     gap
-        Activation distance of contact [m]; the surfaces never quite touch.
+        Activation distance of contact [m]; a distance always remains.
     shear
         Shear modulus [Pa] of the tissue, to scale the contact stiffness.
     device
@@ -95,7 +95,7 @@ class ToolContactTerm:
         self._single: list[Tools] = []
 
     def compute_stride(self, cases: Cases, u: wp.array) -> np.ndarray:
-        """Return the path fraction as `ToolPath.compute_stride`, given each tool's clearance from the surface."""
+        """Return the path fraction (B,) of `ToolPath.compute_stride`, for the clearance of each tool."""
         way = self._way(cases)
         if way is None:
             return np.ones(len(cases.loads))
@@ -106,12 +106,12 @@ class ToolContactTerm:
         return way.compute_stride(self._shapes, of_tools.clip(0.0), self._touch)
 
     def compute_path_in_gaps(self, cases: Cases) -> np.ndarray:
-        """Return the travel of the farthest-moved tool in units of the gap (B,)."""
+        """Return the largest motion (B,) of all tools, in units of the gap."""
         way = self._way(cases)
         return np.zeros(len(cases.loads)) if way is None else way.travel(self._shapes).max(axis=1) / self._gap
 
     def find_penetrating(self, u: wp.array) -> np.ndarray:
-        """Return a mask (b,) of load cases with a tool's centre, or a corner of its cores, inside the body."""
+        """Return a mask (b,) of load cases with a tool centre, or a corner of a tool core, inside the tissue."""
         if self._pose is None:
             return np.zeros(u.shape[1], bool)
         points = [
@@ -121,7 +121,7 @@ class ToolContactTerm:
         return find_enclosing_columns(self._device, np.concatenate(points, axis=1), self._surface.rest, self._closed, u)
 
     def find_overlaps(self, u: wp.array) -> np.ndarray:
-        """Return overlaps as `Barrier.find_overlaps`, for penetration deeper than the gap."""
+        """Return the masks of `Barrier.find_overlaps`, for penetrations deeper than the gap."""
         if self._pose is None:
             return np.zeros((2, u.shape[1]), bool)
         dim, found = (len(self._owner), u.shape[1]), []
@@ -133,18 +133,18 @@ class ToolContactTerm:
         return np.stack(found)
 
     def widen_gap(self, factor: float) -> None:
-        """Widen the barrier by a factor and soften it by the same factor."""
+        """Multiply the barrier width by `factor`, and divide the barrier stiffness by it."""
         self._scale = BarrierScale()
         self._scale.gap, self._scale.stiffness = factor * self._gap, self._shear / (factor * self._gap)
 
     def begin(self, cases: Cases) -> None:
-        """Place the tools at their fraction of the path, and reset the gap."""
+        """Set the tool poses at the path fractions of the load cases, and reset the gap."""
         way = self._way(cases)
         self._set_pose(None if way is None else way.interpolate(cases.path_fraction))
         self.widen_gap(1.0)
 
     def keep(self, columns: np.ndarray) -> None:
-        """Keep the tools of these load cases only."""
+        """Keep only the tools of the load cases `columns`."""
         self._set_pose(None if self._pose is None else self._pose[columns])
 
     def energy(self, u: wp.array, out: wp.array) -> None:
@@ -156,7 +156,7 @@ class ToolContactTerm:
         self._launch(self._kernels.add_gradient, [u], out, u.shape[1])
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
-        """Set the linearisation point u; in `definite` load cases tools count as flat."""
+        """Set the linearisation point u; in `definite` load cases the curvature of the tools is ignored."""
         self._at = [wp.clone(u), definite]
 
     def add_curvature(self, p: wp.array, out: wp.array) -> None:
@@ -168,23 +168,23 @@ class ToolContactTerm:
         self._launch(self._kernels.add_diagonal, self._at, out, out.shape[1])
 
     def rest_curvature(self) -> None:
-        """Return None: there is no contact in the undeformed configuration."""
+        """Return None, since there is no contact in the undeformed configuration."""
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
-        """Bound the step so that no point of the surface passes through a tool."""
+        """Limit the step so that no point of the surface passes through a tool."""
         self._launch(self._kernels.bound_step, [u, du], out, u.shape[1])
 
     def add_matrix(self, u: wp.array, definite: wp.array, index: wp.array, out: wp.array) -> None:
-        """Add the tangent stiffness as `DenseTerm.add_matrix`."""
+        """Add the tangent stiffness to `out`; see `DenseTerm.add_matrix`."""
         self._launch(self._kernels.add_matrix, [u, definite, index], out, u.shape[1])
 
     @cached_property
     def touchable_nodes(self) -> np.ndarray:
-        """Nodes (n,), ascending, of the surface that tools can touch."""
+        """Sorted nodes (n,) of the surface that tools can touch."""
         return np.unique(self._triangles)
 
     def select_nodes(self, max_nodes: int) -> np.ndarray:
-        """Select the touchable nodes and those nearest to them; see `LocalBarrier.select_nodes`."""
+        """Return the touchable nodes and the nearest other nodes; see `LocalBarrier.select_nodes`."""
         own = self.touchable_nodes
         far, _ = KDTree(self._nodes[own]).query(self._nodes)
         far[own] = -1.0
@@ -193,7 +193,7 @@ class ToolContactTerm:
 
     @cached_property
     def _alone(self) -> "tuple[ToolContactTerm, ReducedToolBarrier]":
-        """Term on the touchable nodes alone, and the same as a `ReducedBarrier`."""
+        """Copy of the term on only the touchable nodes, also as a `ReducedBarrier`."""
         nodes, own = self._nodes[self.touchable_nodes], np.searchsorted(self.touchable_nodes, self._triangles)
         corners, exact = own[:, :3], replace(self._device, precision="float64")
         term = ToolContactTerm(
@@ -203,7 +203,7 @@ class ToolContactTerm:
         return term, ReducedToolBarrier(term, len(nodes), own.shape[1], exact)
 
     def reduce(self, columns: np.ndarray) -> ReducedToolBarrier | None:
-        """Return the reduced barrier as `LocalBarrier.reduce`."""
+        """Return the barrier on the touchable nodes, or None; see `LocalBarrier.reduce`."""
         if self._pose is None:
             return None
         term, reduced = self._alone
@@ -212,7 +212,7 @@ class ToolContactTerm:
         return reduced
 
     def get_active_stiffness(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return active nodes and their tangent stiffness as `LocalBarrier.get_active_stiffness`."""
+        """Return the active nodes and their tangent stiffness; see `LocalBarrier.get_active_stiffness`."""
         barrier = self.reduce(np.zeros(1, int))
         if barrier is None:
             return np.zeros(0, int), np.zeros((0, 0))
@@ -222,13 +222,13 @@ class ToolContactTerm:
         return np.flatnonzero(active), barrier.compute_stiffness(w, place, int(active.sum()), np.ones(1, bool))[0]
 
     def compute_reaction(self, u: wp.array) -> np.ndarray:
-        """Return force [N] and moment about its origin [N m] that each tool exerts at u (3N, b): (b, tools, 6)."""
+        """Return the force [N] and the moment about its origin [N m] of each tool, at u (3N, b): (b, tools, 6)."""
         out = wp.zeros((u.shape[1], len(self._owner), 6), dtype=wp.float64, device=self._device.name)
         self._launch(self._kernels.add_reaction, [u], out, u.shape[1])
         return np.add.reduceat(out.numpy(), self._first, axis=1)
 
     def end(self, u: wp.array) -> np.ndarray | None:
-        """Return the poses (b, tools, 4, 4), at which the next path begins."""
+        """Return the tool poses (b, tools, 4, 4), at which the next path begins; None without tools."""
         return self._pose
 
     def _set_pose(self, pose: np.ndarray | None) -> None:
@@ -239,7 +239,7 @@ class ToolContactTerm:
             self._tools = self._copy_tools(self._tools)
 
     def _copy_tools(self, tools: Tools) -> Tools:
-        """Copy the tools of a single load case to fixed arrays, which a captured graph reads."""
+        """Return the tools; those of a single load case are copied to fixed arrays, which a captured graph reads."""
         if not self._single:
             self._single.append(self._build_tools(np.ascontiguousarray(self._pose, np.float64).tobytes()))
         for mine, its in ((self._single[0].rotation, tools.rotation), (self._single[0].origin, tools.origin)):
@@ -259,7 +259,7 @@ class ToolContactTerm:
         return out
 
     def build_structs(self, columns: np.ndarray) -> tuple[ContactStruct, NearPairs]:
-        """Build the arguments of the kernels; see `DenseTerm.build_stage`."""
+        """Return the arguments of the kernels; see `DenseTerm.build_structs`."""
         if self._pose is None:
             raise ValueError("no tool is there")
         out, near, name = ContactStruct(), NearPairs(), self._device.name
@@ -286,7 +286,7 @@ def build_tool_contact(
     device: Device,
     sampling: ContactSampling = CONTACT_SAMPLING,
 ) -> ToolContactTerm:
-    """Return the contact term of an effect on tissue with a shear modulus [Pa]."""
+    """Return the contact term of an effect on tissue with the shear modulus `shear` [Pa]."""
     contact = isinstance(effect, ToolContact)
     name, tools = ("tool contact", effect.tools) if contact else ("retraction", (effect.blade,))
     triangles = space.surface[anatomy.bare]
@@ -300,7 +300,7 @@ def build_tool_contact(
         return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, normals, reach, sampling.max_steps)
 
     def clear(pose: np.ndarray) -> np.ndarray:
-        """Return the poses from which tools (B, tools, 4, 4) approach."""
+        """Return the contact-free poses (B, tools, 4, 4) from which tools approach the poses `pose`."""
         begin = [came_from(number, one.tobytes()) for case in pose for number, one in enumerate(case)]
         return np.reshape(begin, pose.shape)
 
@@ -333,7 +333,7 @@ def build_tool_contact(
 
 
 def _build_surface(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Device) -> tuple[Surface, int]:
-    """Return surface triangles with sample points at most `fine` [m] apart, and the maximum rows per triangle."""
+    """Return the surface with sample points at most `fine` [m] apart, and the maximum number of rows per triangle."""
     corners = nodes[triangles[:, :3]]
     pieces = np.ceil(compute_edge_lengths(corners).max(axis=1) / fine).astype(np.int32)
     out = Surface()
@@ -347,7 +347,7 @@ def _build_surface(nodes: np.ndarray, triangles: np.ndarray, fine: float, device
 def _find_path_starts(
     last: np.ndarray | None, restarted: np.ndarray | None, clear: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
 ) -> np.ndarray:
-    """Return path starts for poses (B, tools, 4, 4): the last; without history or if `restarted`, contact-free ones."""
+    """Return path starts (B, tools, 4, 4): the last poses; without history or if `restarted`, poses without contact."""
     begin = pose.copy() if last is None else last.copy()
     new = np.ones(len(pose), bool) if last is None else np.zeros(len(pose), bool) if restarted is None else restarted
     begin[new] = clear(pose[new])
@@ -355,7 +355,7 @@ def _find_path_starts(
 
 
 def _compute_node_reach(nodes: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the maximum distance (n,) [m] from each surface node, ascending, to the points nearest to it."""
+    """Return, for each surface node, sorted, the maximum distance (n,) [m] to surface points nearest to this node."""
     numbers, table = np.unique(triangles, return_inverse=True)
     out = np.zeros(len(numbers))
     np.maximum.at(

@@ -1,4 +1,4 @@
-"""Warp functions for contact of a surface triangle and a tool: forces, tangent stiffness and step bounds."""
+"""Warp functions for contact between a surface triangle and a tool: forces, tangent stiffness and step bounds."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -20,7 +20,7 @@ SLOPE_SUMS = {3: 4.0 / 3.0, 6: 28.0 / 3.0}
 
 @wp.struct
 class Tools:
-    """T tools in b load cases: cores as `tools.Core`, and their rotations and origins."""
+    """Data of T tools in b load cases: cores, as `tools.Core`, and their rotations and origins."""
 
     centre: wp.array(dtype=wp.vec3d)
     half: wp.array(dtype=wp.vec3d)
@@ -31,7 +31,7 @@ class Tools:
 
 @wp.struct
 class Surface:
-    """Surface triangles: undeformed node positions, node numbers, subdivisions of an edge, and areas."""
+    """Data of surface triangles: undeformed node positions, node numbers, subdivisions per edge, and areas."""
 
     rest: wp.array(dtype=wp.vec3d)
     table: wp.array2d(dtype=wp.int32)
@@ -49,7 +49,7 @@ class BarrierScale:
 
 @wp.struct
 class ToolDistance:
-    """Distance to a tool [m], its gradient, and its second derivative [1/m]."""
+    """Distance to a tool [m], with its gradient and its second derivative [1/m]."""
 
     distance: wp.float64
     normal: wp.vec3d
@@ -58,9 +58,9 @@ class ToolDistance:
 
 @wp.func
 def distance_to_core(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
-    """Return distance d = |v| - r to a core, v from its nearest point to p; n = v / |v|; dn = (M - n (x) n) / |v|.
+    """Return the distance d = |v| - r to a core, v from the nearest point of the core to p, and two derivatives.
 
-    M selects the components in which p lies outside the core.
+    These are n = v / |v| and dn = (M - n (x) n) / |v|; M selects the components in which p is outside the core.
     """
     one, zero = wp.float64(1.0), wp.float64(0.0)
     v, beyond = wp.vec3d(), wp.vec3d()
@@ -79,7 +79,7 @@ def distance_to_core(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDis
 
 @wp.func
 def skip(clearance: wp.float64, spacing: wp.float64, max_offset: int) -> int:
-    """Return the offset, 1 to `max_offset`, of the next point to test if `clearance` shrinks by `spacing` per point."""
+    """Return the offset, 1 to `max_offset`, of the next point to test; each point lowers `clearance` by `spacing`."""
     out = wp.int32(1)
     if clearance > spacing:
         out = wp.int32(wp.min(clearance / spacing, wp.float64(max_offset)))
@@ -97,11 +97,11 @@ def curvature_at(touch: ToolDistance, gap: wp.float64, definite: int) -> wp.mat3
 
 @dataclass(frozen=True)
 class ToolFunctions:
-    """Warp functions for triangles with a fixed number of nodes; `forces` is their type (size, 3).
+    """Warp functions for triangles with `size` nodes; `forces` is the type of nodal vectors (size, 3).
 
-    A triangle is sampled at the centroids of pieces^2 congruent parts, in as many rows as pieces. Functions
-    `_in_row` sum over one row. They work in the axes of a core (`seen`), and skip
-    points that are certainly out of its range.
+    A triangle is sampled at the centroids of n^2 congruent parts in n rows, where n is the number of pieces per edge.
+    Functions `_in_row` sum over one row. These functions use the axes of a core (see `seen`), and skip points that are
+    certainly outside the range of the core.
     """
 
     forces: Any
@@ -123,9 +123,9 @@ class ToolFunctions:
 
 @cache
 def build_functions(device: Device, size: int) -> ToolFunctions:
-    """Build functions for surface triangles of `size` nodes, 3 or 6.
+    """Return the functions for surface triangles with `size` nodes, 3 or 6.
 
-    Positions and distances are in double precision on every device, since gaps are small compared with bodies.
+    Positions and distances are in double precision on all devices, since gaps are small compared with the tissue.
     """
     scalar = device.scalar
     shares = wp.types.vector(length=size, dtype=wp.float64)
@@ -136,7 +136,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def shape_of(i: int, j: int, n: int) -> shares:
-        """Return shape functions at the centroid of the j-th part of the i-th row; odd parts are turned upside down."""
+        """Return the shape functions at the centroid of part j in row i of n rows; odd parts are inverted triangles."""
         third, turned = wp.float64(1.0) / wp.float64(3 * n), j % 2
         y = wp.float64(3 * i + 1 + turned) * third
         z = wp.float64(3 * (j // 2) + 1 + turned) * third
@@ -170,7 +170,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def seen(at: forces, tools: Tools, k: int, c: int) -> forces:
-        """Return positions relative to a core's centre, along its axes."""
+        """Return positions relative to the centre of a core, along the axes of the core."""
         R = tools.rotation[k, c]
         start = tools.origin[k, c] + R * tools.centre[k]
         out = forces()
@@ -180,19 +180,19 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def spread(surface: Surface, total: forces, s: int, c: int, out: wp.array2d(dtype=scalar)):
-        """Add nodal forces of a triangle: f_a += total_a."""
+        """Add the nodal forces of a triangle: f_a += total_a."""
         for a in range(size):
             for k in range(3):
                 wp.atomic_add(out, 3 * surface.table[s, a] + k, c, scalar(total[a, k]))
 
     @wp.func
     def weight_of(surface: Surface, scale: BarrierScale, s: int) -> wp.float64:
-        """Return stiffness times the area per sample point of a triangle [N/m]."""
+        """Return the barrier stiffness times the area per sample point of a triangle [N/m]."""
         return scale.stiffness * surface.area[s] / wp.float64(surface.pieces[s] * surface.pieces[s])
 
     @wp.func
     def reach_of(along: forces) -> wp.float64:
-        """Return a bound of the norm over a triangle, from nodal vectors (size, 3)."""
+        """Return an upper bound of the norm over a triangle of an interpolated vector, from nodal vectors (size, 3)."""
         out = wp.float64(0.0)
         for a in range(size):
             out = wp.max(out, wp.length(along[a]))
@@ -200,7 +200,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def around(at: forces) -> forces:
-        """Return the nodes (size, 3) relative to the centroid of their corners."""
+        """Return the node positions (size, 3) relative to the centroid of the corners."""
         middle, out = wp.vec3d(), at
         for a in range(3):
             middle += at[a] / wp.float64(3.0)
@@ -210,15 +210,15 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def pace_of(at: forces, n: int) -> wp.float64:
-        """Return a bound of the distance between neighbouring points of a row.
+        """Return an upper bound of the distance between adjacent sample points of a row.
 
-        Barycentric coordinates change by 1, 1 and 2 thirds of a piece between them.
+        Between these points, barycentric coordinates change by 1/3, 1/3 and 2/3 of a piece.
         """
         return steep * reach_of(around(at)) / (bulge * wp.float64(n))
 
     @wp.func
     def least_distance(at: forces, times: wp.float64, half: wp.vec3d, radius: wp.float64) -> wp.float64:
-        """Return a lower bound of a core's distance from a triangle scaled by `times` about its centroid."""
+        """Return a lower bound of the distance of a core from a triangle scaled by `times` about its centroid."""
         arms = around(at)
         return distance_to_core(at[0] - arms[0], half, radius).distance - times * reach_of(arms)
 
@@ -229,7 +229,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def energy_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> wp.float64:
-        """Return the sum over points of a row of b(d)."""
+        """Return the sum of b(d) over the points of a row."""
         total, pace, most, j = wp.float64(0.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             d = distance_to_core(shape_of(i, j, n) * at, half, radius).distance
@@ -239,7 +239,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def force_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> forces:
-        """Return the sum over points of a row of N_a b'(d) n."""
+        """Return the sum of N_a b'(d) n over the points of a row, for each node a."""
         total, pace, most, j = forces(), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             N = shape_of(i, j, n)
@@ -295,7 +295,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
 
     @wp.func
     def share_in_row(at: forces, along: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64) -> wp.float64:
-        """Return the fraction of a motion, at most 1, that takes no point as far as the centre of a core."""
+        """Return the fraction of a motion, at most 1, with which no point of a row reaches the centre of a core."""
         out, pace, most, j = wp.float64(1.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
         farthest = reach_of(along)
         while j < most:

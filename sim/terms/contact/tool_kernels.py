@@ -22,7 +22,7 @@ from .tool_functions import (
 
 @dataclass(frozen=True)
 class ToolKernels:
-    """Kernels over (triangle, load case) for triangles with a fixed number of nodes."""
+    """Kernels over (triangle, load case), for triangles with a fixed number of nodes."""
 
     add_energy: wp.Kernel
     add_gradient: wp.Kernel
@@ -37,7 +37,7 @@ class ToolKernels:
 
 @cache
 def build_kernels(device: Device, size: int) -> ToolKernels:
-    """Build kernels for surface triangles of `size` nodes, 3 or 6. Each launches over (triangle, column)."""
+    """Return kernels over (triangle, load case), for surface triangles with `size` nodes, 3 or 6."""
     scalar, mat = device.scalar, device.matrix
     here, kept = build_functions(device, size), wp.constant(wp.float64(MAX_STEP_FRACTION))
     stretch = wp.constant(wp.float64(1.0 if size == 6 else BULGE_BOUND))
@@ -182,7 +182,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
-        """Add force and moment of each tool about its origin: sums of -w k b'(d) n and of its moments."""
+        """Add the force of each tool, the sum of -w k b'(d) n over points, and its moment about the tool's origin."""
         s, c = wp.tid()
         at, n, weight = nodes_of(surface, u, s, c), surface.pieces[s], weight_of(surface, scale, s)
         for k in range(tools.radius.shape[0]):
@@ -213,7 +213,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array(dtype=scalar),
     ):
-        """Bound t <= kept (d + r) / |dx|: no point moves as far as the centre of a tool, and through it."""
+        """Limit t to kept (d + r) / |dx|, so that no point moves to the centre of a tool or through the tool."""
         s, c = wp.tid()
         at, n, along = nodes_of(surface, u, s, c), surface.pieces[s], motion_of(surface, du, s, c)
         for k in range(tools.radius.shape[0]):
@@ -230,7 +230,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """Compute a lower bound of each tool's distance from the surface, which may be curved or stretched."""
+        """Compute a lower bound of the distance of each tool from the surface, which may be curved or stretched."""
         s, c = wp.tid()
         at = nodes_of(surface, u, s, c)
         for k in range(tools.radius.shape[0]):
@@ -244,7 +244,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
-        """Compute the minimum signed distance from surface points to each core, if negative."""
+        """Compute the minimum signed distance from surface points to each core; 0 if no distance is negative."""
         s, c = wp.tid()
         at, n = nodes_of(surface, u, s, c), surface.pieces[s]
         for k in range(tools.radius.shape[0]):

@@ -11,22 +11,22 @@ from ...tools import Core, Tool, compute_distances, compute_extent, list_cores
 
 @dataclass(frozen=True)
 class ContactSampling:
-    """Sampling of a surface under tools, and step limits of tool paths.
+    """Options for sampling a surface under tools, and step limits of tool paths.
 
     Parameters
     ----------
     max_sag
-        Maximum decrease of a tool's distance between sample points of the surface, as a fraction of the gap. It is
-        added to the tool's radius, so that no point of the surface is inside.
+        Maximum decrease of the distance to a tool between sample points of the surface, as a fraction of the gap. The
+        tool radius is increased by this distance, so that no point of the surface is inside the tool.
     max_stretch
-        Maximum stretch of triangles for which this bound holds.
+        Maximum stretch of triangles for which `max_sag` is guaranteed.
     max_stride
-        Maximum motion of a tool into tissue per step, as a fraction of its radius, so that it cannot pass
-        through.
+        Maximum motion of a tool into tissue per step, as a fraction of its radius, so that it cannot pass through
+        the tissue surface.
     max_steps
-        Maximum steps of a tool's approach through air, each as long as the clearance.
+        Maximum number of steps in the approach of a tool through air; each step is as long as the clearance.
     cached_poses
-        Number of poses whose approach is cached, since a solver requests them repeatedly.
+        Number of poses whose approach is cached, since a solver requests the same poses repeatedly.
     """
 
     max_sag: float = 0.25
@@ -42,7 +42,7 @@ CONTACT_SAMPLING = ContactSampling()
 
 @dataclass(frozen=True, eq=False)
 class ToolPath:
-    """Tool paths of B load cases: T_world_tool (B, tools, 4, 4) at the beginning and at the end."""
+    """Tool paths of B load cases: T_world_tool poses (B, tools, 4, 4) at the start and at the end."""
 
     start_pose: np.ndarray
     end_pose: np.ndarray
@@ -72,7 +72,7 @@ class ToolPath:
     def compute_stride(
         self, tools: tuple[Tool, ...], clearance: np.ndarray, sampling: ContactSampling = CONTACT_SAMPLING
     ) -> np.ndarray:
-        """Return the path fraction (B,), at most 1, that tools with clearance `clearance` (B, tools) [m] may move."""
+        """Return the path fraction (B,), at most 1, that tools with a `clearance` (B, tools) [m] may move at once."""
         radii = np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
         most = clearance + sampling.max_stride * radii
         return (most / np.maximum(self.travel(tools), most)).min(axis=1)
@@ -86,12 +86,12 @@ def approach(
     radii: np.ndarray,
     max_steps: int = ContactSampling.max_steps,
 ) -> np.ndarray:
-    """Return the pose (4, 4), just clear of a surface, from which a tool moves straight to `pose` (4, 4).
+    """Return the pose (4, 4), without contact, from which a tool moves straight to `pose` (4, 4).
 
-    The direction is along its shaft, or along the surface's outward normal if that path is less than half as long: an
-    instrument that lies flat in tissue was not inserted sideways. A tool that is clear at `pose` starts
-    there. The surface has vertices `points` (n, 3) [m] with unit `normals` (n, 3) and extends `radii` (n,) [m] around
-    each vertex. The approach through air takes `max_steps` steps at most.
+    The motion is along the shaft, or along the outward surface normal if that path is less than half as long, since an
+    instrument that is flat in tissue was not inserted sideways. A tool without contact at `pose` starts at `pose`. The
+    surface has vertices `points` (n, 3) [m] with unit `normals` (n, 3), and extends to `radii` (n,) [m] around each
+    vertex. The approach through air takes at most `max_steps` steps.
     """
     cores, R = list_cores(tool), pose[:3, :3]
     along_shaft = _find_clear_pose(tool, pose, R, cores, points, radii, max_steps)
@@ -115,7 +115,7 @@ def _find_clear_pose(
     reach: np.ndarray,
     march: int,
 ) -> np.ndarray:
-    """Return the pose as `approach`, along the third column of R (3, 3); `cores` in the axes of R contain the tool."""
+    """Return the pose of `approach` along the third column of R (3, 3); `cores`, in the axes of R, contain the tool."""
     out, local = pose.copy(), (points - pose[:3, 3]) @ R
     back, room = max(_compute_rise(core, local, reach) for core in cores), 0.0
     for _ in range(march):
@@ -126,7 +126,7 @@ def _find_clear_pose(
 
 
 def _compute_rise(core: Core, local: np.ndarray, reach: np.ndarray) -> float:
-    """Return the distance [m] by which a core must rise along its axis z to be above any surface on its way down."""
+    """Return the distance [m] by which a core must rise along its z axis to clear every surface point on its path."""
     aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
     highest = (local[:, 2] + reach)[aside <= core.radius + reach].max(initial=-np.inf)
     return max(0.0, float(highest - (core.centre[2] - core.half[2] - core.radius)))

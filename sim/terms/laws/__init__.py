@@ -1,1 +1,1 @@
-"""Material laws, one per file."""
+"""Material laws, one law per module."""

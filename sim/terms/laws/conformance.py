@@ -1,4 +1,4 @@
-"""Conformance checks of a material law against the requirements of the solver, also for user-defined laws."""
+"""Checks that a material law, also a user-defined law, satisfies the requirements of the solver."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from ...runtime.device import Device, Precision, find_device, forward_kernel
 
 @dataclass(frozen=True)
 class TestStrains:
-    """Strains at which a law is checked.
+    """Random strains at which a law is checked.
 
     Parameters
     ----------
     count
         Number of random displacement gradients.
     large, small, single
-        Their standard deviation at large strain, at small strain, and in single precision.
+        Standard deviation of the gradients at large strain, at small strain, and in single precision.
     step, short_step
-        Step of central differences of the energy, and of the stress.
+        Step of the central differences of the energy, and of the stress.
     """
 
     count: int = 60
@@ -36,7 +36,7 @@ class TestStrains:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Energies (n,), stresses (n, 3, 3) and stress changes (n, 3, 3) of one law, in units of Pa."""
+    """Results of a law: energies (n,), stresses (n, 3, 3) and stress changes (n, 3, 3), all in Pa."""
 
     energy: np.ndarray
     stress: np.ndarray
@@ -45,18 +45,18 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Warp functions of a law on arrays of displacement gradients; `tissue` is the default tissue."""
+    """Evaluator of the Warp functions of a law for arrays of displacement gradients; `tissue` is the default tissue."""
 
     device: Device
     kernel: wp.Kernel
     tissue: Tissue
 
     def __call__(self, H: np.ndarray, D: np.ndarray | None = None, of: Tissue | None = None) -> Evaluated:
-        """Evaluate at gradients H (n, 3, 3), with increments D (n, 3, 3)."""
+        """Return the results at displacement gradients H (n, 3, 3) with increments D (n, 3, 3)."""
         return self.evaluate(H, D, (of or self.tissue).coefficients)
 
     def evaluate(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
-        """Evaluate with other coefficients."""
+        """Return the results at H (n, 3, 3) with increments D (n, 3, 3) and other coefficients."""
         count, device = len(H), self.device
         energy = device.allocate(count)
         stress, change = (wp.zeros(count, dtype=device.matrix, device=device.name) for _ in range(2))
@@ -68,7 +68,7 @@ class Evaluator:
 
 @cache
 def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
-    """Build the evaluator of a tissue's law on the CPU."""
+    """Return the evaluator of the law of a tissue, on the CPU."""
     device = find_device("cpu", precision)
     scalar, mat = device.scalar, device.matrix
     constants = wp.types.vector(len(of.coefficients), scalar)
@@ -95,7 +95,7 @@ def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check: relative error, and its limit."""
+    """Result of one check of a law: relative error, and limit of this error."""
 
     name: str
     error: float
@@ -103,7 +103,7 @@ class Finding:
 
     @property
     def is_within_limit(self) -> bool:
-        """True if the error is within its limit; False for NaN."""
+        """True if the error does not exceed its limit; False for NaN."""
         return self.error <= self.limit
 
     def __str__(self) -> str:
@@ -113,14 +113,14 @@ class Finding:
 def check_tissue(
     tissue: Tissue, small_strain: bool = False, strains: TestStrains = TestStrains()
 ) -> tuple[Finding, ...]:
-    """Check a tissue's law against the solver's requirements at random strains on the CPU; compiling takes seconds.
+    """Check the law of a tissue at random strains on the CPU, and return all findings; compilation takes seconds.
 
-    `small_strain`: the law is for small rotations only, as Hooke's, and need not be objective.
+    If `small_strain`, the law is for small rotations only, as Hooke's law, and need not be objective.
 
     Raises
     ------
     InputError
-        With every failed check and its error.
+        A check has failed; the message lists all failed checks and their errors.
     """
     with np.errstate(invalid="ignore"):  # infinity - infinity is NaN, which fails the check
         found = tuple(_iterate_findings(tissue, small_strain, strains))
@@ -210,5 +210,5 @@ def _find_largest(values: np.ndarray) -> float:
 
 
 def _compute_error(found: np.ndarray, wanted: np.ndarray) -> float:
-    """Return the largest difference, relative to the largest reference value."""
+    """Return the largest difference between `found` and `wanted`, relative to the largest value of `wanted`."""
     return _find_largest(found - wanted) / max(_find_largest(wanted), np.finfo(float).tiny)

@@ -1,9 +1,9 @@
-"""Corotational law: Hooke's law in the coordinates of the rotation nearest to F.
+"""Corotational law: Hooke's law in coordinates that rotate with R, the rotation nearest to F.
 
     psi = mu |F - R|^2 + lambda/2 tr(R^T F - I)^2, F = R S
 
-Sifakis, Barbic 2012, "FEM Simulation of 3D Deformable Solids", SIGGRAPH course, section 3.4. R is a rotation for
-inverted elements too: the smallest singular value carries the sign.
+Sifakis, Barbic 2012, "FEM Simulation of 3D Deformable Solids", SIGGRAPH course, section 3.4. For inverted elements, R
+is also a rotation, and the smallest singular value is negative.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ def axial(A: Any):
 def spin(S: Any, A: Any):
     """Return w with (tr S I - S) w = axial A: the rotation R exp([w]x) that follows a change R A of F = R S.
 
-    It is zero where the stretch S determines no rotation (two principal stretches cancel).
+    w is zero if the stretch S determines no rotation, because the sum of two principal stretches is zero.
     """
     tiny = type(S[0, 0])(1.0e-6)
     G = wp.trace(S) * wp.identity(n=3, dtype=type(tiny)) - S
@@ -42,9 +42,9 @@ def cross_matrix(w: Any):
 
 @wp.func
 def rotation_excess(H: Any):
-    """Return Q = R - I for the rotation R nearest to F = I + H: approximate singular values of Warp, then Newton steps.
+    """Return Q = R - I for the rotation R nearest to F = I + H, by Warp's approximate SVD and Newton steps.
 
-    With a unit quaternion (v, w), Q = 2 w [v]x + 2 [v]x^2, without cancellation for R near I.
+    For a unit quaternion (v, w), Q = 2 w [v]x + 2 [v]x^2 without cancellation for R near I.
     """
     one = type(H[0, 0])(1.0)
     two = type(one)(2.0)

@@ -1,4 +1,4 @@
-"""Invariants of F = I + H for isotropic laws, written in H to avoid cancellation at small strain.
+"""Invariants of F = I + H for isotropic laws, as functions of H to avoid cancellation at small strain.
 
 Shakeri et al. 2024, "Stable numerics for finite-strain elasticity": if F is formed first, single precision stalls
 near 3e-4 of the load; from H it reaches 1e-5.
@@ -63,7 +63,7 @@ def green_strain(H: Any):
 
 @wp.func
 def exp_less_one(t: Any):
-    """Return exp(t) - 1 = 2 sinh(t/2) exp(t/2); for t < -1 evaluated directly, as sinh would overflow."""
+    """Return exp(t) - 1 = 2 sinh(t/2) exp(t/2), but directly for t < -1, where sinh would overflow."""
     if t < type(t)(-1.0):
         return wp.exp(t) - type(t)(1.0)
     half = t / type(t)(2.0)

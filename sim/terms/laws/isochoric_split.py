@@ -34,10 +34,10 @@ def inverse_transpose(H: Any):
 
 @dataclass(frozen=True)
 class LawSplit:
-    """Warp functions of a split law with coefficients k, at a displacement gradient H with an increment D.
+    """Warp functions of a split law with coefficients k, for a displacement gradient H with an increment D.
 
-    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa], E the strain conjugate to a stress A [Pa]. stress and
-    stress_change(H, D, ...): its derivatives. overstress(H, k) -> S [Pa]: deviatoric stress, conjugate to E.
+    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa]; E is the strain conjugate to a stress A [Pa]. stress and
+    stress_change(H, D, ...) are its derivatives. overstress(H, k) -> S [Pa] is the deviatoric stress conjugate to E.
     """
 
     energy: wp.Function
@@ -48,13 +48,13 @@ class LawSplit:
 
 
 def build_law_split(law: Law, device: Device) -> LawSplit:
-    """Return the law's own split if it has one, else the split by the isochoric part of F."""
+    """Return the split that the law defines, or else the split by the isochoric part of F."""
     return build_isochoric_split(law, device) if law.of_shape is None else build_own_split(law, law.of_shape, device)
 
 
 @cache
 def build_isochoric_split(law: Law, device: Device) -> LawSplit:
-    """Build the split with deviatoric part psi(F) - psi(J^(1/3) I) and E = (Fb^T Fb - I) / 2, Fb = J^(-1/3) F."""
+    """Return the split with deviatoric part psi(F) - psi(J^(1/3) I), E = (Fb^T Fb - I) / 2 and Fb = J^(-1/3) F."""
     scalar, mat = device.scalar, device.matrix
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
 
@@ -77,7 +77,7 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
     @wp.func
     def stress_change(H: mat, D: mat, k: Any, less: scalar, A: mat):
-        """Return dP for dF = D, the derivative of `stress` by the product rule."""
+        """Return dP [Pa] for dF = D, the derivative of `stress`, by the product rule."""
         three = scalar(3.0)
         identity = wp.identity(n=3, dtype=scalar)
         F, V, G = identity + H, dilated(H), inverse_transpose(H)
@@ -107,10 +107,10 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
 @cache
 def build_own_split(law: Law, of_shape: wp.Function, device: Device) -> LawSplit:
-    """Build the split whose deviatoric part is the law with coefficients `of_shape`, and E = (F^T F - I) / 2.
+    """Return the split whose deviatoric part is the law with coefficients `of_shape`, with E = (F^T F - I) / 2.
 
-    The potential is finite wherever the law's is; the overstress is infinite at J = 0. Fully relaxed tissue
-    follows the same law with a smaller shear modulus and the same bulk modulus.
+    The potential is finite if that of the law is finite; the overstress is infinite at J = 0. Fully relaxed tissue
+    has the same law with a smaller shear modulus and the same bulk modulus.
     """
     scalar, mat = device.scalar, device.matrix
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change

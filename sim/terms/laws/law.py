@@ -9,11 +9,11 @@ import warp as wp
 class Law:
     """Isotropic hyperelastic law in the displacement gradient H = F - I, with coefficients c (k,).
 
-    energy(H, c) -> psi [Pa]; stress(H, c) -> P (3, 3) [Pa]; stress_change(H, D, c) -> dP (3, 3) [Pa] for dF = D.
-    All are generic in the scalar type; c is Lamé's (mu, lambda) [Pa] unless the law defines others.
-    `needs_positive_volume`: psi is infinite if det F <= 0, so steps are bounded. `at_rest`(c) -> c: coefficients
-    that vary between points and load cases, reset to the undeformed state; None: none vary. `of_shape`(c) -> c: the
-    law without bulk modulus, if the remainder depends on J only and is finite everywhere; None: not available.
+    energy(H, c) -> psi [Pa]; stress(H, c) -> P (3, 3) [Pa]; stress_change(H, D, c) -> dP (3, 3) [Pa] for dF = D. All
+    functions are generic in the scalar type; c is Lamé's (mu, lambda) [Pa] unless the law defines other coefficients.
+    `needs_positive_volume`: True if psi is infinite for det F <= 0, so that steps are limited. `at_rest`(c) -> c in the
+    undeformed state, for coefficients that vary; None if no coefficient varies. `of_shape`(c) -> c without bulk
+    modulus, if the remaining energy depends only on J and is finite everywhere; None if not available.
     """
 
     name: str

@@ -15,7 +15,7 @@ from .law import Law
 
 @wp.func
 def log_volume_excess(j: Any):
-    """Return j - ln(1 + j); for small j by the series ln(1 + j) = 2 artanh s, s = j / (2 + j), against cancellation."""
+    """Return j - ln(1 + j); for small j by the series of ln(1 + j) = 2 artanh s, s = j / (2 + j), which is accurate."""
     one = type(j)(1.0)
     if wp.abs(j) > type(j)(0.1):
         return j - wp.log(one + j)

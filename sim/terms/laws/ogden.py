@@ -2,9 +2,9 @@
 
     psi = sum_i c_i / m_i^2 (l1^m_i + l2^m_i + l3^m_i - 3) + K/2 (ln J)^2,  l_k = J^(-1/3) lambda_k
 
-Ogden 1972, Proc. R. Soc. Lond. A 326:565-584, in the uncoupled form of FEBio's theory manual. All is written in the
-eigenvalues e_k of Green's strain, lambda_k^2 = 1 + 2 e_k, and the logarithms y_k = ln l_k, which sum to zero: no
-cancellation at small strain, and equal stretches are not a special case. Coefficients: (K, c_1, m_1, c_2, m_2, ...).
+Ogden 1972, Proc. R. Soc. Lond. A 326:565-584, in the uncoupled form of FEBio's theory manual. The functions use the
+eigenvalues e_k of Green's strain, lambda_k^2 = 1 + 2 e_k, and the logarithms y_k = ln l_k, whose sum is zero. There is
+no cancellation at small strain and no special case for equal stretches. Coefficients: (K, c_1, m_1, c_2, m_2, ...).
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ from .spectral import principal_axes
 
 @wp.func
 def log_stretches(H: Any, e: Any, N: Any):
-    """Return ln lambda_k = log1p(2 e_k) / 2; under strong compression ln |F n_k|, as 1 + 2 e_k loses digits."""
+    """Return ln lambda_k = log1p(2 e_k) / 2, or ln |F n_k| under strong compression, where 1 + 2 e_k loses digits."""
     one, two = type(e[0])(1.0), type(e[0])(2.0)
     x = type(e)()
     for k in range(3):
@@ -47,7 +47,7 @@ def isochoric(x: Any):
 
 @wp.func
 def exp_excess(t: Any):
-    """Return exp(t) - 1 - t; for small t by its series, against cancellation."""
+    """Return exp(t) - 1 - t, for small t by a series to avoid cancellation."""
     one = type(t)(1.0)
     if wp.abs(t) > one:
         return wp.exp(t) - one - t
@@ -108,8 +108,8 @@ def stress(H: Any, c: Any):
 def stiffness_between(k: int, l: int, e: Any, y: Any, c: Any):
     """Return b_kl [Pa] = sum_i c_i exp(m_i (y_k + y_l) / 2) sinh(m_i d / 2) / (m_i d / 2) x d / tanh d.
 
-    This is the divided difference of a in `kirchhoff` over the eigenvalues e, times the mean squared stretch. With
-    tanh d = (e_k - e_l) / (1 + e_k + e_l) for d = ln(lambda_k / lambda_l), it is accurate for equal stretches too.
+    b_kl is the divided difference of a in `kirchhoff` over the eigenvalues e, times the mean squared stretch. By use of
+    tanh d = (e_k - e_l) / (1 + e_k + e_l) for d = ln(lambda_k / lambda_l), b_kl is also accurate for equal stretches.
     """
     one, two = type(c[0])(1.0), type(c[0])(2.0)
     tanh = wp.abs(e[k] - e[l]) / (one + e[k] + e[l])

@@ -1,10 +1,10 @@
-"""Mass-spring model: springs along the edges of tetrahedra, and their volume.
+"""Mass-spring model: springs along the edges of tetrahedra, and a volume preserving energy.
 
-A body of equal springs in all directions has Lamé parameters mu = lambda = sum k L^2 / (15 V), so Poisson's ratio 1/4
-(Cauchy's relation). So the six springs of a tetrahedron have k = 15 mu V / sum L^2; in a regular one this is 0.118 E L,
-while Lloyd, Szekely, Harders 2007, IEEE Trans. Vis. Comput. Graph. 13:1081-1094, find 0.113 E L by comparison with a
-finite element. The volume preserving energy of Teschner et al. 2004, "A versatile and robust model for geometrically
-complex deformable solids", has the missing stiffness, lambda - mu:
+Equal springs in all directions have Lamé parameters mu = lambda = sum k L^2 / (15 V), so Poisson's ratio is 1/4
+(Cauchy's relation). The six springs of a tetrahedron thus have k = 15 mu V / sum L^2. For a regular tetrahedron this is
+0.118 E L; Lloyd, Szekely, Harders 2007, IEEE Trans. Vis. Comput. Graph. 13:1081-1094, find 0.113 E L by comparison with
+a finite element. The volume preserving energy of Teschner et al. 2004, "A versatile and robust model for geometrically
+complex deformable solids", adds the missing stiffness lambda - mu:
 
     psi = sum of k (l - L)^2 / (2 V) + (lambda - mu)/2 (J - 1)^2
 """
@@ -21,7 +21,7 @@ from .law import Law
 
 @wp.func
 def edge(c: Any, number: int):
-    """Return the undeformed edge [m] of a number from 0 to 5: 01, 02, 03, 12, 13, 23."""
+    """Return the undeformed edge vector [m] with a number from 0 to 5: edges 01, 02, 03, 12, 13, 23."""
     return wp.vector(c[2 + 3 * number], c[3 + 3 * number], c[4 + 3 * number])
 
 
@@ -77,12 +77,12 @@ LAW = Law("springs", energy, stress, stress_change)
 def compute_spring_coefficients(lame: np.ndarray, gradient: np.ndarray) -> np.ndarray:
     """Return k/V [Pa/m^2], lambda - mu [Pa] and six edges [m] (T, 20) of tetrahedra with mu, lambda (T, 2) [Pa].
 
-    gradient (T, 1, 4, 3) [1/m] of their linear shape functions.
+    `gradient` (T, 1, 4, 3) [1/m] is that of the linear shape functions of each tetrahedron.
 
     Raises
     ------
     InputError
-        Poisson's ratio below 1/4, which springs cannot have.
+        Poisson's ratio is below 1/4, which springs cannot have.
     """
     mu, lam = lame.T
     if (lam < mu * (1.0 - 1e-9)).any():
