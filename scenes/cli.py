@@ -150,13 +150,13 @@ def _list_commands() -> str:
 
 
 def add_plugin(parser: argparse.ArgumentParser) -> None:
-    """Declare the files that bring learners."""
+    """Declare `--plugin`, files that register model types."""
     parser.add_argument(
         "--plugin",
         action="append",
         default=[],
         metavar="FILE.py",
-        help="Python file that registers own learners; it is executed",
+        help="Python file that registers user-defined model types; the file is executed",
     )
 
 

@@ -147,7 +147,7 @@ class ResectedFem:
     def _index_memories(
         self, memory: Mapping[str, np.ndarray], stage: int
     ) -> dict[str, tuple[slice, np.ndarray, slice]]:
-        """Return the rows after `stage` steps as an index into the history variables of the whole anatomy, by name.
+        """Return, by name, the index into each history variable of the whole anatomy for its rows after `stage` steps.
 
         The rows are shorter if the removed tissue had a longer Prony series than the remaining tissue.
         """

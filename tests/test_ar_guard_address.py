@@ -51,7 +51,7 @@ def test_unlisted_address_with_token_is_rejected(proxied, host, origin):
     assert ask(proxied, f"/?token={proxied.token}", Host=host, Origin=origin)[0] == 403
 
 
-def test_addresses_are_printed_with_the_token(proxied):
+def test_page_address_contains_the_token(proxied):
     assert proxied.addresses[0] == f"https://page.example/?token={proxied.token}"
 
 

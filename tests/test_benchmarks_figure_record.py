@@ -297,7 +297,7 @@ def damaged(whole):
 
 
 @pytest.mark.parametrize("kind", damaged(""))
-def test_damaged_record_is_rejected_with_one_line(kind, tmp_path, capsys):
+def test_damaged_record_gives_one_line_error(kind, tmp_path, capsys):
     good = put(tmp_path / "good.json", entry(a=1.25))
     bad = tmp_path / "bad.json"
     bad.write_text(damaged(Path(good).read_text())[kind])

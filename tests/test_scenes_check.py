@@ -176,7 +176,7 @@ class TestThePictureItself:
             and figures.drawn == np.inf
         )
 
-    def test_image_with_a_wrong_tip_distance_fails(self, play, frames, truth):
+    def test_check_rejects_image_with_wrong_tip_distance(self, play, frames, truth):
         deep = frames[2].tip + 0.4e-3 * play.site.axis
         wrong = drawn(play, frames[2], play.compute_positions(frames[2].deformation), tip=deep)
         assert about(self.pixels(play, frames, truth, wrong)[0], "does not show its frame number")
@@ -243,7 +243,7 @@ def test_non_finite_depth_or_displacement_fails_the_checks(play, frames, truth):
         assert about(broken(play, [frames[0], off, *frames[2:]], truth)[0], "not finite")
 
 
-def test_bad_solver_outcome_fails_for_frame_and_reference(play, frames, truth):
+def test_check_reports_bad_outcome_of_frame_and_reference(play, frames, truth):
     doubtful = replace(frames[1].deformation, outcome=(Outcome.EXTRAPOLATED,))
     off = [frames[0], replace(frames[1], deformation=doubtful), *frames[2:]]
     why = Outcome.EXTRAPOLATED.value

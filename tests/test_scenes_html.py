@@ -182,7 +182,7 @@ def test_html_page_outline_matches_python_projection(theatre, window, x, y, forc
     assert words(moved.tumour_error.bound, 1) in window.value("document.getElementById('position').textContent")
 
 
-def test_html_page_tool_tip_matches_python(theatre, window):
+def test_html_page_instrument_tip_equals_python(theatre, window):
     player = theatre.build_player("ann", find_scene("press"))
     for x, y, force in ((0.0, 0.0, 0.0), (0.0, 0.0, 0.38), (7e-3, 5e-3, 0.2)):
         settle(window, f"page.moveTo({x}, {y}); page.press({force})")

@@ -107,7 +107,7 @@ def test_overlay_error_lies_within_its_error_band(shown, truth, calibration, sta
     assert shown[4].result.bound is None and errors[4] is errors[11] is None
 
 
-def test_tool_error_enters_the_band_through_a_deeper_tool(follower, truth, stage):
+def test_tool_depth_error_is_propagated_to_tumour_motion(follower, truth, stage):
     class Falling(Recorded):
         def deform(self, loads, start=None, at=None):
             depth = (loads.get_only(Touching).pose[0, 0, :3, 3] - truth.T_scan_tool[5, :3, 3]) @ stage.site.axis

@@ -67,7 +67,7 @@ def test_finer_reference_is_evaluated_at_the_same_points(study, tmp_path):
     assert 1e-3 < off < 0.3
 
 
-def test_outside_loads_lie_beyond_the_training_range(study):
+def test_extrapolation_loads_are_outside_training_range(study):
     training = study.converged.select(np.flatnonzero(study.disc_split.training_mask)).get(Pushed)
     outside = study.loads_beyond.get(Pushed)
     assert not compute_training_range(study.patch, training).is_inside(study.patch, outside).any()

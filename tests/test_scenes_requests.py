@@ -118,7 +118,7 @@ def test_rejected_load_is_shown_on_the_page(running, monkeypatch):
     other.wire.close()
 
 
-def test_defect_is_logged_in_one_line_and_play_continues(demo, monkeypatch, capfd):
+def test_exception_is_logged_in_one_line_and_play_continues(demo, monkeypatch, capfd):
     refuse(monkeypatch, lambda number, touch: number == 5, IndexError("none such"))
     demo.wish.set(plays=True, number=4)
     assert demo.run(MESSAGE_TIME + 1.5) > 1

@@ -23,7 +23,7 @@ def lattice(levels):
 
 
 @pytest.mark.parametrize("levels", [0, 1, 2, 3])
-def test_lattice_tetrahedra_fit_and_have_good_angles(levels):
+def test_lattice_is_conforming_with_bounded_angles(levels):
     made = lattice(levels)
     assert compute_signed_volumes(made.nodes, made.tets).min() > 0.0
     angles = compute_dihedral_angles(made.nodes, made.tets)

@@ -47,7 +47,7 @@ def test_bonded_skull_fixes_its_nodes_like_held_nodes(cube):
     assert not bonded.displacement[0, cube.slide_normal.any(axis=1)].any() and bonded.leaked[0] == 0.0
 
 
-def test_unbonded_body_has_nan_bond_share(cube):
+def test_bond_traction_ratio_is_nan_without_bond(cube):
     mesh, base = cube.mesh, cube.slide_normal.any(axis=1)
     loose = hold(mesh, base & (mesh.nodes[:, 0] < SIDE / 2), cube.slide_normal)
     assert np.isnan(answered(loose, Slide(), PULL, "p1").bond).all()

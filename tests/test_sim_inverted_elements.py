@@ -18,7 +18,7 @@ from sim.fem import Fem
 from sim.runtime.device import find_device
 
 
-def test_inverted_elements_from_rest_are_counted() -> None:
+def test_inverted_elements_from_undeformed_start_are_counted() -> None:
     """An extreme push: an equilibrium of the law, but not of tissue."""
     load, free = loads(np.array([[0.0, 0.0, -20.0]])), fem(replace(ACCURACY, limit_strain=False))
     found = free.deform(load)

@@ -39,7 +39,7 @@ def applied(factor: SparseFactor, r: np.ndarray, precision: Precision, live: np.
 
 
 @pytest.mark.parametrize("precision", EXACT)
-def test_factor_is_inverse_over_free_motions(precision: Precision) -> None:
+def test_factor_equals_inverse_on_free_dofs(precision: Precision) -> None:
     stiffness, motions = system(sliding())
     factor = SparseFactor(stiffness, motions, find_moved_nodes(motions), find_device("cpu", precision), precision)
     L, r = motions.toarray(), np.random.default_rng(0).normal(size=(stiffness.shape[0], FEW + 2))

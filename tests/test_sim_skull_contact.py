@@ -86,7 +86,7 @@ def test_zero_load_with_skull_gives_zero_displacement() -> None:
     np.testing.assert_array_equal(body("p1", SkullContact(GAP)).deform(lifted(0.0)).displacement, 0.0)
 
 
-def test_start_at_rest_does_not_limit_skull_distance() -> None:
+def test_undeformed_start_keeps_default_skull_gap_limit() -> None:
     """The limit is that of a solution without a start: a body at rest does not predict the next equilibrium."""
     skull, rest = body("p1", SkullContact(GAP)).problem.barriers[0], np.zeros((1, len(MESH.nodes), 3))
 

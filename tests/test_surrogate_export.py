@@ -125,7 +125,7 @@ def test_onnx_runtime_predicts_as_the_model(models, block, loads, name, cortex):
         assert_alike(alone, wanted.select(np.array([row])))
 
 
-def test_onnx_graph_follows_the_numpy_kernel(models, block, loads, monkeypatch):
+def test_changed_numpy_kernel_changes_onnx_graph(models, block, loads, monkeypatch):
     monkeypatch.setattr("surrogate.regressors.gp.compute_matern", lambda distance: np.exp(-distance))
     answer, heard = asked(opened(build_onnx_model("gp", models["gp"])), loads, open_patch(block))
     assert_alike(answer, models["gp"].deform(heard, at=block.tumour_nodes))

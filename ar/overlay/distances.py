@@ -153,7 +153,7 @@ def draw_rings(
 
 
 def remove_labels(mask: np.ndarray) -> np.ndarray:
-    """Return the mask (h, w) bool of the rings, without their numbers, given the mask of both."""
+    """Return the mask (h, w) bool of the distance contours without their labels, from a mask of both."""
     numbers = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OPENING_SIDE,) * 2, np.uint8))
     return mask & (numbers == 0)
 

@@ -20,7 +20,7 @@ def compute_weights_from_corners(p: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.ve
 
 @wp.func
 def compute_edge(a: wp.vec3d, b: wp.vec3d, i: wp.int32, j: wp.int32) -> wp.vec3d:
-    """Compute the edge a x b of vertices i and j with equal rounding for both neighbours: edge(i, j) = -edge(j, i)."""
+    """Compute the normal a x b of an edge from vertex i at a to j at b, so that exactly edge(i, j) = -edge(j, i)."""
     if i < j:
         return wp.cross(a, b)
     return -wp.cross(b, a)

@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_camera_options(parser, "hand-held")
     parser.add_argument(
         "--intrinsics", type=Path, metavar="K.json",
-        help="covariance of --camera, from `sulcus calibrate` (default: that of 24 good views of the board)",
+        help="covariance of the intrinsics, from `sulcus calibrate` (default: of a calibration with 24 board views)",
     )  # fmt: skip
     parser.add_argument(
         "--registration", type=Path, metavar="R.json",

@@ -16,7 +16,7 @@ from ..options.shared_options import add_json, add_style
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command to its parser."""
     parser.add_argument("scene", help="a built-in scene, see `sulcus scenes`, or MY_SCENE.py")
-    parser.add_argument("--out", required=True, type=Path, help="the episode, .h5")
+    parser.add_argument("--out", required=True, type=Path, help="output episode file (.h5)")
     add_patient(parser)
     add_camera_options(parser)
     add_style(parser)

@@ -53,8 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--client",
         metavar="HOST[:PORT]",
-        help="also receive from this server, such as PLUS; nothing is sent to it. --port must differ from its port; "
-        "write an IPv6 address in brackets",
+        help="another server to receive from, such as PLUS; nothing is sent to it. Its port must differ from --port; "
+        "IPv6 addresses in brackets",
     )
     parser.add_argument("--clients", type=int, default=16, help="maximum number of clients")
     title = "received transforms [mm]; AToB maps coordinates in frame A to frame B; the scan's space is RAS"
@@ -75,8 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--tool", metavar="TOOL.json",
-        help="tool and its position in the received frame (default: the model's tool at PLUS's StylusTip: origin at "
-        "the tip, z away from the shaft)",
+        help="tool geometry and its pose in the received transform (default: tool of the model at StylusTip of "
+        "PLUS; origin at the tip, z away from the shaft)",
     )  # fmt: skip
     parser.add_argument(
         "--tracking-noise", type=float, default=0.5, metavar="MM",

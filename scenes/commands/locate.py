@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "observed", metavar="OBSERVED.csv",
         help="observations [mm, RAS], with a header. `x,y,z,dx,dy,dz`: points in the scan, such as vessels, "
         "and their observed displacements; `x,y,z`: point cloud of the deformed open cortex. Optional last column "
-        "`sigma`: non-rigid error of each point (default: 0.58)",
+        "`sigma`: standard deviation of the non-rigid error per axis [mm] (default: 0.58)",
     )  # fmt: skip
     parser.add_argument(
         "--tips", metavar="TIPS.csv", help="contact points of tools on the cortex [mm], columns `x,y,z`"

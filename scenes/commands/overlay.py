@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "pictures", metavar="FILM|CAMERA", help="a video, a folder of PNG or JPEG images, or a camera number"
     )
-    parser.add_argument("--camera", required=True, metavar="K.yaml", help="the camera, from `sulcus calibrate`")
+    parser.add_argument("--camera", required=True, metavar="K.yaml", help="camera calibration from `sulcus calibrate`")
     parser.add_argument("--registration", required=True, metavar="R.json", help="registration from `sulcus register`")
     parser.add_argument("--tool", metavar="TOOL.json", help="tool with its marker cube (default: no tool)")
     add_model_options(parser)
@@ -69,8 +69,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--covered", type=Path, metavar="MASKS",
-        help="video or folder of PNG masks, one per frame in order. Non-black pixels are in front, as "
-        "a hand: nothing is drawn over it",
+        help="video or folder of PNG masks, one per frame in order; non-black pixels occlude the overlay, such as "
+        "a hand",
     )  # fmt: skip
     add_style(parser)
     parser.add_argument("--rate", type=float, default=30.0, help="frame rate of a folder of images [1/s]")

@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_craniotomy_arguments(parser)
     parser.add_argument(
         "--inspect", action="store_true",
-        help="preview in seconds, without making anything: numbers, warnings, and the image PATIENT.inspect.png",
+        help="only check the input, in seconds: numbers, warnings, and PATIENT.inspect.png; no anatomy is built",
     )  # fmt: skip
     parser.add_argument("--count", type=int, default=1000, help="number of loads to simulate")
     parser.add_argument(

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, type=Path, help="folder of frame_0000.png, frame_0001.png, ...")
     parser.add_argument("--every", type=int, default=1, help="render every Nth frame")
     parser.add_argument("--film", type=Path, help="also write a video: .mp4, .gif or .webp")
-    parser.add_argument("--plain", action="store_true", help="leave out the panel of figures")
+    parser.add_argument("--plain", action="store_true", help="omit the panel of values")
     add_patient(parser)
     add_camera_options(parser)
     add_style(parser)

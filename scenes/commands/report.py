@@ -49,7 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="data sets from `sulcus simulate`, each in its own rows (default: new: palpation, smoothed elements)",
     )  # fmt: skip
     parser.add_argument(
-        "--anatomy", metavar="MESH.vtu", help="anatomy of the simulation without --data (default: the template)"
+        "--anatomy",
+        metavar="MESH.vtu",
+        help="anatomy of the simulated loads if --data is not given (default: the template)",
     )
     parser.add_argument(
         "--loads",
@@ -72,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed-mesh",
         type=Path,
         metavar="FILE.npz",
-        help="mesh of Tonutti et al. 2017: --seed-protocol measures it in addition to the template",
+        help="mesh of Tonutti et al. 2017; --seed-protocol evaluates the models on this mesh, too",
     )
     add_force(parser)
     add_json(parser)

@@ -51,8 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_model_options(parser)
     parser.add_argument(
         "--element", choices=ELEMENTS,
-        help="element of the mesh (default: smoothed, because linear tetrahedra lock as nu nears 0.5; p2 for meshes "
-        "with mid-edge nodes)",
+        help="element; linear tetrahedra lock near nu = 0.5 (default: smoothed; p2 for meshes with mid-edge nodes)",
     )  # fmt: skip
     parser.add_argument(
         "--compare", nargs="+", choices=ELEMENTS, default=[], metavar="ELEMENT",

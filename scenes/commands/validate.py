@@ -85,7 +85,7 @@ def list_missing_episodes(folder: Path) -> list[Report]:
 
 
 def format_reports(reports: list[Report], unreadable: list[Report]) -> list[str]:
-    """Format as lines the faults of each file, checks that were skipped, and statistics of all complete episodes."""
+    """Format faults of each file, skipped checks, and statistics of all complete episodes as text lines."""
     lines = [f"{report.path}: {problem}" for report in unreadable for problem in report.problems]
     lines = [
         *lines[:MAX_LISTED_FILES],

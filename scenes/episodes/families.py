@@ -98,7 +98,7 @@ class Debulk(FamilyMotion, frozen=True):
 
 
 class FamilyMotions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Families of tool motions of a plan; None: the plan does not contain the family."""
+    """Scenarios of a sampling configuration, by type of tool motion; an entry is None if it is not used."""
 
     press: Press | None = None
     slide: SlideMotion | None = None

@@ -66,7 +66,7 @@ class EpisodeScore:
 
 
 def compute_reward(previous: EpisodeScore, current: EpisodeScore, success: bool, is_aborted: bool) -> float:
-    """Return the reward of a step between two scores; `is_aborted` is True if the episode ends at a limit."""
+    """Return the reward of a step from the scores before and after it; `is_aborted`: the episode ends at a limit."""
     reward = current.potential - previous.potential - REWARD.step_penalty
     if current.load_ratio > 1.0:
         reward -= REWARD.limit_penalty

@@ -70,7 +70,7 @@ class TaskSetting:
         return self.patient.build_stage(self.scene)
 
     def get_stage(self, step: int) -> Stage:
-        """Return the rendered parts of the body after `step` resection steps."""
+        """Return the rendered parts of the anatomy after `step` resection steps."""
         cut = Loads((Resected(np.array([float(step)])),))
         return self.stage.select_stage(cut) if self.task.resects else self.stage
 

@@ -281,7 +281,7 @@ class PatientSetup:
         return {name: one for name, one in self.family_figures.items() if pushed and one.tissue == kinds[Elasticity]}
 
     def compute_mark(self, scene: Scene) -> str:
-        """Compute the fingerprint of a scene on this anatomy."""
+        """Compute the hash that identifies a scene on this anatomy."""
         return compute_scene_mark(scene, self.site, self.choose_element(scene))
 
     def estimate_motion_error(self, scene: Scene) -> MotionError | None:

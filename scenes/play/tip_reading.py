@@ -59,7 +59,7 @@ def predict_tip_distance(
 def measure_tip_distance(
     anatomy: Anatomy, loads: Loads, solution: Deformation, tool: Instrument | None, lift: float
 ) -> TipDistance | None:
-    """Measure the tip distance in any deformer's solution, without bound; None unless the only active tool is a ball.
+    """Measure the distance from tip to tumour in any solution, without bound; None unless the only tool is a ball.
 
     Parameters
     ----------

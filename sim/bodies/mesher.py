@@ -191,7 +191,7 @@ def cut_lattice(solids: Solids, max_edge: float, settings: Meshing = Meshing()) 
 
 
 def _fit_mesh_or_reason(solids: Solids, pieces: CutMesh, settings: Meshing) -> TetMesh | tuple[str, str]:
-    """Return the fitted and improved mesh, or reason and remedy; a failed fit is repeated without moves that invert."""
+    """Return the fitted mesh, or reason and remedy. A failed fit is repeated without moves that invert tetrahedra."""
     if not pieces.inside.any():
         raise InputError(TOO_COARSE)
     lost = find_lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)

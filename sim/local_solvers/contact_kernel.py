@@ -169,7 +169,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @wp.func
     def compute_touched_motion(model: ComplianceModel, size: int, s: Scratch, c: int, me: int):
-        """Compute the motion of the touched nodes, `size` rows, under the force change: at = C change."""
+        """Compute the displacement s.at = C s.change of the touched nodes (`size` rows) under the change of force."""
         m = list_changes(model, s, c, me)
         for i in range(me, size, threads):
             row = 3 * s.touched[c, i // 3] + i % 3

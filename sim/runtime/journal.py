@@ -97,7 +97,7 @@ class Journal:
 
 @contextmanager
 def open_journal(path: Path, description: Mapping[str, str]) -> Iterator[Journal]:
-    """Yield the new or resumed journal of the run with this `description`; the file is not removed.
+    """Yield the journal of the run with this `description`, new or resumed from `path`; the file remains on exit.
 
     Raises
     ------

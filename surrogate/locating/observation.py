@@ -242,7 +242,7 @@ def _check(observation: Observation) -> None:
 
 
 def _check_motions(length: np.ndarray) -> None:
-    """Raise InputError for motion lengths (n,) [m] that are larger than any brain's, or probably in metres.
+    """Raise InputError for implausible motion lengths (n,) [m]: too large for a brain, or given in another unit.
 
     Lengths of 0 are accepted, as for a brain that has not moved.
     """

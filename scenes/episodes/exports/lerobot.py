@@ -260,7 +260,7 @@ def to_lerobot_statistics(name: str, statistics: RowStatistics) -> dict[str, lis
 
 
 def build_task_table(tasks: Sequence[str]) -> pa.Table:
-    """Build the table of tasks and task numbers, in which pandas uses the sentence as index."""
+    """Build the table of task sentences and task numbers; the sentence is the index in pandas."""
     index = "__index_level_0__"
     table = pa.table({"task_index": np.arange(len(tasks)), index: list(tasks)})
     kinds = (("task_index", "int64", "int64"), (index, "unicode", "object"))
