@@ -161,7 +161,7 @@ def test_predictions_follow_the_load_history(model, box):
     np.testing.assert_allclose(answer.displacement, alone.displacement, atol=1e-9)
     apart = model.predict_distance(Loads(loads.causes, np.full(3, 9.0)), answer)
     np.testing.assert_allclose(
-        apart.value, model.predict_distance(Loads(loads.causes, np.full(3, 9.0))).value, atol=1e-9
+        apart.distance, model.predict_distance(Loads(loads.causes, np.full(3, 9.0))).distance, atol=1e-9
     )
     up = touching.pose.copy()
     up[:, 0, 2, 3] += 0.05

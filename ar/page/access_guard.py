@@ -146,7 +146,7 @@ class Connection(ServerConnection):
         self.credit, self.counted = limits.max_burst, self.loop.time()
 
     def data_received(self, data: bytes) -> None:
-        """Reject requests other than GET, which websockets would not answer."""
+        """Reject requests other than GET, to which websockets would not respond."""
         if self.request is None and not data.startswith(b"GET "[: len(data)]):
             self.transport.write(b"HTTP/1.1 405 Method Not Allowed\r\nAllow: GET\r\nContent-Length: 0\r\n\r\n")
             self.transport.close()
