@@ -7,6 +7,8 @@ import inspect
 import numpy as np
 import pytest
 
+from sim.runtime.device import find_device
+
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 LEAST = 20  # Number of public names with an example.
 
@@ -30,6 +32,7 @@ EXAMPLES = find_examples()
 def test_docstring_example_prints_its_output(name):
     test = doctest.DocTestParser().get_doctest(EXAMPLES[name], {"np": np}, name, None, None)
     assert not any(doctest.SKIP in example.options for example in test.examples)
+    find_device("cpu", "float32")  # starts Warp, which prints at its first use
     report = []
     failed, attempted = doctest.DocTestRunner(optionflags=FLAGS).run(test, out=report.append)
     assert attempted and not failed, "".join(report)

@@ -75,7 +75,7 @@ class Measurement:
     def draw(self, canvas: np.ndarray, top_canvas: np.ndarray, box: tuple[slice, slice]) -> None:
         """Draw the rings, or the cutting line, in place on the canvas of the image part `box`.
 
-        Letters of the cutting line are drawn on `top_canvas`, which is above all lines.
+        Letters of the cutting line are drawn on `top_canvas`, over all lines.
         """
         if self.style == "rings":
             free = self.roles.read_roles(self.image.segmentation, box) == 0
