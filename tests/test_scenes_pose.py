@@ -28,8 +28,7 @@ def test_forces_are_found_that_move_footprints_as_given():
     random = np.random.default_rng(0)
     force, weights = random.normal(size=(9, 3)), np.full((9, 2), 0.5)
     target = compute_motion(weights, solve_stiffening(None, 1.7 * force + 0.2 * random.normal(size=(9, 3))))
-    good = np.ones(9, bool)
-    good[4] = False
+    good = np.arange(9) != 4
     field = find_field_of_motion(solve_stiffening, force, target, weights, good)
     assert good.sum() == 8 and not field[4].any()
     error = np.linalg.norm(compute_motion(weights, field) - target, axis=1)[good]
@@ -43,8 +42,7 @@ def test_motion_that_no_force_gives_is_excluded():
     force = np.full((3, 3), 0.1)
 
     def solve(rows, force):
-        field = solve_stiffening(rows, force)
-        return np.clip(field, -1.0, 1.0)
+        return np.clip(solve_stiffening(rows, force), -1.0, 1.0)
 
     find_field_of_motion(solve, force, target, np.array([[1.0, 0.0]] * 3), good)
     assert good.tolist() == [True, False, False]
