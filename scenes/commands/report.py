@@ -134,7 +134,7 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
             *list_family_specs(),
             *list_learner_specs(series),
         )
-        after = 0 if not full else len(study.dataset.loads) + len(study.dataset.unit_good)
+        after = len(study.dataset.loads) + len(study.dataset.unit_good) if full else 0
         total = len(study.test_loads) + len(study.loads_beyond) + after + len(specs)
         found = []
         with tqdm(total=total, desc=study.data.stem, unit="step", file=sys.stderr) as bar:

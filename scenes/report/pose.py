@@ -8,7 +8,7 @@ from sim.discretisation.footprint import compute_footprint_weights
 from sim.loads import Pushed
 
 from .reference import get_reference
-from .row import ErrorFigures, compute_figures
+from .row import ErrorFigures, compare_with_reference
 from .study import ReportStudy
 
 Solve = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -28,8 +28,8 @@ def measure_pose_error(study: ReportStudy, solve: Solve) -> ErrorFigures | None:
     weights = weights.toarray() / weights.sum(axis=1)[:, None]
     good = truth.good.copy()
     field = find_field_of_motion(solve, pushed.force, compute_motion(weights, truth.displacement), weights, good)
-    rows, tumour = np.flatnonzero(good), np.isin(study.read_nodes, study.anatomy.tumour_nodes)
-    return compute_figures(field[rows][:, tumour], truth.displacement[rows][:, tumour], study.test_loads.select(rows))
+    nodes = study.anatomy.tumour_nodes
+    return compare_with_reference(study, field[:, np.isin(study.read_nodes, nodes)], good, nodes)
 
 
 def compute_motion(weights: np.ndarray, field: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ from sim.geometry.tetmesh import compute_digest
 from sim.material import LAWS
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
+from sim.runtime.optional_packages import require_extra
 from sim.runtime.processes import LostProcessError, process_pool, run_on_each
 from sim.runtime.threads import limit_to_one_thread
 from surrogate.training.expansion import SERIES_MODELS
@@ -161,11 +162,12 @@ def measure_on_workers(study: ReportStudy, specs: Sequence[Spec], address: str) 
     Raises
     ------
     InputError
-        The scheduler cannot be reached or ends; see also `measure_on_worker`.
+        The scheduler cannot be reached or ends, or Dask is not installed; see also `measure_on_worker`.
     """
-    from distributed.scheduler import KilledWorker
+    with require_extra("data", "--scheduler needs"):
+        from distributed.scheduler import KilledWorker
 
-    from ..episodes.workers import connect_workers, describe_scheduler_end
+        from ..episodes.workers import connect_workers, describe_scheduler_end
 
     here = replace(study, data=study.data.resolve(), folder=study.folder.resolve())
     with connect_workers(address, "cuda" if study.on_card else "cpu") as workers:
