@@ -1,6 +1,5 @@
 """FEM thread of a page, which solves the newest requested frame for display or for comparison with a model."""
 
-import os
 import threading
 import time as clock
 from dataclasses import dataclass
@@ -8,7 +7,7 @@ from dataclasses import dataclass
 from sim.deformation import Deformation
 from sim.errors import InputError
 from sim.loads import Loads
-from sim.runtime.threads import enter_background
+from sim.runtime.threads import count_cores, enter_background
 
 from ..play.deformers import PatientSetup, describe_solvers
 from ..play.player import Player
@@ -19,7 +18,7 @@ from ..script.tool_paths import Touch
 FrameRequest = tuple[int, Touch | None]
 """Frame number, and manual tool input (None: the tool follows the script)."""
 # Pause between comparisons with FEM while playing, relative to the duration of one: leaves few CPU cores to the images.
-COMPARISON_REST = 2.0 if (os.cpu_count() or 1) < 4 else 0.0
+COMPARISON_REST = 2.0 if count_cores() < 4 else 0.0
 
 
 @dataclass(frozen=True, eq=False)

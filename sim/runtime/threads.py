@@ -83,12 +83,16 @@ class ThreadLimits:
     min_size: int = 3000
 
 
+def count_cores() -> int:
+    """Return the number of CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def choose_threads(size: int, limits: ThreadLimits = ThreadLimits()) -> int:
     """Return the number of threads for a native loop over `size` elements or unknowns."""
     if size < limits.min_size:
         return 1
-    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(limits.max_threads, here)
+    return min(limits.max_threads, count_cores())
 
 
 def run_concurrently(tasks: Sequence[Task]) -> None:
