@@ -334,7 +334,8 @@ class Fem:
         """Return the deformation of a solver result, with reactions, warm-start data `more`, and `seconds` by stage."""
         solved = time.perf_counter()
         self.problem.begin(replace(cases, share=found.path_fraction, restarted=found.restarted))
-        memory, displaced = dict(self.problem.end(found.u)), cases.loads.get(Displaced) is not None
+        memory = dict(self.problem.end(found.u))
+        displaced = cases.loads.get(Displaced) is not None
         held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
         on_footprint = self.problem.constraint.compute_footprint_force(held) if displaced else None
         touching = [term.compute_reaction(found.u) for term in self.problem.barriers]

@@ -52,7 +52,8 @@ def synthesise_falx(cortex: np.ndarray, depth: float) -> Septum:
     low, high = cortex.min(axis=0), cortex.max(axis=0)
     middle = 0.5 * (low + high)
     y, z = np.meshgrid(np.arange(low[1], high[1], SPACING), np.arange(middle[2], high[2], SPACING), indexing="ij")
-    side, outline = np.column_stack([y.ravel(), z.ravel()]), ConvexHull(cortex[:, 1:]).equations
+    side = np.column_stack([y.ravel(), z.ravel()])
+    outline = ConvexHull(cortex[:, 1:]).equations
     under = -(side @ outline[:, :2].T + outline[:, 2]).max(axis=1)
     sheet = side[(under >= 0.0) & (under <= depth)]
     return Septum("falx", np.column_stack([np.full(len(sheet), middle[0]), sheet]), np.sqrt(0.5) * SPACING)

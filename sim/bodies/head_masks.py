@@ -274,7 +274,8 @@ def _read_other_masks(sources: MaskSources, tumour: Sequence[Label]) -> dict[str
     if sources.tumour_file:
         second, necrosis = read_labels(sources.tumour_file, sources.voxel_spec), sources.parts.get(NECROSIS, ())
         whole = second.mask((*tumour, *necrosis) if tumour else ())
-        several, said = not tumour and len(second.labels) > 1, format_labels(sorted(second.labels))
+        several = not tumour and len(second.labels) > 1
+        said = format_labels(sorted(second.labels))
         all_of = f"its labels {said} are all taken for tumour: name those of the core by --tumour"
         notes = (*second.notes, all_of) if several else second.notes
         others["tumour"] = Mask(Path(sources.tumour_file), whole, second.affine, notes)

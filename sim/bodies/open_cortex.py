@@ -140,7 +140,8 @@ def open_cortex(anatomy: Anatomy) -> OpenCortex:
     corners = anatomy.mesh.nodes[triangles]
     a, b, c = np.moveaxis(corners, 1, 0)
     area = 0.5 * np.cross(b - a, c - a)
-    axis, size = -area.sum(axis=0) / np.linalg.norm(area.sum(axis=0)), np.linalg.norm(area, axis=1)
+    axis = -area.sum(axis=0) / np.linalg.norm(area.sum(axis=0))
+    size = np.linalg.norm(area, axis=1)
     middle = (size @ (a + b + c)) / (3.0 * size.sum())
     # superior, or anterior if the craniotomy faces up or down
     reference = np.array([0.0, 0.0, 1.0]) if abs(axis[2]) < 0.9 else np.array([0.0, 1.0, 0.0])

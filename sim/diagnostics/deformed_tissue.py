@@ -45,7 +45,8 @@ class Diagnostics:
 
         `inverted` (B,) are numbers of tetrahedra, and `strained` (B,) are volumes [m^3], as in `Deformation`.
         """
-        good, out = np.array([one.good and self._limit_strain for one in outcome], bool), outcome.copy()
+        good = np.array([one.good and self._limit_strain for one in outcome], bool)
+        out = outcome.copy()
         out[good & self._stretch.is_beyond_range(strained)] = Outcome.OVERSTRAINED
         out[good & (inverted > 0)] = Outcome.INVERTED
         return out

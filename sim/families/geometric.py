@@ -43,7 +43,8 @@ def compute_kelvinlets(points: np.ndarray, sources: np.ndarray, radius: float, p
     De Goes, James 2017, "Regularized Kelvinlets", ACM Trans. Graph. 36:40, equation 6.
     """
     arm = points - sources[:, None]
-    length, b = np.sqrt((arm**2).sum(axis=2) + radius**2)[..., None, None], 1.0 / (4.0 - 4.0 * poisson)
+    length = np.sqrt((arm**2).sum(axis=2) + radius**2)[..., None, None]
+    b = 1.0 / (4.0 - 4.0 * poisson)
     block = ((1.0 - b) / length + radius**2 / (2.0 * length**3)) * np.eye(3)
     block += b * arm[..., :, None] * arm[..., None, :] / length**3
     return block.transpose(0, 2, 1, 3)
