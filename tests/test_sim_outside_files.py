@@ -124,7 +124,7 @@ class TestMeshes:
                 read_mesh(path)
 
     def test_every_stream_of_a_block_counts(self, tmp_path: Path) -> None:
-        """The library that unpacks LZMA goes on behind the first."""
+        """The library that unpacks LZMA continues after the first stream."""
         block = lzma.compress(bytes(24)) + lzma.compress(bytes(2**20))
         path = with_raw_bytes(tmp_path / "a.vtu", struct.pack("<4Q", 1, 24, 0, len(block)) + block)
         path.write_bytes(path.read_bytes().replace(b"ZLib", b"LZMA"))

@@ -329,7 +329,7 @@ def list_hosts(origin: str) -> set[str]:
 
 
 def to_url_host(host: str) -> str:
-    """Return a host as it is written in an address, with IPv6 in brackets."""
+    """Return a host in the notation of addresses, with IPv6 in brackets."""
     return f"[{host}]" if ":" in host else host
 
 

@@ -64,7 +64,7 @@ class ReportedErrors:
 
     @property
     def is_weak(self) -> bool:
-        """True if the model needs FEM fallback, by `held_out` or, if that is None, by `bound` alone."""
+        """True if the model needs FEM fallback: decided by `held_out`, or by `bound` if there is none."""
         return not (self.bound <= MAX_VERTEX_ERROR if self.held_out is None else self.held_out.is_sufficient)
 
     def __str__(self) -> str:
