@@ -37,8 +37,12 @@ def study_of(folder, box, count):
     fem = Fem(box, (*build_push_effects(box, TISSUE), NodalForce()), TRAIN, "cpu", element="p1")
     said = {"tissue": to_tissue_json(TISSUE), "element": "p1", "preset": "palpation"}
     simulate(folder / "data.h5", fem, draw("palpation", box, count, 0), said)
-    study = ReportStudy(folder / "data.h5", folder, "cpu", loads=2, beyond=QUICK_COUNTS[2], timed=30)
-    solve_reference(study, nothing)
+    return solved(ReportStudy(folder / "data.h5", folder, "cpu", loads=2, beyond=QUICK_COUNTS[2], timed=30))
+
+
+def solved(study):
+    """The study, when its reference is solved."""
+    solve_reference(study, nothing, TRAIN)
     solve_beyond(study, nothing)
     return study
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from studies import TISSUE
+from studies import TISSUE, solved
 
 from scenes.report.finite_elements import FemVariant, measure_elements
 from scenes.report.pose import compute_motion, find_field_of_motion, measure_pose_error
@@ -68,7 +68,7 @@ def test_stiffness_of_body_is_irrelevant_if_tool_is_moved(study, factor):
     assert found.loads == 2 and found.percent.mean < 0.2
 
 
-def test_row_has_error_of_moved_tool_only_if_asked(study):
-    row = measure_elements(replace(study, poses=True), FemVariant("FEM"))
-    assert row.pose.loads == 2 and 0.0 < row.pose.percent.mean < 100.0
-    assert measure_elements(study, FemVariant("FEM")).pose is None
+def test_only_thorough_reports_measure_moved_tools_and_batches(study):
+    long, short = (measure_elements(each, FemVariant("FEM")) for each in (solved(replace(study, thorough=True)), study))
+    assert long.pose.loads == 2 and 0.0 < long.pose.percent.mean < 100.0 and long.batch_ms > 0.0
+    assert short.pose is None and short.batch_ms is None and short.reference.loads == 2

@@ -59,7 +59,7 @@ def test_damaged_reference_file_is_rejected_by_name(study):
 
 def test_finer_reference_is_evaluated_at_the_same_points(study, tmp_path):
     """On a coarse box, halved edges change the motion by some percent."""
-    one, fine = (replace(study, folder=tmp_path, loads=1, fine=fine) for fine in (False, True))
+    one, fine = (replace(study, folder=tmp_path, loads=1, thorough=fine) for fine in (False, True))
     for each in (one, fine):
         solve_reference(each, nothing, TRAIN)
     coarse, finer = get_reference(one).displacement, get_reference(fine).displacement

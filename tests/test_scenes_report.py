@@ -19,7 +19,6 @@ from sim.effects import build_push_effects
 from sim.families.registry import build_family
 from sim.fem import Fem
 from surrogate.data.dataset import read_dataset
-from surrogate.data.splits import hold_out_sectors
 from surrogate.training.train import train
 
 
@@ -61,18 +60,17 @@ def test_report_figures_match_independent_recomputation(study, page, study_box):
         assert np.allclose([stored[0]["reference"][kind][name] for name in names], values, rtol=2e-3)
         assert np.allclose([float(lines[0][f"reference.{kind}.{name}"]) for name in names], values, rtol=2e-3)
     data = read_dataset(study.data)
-    for name, split in (("discs", study.disc_split), ("sectors", hold_out_sectors(study.pushed, study.patch))):
-        test = split.test_mask
-        model = train(data, ["linear"], split=split).models["linear"]
-        truth = data.read_displacement(study_box.tumour_nodes)[test]
-        guess = model.deform(data.loads.select(np.flatnonzero(test)), at=study_box.tumour_nodes).displacement
-        wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
-        held = stored[2]["own_fem"][name]
-        assert np.allclose([held[kind][each] for kind in ("mm", "percent") for each in names], wanted, rtol=1e-5)
-        miss = 1e3 * np.linalg.norm(guess - truth, axis=2).max(axis=1)
-        worst = [miss.mean(), np.percentile(miss, 95.0), miss.max()]
-        assert np.allclose([held["worst"][each] for each in names], worst, rtol=1e-5)
-        assert held["loads"] == test.sum() and held["values"] == test.sum() * len(study_box.tumour_nodes)
+    test = study.disc_split.test_mask
+    model = train(data, ["linear"], split=study.disc_split).models["linear"]
+    truth = data.read_displacement(study_box.tumour_nodes)[test]
+    guess = model.deform(data.loads.select(np.flatnonzero(test)), at=study_box.tumour_nodes).displacement
+    wanted = figures_by_hand(np.linalg.norm(guess - truth, axis=2), truth)
+    held = stored[2]["own_fem"]["discs"]
+    assert np.allclose([held[kind][each] for kind in ("mm", "percent") for each in names], wanted, rtol=1e-5)
+    miss = 1e3 * np.linalg.norm(guess - truth, axis=2).max(axis=1)
+    worst = [miss.mean(), np.percentile(miss, 95.0), miss.max()]
+    assert np.allclose([held["worst"][each] for each in names], worst, rtol=1e-5)
+    assert held["loads"] == test.sum() and held["values"] == test.sum() * len(study_box.tumour_nodes)
     assert (
         stored[2]["loads"] == study.disc_split.training_mask.sum()
         and stored[2]["units"] == 3 * study_box.craniotomy.sum()
@@ -111,7 +109,7 @@ def test_family_rows_have_error_and_outcome_of_each_load(study, study_rows, stud
 
 @pytest.mark.parametrize("fine", [False, True])
 def test_row_with_reference_elements_differs_by_tolerance_only(study, fine):
-    here = replace(study, fine=fine)
+    here = replace(study, thorough=fine)
     said = {
         (element, mesh): describe_difference(here, FemVariant("it", element=element, mesh=mesh))
         for element in ("p1", "p2")

@@ -100,6 +100,7 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
     from ..report.reference import solve_beyond, solve_reference
     from ..report.row import describe_reference_error
     from ..report.rows import (
+        connect_scheduler,
         list_all_combinations,
         list_family_specs,
         list_learner_specs,
@@ -118,14 +119,15 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
         raise InputError("--anatomy cannot be combined with --data, which contains an anatomy: leave one of them out.")
     if len({path.stem for path in args.data}) < len(args.data):
         raise InputError("two of the data sets have the same name: rename one.")
+    if args.scheduler:
+        with connect_scheduler(args.scheduler, "cpu"):  # a wrong address is reported before anything is solved
+            pass
     paths = args.data
     if not paths:
         paths = [args.out / "palpation.h5"]
         _simulate_data(paths[0], args, count)
     full = not args.quick
-    studies = [
-        ReportStudy(path, args.out, device, args.loads or loads, beyond, fine=full, poses=full) for path in paths
-    ]
+    studies = [ReportStudy(path, args.out, device, args.loads or loads, beyond, thorough=full) for path in paths]
     sections = []
     for study in studies:
         series = full or study.on_card
@@ -151,9 +153,9 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
                 found.append(row)
                 bar.update()
         effects = read_effect_records(get_template_path().with_suffix(SUFFIX)) if study.is_shipped else {}
-        about = (*_describe_study(study), describe_reference_error(study.fine, found), *([] if series else [NO_SERIES]))
+        about = [*_describe_study(study), describe_reference_error(full, found), *([] if series else [NO_SERIES])]
         body = study.anatomy.digest, str(study.tissue)
-        sections.append(Section(study.data.stem, about, tuple(found), *body, tuple(effects.values())))
+        sections.append(Section(study.data.stem, tuple(about), tuple(found), *body, tuple(effects.values())))
         write_report(args.out, describe_machine(device), sections)
     return sections
 
@@ -223,14 +225,15 @@ def _describe_study(study: ReportStudy) -> tuple[str, ...]:
     from ..report.study import KINDS
 
     truth, preset = get_reference(study), study.dataset.provenance.get("preset", "")
-    mesh = "the same mesh with every edge halved" if study.fine else "the same mesh"
-    good = int(truth.good.sum())
+    mesh = "the same mesh with every edge halved" if study.thorough else "the same mesh"
+    solver, good = study.reference_accuracy, int(truth.good.sum())
     return (
         f"Data: {len(study.converged)} {preset} loads on {len(study.anatomy.mesh.nodes)} vertices, "
         f"{study.element} elements, {study.tissue}; {study.disc_split.summarise()}.",
-        f"Reference: quadratic tetrahedra (p2) on {mesh}, the data's tissue, to 1e-8 in double precision, read at the "
-        f"same material points. {good} of {len(truth.good)} loads of the left-out discs converged, "
-        f"{truth.seconds.mean():.2g} s each. Beyond the training range, in equal parts: {', '.join(KINDS)}.",
+        f"Reference: quadratic tetrahedra (p2) on {mesh}, the data's tissue, to {solver.tolerance:g} in "
+        f"{solver.precision}, read at the same material points. {good} of {len(truth.good)} loads of the left-out "
+        f"discs converged, {truth.seconds.mean():.2g} s each. Beyond the training range, in equal parts: "
+        f"{', '.join(KINDS)}.",
     )
 
 

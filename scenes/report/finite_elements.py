@@ -124,7 +124,7 @@ def measure_family(study: ReportStudy, spec: FamilySpec) -> ReportRow:
 
 
 def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: Loads) -> ReportRow:
-    """Return `row` with the errors and times of `model`, which solves the loads one by one, then in a batch."""
+    """Return `row` with the errors and times of `model`, which solves the loads one by one, and in a batch."""
     own, drawn = study.anatomy, study.read_nodes
     same = model.anatomy is own
     located = None if same else locate(model.anatomy.mesh, own.mesh.nodes[drawn])
@@ -144,7 +144,10 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
         seconds.append(spent)
         fields.append(read(result)[0])
         outcomes.append(result.outcome[0])
-    together = time_work(model.deform, loads, None, drawn if same else None)[1]
+    batch_ms = None
+    if study.thorough or study.on_card:
+        together = time_work(model.deform, loads, None, drawn if same else None)[1]
+        batch_ms = 1e3 * together / len(loads)
     field, tumour = np.array(fields), np.isin(drawn, own.tumour_nodes)
     good = np.array([outcome is not Outcome.NOT_FINITE for outcome in outcomes])
     return replace(
@@ -152,8 +155,8 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
         reference=compare_with_reference(study, field[:, tumour], good, own.tumour_nodes),
         failed=int((~good).sum()),
         outcomes=dict(Counter(outcome.name for outcome in outcomes)),
-        batch_ms=1e3 * together / len(loads),
-        pose=measure_pose_error(study, solve) if study.poses else None,
+        batch_ms=batch_ms,
+        pose=measure_pose_error(study, solve) if study.thorough else None,
         **compute_load_errors(study, field, good, drawn),
         **summarise_times(seconds),
     )
@@ -172,7 +175,7 @@ def describe_difference(study: ReportStudy, spec: FemVariant) -> str:
     if change_law(study.tissue, spec.law) != study.tissue:
         return DIFFERENCE
     same = (spec.element or study.element) == study.reference_element and spec.mesh == (
-        HALVED_MESH if study.fine else OWN_MESH
+        HALVED_MESH if study.thorough else OWN_MESH
     )
     return TOLERANCE_ALONE if same else ERROR
 

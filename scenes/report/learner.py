@@ -42,22 +42,21 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
         rows = np.flatnonzero(split.test_mask)
         return _compute_errors(model, study.converged.select(rows), truth[rows], nodes)
 
-    discs, sectors = study.disc_split, hold_out_sectors(study.pushed, study.patch)
+    discs = study.disc_split
     (model, solves), learning = time_work(_train_model, study, spec, discs)
     order = np.flatnonzero(discs.training_mask)
     curve = []
-    for count in list_counts(len(order)):
+    for count in list_counts(len(order)) if study.thorough else ():
         left_aside = np.isin(np.arange(len(discs.disc_index)), order[count:])
         fewer = replace(discs, disc_index=np.where(left_aside, -2, discs.disc_index))
         curve.append((count, judged(_train_model(study, spec, fewer)[0], discs)[0]))
-    of_discs, of_sectors = judged(model, discs), judged(_train_model(study, spec, sectors)[0], sectors)
+    of_discs = judged(model, discs)
     beyond = get_solutions_beyond(study)
     outside = study.loads_beyond.select(np.flatnonzero(beyond.good))
-    sets = {
-        "discs": of_discs,
-        "sectors": of_sectors,
-        "beyond": _compute_errors(model, outside, beyond.displacement[beyond.good], nodes),
-    }
+    sets = {"discs": of_discs, "beyond": _compute_errors(model, outside, beyond.displacement[beyond.good], nodes)}
+    if study.thorough:
+        sectors = hold_out_sectors(study.pushed, study.patch)
+        sets["sectors"] = judged(_train_model(study, spec, sectors)[0], sectors)
     field, together = time_work(lambda: model.deform(study.test_loads, at=nodes).displacement)
     covered = compute_coverage_beyond(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _measure_adaptation(study, spec)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim.accuracy import REFERENCE, TRAIN, Accuracy
+from sim.accuracy import TRAIN, Accuracy
 from sim.bodies.refine import refine
 from sim.effects import build_push_effects
 from sim.fem import Fem
@@ -34,18 +34,18 @@ class ReferenceSolutions:
     seconds: np.ndarray
 
 
-def solve_reference(study: ReportStudy, progress: Callable[[int], object], accuracy: Accuracy = REFERENCE) -> None:
+def solve_reference(study: ReportStudy, progress: Callable[[int], object], accuracy: Accuracy | None = None) -> None:
     """Solve the test loads with the reference's element type, and store each solution at `study.read_nodes`.
 
     `progress` receives the number of newly available loads. Loads with a stored solution are not solved again.
     """
 
     def made() -> tuple[Fem, LocatedPoints]:
-        body = refine(study.anatomy) if study.fine else study.anatomy
+        body = refine(study.anatomy) if study.thorough else study.anatomy
         fem = Fem(
             body,
             build_push_effects(body, study.get_tissue_on(body)),
-            accuracy,
+            accuracy or study.reference_accuracy,
             study.device,
             None,
             study.reference_element,

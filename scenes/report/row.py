@@ -225,10 +225,10 @@ class ReportRow:
         return None if self.solving is None else self.learning + self.solving
 
 
-def describe_reference_error(fine: bool, rows: Sequence[ReportRow]) -> str:
+def describe_reference_error(finer_mesh: bool, rows: Sequence[ReportRow]) -> str:
     """Describe the error of the reference, from the row "FEM p2" on the mesh with edges twice as long."""
     coarse = next((row.reference for row in rows if row.name == "FEM p2"), None)
-    if not fine or coarse is None:
+    if not finer_mesh or coarse is None:
         return (
             "Error of the reference: not measured. Without --quick its mesh is finer, and is compared with p2 on this."
         )

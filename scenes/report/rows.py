@@ -12,6 +12,7 @@ from importlib import import_module
 from itertools import chain, groupby, product, takewhile
 from pathlib import Path
 from threading import BoundedSemaphore, Event
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -93,7 +94,7 @@ def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[F
 
     The factor may be the mesh if `remesh`. The reference's element is excluded: it would show only its tolerance.
     """
-    known = (study.element, "" if study.fine else study.reference_element)
+    known = (study.element, "" if study.thorough else study.reference_element)
     meshes = {} if not remesh else MESHES if study.is_shipped else {"halved edges": HALVED_MESH}
     return (
         FemVariant("FEM"),
@@ -156,21 +157,33 @@ def measure_on_worker(study: ReportStudy, spec: Spec) -> ReportRow:
     return _get_row(study, lambda study, spec: replace(measure_row(study, spec), memory=None), spec)
 
 
+def connect_scheduler(address: str, device: str) -> AbstractContextManager[Any]:
+    """Return a context that yields the workers of the Dask scheduler at `address`, for "cpu" or "cuda".
+
+    Raises
+    ------
+    InputError
+        The scheduler cannot be reached, or Dask is not installed.
+    """
+    with require_extra("data", "--scheduler needs"):
+        from ..episodes.workers import connect_workers
+    return connect_workers(address, device)
+
+
 def measure_on_workers(study: ReportStudy, specs: Sequence[Spec], address: str) -> Iterator[ReportRow]:
     """Yield a row for each of the `specs`, measured by the workers of the Dask scheduler at `address`.
 
     Raises
     ------
     InputError
-        The scheduler cannot be reached or ends, or Dask is not installed; see also `measure_on_worker`.
+        The scheduler ends; see also `connect_scheduler` and `measure_on_worker`.
     """
-    with require_extra("data", "--scheduler needs"):
+    with connect_scheduler(address, "cuda" if study.on_card else "cpu") as workers:
         from distributed.scheduler import KilledWorker
 
-        from ..episodes.workers import connect_workers, describe_scheduler_end
+        from ..episodes.workers import describe_scheduler_end
 
-    here = replace(study, data=study.data.resolve(), folder=study.folder.resolve())
-    with connect_workers(address, "cuda" if study.on_card else "cpu") as workers:
+        here = replace(study, data=study.data.resolve(), folder=study.folder.resolve())
         rows = workers.client.map(partial(measure_on_worker, here), specs, pure=False, resources=workers.needs)
         for spec, row in zip(specs, rows, strict=True):
             try:
