@@ -15,8 +15,8 @@ from studies import SPECS, TISSUE, read_back, solved
 
 from scenes.analysis.measurement import measure_peak_memory
 from scenes.report.finite_elements import OWN_MESH, FamilySpec, FemVariant
-from scenes.report.learner import LearnerSpec, list_counts, measure_learner
-from scenes.report.reference import get_reference
+from scenes.report.learner import LearnerSpec, compute_coverage_beyond, list_counts, measure_learner
+from scenes.report.reference import get_reference, get_solutions_beyond
 from scenes.report.rows import (
     list_all_combinations,
     list_learner_specs,
@@ -72,6 +72,7 @@ def test_learner_error_is_computed_on_held_out_loads(study, study_box, tmp_path,
     guess = train(data, ["svr"], split=sectors).models["svr"].deform(asked, at=nodes).displacement
     wanted = 1e3 * np.linalg.norm(guess - data.read_displacement(nodes)[data.good][sectors.test_mask], axis=2)
     mm = row.own_fem["sectors"].mm
+    assert row.curve[-1] == (row.loads, row.own_fem["discs"])
     assert (mm.mean, mm.largest) == pytest.approx((wanted.mean(), wanted.max()), rel=1e-4)
 
 
@@ -89,15 +90,18 @@ def test_played_loads_lie_in_the_held_out_discs(study):
     assert list(force) == [size.min(), size.max()]
 
 
-def test_rows_state_error_type_and_coverage(study_rows):
+def test_rows_state_error_type_and_coverage(study, study_rows):
     fem, law, learner = study_rows[:3]
     assert (fem.against, law.against, learner.against) == ("error", "model difference", "error")
     assert law.reference.mm.mean > fem.reference.mm.mean > 0.0 and not fem.own_fem
     assert set(learner.own_fem) == {"discs", "beyond"} and learner.flagged["beyond"] == 1.0
-    assert set(learner.covered) == {"discs", "beyond"} and max(learner.covered.values()) <= 1.0
+    beyond = get_solutions_beyond(study)
+    outside, answers = study.loads_beyond.select(np.flatnonzero(beyond.good)), beyond.displacement[beyond.good]
+    covered = compute_coverage_beyond(study, LearnerSpec("linear"), outside, answers)
+    assert set(covered) == {"discs", "beyond"} and max(covered.values()) <= 1.0 and not learner.covered
     assert learner.own_fem["beyond"].percent.mean > learner.own_fem["discs"].percent.mean
     assert (fem.timed, fem.p99, learner.timed) == (2, None, 30) and fem.median > learner.median > 0.0
-    assert learner.adapt is None and fem.adapt > 0.0 and learner.curve[-1] == (learner.loads, learner.own_fem["discs"])
+    assert learner.adapt is None and fem.adapt > 0.0 and learner.curve == ()
     assert read_back(learner) == learner
     assert 0.05 < measure_peak_memory() < 50.0
 
@@ -143,15 +147,11 @@ def test_only_missing_rows_are_measured_again(study, study_rows, tmp_path):
 
 
 def test_report_plans_list_unique_variants(study):
-    names = [spec.name for spec in list_one_factor_variants(study)]
-    assert names[0] == "FEM" and len(set(names)) == len(names) == 11 and "FEM halved edges" in names
-    assert (
-        list_one_factor_variants(study)[0].accuracy == TRAIN and list_one_factor_variants(study)[-1].law != TISSUE.law
-    )
-    assert (
-        not any(spec.mesh != OWN_MESH for spec in list_one_factor_variants(study, remesh=False))
-        and len(list_one_factor_variants(study, remesh=False)) == 10
-    )
+    quick, thorough = (list_one_factor_variants(replace(study, thorough=thorough)) for thorough in (False, True))
+    names = [spec.name for spec in thorough]
+    assert names[0] == "FEM" and len(set(names)) == len(names) == 12 and "FEM halved edges" in names
+    assert thorough[0].accuracy == TRAIN and thorough[-1].law != TISSUE.law
+    assert set(quick) < set(thorough) and len(quick) == 7 and all(spec.mesh == OWN_MESH for spec in quick)
     product = list_all_combinations(study)
     assert len({spec.name for spec in product}) == len(product) == 4 * 3 * 2 * (3 + 5)
     assert list_counts(300) == [64, 128, 256] and list_counts(64) == []

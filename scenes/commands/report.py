@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Numbers of loads of a short and of a full report: simulated where no data are given; compared with the reference;
 # beyond the training range.
-QUICK_COUNTS, FULL_COUNTS = (256, 8, 24), (3000, 64, 120)
+QUICK_COUNTS, FULL_COUNTS = (256, 8, 12), (3000, 64, 120)
 NO_SERIES = "Models of the power series: not measured with --quick on a CPU, where their table takes minutes."
 
 
@@ -132,7 +132,7 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
     for study in studies:
         series = full or study.on_card
         specs = (
-            *(list_all_combinations(study) if args.full else list_one_factor_variants(study, full)),
+            *(list_all_combinations(study) if args.full else list_one_factor_variants(study)),
             *list_family_specs(),
             *list_learner_specs(series),
         )

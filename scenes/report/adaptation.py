@@ -1,6 +1,5 @@
 """Time that a model needs to adapt to an anatomy after resection of a fifth of its tumour."""
 
-import time as clock
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +11,9 @@ from sim.anatomy import Anatomy
 from sim.effects import NodalForce, build_push_effects
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
-from sim.runtime.partial_files import to_unfinished_path
 from surrogate.data.simulate import simulate
 
-from .study import ReportStudy, note_seconds, read_noted_seconds
+from .study import ReportStudy
 
 REMOVED_SHARE = 0.2  # Removed share of the tumour's volume.
 
@@ -49,10 +47,8 @@ def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> 
     if path.exists():
         progress(len(study.dataset.loads) + len(study.dataset.unit_good))
         return
-    whole = not to_unfinished_path(path).exists()
     body, data = debulk_tumour(study.anatomy), study.dataset
     effects = (*build_push_effects(body, study.get_tissue_on(body)), NodalForce())
-    begun = clock.perf_counter()
     fem = Fem(body, effects, TRAIN, study.device, None, study.element)
     reported = [0]
 
@@ -61,13 +57,16 @@ def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> 
         reported[0] = done
 
     simulate(path, fem, data.loads, data.provenance, fem.batch, tell)
-    if whole:
-        note_seconds(path, clock.perf_counter() - begun)
 
 
 def read_simulation_seconds(study: ReportStudy) -> float | None:
-    """Read the duration [s] of `simulate_debulked`; None if there was no run, or if it was interrupted."""
-    return read_noted_seconds(_to_answers_path(study))
+    """Read the duration [s] of the solves of `simulate_debulked`, without set-up; None without such a data set."""
+    if not _to_answers_path(study).exists():
+        return None
+    data = build_debulked_study(study).dataset
+    loads, units = len(data.loads), len(data.unit_good)
+    seconds = data.estimate_seconds("load", loads), data.estimate_seconds("unit response", units)
+    return None if None in seconds else sum(filter(None, seconds))
 
 
 def _to_answers_path(study: ReportStudy) -> Path:

@@ -8,7 +8,7 @@ from sim.deformation import Deformer, Outcome
 from sim.loads import Loads
 from surrogate.data.splits import DiscSplit, hold_out_sectors
 from surrogate.evaluation.coverage import FORCE_CLASSES, compute_coverage
-from surrogate.evaluation.score import SolveCounts, time_model_alone, time_single_loads
+from surrogate.evaluation.score import SolveCounts, time_single_loads
 from surrogate.training.train import train
 
 from ..analysis.measurement import time_work
@@ -42,26 +42,24 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
         rows = np.flatnonzero(split.test_mask)
         return _compute_errors(model, study.converged.select(rows), truth[rows], nodes)
 
-    discs = study.disc_split
+    discs, beyond = study.disc_split, get_solutions_beyond(study)
     (model, solves), learning = time_work(_train_model, study, spec, discs)
-    order = np.flatnonzero(discs.training_mask)
-    curve = []
-    for count in list_counts(len(order)) if study.thorough else ():
-        left_aside = np.isin(np.arange(len(discs.disc_index)), order[count:])
-        fewer = replace(discs, disc_index=np.where(left_aside, -2, discs.disc_index))
-        curve.append((count, judged(_train_model(study, spec, fewer)[0], discs)[0]))
-    of_discs = judged(model, discs)
-    beyond = get_solutions_beyond(study)
-    outside = study.loads_beyond.select(np.flatnonzero(beyond.good))
-    sets = {"discs": of_discs, "beyond": _compute_errors(model, outside, beyond.displacement[beyond.good], nodes)}
+    outside, outside_truth = study.loads_beyond.select(np.flatnonzero(beyond.good)), beyond.displacement[beyond.good]
+    sets = {"discs": judged(model, discs), "beyond": _compute_errors(model, outside, outside_truth, nodes)}
+    curve, covered = [], {}
     if study.thorough:
         sectors = hold_out_sectors(study.pushed, study.patch)
         sets["sectors"] = judged(_train_model(study, spec, sectors)[0], sectors)
+        covered = compute_coverage_beyond(study, spec, outside, outside_truth)
+        order = np.flatnonzero(discs.training_mask)
+        for count in list_counts(len(order)):
+            left_aside = np.isin(np.arange(len(discs.disc_index)), order[count:])
+            fewer = replace(discs, disc_index=np.where(left_aside, -2, discs.disc_index))
+            curve.append((count, judged(_train_model(study, spec, fewer)[0], discs)[0]))
+        curve.append((len(order), sets["discs"][0]))
     field, together = time_work(lambda: model.deform(study.test_loads, at=nodes).displacement)
-    covered = compute_coverage_beyond(study, spec, outside, beyond.displacement[beyond.good])
     adapt, adapted = _measure_adaptation(study, spec)
     held_out = study.converged.select(np.flatnonzero(discs.test_mask))
-    bare = time_model_alone(model, held_out)
     return ReportRow(
         spec.name,
         "trained models",
@@ -75,13 +73,12 @@ def measure_learner(study: ReportStudy, spec: LearnerSpec) -> ReportRow:
         series=solves.series,
         inside=solves.inside,
         batch_ms=1e3 * together / len(field),
-        bare=None if bare is None else 1e-3 * bare,
         solving=solves.seconds,
         learning=learning,
         adapt=adapt,
         adapted=adapted,
         command=f"sulcus train DATA.h5 --learners {spec.name} --out MODEL.npz",
-        curve=tuple((count, each) for count, each in [*curve, (len(order), of_discs[0])] if each is not None),
+        curve=tuple((count, each) for count, each in curve if each is not None),
         **summarise_times(time_single_loads(model, held_out, nodes, study.timed)),
     )
 

@@ -147,16 +147,12 @@ class ReportRow:
         Mean distance from the reference of each test load [mm], at the tumour and at the open cortex.
     pose
         Distances from the reference if the tool moves as in the reference, instead of pushing with the same force.
-    failed
-        Number of test loads without a solution, which are excluded from all figures.
     outcomes
-        Numbers of test loads by the name of their `Outcome`.
+        Numbers of test loads by the name of their `Outcome`; NOT_FINITE loads are excluded from all errors.
     median, p99, central_ms
         Time per load [ms], solved one at a time: median, 99th percentile (None below 1,000 loads), central 95 %.
     batch_ms
         Time per load [ms] if all test loads are solved in one batch.
-    bare
-        Time per load [ms] of the trained model alone in NumPy, without error bound and without range checks.
     timed
         Number of timed loads.
     set_up
@@ -194,13 +190,11 @@ class ReportRow:
     load_mm: tuple[float, ...] = ()
     cortex_mm: tuple[float, ...] = ()
     pose: ErrorFigures | None = None
-    failed: int = 0
     outcomes: Mapping[str, int] = field(default_factory=dict)
     median: float | None = None
     p99: float | None = None
     central_ms: tuple[float, float] | None = None
     batch_ms: float | None = None
-    bare: float | None = None
     timed: int = 0
     set_up: float | None = None
     memory: float | None = None

@@ -89,23 +89,24 @@ Run = Callable[[ReportStudy, Spec], ReportRow]
 CORES = 4  # Number of CPU cores per measured learner, which uses one; the others prepare the next process.
 
 
-def list_one_factor_variants(study: ReportStudy, remesh: bool = True) -> tuple[FemVariant, ...]:
+def list_one_factor_variants(study: ReportStudy) -> tuple[FemVariant, ...]:
     """List the FEM variant of the data set, and the variants that differ from it in one factor.
 
-    The factor may be the mesh if `remesh`. The reference's element is excluded: it would show only its tolerance.
+    Other meshes and precisions, and all tolerances, belong to a thorough report. The reference's element is excluded:
+    it would show only its tolerance.
     """
     known = (study.element, "" if study.thorough else study.reference_element)
-    meshes = {} if not remesh else MESHES if study.is_shipped else {"halved edges": HALVED_MESH}
+    meshes = {} if not study.thorough else MESHES if study.is_shipped else {"halved edges": HALVED_MESH}
     return (
         FemVariant("FEM"),
         *(FemVariant(f"FEM {name}", element=name) for name in ELEMENTS if name not in known),
         *(FemVariant(f"FEM {name}", mesh=mesh) for name, mesh in meshes.items()),
         *(
             FemVariant(f"FEM {_format_power(size)}", tolerance=size)
-            for size in TOLERANCES
+            for size in TOLERANCES[:: 1 if study.thorough else 4]
             if size != STANDARD_TOLERANCE
         ),
-        FemVariant("FEM float64", precision="float64"),
+        *((FemVariant("FEM float64", precision="float64"),) if study.thorough else ()),
         *((FemVariant("FEM CPU", device="cpu"),) if study.on_card else ()),
         *(FemVariant(f"FEM {law} law", law=law) for law in LAWS if law != get_law_name(study.tissue)),
     )

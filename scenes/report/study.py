@@ -1,6 +1,5 @@
 """Study of a report: its test loads, inside and beyond the training range, and the recorded durations of solves."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,7 +14,6 @@ from sim.effects import Elasticity
 from sim.errors import InputError
 from sim.geometry.tetmesh import compute_digest
 from sim.loads import Loads, Pushed
-from sim.runtime.atomic_files import write_atomically
 from sim.runtime.device import find_device
 from sim.runtime.versions import get_version
 from surrogate.data.cortex_patch import Patch, open_patch
@@ -45,7 +43,7 @@ class ReportStudy:
         single loads that are timed.
     thorough
         True to halve every edge of the reference mesh, and to measure also what takes long: tools that move as in the
-        reference, batches of FEM on a CPU, learning curves, and held-out sectors.
+        reference, batches of FEM on a CPU, more FEM variants, learning curves, held-out sectors, and coverage.
     reference_element
         Element type of the reference.
     """
@@ -214,24 +212,6 @@ def _sample_near_rim(patch: Patch, footprint: np.ndarray, random: np.random.Gene
     ratio = patch.compute_edge_distance(points)[None] / footprint[:, None]
     wanted = random.uniform(*EDGE_DISTANCES, len(footprint))[:, None]
     return points[np.abs(ratio - wanted).argmin(axis=1)]
-
-
-def note_seconds(path: Path, seconds: float) -> None:
-    """Store the duration [s] of the computation of a file, in a JSON file with the same name."""
-    with write_atomically(_to_json_path(path), ".json") as partial:
-        partial.write_text(json.dumps({"seconds": seconds}))
-
-
-def read_noted_seconds(path: Path) -> float | None:
-    """Read the duration [s] that `note_seconds` stored; None if it is missing or incomplete."""
-    try:
-        return float(json.loads(_to_json_path(path).read_text())["seconds"])
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return None
-
-
-def _to_json_path(made: Path) -> Path:
-    return made.with_suffix(".json")
 
 
 def tabulate_series(study: ReportStudy, progress: Callable[[int, int], object]) -> None:
