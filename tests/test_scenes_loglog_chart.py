@@ -103,3 +103,10 @@ def test_missing_matplotlib_message_names_the_extra(monkeypatch, capsys):
         monkeypatch.delitem(sys.modules, f"scenes.analysis.{name}", raising=False)
     assert main(["sensitivity", "--factorial"]) == 2
     assert "pip install -e '.[report]'" in capsys.readouterr().err
+
+
+def test_group_has_the_same_colour_in_each_chart():
+    dots = (Dot("", "b", 1.0, 1.0),)
+    alone, listed = (draw_svg(ChartPanel("t", "x", "y", dots=dots, groups=names)) for names in ((), ("a", "b")))
+    assert "#1f77b4" in alone and "#ff7f0e" not in alone and ">a<" not in listed
+    assert "#ff7f0e" in listed and "#1f77b4" not in listed

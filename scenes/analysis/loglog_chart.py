@@ -23,6 +23,7 @@ DPI = 100  # Resolution of a chart [pixel/inch].
 PALE_OPACITY = 0.35  # Opacity of pale dots.
 NAME_GREY = "0.45"  # Grey level of pale names, 0 to 1.
 DOT_DIAMETER = 7.0  # Diameter of a dot [pt].
+NAME_BACKGROUND = {"facecolor": "white", "alpha": 0.7, "pad": 0.0, "linewidth": 0.0}  # Box behind a name.
 NAME_DISTANCE = 6.0  # Distance of a name from the centre of its dot [pt].
 SIDES = ((1, 0), (-1, 0), (0, -1), (0, 1), (1, -1), (1, 1), (-1, -1), (-1, 1))
 """Positions of a name relative to its dot (right, up), in order of preference."""
@@ -59,7 +60,7 @@ class ChartPanel:
     """Chart with one pair of axes: title, axis labels, curves, dots, and labelled vertical lines (`marks`: x, label).
 
     `size`: width and height [pixel]; `y_range`: limits of the y axis (None: range of the data with a margin); `front`:
-    points that are joined by a stepped line.
+    points that are joined by a stepped line; `groups`: groups of dots in the order of colours (others follow).
     """
 
     title: str
@@ -71,6 +72,7 @@ class ChartPanel:
     size: tuple[int, int] = (WIDTH, HEIGHT)
     y_range: tuple[float, float] | None = None
     front: tuple[tuple[float, float], ...] = ()
+    groups: tuple[str, ...] = ()
 
 
 def draw_panels(panels: Sequence[ChartPanel]) -> np.ndarray:
@@ -133,12 +135,14 @@ def _build_canvas(panel: ChartPanel) -> FigureCanvasAgg:
     axes.set_axisbelow(True)
     for x, name in (mark for mark in panel.marks if x_range[0] < mark[0] < x_range[1]):
         axes.axvline(x, color=NAME_GREY, linestyle="--", linewidth=1.0)
-        axes.annotate(name, (x, 0.0), (5, 8), ("data", "axes fraction"), "offset points", color=NAME_GREY, size="small")
+        place = (x, 0.0), (-5, 8), ("data", "axes fraction"), "offset points"
+        axes.annotate(name, *place, color=NAME_GREY, size="small", ha="right")
     for curve in panel.curves:
         axes.plot(*np.array(sorted(curve.points)).reshape(-1, 2).T, marker="o", markersize=5, label=curve.name)
-    groups = {group: f"C{number}" for number, group in enumerate({dot.group: 0 for dot in panel.dots})}
-    for group, colour in groups.items():
-        axes.plot([], [], "o", color=colour, markersize=DOT_DIAMETER, label=group)
+    found = [dot.group for dot in panel.dots]
+    groups = {group: f"C{number}" for number, group in enumerate(dict.fromkeys((*panel.groups, *found)))}
+    for group in sorted(set(found), key=list(groups).index):
+        axes.plot([], [], "o", color=groups[group], markersize=DOT_DIAMETER, label=group)
     if panel.front:
         axes.step(*np.array(sorted(panel.front)).T, where="post", color=NAME_GREY, linewidth=1.0, zorder=1)
     for number, dot in sorted(enumerate(panel.dots), key=lambda each: not each[1].is_pale):  # pale ones are covered
@@ -170,6 +174,7 @@ def _write_names(axes: Axes, dots: Sequence[Dot]) -> None:
                 (NAME_DISTANCE * right, NAME_DISTANCE * up),
                 textcoords="offset points",
                 size="small",
+                bbox=NAME_BACKGROUND,
             )
             for right, up in SIDES
         ]

@@ -10,10 +10,12 @@ from surrogate.evaluation.choose import find_pareto_front
 
 from ..analysis.loglog_chart import ChartPanel, Curve, Dot
 from ..play.effect_record import EffectRecord
+from .finite_elements import GEOMETRY, MECHANICS, SPRINGS
 from .row import ERROR, TOLERANCE_ALONE, ErrorFigures, ReportRow
 
 SIZE = (880, 560)  # Width and height of a chart [pixel].
 DIFFERENT_LAW = "another law: model difference"  # Name of the group of rows with another material law.
+GROUPS = ("finite elements", DIFFERENT_LAW, GEOMETRY, SPRINGS, MECHANICS, "trained models")  # One colour for each.
 ERROR_LABEL = "mean distance from the reference at the tumour [mm]"  # Label of the error axes.
 MARKS = ((60.0, "1 minute"), (600.0, "10 minutes"), (3600.0, "1 hour"))  # Times on the axes of preparation [s].
 Place = tuple[float, float]
@@ -145,7 +147,7 @@ def _scatter(
         if row.name in places
     )
     front = tuple(places[name] for name in best)
-    return ChartPanel(title, x, ERROR_LABEL, dots=dots, size=SIZE, front=front) if dots else None
+    return ChartPanel(title, x, ERROR_LABEL, dots=dots, size=SIZE, front=front, groups=GROUPS) if dots else None
 
 
 def _find_central_range(load_mm: Sequence[float]) -> tuple[float, float] | None:

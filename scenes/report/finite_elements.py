@@ -146,17 +146,15 @@ def _measure_loads(study: ReportStudy, row: ReportRow, model: Deformer, loads: L
         seconds.append(spent)
         fields.append(read(result)[0])
         outcomes.append(result.outcome[0])
-    batch_ms = None
-    if study.thorough or study.on_card:
-        together = time_work(model.deform, loads, None, drawn if same else None)[1]
-        batch_ms = 1e3 * together / len(loads)
+    work = model.deform, loads, None, drawn if same else None
+    together = time_work(*work)[1] if study.thorough or study.on_card else None
     field, tumour = np.array(fields), np.isin(drawn, own.tumour_nodes)
     good = np.array([outcome is not Outcome.NOT_FINITE for outcome in outcomes])
     return replace(
         row,
         reference=compare_with_reference(study, field[:, tumour], good, own.tumour_nodes),
         outcomes=dict(Counter(outcome.name for outcome in outcomes)),
-        batch_ms=batch_ms,
+        batch_ms=None if together is None else 1e3 * together / len(loads),
         pose=measure_pose_error(study, solve) if study.thorough else None,
         **compute_load_errors(study, field, good, drawn),
         **summarise_times(seconds),
