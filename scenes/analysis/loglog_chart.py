@@ -96,19 +96,24 @@ def draw_svg(panel: ChartPanel) -> str:
     ValueError
         The panel has no points, or a point that is not positive.
     """
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "sulcus"}), io.StringIO() as file:
-        canvas = _build_canvas(panel)
-        canvas.draw()
-        canvas.figure.set_layout_engine("none")  # names and axes keep their positions at this resolution
-        canvas.figure.savefig(file, format="svg", metadata={"Date": None})
-        text = file.getvalue()
-    text = re.sub(
-        r"<metadata>.*?</metadata>|\sxmlns(:xlink)?=\"[^\"]*\"", "", text[text.index("<svg") :], flags=re.DOTALL
-    )
+    canvas = _build_canvas(panel)
+    canvas.draw()
+    canvas.figure.set_layout_engine("none")  # names and axes keep their positions at this resolution
+    text = format_svg(canvas.figure)
     for number, dot in enumerate(panel.dots):
         mark = f'<g id="dot-{number}">'
         text = text.replace(mark, f"{mark}<title>{escape(dot.hint or dot.name)}</title>", 1)
     return text
+
+
+def format_svg(figure: Figure) -> str:
+    """Format a figure as an SVG element for HTML, without metadata; equal figures have equal texts."""
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "sulcus"}), io.StringIO() as file:
+        figure.savefig(file, format="svg", metadata={"Date": None})
+        text = file.getvalue()
+    return re.sub(
+        r"<metadata>.*?</metadata>|\sxmlns(:xlink)?=\"[^\"]*\"", "", text[text.index("<svg") :], flags=re.DOTALL
+    )
 
 
 def _draw_panel(panel: ChartPanel) -> np.ndarray:

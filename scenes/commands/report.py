@@ -76,12 +76,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.npz",
         help="mesh of Tonutti et al. 2017; --seed-protocol evaluates the models on this mesh, too",
     )
+    parser.add_argument(
+        "--tissue",
+        type=Path,
+        metavar="DIR",
+        help="compare tissue laws with measured stresses instead: a CSV file for each tissue (docs/notes/tissue.md)",
+    )
     add_force(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure all rows and write the report; return 1 if a row could not be measured, else 0."""
+    if args.tissue:
+        return _compare_tissues(args)
     try:
         sections = _measure_seed_sections(args) if args.seed_protocol else _measure_sections(args)
     except KeyboardInterrupt:
@@ -158,6 +166,25 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
         sections.append(Section(study.data.stem, tuple(about), tuple(found), *body, tuple(effects.values())))
         write_report(args.out, describe_machine(device), sections)
     return sections
+
+
+def _compare_tissues(args: argparse.Namespace) -> int:
+    """Write the comparison with measured tissue, and print R2 of each law in each test."""
+    from ..report.tissue import read_measured_tissues, write_tissue_report
+
+    if args.data or args.anatomy or args.seed_protocol or args.scheduler:
+        raise InputError("--tissue solves no loads: leave out --data, --anatomy, --seed-protocol and --scheduler.")
+    measured = read_measured_tissues(args.tissue)
+    check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / "tissue.json").is_file())
+    fits = write_tissue_report(args.out, measured)
+    if args.json:
+        print(json.dumps({"page": str(args.out / "index.html"), "fits": [asdict(fit) for fit in fits]}))
+        return 0
+    print(f"{'R2':<40} " + " ".join(f"{test:>11}" for test in fits[0].r2))
+    for fit in fits:
+        print(f"{fit.measured + ': ' + fit.model:<40} " + " ".join(f"{value:11.2f}" for value in fit.r2.values()))
+    print(f"written: {args.out / 'index.html'}")
+    return 0
 
 
 def _check_options(args: argparse.Namespace) -> str:

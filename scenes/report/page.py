@@ -69,13 +69,17 @@ def write_report(folder: Path, machine: str, sections: Sequence[Section]) -> Non
         bodies.append(_format_section(section, plots))
     with write_atomically(folder / "report.json", ".json") as partial:
         partial.write_text(json.dumps({"machine": machine, "sections": [asdict(section) for section in sections]}))
-    notes = "".join(f"<p>{escape(note)}</p>" for note in NOTES)
     with write_atomically(folder / "index.html", ".html") as partial:
-        partial.write_text(
-            f'<!doctype html><html lang="en"><meta charset="utf-8"><title>What accuracy costs in time</title>'
-            f"<style>{STYLE}</style><h1>What accuracy costs in time</h1>{''.join(bodies)}<h2>How to read this</h2>"
-            f"{notes}<p>{escape(machine)}. Research software, not a medical device.</p></html>\n"
-        )
+        partial.write_text(format_page("What accuracy costs in time", "".join(bodies), (*NOTES, f"{machine}.")))
+
+
+def format_page(title: str, body: str, notes: Sequence[str]) -> str:
+    """Format a self-contained HTML page: title, body (HTML), and paragraphs of plain text on how to read it."""
+    paragraphs = "".join(f"<p>{escape(note)}</p>" for note in (*notes, "Research software, not a medical device."))
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
+        f"<h1>{title}</h1>{body}<h2>How to read this</h2>{paragraphs}</html>\n"
+    )
 
 
 def _format_section(section: Section, plots: Sequence[str]) -> str:
@@ -107,10 +111,10 @@ def _format_summary(rows: Sequence[ReportRow]) -> str:
             f"{reliable} of {sum(row.outcomes.values())}" if row.outcomes else "",
         )  # fmt: skip
         lines.append(("front" if row.name in best else "", cells))
-    return _format_table(SUMMARY_HEADS, lines) if lines else ""
+    return format_table(SUMMARY_HEADS, lines) if lines else ""
 
 
-def _format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
+def format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
     """Format an HTML table from column titles and lines, each a CSS class and its cells."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(
