@@ -8,13 +8,18 @@ from contact_examples import CONTACTS
 from term_examples import EXAMPLES as OTHERS
 from term_examples import LOGARITHMIC, MESH, ROWS, Example
 
-from sim.discretisation.term import Term
+from sim.discretisation.term import HistoryTerm, LocalBarrier, StepTerm, StrainTerm, Term
 from sim.geometry.tetmesh import compute_signed_volumes
 from sim.runtime.device import Device
 from sim.terms.contact.tool_contact import ToolContactTerm
 from sim.terms.element_kernels import MIN_VOLUME_RATIO
 
 EXAMPLES = OTHERS | CONTACTS
+INTERFACES = {
+    "ElasticTerm": {"HistoryTerm", "StrainTerm"},
+    "InertiaTerm": {"HistoryTerm", "StepTerm"},
+    "ToolContactTerm": {"LocalBarrier"},
+}
 
 
 @pytest.fixture(params=EXAMPLES, scope="module")
@@ -261,3 +266,9 @@ def test_spring_history_creeps_and_is_returned_rows_first(device: Device) -> Non
     before, u = example.cases.memory["spring"], example.u.T.reshape(3, -1, 3)
     share = 1.0 - np.exp(-np.array([0.5, 2.0, 0.1]))[:, None, None]
     np.testing.assert_allclose(spring.end(device.upload(example.u)), before + share * (u - before), atol=1e-15)
+
+
+def test_term_has_the_interfaces_that_solvers_look_for(built):
+    """Interfaces are recognised by the names of their members: a renamed member would silently lose the history."""
+    found = {kind.__name__ for kind in (HistoryTerm, StepTerm, StrainTerm, LocalBarrier) if isinstance(built, kind)}
+    assert found == INTERFACES.get(type(built).__name__, set())
