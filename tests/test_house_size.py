@@ -9,9 +9,9 @@ from test_house import FILES, HOUSE, PACKAGED, name_of, nodes_of
 # Lower a number when lines have gone. Raise it only with the reason in the commit.
 # 1,380 of the packages are the families of models that finite elements are compared with; 770 lines are their tests.
 # 900 more measure the published experiment, choose among families, and plot batches and effects.
-# 320 compare tissue laws with measured brain; 120 lines are their tests.
+# 360 compare tissue laws with measured brain; 140 lines are their tests.
 # 290 of the tests are calls that names of full words wrap.
-MOST = {"packages": 84_840, "tests": 54_220}
+MOST = {"packages": 84_880, "tests": 54_250}
 
 
 def lines(paths):

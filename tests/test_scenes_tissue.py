@@ -61,14 +61,34 @@ def test_report_command_writes_page_and_plots(tmp_path, capsys):
     assert main(words) == 0 and "ogden, fitted" in capsys.readouterr().out
 
 
+def test_file_may_have_one_test_and_empty_cells(tmp_path):
+    rows = [f" {1.0 + 0.01 * k},{0.03 * k},,," for k in range(9)]
+    (tmp_path / "brain.csv").write_text("\r\n".join([HEAD, *rows[:4], "1.04,,,,", *rows[4:]]), encoding="utf-8-sig")
+    (measured,) = read_measured_tissues(tmp_path)
+    assert list(measured.tests) == ["tension"] and measured.tests["tension"][1].tolist()[-1] == pytest.approx(240.0)
+
+
+GOOD = "0.95,-0.1\n0.92,-0.2\n"
+
+
 @pytest.mark.parametrize(
-    ("text", "problem"),
-    [("", "stretch_tension"), (f"{HEAD}\n1,0,1,0,0,0\n", "3 or more rows"), (f"{HEAD}\n" + "1,x,1,0,0,0\n" * 4, "kPa")],
+    ("rows", "problem"),
+    [
+        ("1,0\n0.9,-1\n", "3 or more rows"),
+        ("1,0\n0.9,x\n0.8,-1\n", "numbers in both columns"),
+        (f"1,0\n{GOOD}1.2,-0.3\n", "outside its range"),
+        (f"1,0\n{GOOD}0.9,-300\n", "stress above 100 kPa"),
+        (f"1,0\n{GOOD}0.9,1\n", "wrong sign"),
+    ],
 )
-def test_unreadable_measurements_are_rejected(tmp_path, capsys, text, problem):
-    (tmp_path / "brain.csv").write_text(text)
-    assert main(["report", "--tissue", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+def test_unreadable_measurements_are_rejected(tmp_path, capsys, rows, problem):
+    (tmp_path / "brain.csv").write_text(f"{','.join(COLUMNS['compression'])}\n{rows}")
+    words = ["report", "--tissue", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main(words) == 2
     said = capsys.readouterr().err
-    assert "brain.csv" in said and problem in said and not (tmp_path / "out").exists()
-    assert main(["report", "--tissue", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 2
-    assert main(["report", "--tissue", str(tmp_path), "--seed-protocol"]) == 2
+    assert "brain.csv" in said and problem in said and "compression is negative" in said
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "brain.csv").write_text(f"{HEAD.replace(',', ';')}\n")
+    assert main(words) == 2 and "its columns are stretch_tension;" in capsys.readouterr().err
+    assert main([*words[:-1], str(tmp_path / "out"), "--seed-protocol"]) == 2
+    assert main(["report", "--tissue", str(tmp_path / "none")]) == 2

@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tissue",
         type=Path,
         metavar="DIR",
-        help="compare tissue laws with measured stresses instead: a CSV file for each tissue (docs/notes/tissue.md)",
+        help="compare tissue laws with measured stresses instead: CSV files of one tissue each (docs/notes/tissue.md)",
     )
     add_force(parser)
     add_json(parser)
@@ -172,17 +172,18 @@ def _compare_tissues(args: argparse.Namespace) -> int:
     """Write the comparison with measured tissue, and print R2 of each law in each test."""
     from ..report.tissue import read_measured_tissues, write_tissue_report
 
-    if args.data or args.anatomy or args.seed_protocol or args.scheduler:
-        raise InputError("--tissue solves no loads: leave out --data, --anatomy, --seed-protocol and --scheduler.")
+    if args.data or args.anatomy or args.seed_protocol or args.scheduler or args.quick or args.full or args.loads:
+        raise InputError("--tissue solves no loads: give only --out, --force and --json with it.")
     measured = read_measured_tissues(args.tissue)
     check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / "tissue.json").is_file())
     fits = write_tissue_report(args.out, measured)
     if args.json:
         print(json.dumps({"page": str(args.out / "index.html"), "fits": [asdict(fit) for fit in fits]}))
         return 0
-    print(f"{'R2':<40} " + " ".join(f"{test:>11}" for test in fits[0].r2))
     for fit in fits:
-        print(f"{fit.measured + ': ' + fit.model:<40} " + " ".join(f"{value:11.2f}" for value in fit.r2.values()))
+        agreement = ", ".join(f"{test} {value:.2f}" for test, value in fit.r2.items())
+        constants = f"mu {1e-3 * fit.mu:.3g} kPa" + ("" if fit.alpha is None else f", alpha {fit.alpha:.1f}")
+        print(f"{fit.measured}: {fit.model + ':':<27} R2 of {agreement}; {constants}")
     print(f"written: {args.out / 'index.html'}")
     return 0
 

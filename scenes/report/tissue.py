@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -13,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from ar.screen import write_png
 from sim.diagnostics.homogeneous import compute_shear_stress, compute_uniaxial_stress
 from sim.errors import InputError
-from sim.material import LAWS, MATERIALS, Material, Ogden
+from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import wrap_errors
 
@@ -26,17 +27,27 @@ COLUMNS = {
     "shear": ("shear_strain", "shear_stress_kPa"),
 }
 """Columns of a CSV file by test: stretch or shear strain, and nominal stress [kPa]."""
-REMEDY = f"Give CSV files with the columns {', '.join(name for pair in COLUMNS.values() for name in pair)}."
+RANGES = {"tension": (1.0, 5.0), "compression": (0.2, 1.0), "shear": (0.0, 2.0)}
+"""Allowed stretches or shear strains by test, which begin or end at the undeformed state."""
+MAX_STRESS = 100.0  # Largest stress [kPa]; soft tissue has less, but numbers in Pa are larger.
+REMEDY = (
+    "Give comma-separated columns for one test or more: "
+    + "; ".join(f"{strain} ({low:g} to {high:g}), {stress}" for (strain, stress), (low, high) in
+                zip(COLUMNS.values(), RANGES.values(), strict=True))
+    + ". Stress in compression is negative."
+)  # fmt: skip
 MAX_BYTES = 1_000_000  # Largest size of a CSV file.
 FITTED_POISSON = 0.4999  # Poisson's ratio of fitted laws: tests of brain are evaluated as incompressible.
 EXPONENTS = [*range(-40, 0), *range(1, 41)]  # Exponents of Ogden's law from which a fit begins.
 MIN_MU = 0.01  # Smallest fitted shear modulus [Pa].
+DRAWN = ("linear, fitted", "corotational, fitted", "neo-hookean, fitted", "ogden, fitted")  # Fits in the plots.
 MIN_R2 = 0.9  # Smallest R2 of each test for which a law describes a tissue.
 ABOUT = (
     "R2 = 1 - sum (model - measured)^2 / sum (measured - mean)^2 for each test; below 0: worse than a constant. Errors "
     "are of the nominal stress, where the largest was measured. Fitted: one parameter set for all tests, by least "
-    "squares of the stresses, nu 0.4999. Bold: R2 is at least 0.9 in each test. Other rows are the named tissues, "
-    "without relaxation.",
+    "squares of the stresses, nu 0.4999. Bold: R2 is at least 0.9 in each test. Other rows are the named tissues of "
+    "`--material`, without relaxation.",
+    "mu is the shear modulus at small strain: E = 2 (1 + nu) mu; c = 2 mu and m = alpha in the convention of FEBio.",
     "This compares laws with samples outside the body, under one protocol. It says nothing of a patient.",
 )
 
@@ -51,11 +62,16 @@ class MeasuredTissue:
 
 @dataclass(frozen=True)
 class TissueFit:
-    """Agreement of a law with a measured tissue by test: R2, and relative error at the largest measured stress."""
+    """Agreement of a law with a measured tissue by test: R2, and relative error at the largest measured stress.
+
+    `mu`: shear modulus at small strain [Pa]; `alpha`: exponent of Ogden's law with one term, else None.
+    """
 
     measured: str
     model: str
     tissue: str
+    mu: float
+    alpha: float | None
     r2: Mapping[str, float]
     error: Mapping[str, float]
 
@@ -84,14 +100,29 @@ def _read_tissue(path: Path) -> MeasuredTissue:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"has more than {MAX_BYTES} bytes. {REMEDY}")
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file, strict=True))
-        tests = {}
-        for test, names in COLUMNS.items():
-            values = np.array([[float(row[name]) for name in names] for row in rows if row[names[0]]], float)
-            if len(values) < 3 or not np.isfinite(values).all() or not np.ptp(values, axis=0).all():
-                raise InputError(f"{test} needs 3 or more rows of finite numbers that are not all equal. {REMEDY}")
-            tests[test] = values[:, 0], 1e3 * values[:, 1]
+            reader = csv.DictReader(file, strict=True, skipinitialspace=True)
+            rows, found = list(reader), reader.fieldnames or ()
+        pairs = {test: [[row.get(name) for name in names] for row in rows] for test, names in COLUMNS.items()}
+        tests = {test: _read_test(test, cells) for test, cells in pairs.items() if any(map(all, cells))}
+        if not tests:
+            raise InputError(f"has no row of a test; its columns are {', '.join(found)[:80]}. {REMEDY}")
         return MeasuredTissue(path.stem, tests)
+
+
+def _read_test(test: str, cells: Sequence[Sequence[str | None]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return strains or stretches (n,) and stresses (n,) [Pa] of a test; rows with an empty cell are skipped."""
+    names, (low, high) = COLUMNS[test], RANGES[test]
+    try:
+        strain, stress = np.array([[float(cell or "") for cell in pair] for pair in cells if all(pair)]).T
+    except ValueError:
+        raise InputError(f"{' and '.join(names)} need numbers in both columns. {REMEDY}") from None
+    if len(strain) < 3 or not np.ptp(stress) > 0.0:
+        raise InputError(f"{names[1]} needs 3 or more rows with different numbers. {REMEDY}")
+    if not ((strain >= low) & (strain <= high)).all() or not (np.abs(stress) <= MAX_STRESS).all():
+        raise InputError(f"{test} has strains outside its range, or a stress above {MAX_STRESS:g} kPa. {REMEDY}")
+    if not (stress * (-1.0 if test == "compression" else 1.0)).sum() > 0.0:
+        raise InputError(f"{names[1]} has the wrong sign. {REMEDY}")
+    return strain, 1e3 * stress
 
 
 def compute_stresses(tissue: Material | Ogden, measured: MeasuredTissue) -> dict[str, np.ndarray]:
@@ -142,7 +173,9 @@ def fit_law(law: str, measured: MeasuredTissue) -> Material | Ogden:
     best = 2.0
     if law == Ogden.law:
         best = min(EXPONENTS, key=compute_misfit)
-        best = float(minimize_scalar(compute_misfit, bounds=(best - 0.9, best + 0.9), method="bounded").x)
+        bounds = max(best - 0.9, min(EXPONENTS)), min(best + 0.9, max(EXPONENTS))
+        found: Any = minimize_scalar(compute_misfit, bounds=bounds, method="bounded")
+        best = float(found.x)
     return build(fit(best)[0], best)
 
 
@@ -154,13 +187,15 @@ def compare_tissue(name: str, tissue: Material | Ogden, measured: MeasuredTissue
         r2[test] = float(1.0 - np.square(stress - known).sum() / np.square(known - known.mean()).sum())
         last = np.abs(known).argmax()
         error[test] = float(stress[last] / known[last] - 1.0)
-    return TissueFit(measured.name, name, str(tissue), r2, error)
+    alpha = tissue.terms[0][1] if isinstance(tissue, Ogden) and len(tissue.terms) == 1 else None
+    return TissueFit(measured.name, name, str(tissue), tissue.lame[0], alpha, r2, error)
 
 
 def list_tissues(measured: MeasuredTissue) -> dict[str, Material | Ogden]:
     """Return the fitted laws and the named tissues without relaxation, by the name of their row."""
     fitted = {f"{law}, fitted": fit_law(law, measured) for law in (*LAWS, Ogden.law)}
-    return {**fitted, **{name: replace(each.tissue, prony=()) for name, each in MATERIALS.items()}}
+    named = {name: replace(each.tissue, prony=()) for name, each in MATERIALS.items()}
+    return {**fitted, **{name: tissue for name, tissue in named.items() if name == "default" or tissue != BRAIN}}
 
 
 def write_tissue_report(folder: Path, measured: Sequence[MeasuredTissue]) -> tuple[TissueFit, ...]:
@@ -169,23 +204,27 @@ def write_tissue_report(folder: Path, measured: Sequence[MeasuredTissue]) -> tup
     for each in measured:
         tissues = list_tissues(each)
         own = [compare_tissue(name, tissue, each) for name, tissue in tissues.items()]
-        fitted = {name: compute_stresses(tissue, each) for name, tissue in tissues.items() if "fitted" in name}
+        drawn = [name for name in tissues if name in (*DRAWN, "default")]
+        found = {name: compute_stresses(tissues[name], each) for name in drawn}
         image, svg = draw_stress(
             {
-                test: (strain, {MEASURED: stress, **{name: curves[test] for name, curves in fitted.items()}})
+                test: (strain, {MEASURED: stress, **{name: curves[test] for name, curves in found.items()}})
                 for test, (strain, stress) in each.tests.items()
             }
         )
         write_png(folder / f"{each.name}.png", image)
-        heads = ("model", *(f"R2 {test}" for test in COLUMNS), *(f"error, {test}" for test in COLUMNS), "parameters")
-        lines = [
-            (
-                "front" if fit.is_good else "",
-                (fit.model, *(f"{value:.2f}" for value in fit.r2.values()),
-                 *(f"{value:+.0%}" for value in fit.error.values()), fit.tissue),
-            )
-            for fit in own
-        ]  # fmt: skip
+        heads = (
+            "model",
+            *(f"R2 {test}" for test in each.tests),
+            *(f"error, {test}" for test in each.tests),
+            "mu kPa",
+            "alpha",
+        )
+        lines = []
+        for fit in own:
+            figures = *(f"{value:.2f}" for value in fit.r2.values()), *(f"{value:+.0%}" for value in fit.error.values())
+            constants = f"{1e-3 * fit.mu:.3g}", "" if fit.alpha is None else f"{fit.alpha:.1f}"
+            lines.append(("front" if fit.is_good else "", (fit.model, *figures, *constants)))
         body.append(f"<h2>{escape(each.name)}</h2><figure class=chart>{svg}</figure>{format_table(heads, lines)}")
         fits += own
     with write_atomically(folder / "tissue.json", ".json") as partial:
