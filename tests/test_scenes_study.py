@@ -1,14 +1,11 @@
-"""Recorded time of a step: unknown if its file is damaged."""
+"""Study of a report."""
 
-import pytest
+from dataclasses import replace
 
-from scenes.report.study import note_seconds, read_noted_seconds
+from sim.accuracy import REFERENCE, TRAIN
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"seconds": "many"}', b"\xff"])
-def test_damaged_time_file_gives_unknown_seconds(tmp_path, content):
-    made = tmp_path / "made.npz"
-    note_seconds(made, 1.25)
-    assert read_noted_seconds(made) == 1.25
-    made.with_suffix(".json").write_bytes(content)
-    assert read_noted_seconds(made) is None
+def test_quick_and_thorough_references_are_not_confused(study):
+    quick, thorough = (replace(study, thorough=thorough) for thorough in (False, True))
+    assert (quick.reference_accuracy, thorough.reference_accuracy) == (TRAIN, REFERENCE)
+    assert quick.digest != thorough.digest and quick.digest == study.digest
