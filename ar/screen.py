@@ -186,7 +186,7 @@ def decode_labels(data: bytes, width: int, height: int) -> np.ndarray:
     return _decode_image(data, (height, width), cv2.IMREAD_UNCHANGED | IGNORE_ORIENTATION, np.uint8)
 
 
-def _decode_image(code: bytes, shape: tuple[int, ...], flag: int, kind: type) -> np.ndarray:
+def _decode_image(code: bytes, shape: tuple[int, ...], flag: int, dtype: type) -> np.ndarray:
     width, height = read_image_size(code)
     if (height, width) != shape[:2]:
         raise ValueError(f"it has {width} x {height} pixels in place of {shape[1]} x {shape[0]}")
@@ -196,7 +196,7 @@ def _decode_image(code: bytes, shape: tuple[int, ...], flag: int, kind: type) ->
         raise ValueError("it is damaged") from error
     if picture is None:
         raise ValueError("it is damaged")
-    if picture.shape != shape or picture.dtype != kind:
+    if picture.shape != shape or picture.dtype != dtype:
         channels = 1 if picture.ndim == 2 else picture.shape[2]
         raise ValueError(f"it has {channels} channels of {8 * picture.dtype.itemsize} bits")
     return picture

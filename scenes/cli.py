@@ -120,7 +120,7 @@ def limit_threads() -> None:
         os.environ.setdefault(name, str(min(MAX_THREADS, os.cpu_count() or 1)))
 
 
-def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+def make_parsers(*names: str | None) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
     """Return the parser of `sulcus`, and that of each command by name.
 
     Only the requested commands get arguments and examples.
@@ -131,7 +131,7 @@ def make_parsers(*asked: str | None) -> tuple[argparse.ArgumentParser, dict[str,
     for name, text in COMMANDS.items():
         command = commands.add_parser(name, description=text[0].upper() + text[1:] + ".")
         command.set_defaults(program=f"sulcus {name}")
-        if name in asked:
+        if name in names:
             command.epilog = format_guidance(name)
             importlib.import_module(f"scenes.commands.{name}").add_arguments(command)
             if name in MODEL_MAKING_COMMANDS + MODEL_READING_COMMANDS:

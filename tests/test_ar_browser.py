@@ -234,13 +234,13 @@ def test_slices_and_history_are_sent_together_at_limited_rate(page):
         drawn.append(number)
         return np.full((20, 60, 3), number, np.uint8), f"seconds of {number}"
 
-    page.show_beside(lambda: draw(1))
+    page.show_side_panels(lambda: draw(1))
     time.sleep(0.3)
     assert not drawn  # nobody looks
     visitor, begun = Visitor(page, 1200), time.monotonic()
     assert wait_for(lambda: page.visitors == 1)
     for number in range(40):
-        page.show_beside(lambda number=number: draw(number))
+        page.show_side_panels(lambda number=number: draw(number))
         time.sleep(0.02)
     assert wait_for(lambda: "seconds of 39" in page.beside.content)
     assert drawn[-1] == 39 and len(drawn) <= 2 + DEFAULT_LIMITS.slice_updates_per_second * (time.monotonic() - begun)

@@ -307,13 +307,13 @@ def test_rolling_shutter_increases_tracking_error_on_video(player):
     )
     known, all_known = None, []
     for shot in shots:
-        known = follower.step(cv2.cvtColor(shot.image, cv2.COLOR_RGB2GRAY), shot.time, known)
+        known = follower.track(cv2.cvtColor(shot.image, cv2.COLOR_RGB2GRAY), shot.time, known)
         all_known.append(known)
     # How the camera moves is not known from one picture.
     assert all_known[0].state is TumourState.UNSURE and "rolling shutter" in all_known[0].warning
     assert all(each.is_reliable and each.sources["shutter"] > 0.0 for each in all_known[1:])
     at_once = replace(follower, calibration=replace(calibration, readout=0.0))
-    alike = at_once.step(cv2.cvtColor(shots[1].image, cv2.COLOR_RGB2GRAY), shots[1].time)
+    alike = at_once.track(cv2.cvtColor(shots[1].image, cv2.COLOR_RGB2GRAY), shots[1].time)
     assert alike.is_reliable and "shutter" not in alike.sources
     assert all_known[1].bound > 1.5 * alike.bound
     # A hand that was fast a moment ago may be again.

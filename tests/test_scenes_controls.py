@@ -70,11 +70,11 @@ class TestControls:
         assert isinstance(tilt, Slider) and isinstance(distance, Slider) and distance.initial == 300.0
         tilt.on_change(20.0)
         distance.on_change(200.0)
-        assert asks.look == ("window", "orbit", TIP, pytest.approx(-np.radians(20.0)), pytest.approx(0.2), None)
+        assert asks.display == ("window", "orbit", TIP, pytest.approx(-np.radians(20.0)), pytest.approx(0.2), None)
         registration = cast(Dropdown, found["registration"])
         assert registration.options == ("perfect registration", "clinical registration, 1.6 mm per axis")
         registration.on_change(registration.options[1])
-        assert registration.initial == registration.options[0] and asks.look.registration == "clinical"
+        assert registration.initial == registration.options[0] and asks.display.registration == "clinical"
         assert "slices" not in {
             each.label for each in build_controls(sinking(), theatre.site, ("fem",), asks, *ACTIONS)
         }
@@ -89,13 +89,13 @@ class TestControls:
 class TestHand:
     def test_manual_control_pauses_the_script_until_play(self):
         wish = Requests("svr", Touch())
-        wish.take_over(force=0.2)
+        wish.set_manual_input(force=0.2)
         assert not wish.plays and wish.read_current()[2] == Touch(force=0.2)
         wish.play(True)
         assert wish.plays and wish.read_current()[2] is None
 
     def test_manual_tool_is_kept_during_play_of_timed_scene(self):
         wish = Requests("fem", Touch(), clocked=True)
-        wish.take_over(depth=1e-3)
+        wish.set_manual_input(depth=1e-3)
         wish.play(True)
         assert wish.plays and wish.read_current()[2] == Touch(depth=1e-3)

@@ -253,7 +253,7 @@ def test_demo_reports_a_running_long_solve(demo, monkeypatch):
 
     monkeypatch.setattr(Learned, "deform", slow)
     demo.wish.set(plays=False)
-    demo.wish.take_over(force=0.2)
+    demo.wish.set_manual_input(force=0.2)
     demo.run(0.2)
     assert said[0].startswith("computing the deformation for the manual tool, 0.20 N (fast model (linear))")
     assert said[-1] == ""

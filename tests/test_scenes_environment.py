@@ -80,10 +80,10 @@ def test_vector_environment_equals_gymnasium_sync_vector():
     ],
 )
 def test_environment_rejects_invalid_options(given, said):
-    from scenes.gym.environment import Operation
+    from scenes.gym.environment import SurgeryEnv
 
     with pytest.raises(InputError, match=said.replace("(", r"\(")):
-        Operation(**({"device": "cpu", "size": SIZE} | given))
+        SurgeryEnv(**({"device": "cpu", "size": SIZE} | given))
 
 
 def test_environment_rejects_invalid_actions_and_reset_options():

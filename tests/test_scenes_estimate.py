@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scenes.episodes.estimate import compute_estimate, format_estimate
-from scenes.episodes.rates import Rate, read_rates, write_rates
+from scenes.episodes.rates import TaskRate, read_rates, write_rates
 from scenes.episodes.tasks import TaskOutcome
 from sim.errors import InputError
 
@@ -21,7 +21,7 @@ def test_run_time_is_estimated_from_measured_rates(tmp_path):
     with next((tmp_path / "rates").glob("*.csv")).open("a") as file:
         file.write("episode,7,100,50")  # torn by a kill
     rates = read_rates(tmp_path)
-    assert len(rates) == 5 and rates[4] == Rate("body", 0, 0, 2000, 60.0, "process")
+    assert len(rates) == 5 and rates[4] == TaskRate("body", 0, 0, 2000, 60.0, "process")
     found = compute_estimate(rates, 1000, 10)
     assert found.seconds.mean == 12_000 + 600 and found.bytes.mean == 5_000_000 + 20_000
     assert found.frames.mean == 100_000 and found.frames.error == 0.0 and np.isnan(found.seconds.error)
@@ -40,7 +40,7 @@ def test_run_time_is_estimated_from_measured_rates(tmp_path):
     assert "time of 1 process      9.89 ± " in text  # hours: 35 s of each, and 60 s of each body
     more = [
         *rates[1:4],
-        *(Rate("episode", number, 100, 5000, seconds, "body") for number, seconds in ((4, 15), (5, 17))),
+        *(TaskRate("episode", number, 100, 5000, seconds, "body") for number, seconds in ((4, 15), (5, 17))),
     ]
     one = compute_estimate(more, 1000, 10)
     assert one.start.mean == one.start.error == 28.0 and one.opening.mean == 4.0  # of one process alone

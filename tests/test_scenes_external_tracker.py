@@ -207,7 +207,7 @@ def test_image_without_external_poses_is_stale(follower, bodies):
     for each in read_timed_images(read_video(FILM / "film.mp4", 30.0)):
         if each.source.time > 0.9:
             break
-        known = one.step(each.source.grey, each.source.time, known)
+        known = one.track(each.source.grey, each.source.time, known)
         said.append((known.state, known.warning))
     assert [state for state, _ in said[:4]] == [TumourState.REST] * 4
     assert said[5] == (TumourState.NO_TOOL, "tool stale, no pose for 0.2 s: the tumour as 0.3 s ago")
@@ -221,7 +221,7 @@ def followed(follower, other, until=1.0):
     for each in read_timed_images(read_video(FILM / "film.mp4", 30.0)):
         if each.source.time > until:
             break
-        known = one.step(each.source.grey, each.source.time, known)
+        known = one.track(each.source.grey, each.source.time, known)
         out.append(known)
     return [known for known in out if known.state is not TumourState.NO_REFERENCE]
 
@@ -350,13 +350,12 @@ def test_overlay_command_estimates_clock_of_pose_files(bodies, tmp_path, capsys)
 
 def test_calibration_error_in_band_unless_cancelled_by_reference(follower, stage, tmp_path):
     follower = replace(follower, motion=replace(follower.motion, deformer=Still()))
-    first, deviations = (
-        next(iter(read_video(FILM / "film.mp4", 30.0))),
-        np.array([2, 2, 2, 2, 5e-3, 0.05, 3e-4, 3e-4, 0.1]),
-    )
+    first = next(iter(read_video(FILM / "film.mp4", 30.0)))
+    deviations = np.array([2, 2, 2, 2, 5e-3, 0.05, 3e-4, 3e-4, 0.1])
     stored = {"format": "sulcus intrinsics 1", "covariance": np.diag(deviations**2).tolist()}
     (tmp_path / "k.json").write_text(json.dumps(stored))
-    known = replace(follower, intrinsic_covariance=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
+    calibrated = replace(follower, intrinsic_covariance=read_intrinsic_covariance(tmp_path / "k.yaml"))
+    known = calibrated.track(first.grey, 0.0)
     rng, off = np.random.default_rng(0), []
     reference = known.targets.poses["patient"].T_camera_target
     corners = build_patient_reference().faces[0].corners
@@ -378,12 +377,13 @@ def test_calibration_error_in_band_unless_cancelled_by_reference(follower, stage
     assert known.sources["camera"] == pytest.approx(
         2.448 * np.linalg.svd(np.cov(np.transpose(off)))[1][0] ** 0.5, rel=0.25
     )
-    bare = follower.step(first.grey, 0.0)
+    bare = follower.track(first.grey, 0.0)
     assert known.bound > known.sources["camera"] > 1e-4 and "camera" not in bare.sources
     assert format_top_lines(bare)[-1].startswith("error by tissue, camera and segmentation: not known")
     assert format_top_lines(known)[-1].startswith("error by tissue and segmentation: not known")
     write_exact_intrinsics(tmp_path / "k.json", follower.calibration)
-    exact = replace(follower, intrinsic_covariance=read_intrinsic_covariance(tmp_path / "k.yaml")).step(first.grey, 0.0)
+    calibrated = replace(follower, intrinsic_covariance=read_intrinsic_covariance(tmp_path / "k.yaml"))
+    exact = calibrated.track(first.grey, 0.0)
     assert exact.sources["camera"] == 0.0 and exact.bound == pytest.approx(bare.bound)
     assert "The camera is reported to be exactly known." in format_overlay_error(exact)
     (tmp_path / "k.json").write_text(json.dumps(stored | {"covariance": [[1.0]]}))

@@ -26,7 +26,7 @@ def test_uncertain_registration_is_in_band_up_to_limit(follower):
     for shift, state in ((1e-3, TumourState.REST), (3e-3, TumourState.UNSURE)):
         covariance = np.diag(np.repeat([shift**2, 0.0], 3))
         other = replace(follower, registration=replace(follower.registration, covariance=covariance))
-        known = other.step(first.grey, 0.0)
+        known = other.track(first.grey, 0.0)
         assert known.state is state and known.sources["registration"] == pytest.approx(2.448 * shift, rel=1e-3)
         assert known.bound == pytest.approx(2.448 * shift, rel=0.02)
         assert ("do not rely" in known.warning) is (state is TumourState.UNSURE)
@@ -35,46 +35,46 @@ def test_uncertain_registration_is_in_band_up_to_limit(follower):
 def test_registration_without_anatomy_is_not_reliable(follower):
     first = next(iter(pictures())).source
     other = replace(follower, registration=replace(follower.registration, scan=None))
-    known = other.step(first.grey, 0.0)
+    known = other.track(first.grey, 0.0)
     assert known.state is TumourState.UNSURE and "not checked whose registration" in known.warning
-    assert known.bound == follower.step(first.grey, 0.0).bound
+    assert known.bound == follower.track(first.grey, 0.0).bound
 
 
 def test_repeated_image_or_stopped_camera_is_stale(follower):
     few = [each.source for each in islice(pictures(), 2)]
-    known = follower.step(few[0].grey, 0.0)
-    assert follower.step(few[0].grey, 0.0, known).warning.startswith("stale, the camera repeats an image")
-    assert follower.step(few[1].grey, 0.5, replace(known, interval=0.1)).state is TumourState.STALE
-    assert follower.step(few[1].grey, 0.1, known).state is TumourState.REST
+    known = follower.track(few[0].grey, 0.0)
+    assert follower.track(few[0].grey, 0.0, known).warning.startswith("stale, the camera repeats an image")
+    assert follower.track(few[1].grey, 0.5, replace(known, interval=0.1)).state is TumourState.STALE
+    assert follower.track(few[1].grey, 0.1, known).state is TumourState.REST
     old = mark_stale(known, 0.5)
     assert old.state is TumourState.STALE and "0.5 s old" in old.warning and mark_stale(known, 0.1) is known
 
 
 def test_reference_never_detected_gives_no_overlay(follower, stage):
     blank = np.full((720, 960, 3), 120, np.uint8)
-    known = follower.step(blank[..., 0], 0.0)
+    known = follower.track(blank[..., 0], 0.0)
     assert known.state is TumourState.NO_REFERENCE and known.camera is None and "not seen yet" in known.warning
     painted = Painter(stage).paint(blank, known).colour
     foot = painted[600:]
     assert np.array_equal(painted[:600], blank[:600]) and not np.array_equal(foot, blank[600:])
-    seen = follower.step(next(iter(pictures())).source.grey, 0.0)
+    seen = follower.track(next(iter(pictures())).source.grey, 0.0)
     hold = FollowerSettings().hold_time
-    frozen, gone = (follower.step(blank[..., 0], time, seen) for time in (hold, hold + 0.01))
+    frozen, gone = (follower.track(blank[..., 0], time, seen) for time in (hold, hold + 0.01))
     assert frozen.camera is seen.camera and frozen.warning == "reference lost: drawn where it was"
     assert frozen.bound is None and not frozen.is_reliable and gone.camera is None  # no band of a frozen overlay
     with pytest.raises(ValueError, match="calibrate it at this size"):
-        follower.step(blank[::2, ::2, 0], 0.0)
+        follower.track(blank[::2, ::2, 0], 0.0)
 
 
 def test_slow_video_is_stale_at_missing_images_only(follower):
     blank, known, states = np.full((720, 960), 120, np.uint8), None, []
     first = next(iter(pictures())).source.grey
     for moment in (0.0, 0.3, 0.6, 0.9, 1.8, 2.1):
-        known = follower.step(first, moment, known)
+        known = follower.track(first, moment, known)
         states.append(known.state)
     assert [each is TumourState.STALE for each in states] == [False, False, False, False, True, False]
-    assert follower.step(blank, 2.4, known).state is TumourState.NO_REFERENCE
-    assert follower.step(first, 1.5).interval == follower.step(first, 4.0, follower.step(first, 1.5)).interval == 1.0
+    assert follower.track(blank, 2.4, known).state is TumourState.NO_REFERENCE
+    assert follower.track(first, 1.5).interval == follower.track(first, 4.0, follower.track(first, 1.5)).interval == 1.0
 
 
 PARTS = np.array([1e-3, 2e-3, 3e-3])
@@ -105,7 +105,7 @@ def looking(motion, **given):
     vars(follower)["tracker"] = SimpleNamespace(track=lambda grey, before: seen[int(grey[0, 0])])
     known = [None]
     for number in range(len(motion)):
-        known.append(follower.step(np.full((1, 1), number, np.uint8), 0.04 * number, known[-1]))
+        known.append(follower.track(np.full((1, 1), number, np.uint8), 0.04 * number, known[-1]))
     return follower, known[1:]
 
 

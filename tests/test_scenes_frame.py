@@ -22,7 +22,7 @@ from scenes.play.player import Player
 
 
 def test_benchmark_draws_and_sends_each_frame_once(box, monkeypatch):
-    drawn, sent, play, put_sight = [], [], Player.draw_frame, Browser.put_sight
+    drawn, sent, play, send_image_element = [], [], Player.draw_frame, Browser.send_image_element
 
     def seen(player, number, *rest):
         drawn.append(number)
@@ -30,10 +30,10 @@ def test_benchmark_draws_and_sends_each_frame_once(box, monkeypatch):
 
     def heard(page, code, words):
         sent.append((code, words))
-        put_sight(page, code, words)
+        send_image_element(page, code, words)
 
     monkeypatch.setattr(Player, "draw_frame", seen)
-    monkeypatch.setattr(Browser, "put_sight", heard)
+    monkeypatch.setattr(Browser, "send_image_element", heard)
     player = theatre_of(box).build_player("linear", short())
     found = list(time_frames(player, 4))
     assert len(found) == 4 and all(len(row) == len(STAGES) and min(row) > 0.0 for row in found)

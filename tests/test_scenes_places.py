@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scenes.cli import main
-from scenes.warp.deformed_anatomy import Cause, DeformedAnatomy
+from scenes.warp.deformed_anatomy import DeformationCause, DeformedAnatomy
 from scenes.warp.landmarks import list_landmarks
 from scenes.warp.places import MIN_SPACING, SpacingSettings, compute_fields, find_finer_spacing, find_folds, list_points
 from sim.anatomy import NECROSIS_LABEL, TUMOUR_LABEL
@@ -18,7 +18,7 @@ from sim.geometry.tetmesh import compute_signed_volumes
 
 
 def choose_moment(body, displacement):
-    return DeformedAnatomy(Cause("a test", {}), body, body, displacement)
+    return DeformedAnatomy(DeformationCause("a test", {}), body, body, displacement)
 
 
 @pytest.fixture(scope="module")

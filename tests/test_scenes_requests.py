@@ -40,9 +40,9 @@ class TestWish:
     def test_manual_control_keeps_unchanged_values(self):
         wish = Requests("linear", Touch(force=0.1))
         assert wish.read_current()[2] is None
-        wish.take_over(x=0.01)
+        wish.set_manual_input(x=0.01)
         assert wish.read_current()[2] == Touch(x=0.01, force=0.1)
-        wish.take_over(force=0.3)
+        wish.set_manual_input(force=0.3)
         assert wish.read_current()[2] == Touch(x=0.01, force=0.3)
         wish.set(tool=SCRIPT, deformer="fem")
         assert wish.read_current()[1:3] == ("fem", None)
@@ -50,7 +50,7 @@ class TestWish:
     def test_simultaneous_slider_changes_are_both_applied(self):
         """The page calls each slider in its own thread."""
         wish = Requests("linear", Touch(force=0.1))
-        hands = [threading.Thread(target=wish.take_over, kwargs=turn) for turn in ({"right": 0.2}, {"up": -0.3})]
+        hands = [threading.Thread(target=wish.set_manual_input, args=turn) for turn in ((0.2,), (None, -0.3))]
         with wish.lock:  # both are under way before either is heard
             for hand in hands:
                 hand.start()

@@ -57,7 +57,7 @@ def test_frozen_overlay_is_hidden_by_the_mask(parts):
     follower, painter = parts
     (shown,) = draw_overlays(read_timed_images(film(1)), follower, painter)
     blank = np.full(shown.image.shape, 120, np.uint8)
-    lost = follower.step(blank[..., 0], 0.1, shown.result)
+    lost = follower.track(blank[..., 0], 0.1, shown.result)
     covered = np.zeros(blank.shape[:2], bool)
     covered[:600] = True
     assert (painter.paint(blank, lost).colour[:600] != 120).any()

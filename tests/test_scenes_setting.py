@@ -10,7 +10,7 @@ from programs import main
 from theatres import put, theatre_of
 
 from scenes.gym.episode import REWARD, EpisodeScore, compute_reward
-from scenes.gym.model_responses import PressedModel
+from scenes.gym.model_responses import PushSurrogate
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT
 from scenes.play.deformers import to_model_path
@@ -74,7 +74,7 @@ def stiff(box, tmp_path_factory):
 
 def test_task_uses_the_tissue_of_the_models(stiff):
     setting = open_setting(PALPATE, str(stiff), "auto", "cpu", SIZE)
-    assert isinstance(setting.tissue_model, PressedModel) and setting.scene.elasticity == STIFF
+    assert isinstance(setting.tissue_model, PushSurrogate) and setting.scene.elasticity == STIFF
     assert setting.tissue_model.ball.tissue == BRAIN  # which lies over the tumour
     exact = open_setting(DEBULK, str(stiff), "auto", "cpu", SIZE)  # drained brain: as many times as stiff
     assert exact.scene.elasticity.get_law(TUMOUR_LABEL) == replace(MATERIALS["drained"].tissue, young=6300.0)

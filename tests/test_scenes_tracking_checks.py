@@ -36,24 +36,24 @@ def made(kind, whole):
 class Sure(Follower):
     """Says that it knows the tumour's place while reference or tool are lost."""
 
-    def step(self, grey, time, before=None):
-        known = super().step(grey, time, before)
+    def track(self, grey, time, before=None):
+        known = super().track(grey, time, before)
         return as_known(known) if known.state in (TumourState.NO_REFERENCE, TumourState.NO_TOOL) else known
 
 
 class Blind(Follower):
     """Finds nothing again that it lost."""
 
-    def step(self, grey, time, before=None):
+    def track(self, grey, time, before=None):
         lost = before is not None and before.state is TumourState.NO_REFERENCE
-        return super().step(np.full_like(grey, 120) if lost else grey, time, before)
+        return super().track(np.full_like(grey, 120) if lost else grey, time, before)
 
 
 class Frozen(Follower):
     """Goes on with the camera of the first picture."""
 
-    def step(self, grey, time, before=None):
-        known = super().step(grey, time, before)
+    def track(self, grey, time, before=None):
+        known = super().track(grey, time, before)
         return known if before is None or before.camera is None else replace(known, camera=before.camera)
 
 

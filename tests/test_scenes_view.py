@@ -39,7 +39,7 @@ def test_comparison_of_previous_load_is_greyed_until_new_one(demo, monkeypatch):
     monkeypatch.setattr(demo.browser, "tint", lambda name, colour: tints.append(colour))
     asked = []
     monkeypatch.setattr(demo.fem_worker, "request_frame", lambda *request: asked.append(request[:2]))
-    demo.wish.take_over(x=0.004, force=0.25)
+    demo.wish.set_manual_input(x=0.004, force=0.25)
     demo.run(0.5)
     assert wait_for(lambda: "force 0.25 N" in report(demo))
     said = demo.browser.shown[2]

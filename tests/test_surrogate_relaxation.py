@@ -20,7 +20,7 @@ from sim.tools import Ball
 from surrogate.data.cortex_patch import open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import compute_tool_features
-from surrogate.data.indentation import Relaxing, add_relaxation, get_poses, get_relaxation, to_indentation
+from surrogate.data.indentation import RelaxingPushes, add_relaxation, get_poses, get_relaxation, to_indentation
 from surrogate.data.load_histories import APPROACH_TIME, HISTORY, read_prony_series, sample_times
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import draw_poses
@@ -173,7 +173,7 @@ def test_pose_features_end_with_the_relaxed_share(box):
     pushed = to_indentation(draw_poses("palpation", box, 2, 0, BALL), BALL, open_patch(box))
     assert get_relaxation(pushed) is None
     known = add_relaxation(pushed, np.array([0.1, 0.2]))
-    assert isinstance(known, Relaxing)
+    assert isinstance(known, RelaxingPushes)
     np.testing.assert_array_equal(get_relaxation(known), [0.1, 0.2])
 
 

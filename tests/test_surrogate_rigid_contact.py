@@ -19,7 +19,7 @@ from sim.tools import Ball, BuiltIn, Capsule, Spatula, compute_distances, get_co
 from surrogate.data.cortex_patch import build_barycentric_lattice, open_patch
 from surrogate.data.dataset import read_dataset
 from surrogate.data.encode import Basis, compute_core_features, compute_tool_features
-from surrogate.data.indentation import Indented, get_poses, to_indentation
+from surrogate.data.indentation import IndentationPushes, get_poses, to_indentation
 from surrogate.data.simulate import simulate
 from surrogate.data.tool_poses import ToolPoseSettings, draw_poses
 from surrogate.evaluation.score import compute_point_errors
@@ -41,9 +41,9 @@ def condensed_box(box: Anatomy, tool: BuiltIn | None) -> tuple[RigidContact, lis
     return condense_contact(fem, [box.tumour_nodes, np.setdiff1d(open_patch(box).nodes, box.tumour_nodes)], tool)
 
 
-def asked(box: Anatomy, loads: Loads, tool: BuiltIn) -> Indented:
+def asked(box: Anatomy, loads: Loads, tool: BuiltIn) -> IndentationPushes:
     found = to_indentation(loads, tool, open_patch(box))
-    assert isinstance(found, Indented)
+    assert isinstance(found, IndentationPushes)
     return found
 
 

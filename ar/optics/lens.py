@@ -90,7 +90,7 @@ class Lens:
         """Map distorted positions (..., 2) to undistorted ones by Newton's method; NaN if there are none in `reach`."""
         places = np.asarray(places, np.float64)
         wanted = places.reshape(-1, 2).T
-        _, moved = self._along
+        _, moved = self._distorted_radii
         # Upper bound of positions with the tangential part.
         far = moved[-1] + 3.0 * (abs(self.p1) + abs(self.p2)) * self.reach**2
         near = np.flatnonzero(np.hypot(*wanted) <= far)
@@ -99,15 +99,15 @@ class Lens:
             out[:, part] = self._undistort_points(wanted[:, part])
         return out.T.reshape(places.shape)
 
-    def _undistort_points(self, wanted: np.ndarray) -> np.ndarray:
+    def _undistort_points(self, distorted: np.ndarray) -> np.ndarray:
         """Undistort normalised positions (2, n); return (2, n), NaN where Newton's method fails."""
-        far = np.hypot(*wanted)
+        far = np.hypot(*distorted)
         # Start: without its tangential part the lens moves positions along rays.
-        radii, moved = self._along
-        x, y = np.interp(far, moved, radii) / np.where(far > 0.0, far, 1.0) * wanted
+        radii, moved = self._distorted_radii
+        x, y = np.interp(far, moved, radii) / np.where(far > 0.0, far, 1.0) * distorted
         for _ in range(MAX_NEWTON_ITERATIONS):
             at = self._apply_distortion(x, y)
-            off_x, off_y = at[0] - wanted[0], at[1] - wanted[1]
+            off_x, off_y = at[0] - distorted[0], at[1] - distorted[1]
             if max(np.abs(off_x).max(initial=0.0), np.abs(off_y).max(initial=0.0)) <= NEWTON_TOLERANCE:
                 break
             a, b, c = self._compute_slopes(x, y)
@@ -117,11 +117,11 @@ class Lens:
             back = np.minimum(1.0, self.reach / np.maximum(np.hypot(x, y), self.reach))
             x, y = back * x, back * y
         at = self._apply_distortion(x, y)
-        found = np.hypot(at[0] - wanted[0], at[1] - wanted[1]) < 1e3 * NEWTON_TOLERANCE
+        found = np.hypot(at[0] - distorted[0], at[1] - distorted[1]) < 1e3 * NEWTON_TOLERANCE
         return np.where(found, (x, y), np.nan)
 
     @cached_property
-    def _along(self) -> tuple[np.ndarray, np.ndarray]:
+    def _distorted_radii(self) -> tuple[np.ndarray, np.ndarray]:
         """Distances from the axis, undistorted and distorted (tangential part excluded), both ascending."""
         radii = np.linspace(0.0, self.reach, RADIUS_COUNT)
         moved = radii * self._compute_radial(radii**2)[0]

@@ -162,7 +162,7 @@ def composite(
     >>> overlay.colour.shape, bool(overlay.taken.any())
     ((480, 640, 3), True)
     """
-    _check(picture, camera, style, cover.occluder_mask)
+    _check_inputs(picture, camera, style, cover.occluder_mask)
     if style == "none":
         plain = Overlaid(picture.colour.copy(), np.zeros((camera.height, camera.width), np.uint8))
         write_header(plain, words.header)
@@ -182,7 +182,7 @@ def composite(
     surfaces = [layer.vertices for layer in (hidden, grown, marks.initial) if layer is not None]
     surfaces += [trace.layer.vertices for trace in marks.outlines]
     box = find_pixel_box(camera, np.concatenate([*surfaces, measure.extent]))
-    sketch = _draw_sketch(measure, grown, marks, cover.opening, bool(words.warning), box)
+    sketch = _draw_lines(measure, grown, marks, cover.opening, bool(words.warning), box)
     motion = "" if box is None or marks.initial is None else _describe_motion(hidden, marks.initial, words)
     drawn = _write_lines(sketch, camera, words, motion)
     if marks.gauge is None and cover.opening is None and style not in ("depth", "rings", "cut"):
@@ -190,11 +190,11 @@ def composite(
     return _write_labels(drawn, sketch, measure, list_legend_entries(hidden, grown, marks, words))
 
 
-def _draw_sketch(
-    measure: Measurement, grown: Layer | None, marks: Marks, opening: Opening | None, doubtful: bool,
+def _draw_lines(
+    measure: Measurement, margin_layer: Layer | None, marks: Marks, opening: Opening | None, unreliable: bool,
     box: tuple[slice, slice] | None,
 ) -> LineDrawing:  # fmt: skip
-    """Draw all lines of a style; `grown` is the surface with its margin, and `box` contains the surfaces."""
+    """Draw all lines of a style; `margin_layer` is the surface with its margin, and `box` contains the surfaces."""
     picture, camera, hidden, style, gauge = measure.image, measure.camera, measure.layer, measure.style, marks.gauge
     shape = camera.height, camera.width
     taken, faint, thin = np.zeros(shape, np.uint8), np.zeros(shape, bool), np.zeros(shape, bool)
@@ -207,9 +207,9 @@ def _draw_sketch(
     under, above, ground, front = allocate_canvas(part), None, None, None
     if marks.initial is not None:
         draw_motion(under, camera, around, marks.initial, hidden)
-    if grown is not None:
+    if margin_layer is not None:
         bare = under[..., 3] == 0
-        wider = rasterise_surface(part, grown.vertices, grown.triangles, device=device).mask
+        wider = rasterise_surface(part, margin_layer.vertices, margin_layer.triangles, device=device).mask
         draw_dashes(under, find_outlines(wider), tint_margin(hidden), MARGIN_STROKES, 1)
         faint[around] = bare & (under[..., 3] > 0)
     if opening is not None:
@@ -219,7 +219,7 @@ def _draw_sketch(
             front &= ~measure.roles.occluder_mask[around]
     for trace in marks.outlines:
         draw_outline(under, part, trace)
-    draw_broken_outline(under, found, average_colour(hidden.colour), ground, doubtful)
+    draw_broken_outline(under, found, average_colour(hidden.colour), ground, unreliable)
     if gauge is not None or style == "cut":
         above = allocate_canvas(part)
     if gauge is not None and above is not None:
@@ -229,40 +229,40 @@ def _draw_sketch(
     measure.draw(under, under if above is None else above, around)
     if style == "rings":
         thin[around] = remove_labels(bare & (under[..., 3] > 0))
-    lines = OverlayLines(average_colour(hidden.colour), not doubtful, under, above)
+    lines = OverlayLines(average_colour(hidden.colour), not unreliable, under, above)
     out, taken[around] = draw_overlay(picture.drawn, around, part, hidden, found, measure.roles, style, lines)
     if front is not None and crossing is not None:
-        if not doubtful:
+        if not unreliable:
             pieces = clip_to_mask(find_outlines(found.mask), front)
             draw_dashes(crossing, pieces, lines.colour, HIDDEN_STROKES, HIDDEN_LINE_WIDTH)
         blend_canvas(out[around], crossing, front)
     return LineDrawing(out, taken, faint, thin, around, ground)
 
 
-def _describe_motion(hidden: Layer, before: Layer, words: ImageText) -> str:
-    """Describe the surface's mean motion, or the motion given in `words`."""
-    mean = float(np.linalg.norm(hidden.vertices - before.vertices, axis=1).mean())
-    return f"{words.legend.motion} {format_millimetres(*((mean, None) if words.motion is None else words.motion))}"
+def _describe_motion(layer: Layer, initial: Layer, text: ImageText) -> str:
+    """Describe the surface's mean motion, or the motion given in `text`."""
+    mean = float(np.linalg.norm(layer.vertices - initial.vertices, axis=1).mean())
+    return f"{text.legend.motion} {format_millimetres(*((mean, None) if text.motion is None else text.motion))}"
 
 
-def _write_lines(sketch: LineDrawing, camera: Camera, words: ImageText, motion: str) -> Overlaid:
+def _write_lines(sketch: LineDrawing, camera: Camera, text: ImageText, motion: str) -> Overlaid:
     """Write the header, the motion and the warning; return the image.
 
     Texts at the top and in the corners are placed first, so that they seldom move; other texts follow by importance.
     """
     drawn = Overlaid(sketch.colour, sketch.occupied.copy())
-    write_header(drawn, words.header)
+    write_header(drawn, text.header)
     if motion:
         firm = drawn.taken * ~sketch.margin_lines  # without the margin's line, so that the text does not move
         place_text(drawn.colour, firm, wrap_line(motion, MAX_BOTTOM_WIDTH * camera.width), (0, camera.height))
         np.bitwise_or(drawn.taken, firm, out=drawn.taken)
-    write_warning(drawn, words.warning)
+    write_warning(drawn, text.warning)
     return drawn
 
 
-def _write_labels(drawn: Overlaid, sketch: LineDrawing, measure: Measurement, keys: Sequence[LegendEntry]) -> Overlaid:
+def _write_labels(image: Overlaid, sketch: LineDrawing, measure: Measurement, keys: Sequence[LegendEntry]) -> Overlaid:
     """Write the tip's distance, the label of closed ground, the style's text and the legend; return the image."""
-    out, taken = drawn.colour, drawn.taken
+    out, taken = image.colour, image.taken
     whole = measure.roles.read_roles(measure.image.segmentation)
     front = (whole == FRONT).view(np.uint8)
     apart = np.zeros_like(taken)
@@ -275,17 +275,17 @@ def _write_labels(drawn: Overlaid, sketch: LineDrawing, measure: Measurement, ke
     ground, around = sketch.ground, sketch.box
     if ground is None or around is None:
         measure.draw_insets(out, taken, front, front)
-        return drawn
-    write_ground_label(drawn, around, ground, front, sketch.occupied)
+        return image
+    write_ground_label(image, around, ground, front, sketch.occupied)
     sights = (whole != CLOSED_GROUND).view(np.uint8)
     needed = front.copy()
     for each in (sights, needed):
         each[around] |= ground.silhouette
     measure.draw_insets(out, taken, sights | apart, needed)
-    return replace(drawn, named=bool(keys) and place_inset(out, taken, draw_legend(keys), sights))
+    return replace(image, named=bool(keys) and place_inset(out, taken, draw_legend(keys), sights))
 
 
-def _check(picture: Picture, camera: Camera, style: str, covered: np.ndarray | None) -> None:
+def _check_inputs(picture: Picture, camera: Camera, style: str, covered: np.ndarray | None) -> None:
     """Raise ValueError for an unknown style, or a camera or mask of another size than the image."""
     if style not in STYLES:
         raise ValueError(f"there is no overlay style {style!r}: choose one of {', '.join(STYLES)}.")
@@ -347,9 +347,9 @@ def draw_points(overlay: Overlaid, camera: Camera, points: np.ndarray, mask: np.
 
 
 def write_ground_label(
-    overlay: Overlaid, box: tuple[slice, slice], ground: Ground, front: np.ndarray, lines_there: np.ndarray
+    overlay: Overlaid, box: tuple[slice, slice], ground: Ground, front: np.ndarray, lines_mask: np.ndarray
 ) -> None:
-    """Write the label of closed ground over the surface, in place; `front` and `lines_there` are as in `Hideable`."""
+    """Write the label of closed ground over the surface, in place; `front` and `lines_mask` are as in `Hideable`."""
     if not ground.label:
         return
     there = cv2.moments((ground.silhouette & ground.opaque).view(np.uint8), binaryImage=True)
@@ -357,7 +357,7 @@ def write_ground_label(
     wide = max(cv2.getTextSize(line, FONT, TEXT_SCALE, 1)[0][0] for line in lines)
     column, row = there["m10"] / there["m00"] + box[1].start, there["m01"] / there["m00"] + box[0].start
     wish = round(column - wide / 2), round(row - LINE_SPACING * len(lines) / 2)
-    place_text(overlay.colour, overlay.taken, lines, wish, TEXT_SCALE, force=True, parts=Hideable(front, lines_there))
+    place_text(overlay.colour, overlay.taken, lines, wish, TEXT_SCALE, force=True, parts=Hideable(front, lines_mask))
 
 
 def wrap_label(label: str) -> list[str]:

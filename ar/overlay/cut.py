@@ -148,10 +148,10 @@ def add_caption(inset: np.ndarray, lines: list[str]) -> np.ndarray:
 
 
 def _compute_frame(
-    plane: CutPlane, hidden: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
+    plane: CutPlane, layer: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
 ) -> tuple[np.ndarray, float]:
     """Compute the plane coordinates (2,) [m] of the inset's upper left corner, and its scale [pixel/m]."""
-    places = plane.to_plane(hidden.vertices)
+    places = plane.to_plane(layer.vertices)
     held = [places.min(axis=0) - SURFACE_MARGIN, places.max(axis=0) + SURFACE_MARGIN]
     near = surface[(surface[:, 0] > held[0][0]) & (surface[:, 0] < held[1][0])]
     held += [near.min(axis=0) - TOP_MARGIN] if len(near) else []
@@ -161,14 +161,14 @@ def _compute_frame(
     return 0.5 * (low + high) - 0.5 * np.array(size) / scale, scale
 
 
-def _write_bands(out: np.ndarray, distance: np.ndarray, places: np.ndarray, surface: np.ndarray) -> None:
+def _write_bands(image: np.ndarray, distance: np.ndarray, positions: np.ndarray, surface: np.ndarray) -> None:
     """Write the distances [mm] at the borders of tones, near the centre row, on the side with more tissue; in place."""
-    middle, wide = int(np.abs(places[:, 0, 1]).argmin()), out.shape[1]
+    middle, wide = int(np.abs(positions[:, 0, 1]).argmin()), image.shape[1]
     for step in (1, 2, 3):
-        row = min(max(middle + (step - 2) * INSET_LINE_SPACING, 0), len(out) - 1)
+        row = min(max(middle + (step - 2) * INSET_LINE_SPACING, 0), len(image) - 1)
         tissue = np.ones(wide, bool)
         if len(surface):
-            tissue = places[row, :, 1] > np.interp(places[row, :, 0], surface[:, 0], surface[:, 1])
+            tissue = positions[row, :, 1] > np.interp(positions[row, :, 0], surface[:, 0], surface[:, 1])
         left = tissue[: wide // 2].sum() >= tissue[wide // 2 :].sum()
         columns = np.flatnonzero((distance[row] < step * TONE_WIDTH) & tissue)
         column = int(columns[0 if left else -1]) if len(columns) else 0
@@ -177,5 +177,5 @@ def _write_bands(out: np.ndarray, distance: np.ndarray, places: np.ndarray, surf
             and tissue[column - HALF_NUMBER_WIDTH : column + HALF_NUMBER_WIDTH].all()
         ):
             write_text_with_halo(
-                out, f"{1e3 * step * TONE_WIDTH:.0f}", (column - HALF_NUMBER_WIDTH // 2, row + 4), INSET_TEXT_SCALE
+                image, f"{1e3 * step * TONE_WIDTH:.0f}", (column - HALF_NUMBER_WIDTH // 2, row + 4), INSET_TEXT_SCALE
             )

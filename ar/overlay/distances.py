@@ -141,11 +141,11 @@ def draw_rings(
             cv2.polylines(canvas, lines, False, (*ink, OPAQUE), width, cv2.LINE_AA)
     taken, written = ~free_mask, np.zeros(free_mask.shape, bool)
     for number, lines in rings.items():
-        found = [_write_on(canvas, line, number, taken, written) for line in lines if len(line) >= MIN_NUMBERED_LENGTH]
+        found = [_label(canvas, line, number, taken, written) for line in lines if len(line) >= MIN_NUMBERED_LENGTH]
         if not any(found):
             # Without free space, the number covers lines, or else another number.
             any(
-                _write_on(canvas, line, number, shut, written)
+                _label(canvas, line, number, shut, written)
                 for shut in (written, np.zeros_like(written))
                 for line in lines
             )
@@ -158,8 +158,8 @@ def remove_labels(mask: np.ndarray) -> np.ndarray:
     return mask & (numbers == 0)
 
 
-def _write_on(sheet: np.ndarray, line: np.ndarray, text: str, shut: np.ndarray, written: np.ndarray) -> bool:
-    """Write a number on a line (n, 1, 2), as near its centre as `shut` allows; return False if there is no space."""
+def _label(canvas: np.ndarray, line: np.ndarray, text: str, occupied: np.ndarray, written: np.ndarray) -> bool:
+    """Write a number on a line (n, 1, 2), as near its centre as `occupied` allows; return False without space."""
     (width, height), _ = cv2.getTextSize(text, FONT, TEXT_SCALE, 1)
     middle = len(line) // 2
     for at in sorted(range(0, len(line), 4), key=lambda at: abs(at - middle)):
@@ -169,15 +169,15 @@ def _write_on(sheet: np.ndarray, line: np.ndarray, text: str, shut: np.ndarray, 
             slice(max(top - NUMBER_GAP, 0), top + height + NUMBER_GAP),
             slice(max(left - NUMBER_GAP, 0), left + width + NUMBER_GAP),
         )
-        if left >= NUMBER_GAP and top >= NUMBER_GAP and not shut[box].any() and _is_within(sheet, box):
+        if left >= NUMBER_GAP and top >= NUMBER_GAP and not occupied[box].any() and _is_within(canvas, box):
             cv2.rectangle(
-                sheet, (left - 2, top - 2), (left + width + 1, top + height + 1), (*BORDER_COLOUR, OPAQUE), -1
+                canvas, (left - 2, top - 2), (left + width + 1, top + height + 1), (*BORDER_COLOUR, OPAQUE), -1
             )
-            cv2.putText(sheet, text, (left, top + height), FONT, TEXT_SCALE, (*RING_COLOUR, OPAQUE), 1, cv2.LINE_AA)
-            shut[box] = written[box] = True
+            cv2.putText(canvas, text, (left, top + height), FONT, TEXT_SCALE, (*RING_COLOUR, OPAQUE), 1, cv2.LINE_AA)
+            occupied[box] = written[box] = True
             return True
     return False
 
 
-def _is_within(sheet: np.ndarray, box: tuple[slice, slice]) -> bool:
-    return box[0].stop <= sheet.shape[0] and box[1].stop <= sheet.shape[1]
+def _is_within(canvas: np.ndarray, box: tuple[slice, slice]) -> bool:
+    return box[0].stop <= canvas.shape[0] and box[1].stop <= canvas.shape[1]

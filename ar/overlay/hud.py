@@ -141,11 +141,11 @@ def wrap_line(text: str, max_width: float, scale: float = TEXT_SCALE) -> list[st
 
 
 @lru_cache(maxsize=256)  # most texts recur in the next image, and a call takes 1 ms
-def _wrap_line(text: str, room: float, scale: float) -> list[str]:
-    if _measure_width(text, scale) <= room:
+def _wrap_line(text: str, max_width: float, scale: float) -> list[str]:
+    if _measure_width(text, scale) <= max_width:
         return [text] if text else []
-    lines = _break_lines(text, room, scale)
-    for narrower in range(int(room), 0, -BORDER_DISTANCE):
+    lines = _break_lines(text, max_width, scale)
+    for narrower in range(int(max_width), 0, -BORDER_DISTANCE):
         tried = _break_lines(text, narrower, scale)
         if len(tried) > len(lines):
             break
@@ -153,11 +153,11 @@ def _wrap_line(text: str, room: float, scale: float) -> list[str]:
     return lines
 
 
-def _break_lines(text: str, room: float, scale: float) -> list[str]:
+def _break_lines(text: str, max_width: float, scale: float) -> list[str]:
     lines: list[str] = []
     for word in BREAK_PATTERN.split(text.strip()):
         longer = f"{lines[-1]} {word}" if lines else word
-        if lines and _measure_width(longer, scale) <= room:
+        if lines and _measure_width(longer, scale) <= max_width:
             lines[-1] = longer
         else:
             lines.append(word)
@@ -240,15 +240,15 @@ def _compute_size(lines: Sequence[str], scale: float) -> tuple[tuple[int, int], 
 
 
 def _write_panel(
-    out: np.ndarray, lines: Sequence[str], at: tuple[int, int], size: tuple[int, int], step: int, scale: float
+    image: np.ndarray, lines: Sequence[str], position: tuple[int, int], size: tuple[int, int], step: int, scale: float
 ) -> np.ndarray:
-    """Draw a text panel into an image (H, W, 3) uint8 with its upper left corner at `at`; return the image."""
-    left, top = at
-    ground = out[top : top + size[1], left : left + size[0]]
+    """Draw a text panel into an image (H, W, 3) uint8 with its upper left corner at `position`; return the image."""
+    left, top = position
+    ground = image[top : top + size[1], left : left + size[0]]
     ground[:] = ground * 0.35 + np.array([6.0, 9.0, 11.0])
     for number, line in enumerate(lines, start=1):
-        write_text(out, line, (left + BORDER_DISTANCE, top + number * step), scale)
-    return out
+        write_text(image, line, (left + BORDER_DISTANCE, top + number * step), scale)
+    return image
 
 
 def name_direction(direction: np.ndarray) -> str:

@@ -147,17 +147,17 @@ class Measurement:
             said = f"rings: mm to the {self.name or 'surface'}; {self.error_text}"
             place_text(image, occupied, wrap_line(said, 0.3 * width), (width, HEAD_ROW), parts=Hideable(obstacles))
         if self.style == "cut":
-            self._lay_cut(image, occupied, obstacles, required)
+            self._draw_cut(image, occupied, obstacles, required)
 
-    def _lay_cut(self, colour: np.ndarray, taken: np.ndarray, sights: np.ndarray, needed: np.ndarray) -> None:
+    def _draw_cut(self, image: np.ndarray, occupied: np.ndarray, obstacles: np.ndarray, required: np.ndarray) -> None:
         roles = self.roles.read_roles(self.image.segmentation)
         plane = self.plane
         reach = SEARCH_HALF_WIDTH * float(np.abs(plane.to_plane(self.layer.vertices)[:, 0]).max())
         seen = compute_surface_profile(self.camera, plane, self.image.depth, roles, reach)
         tip = None if self.gauge is None else self.gauge.tip
         ink = shift_shade(average_colour(self.layer.colour))
-        for shut, share in itertools.product((taken | sights, taken | needed), INSET_WIDTHS):
-            wide = round(share * taken.shape[1])
+        for shut, share in itertools.product((occupied | obstacles, occupied | required), INSET_WIDTHS):
+            wide = round(share * occupied.shape[1])
             lines = [
                 line
                 for text in (f"cut: mm to the {self.name or 'surface'}", self.error_text)
@@ -165,12 +165,12 @@ class Measurement:
             ]
             inset = add_caption(np.zeros((round(INSET_ASPECT * wide), wide, 3), np.uint8), lines)
             shut[-HEAD_ROW:] = 1  # for the text at the bottom
-            place = find_free_position(shut, inset.shape[1::-1], (taken.shape[1], HEAD_ROW))
+            place = find_free_position(shut, inset.shape[1::-1], (occupied.shape[1], HEAD_ROW))
             if place is not None:
                 drawn = draw_section(
                     self.camera, self.layer, plane, seen, (wide, round(INSET_ASPECT * wide)), ink, tip, self.error
                 )
                 whole = add_caption(drawn, lines)
-                paste_inset(colour, taken, np.dstack([whole, np.full(whole.shape[:2], OPAQUE, np.uint8)]), place)
+                paste_inset(image, occupied, np.dstack([whole, np.full(whole.shape[:2], OPAQUE, np.uint8)]), place)
                 return
-        place_text(colour, taken, [NO_ROOM_TEXT], (taken.shape[1], HEAD_ROW))
+        place_text(image, occupied, [NO_ROOM_TEXT], (occupied.shape[1], HEAD_ROW))

@@ -254,7 +254,7 @@ def compute_drawn_share(
     shut = cv2.dilate(
         np.pad(occluders, 1, constant_values=True).astype(np.uint8), np.ones((2 * CUT_DISTANCE + 1,) * 2, np.uint8)
     )
-    return _share(find_colour(image, colour), (outline > 0) & (shut[1:-1, 1:-1] == 0))
+    return _compute_share(find_colour(image, colour), (outline > 0) & (shut[1:-1, 1:-1] == 0))
 
 
 def compute_changed_share(before: np.ndarray, after: np.ndarray, mask: np.ndarray) -> float:
@@ -263,8 +263,8 @@ def compute_changed_share(before: np.ndarray, after: np.ndarray, mask: np.ndarra
     NaN for fewer than `MIN_PIXELS` pixels.
     """
     inner = cv2.erode(mask.astype(np.uint8), np.ones((2 * LINE_DISTANCE + 1,) * 2, np.uint8), borderValue=0) > 0
-    return _share(~find_colour(cv2.absdiff(before, after), (0, 0, 0)), inner)
+    return _compute_share(~find_colour(cv2.absdiff(before, after), (0, 0, 0)), inner)
 
 
-def _share(found: np.ndarray, where: np.ndarray) -> float:
-    return float(found[where].mean()) if np.count_nonzero(where) >= MIN_PIXELS else np.nan
+def _compute_share(values: np.ndarray, mask: np.ndarray) -> float:
+    return float(values[mask].mean()) if np.count_nonzero(mask) >= MIN_PIXELS else np.nan

@@ -252,14 +252,14 @@ def guard_server(policy: AccessPolicy, controls: ControlLookup, limits: Connecti
     log = logging.Logger("page", logging.WARNING)
     log.addFilter(ConnectionLog())
 
-    def guarded(*args: Any, process_request: Callable, **settings: Any) -> Any:
+    def serve_guarded(*args: Any, process_request: Callable, **settings: Any) -> Any:
         opened.append(True)
         visit = partial(Connection, controls=controls, limits=limits)
         settings |= {"max_size": MAX_MESSAGE_BYTES, "logger": log, "create_connection": visit}
         return serve(*args, process_request=partial(handle_request, policy, limits, process_request), **settings)
 
     with PATCH_LOCK:
-        websockets.asyncio.server.serve = guarded
+        websockets.asyncio.server.serve = serve_guarded
         try:
             yield opened
         finally:

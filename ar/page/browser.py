@@ -100,7 +100,7 @@ class Browser:
         self.folder: viser.GuiFolderHandle | None = None
         self.fill(bodies, playback, controls, title, words)
         self.closed = threading.Event()
-        self.sender = threading.Thread(target=self.send, name="page", daemon=True)
+        self.sender = threading.Thread(target=self.send_updates, name="page", daemon=True)
         self.sender.start()
 
     def fill(
@@ -172,15 +172,15 @@ class Browser:
         """
         with self.lock:
             self.wanted = number, colour, words, number if sought is None else sought
-            self.newest["sight"] = self.send_sight
+            self.newest["sight"] = self.send_image
 
     def report(self, words: str) -> None:
         """Replace the report (HTML) next to the image."""
         with self.lock:
             self.wanted = self.wanted[0], self.wanted[1], words, self.wanted[3]
-            self.newest["sight"] = self.send_sight
+            self.newest["sight"] = self.send_image
 
-    def send_sight(self) -> None:
+    def send_image(self) -> None:
         """Send the image with its report, unless both are already shown."""
         with self.lock:
             _, colour, words, place = wanted = self.wanted
@@ -188,28 +188,28 @@ class Browser:
         if colour is not self.shown[1]:
             self.coded = to_data_url(colour)
         if colour is not self.shown[1] or words != self.shown[2]:
-            self.put_sight(self.coded, words)
+            self.send_image_element(self.coded, words)
         self.shown = wanted
         # Set the slider only on a change: a client may be moving it.
         if place != at:
             self.controls.assign(self.frame, place)
 
-    def put_sight(self, code: str, words: str) -> None:
+    def send_image_element(self, data_url: str, html: str) -> None:
         """Send a `to_data_url` image and its text (HTML) immediately."""
         self.sent += 1
-        self.sight.content = build_image_element(self.sent, code, keep_numbers_together(words))
-        self.recorder.add_image(code)
+        self.sight.content = build_image_element(self.sent, data_url, keep_numbers_together(html))
+        self.recorder.add_image(data_url)
 
-    def show_beside(self, drawn: Callable[[], tuple[np.ndarray, str]]) -> None:
+    def show_side_panels(self, render: Callable[[], tuple[np.ndarray, str]]) -> None:
         """Show an image (H, W, 3) uint8 of slices, and charts (HTML), in the tabs next to the 3-D view.
 
-        The page's thread calls `drawn` to compute both, as often as `ConnectionLimits` allow; only the newest `drawn`
+        The page's thread calls `render` to compute both, as often as `ConnectionLimits` allow; only the newest `render`
         is called.
         """
         with self.lock:
-            self.drawn = drawn
+            self.drawn = render
 
-    def send_beside(self) -> None:
+    def send_side_panels(self) -> None:
         """Draw and send the newest slices and charts, if due and if a client is connected."""
         with self.lock:
             drawn = self.drawn if clock.monotonic() >= self.due and self.visitors else None
@@ -224,32 +224,32 @@ class Browser:
         """Replace the vertices (V, 3) [m] of a surface in the 3-D view, and the triangles (F, 3) if they changed."""
         mesh = self.meshes[name]
 
-        def send() -> None:
+        def send_mesh() -> None:
             if triangles is not None and not np.array_equal(mesh.faces, triangles):
                 mesh.faces = np.asarray(triangles, np.uint32)
             mesh.vertices = np.asarray(vertices, np.float32)
 
-        self.note(f"body {name}", send)
+        self.store_update(f"body {name}", send_mesh)
 
     def tint(self, name: str, colour: tuple[float, float, float]) -> None:
         """Set the colour (3,), sRGB in [0, 1], of a surface in the 3-D view."""
         mesh = self.meshes[name]
-        self.note(f"colour {name}", lambda: setattr(mesh, "color", tuple(round(255 * part) for part in colour)))
+        self.store_update(f"colour {name}", lambda: setattr(mesh, "color", tuple(round(255 * part) for part in colour)))
 
     def show_status(self, words: str) -> None:
         """Show a status line (HTML) over the image; an empty text hides it."""
         said = build_element(STATUS, f"<span>{words}</span>") if words else ""
-        self.note("status", lambda: setattr(self.line, "content", said))
+        self.store_update("status", lambda: setattr(self.line, "content", said))
 
     def show_playback(self, playing: bool) -> None:
         """Set the play/pause button to the playback state `playing`."""
         button, self.playing = self.button, playing
 
-        def send() -> None:
+        def send_button() -> None:
             button.label = "Pause" if playing else "Play"
             button.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
 
-        self.note("button", send)
+        self.store_update("button", send_button)
 
     def show_line(self, line: Callable[[int], str]) -> None:
         """Show each client its own line of Markdown below the report; `line` maps the client's number to the text.
@@ -257,12 +257,12 @@ class Browser:
         If there are several clients, the line also says who has control, and others may request control.
         """
 
-        def send() -> None:
+        def send_lines() -> None:
             if not self.closed.is_set():
                 self.crowd.show_lines(line)
 
         # While this thread runs `send`, no client leaves.
-        self.note("lines", lambda: self.server.get_event_loop().call_soon_threadsafe(send))
+        self.store_update("lines", lambda: self.server.get_event_loop().call_soon_threadsafe(send_lines))
 
     def put(self, label: str, value: float | str, wanted: Callable[[], bool] | None = None) -> None:
         """Set a control without calling its `on_change`, for example when a script moves the tool.
@@ -273,21 +273,21 @@ class Browser:
         control = self.controls.handles[label]
         if isinstance(control, viser.GuiSliderHandle) and not isinstance(value, str):
             value = min(max(value, control.min), control.max)
-        self.note(f"control {label}", lambda: self.controls.assign(control, value, wanted))
+        self.store_update(f"control {label}", lambda: self.controls.assign(control, value, wanted))
 
     def rename(self, label: str, words: str) -> None:
         """Show another text for a control; an unknown label, such as one of the previous scene, is ignored."""
         if (control := self.controls.handles.get(label)) is not None:
-            self.note(f"words {label}", lambda: setattr(control, "label", words))
+            self.store_update(f"words {label}", lambda: setattr(control, "label", words))
 
     def write(self, label: str, words: str) -> None:
         """Replace the text (HTML) of a note; an empty note is hidden."""
         folder, text = self.controls.notes[label]
 
-        def send() -> None:
+        def send_text() -> None:
             text.content, folder.visible = format_note(words), bool(words)
 
-        self.note(f"note {label}", send)
+        self.store_update(f"note {label}", send_text)
 
     def close(self) -> None:
         """Stop the page's thread and its server."""
@@ -295,12 +295,12 @@ class Browser:
         self.sender.join()
         self.server.stop()
 
-    def note(self, key: str, send: Callable[[], object]) -> None:
+    def store_update(self, key: str, send: Callable[[], object]) -> None:
         """Store the newest update of each kind until it is sent."""
         with self.lock:
             self.newest[key] = send
 
-    def send(self) -> None:
+    def send_updates(self) -> None:
         """Send the stored updates until the page is closed; updates of one interval arrive together."""
         while not self.closed.wait(1.0 / self.limits.updates_per_second):
             with self.sending:
@@ -309,7 +309,7 @@ class Browser:
                 with self.server.atomic():
                     for send in newest.values():
                         send()
-                self.send_beside()
+                self.send_side_panels()
 
     def add_playback(self, playback: Playback) -> None:
         """Add a play/pause button and, if there are frames, a slider over them; keys have the same actions."""
@@ -317,24 +317,24 @@ class Browser:
         self.button = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE)
         self.frame = gui.add_slider("frame", 0, max(playback.frame_count - 1, 1), 1, 0, visible=seekable)
 
-        def toggle(_: viser.ClientHandle | None = None) -> None:
+        def toggle_playback(_: viser.ClientHandle | None = None) -> None:
             self.show_playback(not self.playing)
             playback.on_play(self.playing)
 
-        def step(by: int) -> None:
-            number = min(max(self.shown[0] + by, 0), playback.frame_count - 1)
+        def step_frame(change: int) -> None:
+            number = min(max(self.shown[0] + change, 0), playback.frame_count - 1)
             self.show_playback(False)
             playback.on_play(False)
             playback.on_seek(number)
             self.controls.assign(self.frame, number)
 
-        self.controls.bind_button(self.button, toggle)
+        self.controls.bind_button(self.button, toggle_playback)
         # A slider needs two positions, even for a single frame.
         self.controls.receive_input(self.frame, lambda number: playback.on_seek(min(number, playback.frame_count - 1)))
-        self.controls.bind_key(PLAY_KEY, toggle)
+        self.controls.bind_key(PLAY_KEY, toggle_playback)
         if seekable:
-            self.controls.bind_key(BACK_KEY, lambda _: step(-1))
-            self.controls.bind_key(ON_KEY, lambda _: step(1))
+            self.controls.bind_key(BACK_KEY, lambda _: step_frame(-1))
+            self.controls.bind_key(ON_KEY, lambda _: step_frame(1))
 
     def add_savers(self) -> None:
         """Add buttons to download the shown image (every client) and to record a video (client with control)."""
@@ -342,21 +342,21 @@ class Browser:
         self.saver = self.server.gui.add_button("Save the image", icon=viser.Icon.CAMERA, color="gray")
 
         @self.saver.on_click
-        def save(event: viser.GuiEvent) -> None:
+        def save_image(event: viser.GuiEvent) -> None:
             if event.client is not None:
                 number, colour, *_ = self.shown
                 written = cv2.imencode(".png", np.ascontiguousarray(colour[..., ::-1]))[1]
                 event.client.send_file_download(f"{name}-{number}.png", written.tobytes(), save_immediately=True)
 
-        def record(client: viser.ClientHandle) -> None:
+        def toggle_recording(client: viser.ClientHandle) -> None:
             self.recorder.toggle_recording(client, self.coded)
 
-        self.controls.bind_button(self.recorder.add_button(name), record)
-        self.controls.bind_key(RECORD_KEY, record)
+        self.controls.bind_button(self.recorder.add_button(name), toggle_recording)
+        self.controls.bind_key(RECORD_KEY, toggle_recording)
 
-    status, plays = show_status, show_playback  # Former names, for one release.
+    status, plays, show_beside = show_status, show_playback, show_side_panels  # Former names, for one release.
 
 
-def build_element(name: str, words: str) -> str:
+def build_element(name: str, html: str) -> str:
     """Wrap text in an element with an id, for style rules."""
-    return f'<div id="{name}">{words}</div>'
+    return f'<div id="{name}">{html}</div>'

@@ -48,9 +48,9 @@ class ControlLock:
         if self.queue:
             self._give_control(self.queue[0], time)
 
-    def _give_control(self, visitor: int | None, now: float) -> None:
-        self.holder, self.last_action = visitor, now
-        self.queue = tuple(other for other in self.queue if other != visitor)
+    def _give_control(self, client: int | None, time: float) -> None:
+        self.holder, self.last_action = client, time
+        self.queue = tuple(other for other in self.queue if other != client)
 
     def describe_control(self, client: int, present: Collection[int]) -> str:
         """Return a client's status line in Markdown; empty if there is only one client."""
@@ -172,13 +172,13 @@ class Inputs:
         With `condition` the control is set only if the value differs and `condition`, called there, returns True.
         """
 
-        def put() -> None:
+        def set_value() -> None:
             # The page may have been filled again meanwhile.
             if id(control) in self.kept and (condition is None or (control.value != value and condition())):
                 self.kept[id(control)] = value
                 control.value = value
 
-        self.server.get_event_loop().call_soon_threadsafe(put)
+        self.server.get_event_loop().call_soon_threadsafe(set_value)
 
     def bind_button(self, button: viser.GuiButtonHandle, action: Callable[[viser.ClientHandle], None]) -> None:
         """Bind a button to an action, which only the client with control can trigger."""

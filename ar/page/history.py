@@ -76,33 +76,33 @@ def _format_newest(samples: Sequence[Sample], number: int) -> str:
     return "not known" if value is None else f"{value:.2f}"
 
 
-def _plot(line: Trace, number: int, samples: Sequence[Sample]) -> str:
+def _plot(line: Trace, index: int, samples: Sequence[Sample]) -> str:
     """Draw the chart of one line: dotted without an error, interrupted without a value."""
-    known = [each for each in samples if each.values[number] is not None]
-    top, end = CHART_HEIGHT * number + TOP_MARGIN, samples[-1].time if samples else 0.0
+    known = [each for each in samples if each.values[index] is not None]
+    top, end = CHART_HEIGHT * index + TOP_MARGIN, samples[-1].time if samples else 0.0
     room = CHART_HEIGHT - TOP_MARGIN - BOTTOM_MARGIN
-    ends = [(each.values[number] or 0.0, each.errors[number] or 0.0) for each in known]
+    ends = [(each.values[index] or 0.0, each.errors[index] or 0.0) for each in known]
     high = round_up_scale(max((value + error for value, error in ends), default=0.0))
 
-    def at(time: float, value: float) -> str:
+    def to_text(time: float, value: float) -> str:
         across = LEFT_MARGIN + (CHART_WIDTH - LEFT_MARGIN - 6.0) * (1.0 - (end - time) / TIME_SPAN)
         return f"{across:.1f},{top + room * (1.0 - min(max(value / high, 0.0), 1.0)):.1f}"
 
     drawn = []
-    for piece in split_line(samples, number):
+    for piece in split_line(samples, index):
         # An isolated sample is as wide as its dot.
         moments = [
             (each.time + aside, each)
             for each in piece
             for aside in ((0.0,) if len(piece) > 1 else (-HALF_DOT_WIDTH, HALF_DOT_WIDTH))
         ]
-        if piece[-1].errors[number] is not None:
-            above = [at(time, (each.values[number] or 0.0) + (each.errors[number] or 0.0)) for time, each in moments]
-            below = [at(time, (each.values[number] or 0.0) - (each.errors[number] or 0.0)) for time, each in moments]
+        if piece[-1].errors[index] is not None:
+            above = [to_text(time, (each.values[index] or 0.0) + (each.errors[index] or 0.0)) for time, each in moments]
+            below = [to_text(time, (each.values[index] or 0.0) - (each.errors[index] or 0.0)) for time, each in moments]
             corners = " ".join([*above, *reversed(below)])
             drawn.append(f'<polygon points="{corners}" fill="{line.colour}" fill-opacity="0.28"/>')
-        dotted = ' stroke-dasharray="2 3"' if piece[-1].errors[number] is None else ""
-        corners = " ".join(at(time, each.values[number] or 0.0) for time, each in moments)
+        dotted = ' stroke-dasharray="2 3"' if piece[-1].errors[index] is None else ""
+        corners = " ".join(to_text(time, each.values[index] or 0.0) for time, each in moments)
         drawn.append(f'<polyline points="{corners}" fill="none" stroke="{line.colour}" stroke-width="1.6"{dotted}/>')
     if not known:
         middle = f'x="{0.5 * (LEFT_MARGIN + CHART_WIDTH):g}" y="{top + 0.5 * room + 4:g}"'

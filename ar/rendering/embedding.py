@@ -106,7 +106,7 @@ def build_embedded_surface(
         if not long.any():
             break
         new = np.where(long, len(at) + np.cumsum(long) - 1, -1)
-        triangles = _split(triangles, new[number].reshape(-1, 3))
+        triangles = _split_triangles(triangles, new[number].reshape(-1, 3))
         shares = sparse.csr_matrix(sparse.vstack([shares, 0.5 * (shares[a[long]] + shares[b[long]])]))
         at = shares @ points
     row = np.repeat(np.arange(len(at)), np.diff(shares.indptr))
@@ -120,13 +120,13 @@ def build_embedded_surface(
     return EmbeddedSurface(coarse, corners[order], weights[order], triangles, np.zeros(len(at)))
 
 
-def _split(triangles: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Split triangles (F, 3) at new vertices `middle` (F, 3) on their edges ab, bc, ca; -1 for an edge without one."""
-    count = (middle >= 0).sum(axis=1)
+def _split_triangles(triangles: np.ndarray, midpoints: np.ndarray) -> np.ndarray:
+    """Split triangles (F, 3) at new vertices `midpoints` (F, 3) on their edges ab, bc, ca; -1: none."""
+    count = (midpoints >= 0).sum(axis=1)
     # One divided edge comes first, one whole edge last.
-    first = np.select([count == 1, count == 2], [np.argmax(middle, axis=1), np.argmin(middle, axis=1) + 1], 0)
+    first = np.select([count == 1, count == 2], [np.argmax(midpoints, axis=1), np.argmin(midpoints, axis=1) + 1], 0)
     turn = (first[:, None] + np.arange(3)) % 3
-    (a, b, c), (m, n, o) = (np.take_along_axis(each, turn, axis=1).T for each in (triangles, middle))
+    (a, b, c), (m, n, o) = (np.take_along_axis(each, turn, axis=1).T for each in (triangles, midpoints))
     pieces = {
         0: [(a, b, c)],
         1: [(a, m, c), (m, b, c)],

@@ -158,21 +158,21 @@ def draw_triangles(
     # On a GPU the rows of a triangle are shared by several threads.
     parts = 1 if device == "cpu" else ROW_THREADS
 
-    def scan(begin: int, end: int, first: int = 0, last: int = count, out: wp.array = z_buffer) -> None:
+    def draw_rows(begin: int, end: int, first: int = 0, last: int = count, buffer: wp.array = z_buffer) -> None:
         size = z_buffer.shape[0], -(-(last - first) // run), parts
         span = rows.start + begin, rows.start + end
         inputs = [points, triangles[: start + last], start + first, wp.float64(near), *span, parts, run, undistortion]
-        wp.launch(keep_nearest, size, inputs, [out], device=device)
+        wp.launch(keep_nearest, size, inputs, [buffer], device=device)
 
     pool, cores = get_workers()
     if not count:
         return None
     if device != "cpu" or cores == 1 or count * MIN_PIXELS < z_buffer.size:
-        return run_in_bands(scan, rows.stop - rows.start, device)
+        return run_in_bands(draw_rows, rows.stop - rows.start, device)
     # Many small triangles: every band of rows would prepare all of them, so each thread draws some into its own buffer.
     edges = np.linspace(0, count, cores + 1).astype(int).tolist()
     buffers = [z_buffer, *(wp.full_like(z_buffer, EMPTY_PIXEL) for _ in edges[2:])]
-    list(pool.map(partial(scan, 0, rows.stop - rows.start), edges[:-1], edges[1:], buffers))
+    list(pool.map(partial(draw_rows, 0, rows.stop - rows.start), edges[:-1], edges[1:], buffers))
     for other in buffers[1:]:
         np.minimum(z_buffer.numpy(), other.numpy(), out=z_buffer.numpy())
 

@@ -92,7 +92,7 @@ def build_real_image(
         found = rasterise(camera.crop_to(*box), vertices, np.concatenate(triangles), device=device)
         depth[box] = found.depth
         segmentation[box] = np.where(found.mask, ids[found.face], 0)
-    return _upload_picture(image.copy(), depth, segmentation, device)
+    return _upload_image(image.copy(), depth, segmentation, device)
 
 
 def scale_image(image: Picture, width: int, height: int) -> Picture:
@@ -101,10 +101,10 @@ def scale_image(image: Picture, width: int, height: int) -> Picture:
     depth, segmentation = (
         cv2.resize(values, size, interpolation=cv2.INTER_NEAREST) for values in (image.depth, image.segmentation)
     )
-    return _upload_picture(cv2.resize(image.colour, size), depth, segmentation, device)
+    return _upload_image(cv2.resize(image.colour, size), depth, segmentation, device)
 
 
-def _upload_picture(colour: np.ndarray, depth: np.ndarray, segmentation: np.ndarray, device: str) -> Picture:
+def _upload_image(colour: np.ndarray, depth: np.ndarray, segmentation: np.ndarray, device: str) -> Picture:
     """Copy colour (H, W, 3) uint8, depth (H, W) float32 and segmentation (H, W) uint8 to a device; return the image."""
     arrays = (
         wp.array(np.ascontiguousarray(values)[None], dtype=dtype, device=device, copy=False)

@@ -158,8 +158,8 @@ class Renderer:
         """
         moved = self.stack.copy_vertices(np.concatenate([np.zeros((0, 3)), *vertices])[None])
         stays, self.seen_by = camera is self.seen_by, camera
-        backdrop = self._get_backdrop(camera, moved) if stays and self.stack.still_faces else None
-        return Picture(self._draw_images([camera], moved, backdrop))
+        backdrop = self._get_background(camera, moved) if stays and self.stack.still_faces else None
+        return Picture(self._draw_all([camera], moved, backdrop))
 
     def render_batch(self, vertices: np.ndarray | wp.array, cameras: Sequence[Camera]) -> Pictures:
         """Render images of cameras of equal size; the images remain on the device.
@@ -183,9 +183,9 @@ class Renderer:
             raise ValueError(f"{len(cameras)} cameras for {count} images: give one for each, or one for all.")
         if len({(camera.width, camera.height) for camera in cameras}) > 1:
             raise ValueError("the cameras have several sizes: draw those of each size together.")
-        return self._draw_images([*cameras] * (count // len(cameras)), moved, None)
+        return self._draw_all([*cameras] * (count // len(cameras)), moved, None)
 
-    def _draw_images(self, cameras: Sequence[Camera], moved: wp.array, backdrop: StaticBackground | None) -> Pictures:
+    def _draw_all(self, cameras: Sequence[Camera], vertices: wp.array, backdrop: StaticBackground | None) -> Pictures:
         """Draw the image of each camera, on the static background if given."""
         count, height, width = len(cameras), cameras[0].height, cameras[0].width
         if count * max(height * width, SHADOW_PIXELS**2) >= 2**31:
@@ -198,74 +198,74 @@ class Renderer:
             vertex, face, lit_at = stack.still_vertices, stack.still_faces, backdrop.shadow_positions
             nearest, placed = wp.clone(backdrop.z_buffer), copy_surface(backdrop.surface)
             pictures = Pictures(*(wp.clone(array) for array in backdrop.images.arrays))
-        self._place(cameras, moved, placed, vertex)
+        self._place(cameras, vertices, placed, vertex)
         through = build_undistortion(cameras, self.device)
         rows = slice(0, height) if through.pixels.size else self._find_rows(placed.camera_points, vertex, height)
         draw_triangles(
             placed.camera_points, stack.surfaces.triangles, face, rows, nearest, self.device, undistortion=through
         )
-        self._shade(cameras, placed, nearest, stack.casting, face, lit_at, through, pictures)
+        self._shade_images(cameras, placed, nearest, stack.casting, face, lit_at, through, pictures)
         return pictures
 
-    def _shade(
-        self, cameras: Sequence[Camera], placed: PlacedSurface, nearest: wp.array, casting: wp.array, still: int,
-        lit_at: wp.array, through: Undistortion, pictures: Pictures,
+    def _shade_images(
+        self, cameras: Sequence[Camera], surface: PlacedSurface, nearest: wp.array, casting: wp.array, still: int,
+        shadow_positions: wp.array, undistortion: Undistortion, images: Pictures,
     ) -> None:  # fmt: skip
         """Shade the pixels of z-buffers into images with a background; `casting` triangles cast shadows."""
         count, height, width = nearest.shape
-        shadow = self._draw_shadow(placed, casting)
+        shadow = self._draw_shadow(surface, casting)
         inputs = [
-            width, height * width, nearest.flatten(), self.stack.surfaces, placed, self._get_centres(cameras),
+            width, height * width, nearest.flatten(), self.stack.surfaces, surface, self._get_centres(cameras),
             self.light,
-            shadow, self.curve, still, lit_at, through.pixels,
+            shadow, self.curve, still, shadow_positions, undistortion.pixels,
         ]  # fmt: skip
-        outputs = [array.flatten() for array in pictures.arrays]
+        outputs = [array.flatten() for array in images.arrays]
         launch_in_bands(shade_pixels, inputs, outputs, count * height * width, self.device, per_core=4)
 
-    def _place(self, cameras: Sequence[Camera], moved: wp.array, placed: PlacedSurface, since: int) -> None:
-        """Place the vertices from index `since` on in each image."""
+    def _place(self, cameras: Sequence[Camera], vertices: wp.array, surface: PlacedSurface, first: int) -> None:
+        """Place the vertices from index `first` on in each image."""
         stack = self.stack
         matrices = wp.array([compute_projection(camera) for camera in cameras], dtype=wp.mat44d, device=self.device)
         inputs = [
-            since, stack.still, moved, matrices, wp.mat44d(compute_projection(self.lamp_camera)),
+            first, stack.still, vertices, matrices, wp.mat44d(compute_projection(self.lamp_camera)),
             stack.surfaces.triangles,
             stack.around, stack.faces,
         ]  # fmt: skip
-        launch_in_bands(place_vertices, inputs, [placed], len(cameras) * (stack.vertices - since), self.device)
+        launch_in_bands(place_vertices, inputs, [surface], len(cameras) * (stack.vertices - first), self.device)
 
-    def _find_rows(self, seen: wp.array, since: int, height: int) -> slice:
-        """Return the rows that vertices from index `since` on may cover; on a GPU all rows, as a test takes longer."""
+    def _find_rows(self, camera_points: wp.array, first_vertex: int, height: int) -> slice:
+        """Return the rows that vertices from `first_vertex` on may cover; on a GPU all rows, as a test takes longer."""
         if self.device != "cpu":
             return slice(0, height)
-        return slice(*find_covered_rows(seen.numpy()[:, since:].reshape(-1, 3), NEAR_PLANE, height))
+        return slice(*find_covered_rows(camera_points.numpy()[:, first_vertex:].reshape(-1, 3), NEAR_PLANE, height))
 
-    def _draw_shadow(self, placed: PlacedSurface, casting: wp.array) -> Shadow:
+    def _draw_shadow(self, surface: PlacedSurface, casting: wp.array) -> Shadow:
         """Draw the shadow map of each image; return the maps."""
-        count, tiles = placed.lamp_points.shape[0], SHADOW_PIXELS // int(TILE_SIDE)
+        count, tiles = surface.lamp_points.shape[0], SHADOW_PIXELS // int(TILE_SIDE)
         shadow = Shadow()
         shadow.size = SHADOW_PIXELS
         shadow.depth = wp.empty(count * SHADOW_PIXELS**2, dtype=wp.float32, device=self.device)
         shadow.bounds = wp.empty(count * tiles**2, dtype=wp.vec2f, device=self.device)
         nearest = allocate_z_buffer(count, SHADOW_PIXELS, SHADOW_PIXELS, self.device)
-        draw_triangles(placed.lamp_points, casting, 0, slice(0, SHADOW_PIXELS), nearest, self.device)
+        draw_triangles(surface.lamp_points, casting, 0, slice(0, SHADOW_PIXELS), nearest, self.device)
         launch_in_bands(compute_shadow_depths, [nearest], [shadow], count * tiles**2, self.device)
         return shadow
 
     def _get_centres(self, cameras: Sequence[Camera]) -> wp.array:
         return wp.array([camera.centre for camera in cameras], dtype=wp.vec3f, device=self.device)
 
-    def _get_backdrop(self, camera: Camera, moved: wp.array) -> StaticBackground:
+    def _get_background(self, camera: Camera, vertices: wp.array) -> StaticBackground:
         """Return the image of the fixed layers for a camera; the last one is cached."""
         if self.backdrop is not None and self.backdrop.camera is camera:
             return self.backdrop
         stack, height, width = self.stack, camera.height, camera.width
         placed, nearest = stack.allocate_placed(1), allocate_z_buffer(1, height, width, self.device)
         pictures = allocate_images(1, height, width, self.device)
-        self._place([camera], moved, placed, 0)
+        self._place([camera], vertices, placed, 0)
         there = stack.surfaces.triangles[: stack.still_faces]
         through = build_undistortion([camera], self.device)
         draw_triangles(placed.camera_points, there, 0, slice(0, height), nearest, self.device, undistortion=through)
-        self._shade([camera], placed, nearest, self.unshaded, 0, self.nowhere, through, pictures)
+        self._shade_images([camera], placed, nearest, self.unshaded, 0, self.nowhere, through, pictures)
         lit_at = wp.zeros(height * width, dtype=wp.vec3f, device=self.device)
         centres = self._get_centres([camera])
         inputs = [width, nearest.flatten(), stack.surfaces, placed, centres, self.light, through.pixels]

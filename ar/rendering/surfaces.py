@@ -140,18 +140,18 @@ def project_point(P: wp.mat44d, x: wp.vec3d) -> wp.vec3d:
 
 @forward_kernel
 def place_vertices(
-    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, first: wp.int32, fixed: wp.array(dtype=wp.vec3d),
+    begin: wp.int32, end: wp.int32, chunk_size: wp.int32, first_vertex: wp.int32, fixed: wp.array(dtype=wp.vec3d),
     moving: wp.array2d(dtype=wp.vec3d), cameras: wp.array(dtype=wp.mat44d), lamp: wp.mat44d,
     triangles: wp.array(dtype=wp.vec3i), face_starts: wp.array(dtype=wp.int32), faces: wp.array(dtype=wp.int32),
     # output
     placed: PlacedSurface,
 ):  # fmt: skip
-    """Place the vertices from `first` on in each image; normals are area-weighted means of face normals."""
+    """Place the vertices from `first_vertex` on in each image; normals are area-weighted means of face normals."""
     start = begin + wp.tid() * chunk_size
-    each = placed.camera_points.shape[1] - first
+    each = placed.camera_points.shape[1] - first_vertex
     for index in range(start, wp.min(start + chunk_size, end)):
         picture = index / each
-        vertex = first + index - picture * each
+        vertex = first_vertex + index - picture * each
         x = get_vertex_position(picture, vertex, fixed, moving)
         placed.camera_points[picture, vertex] = project_point(cameras[picture], x)
         placed.lamp_points[picture, vertex] = project_point(lamp, x)

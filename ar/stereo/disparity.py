@@ -242,7 +242,7 @@ def track_pixels(
 
     Both windows must have the same resolution and target, so that their pixels have equal size.
     """
-    guess, alike = _find_coarse(previous, current, pixels, settings)
+    guess, alike = _match_coarse(previous, current, pixels, settings)
     which = np.nonzero(alike > settings.min_correlation)[0]
     if not len(which):
         return which, np.zeros((0, 2))
@@ -268,15 +268,15 @@ def find_consistent_motions(
     )
 
 
-def _find_coarse(
-    before: StereoView, now: StereoView, pixels: np.ndarray, settings: FlowSettings
+def _match_coarse(
+    previous: StereoView, current: StereoView, pixels: np.ndarray, settings: FlowSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find pixels (n, 2) in a later view by coarse template matching; return positions (n, 2), correlations (n,)."""
-    size, half = before.geometry.size, settings.half_template
-    share = before.geometry.depth / before.geometry.focal / settings.coarse_pixel
+    size, half = previous.geometry.size, settings.half_template
+    share = previous.geometry.depth / previous.geometry.focal / settings.coarse_pixel
     few = max(1, round(share * size))
     share = few / size
-    small = [cv2.resize(each, (few, few), interpolation=cv2.INTER_AREA) for each in (before.left, now.left)]
+    small = [cv2.resize(each, (few, few), interpolation=cv2.INTER_AREA) for each in (previous.left, current.left)]
     one, other = (
         cv2.copyMakeBorder(each, by, by, by, by, cv2.BORDER_REPLICATE)
         for each, by in zip(small, (half, half + settings.search_radius), strict=True)
@@ -293,12 +293,12 @@ def _find_coarse(
 
 
 def _track_pixels(
-    one: np.ndarray, other: np.ndarray, start: np.ndarray, guess: np.ndarray, settings: FlowSettings
+    previous: np.ndarray, current: np.ndarray, start: np.ndarray, guess: np.ndarray, settings: FlowSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Track pixels `start` (n, 2) float32 to another window from `guess` (n, 2); return positions and success (n,)."""
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, *settings.flow_criteria)
     there, found, _ = cv2.calcOpticalFlowPyrLK(
-        one, other, start, guess.copy(), winSize=2 * (settings.flow_side,), maxLevel=settings.flow_levels,
+        previous, current, start, guess.copy(), winSize=2 * (settings.flow_side,), maxLevel=settings.flow_levels,
         criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     return there, found.ravel() > 0

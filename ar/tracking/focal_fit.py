@@ -52,15 +52,15 @@ def fit_focal_length(
     if freedom <= 0:
         return None
 
-    def squares(factor: float) -> float:
+    def compute_squares(factor: float) -> float:
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= factor
         return sum(compute_pose_residual(replace(camera, K=K), target, corners) for target, corners in enough)
 
     options = {"xatol": settings.factor_tolerance}
-    found = minimize_scalar(squares, bounds=settings.factor_bounds, method="bounded", options=options)
+    found = minimize_scalar(compute_squares, bounds=settings.factor_bounds, method="bounded", options=options)
     assert isinstance(found, OptimizeResult)
-    around = squares(found.x - settings.factor_step), squares(found.x + settings.factor_step)
+    around = compute_squares(found.x - settings.factor_step), compute_squares(found.x + settings.factor_step)
     if not np.isfinite([found.fun, *around]).all() or sum(around) <= 2.0 * found.fun:
         return None
     bend = (sum(around) - 2.0 * found.fun) / settings.factor_step**2

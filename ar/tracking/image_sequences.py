@@ -61,7 +61,7 @@ def read_images(path: Path) -> Iterator[NamedImage]:
     """
     if path.is_dir():
         files = _list_files(path)
-        return (NamedImage(files[index].name, _read(files[index])) for index in _spread(len(files)))
+        return (NamedImage(files[index].name, _read_image(files[index])) for index in _compute_spread(len(files)))
     return islice(_read_video_frames(path, None), MAX_IMAGES)
 
 
@@ -81,8 +81,8 @@ def read_video(path: Path, rate: float, with_colour: bool = False, first_frame: 
     if path.is_dir():
         files = islice(enumerate(_list_files(path)), first_frame, None)
         if with_colour:
-            return (to_named_image(file.name, _read(file, "RGB"), number / rate) for number, file in files)
-        return (NamedImage(file.name, _read(file), number / rate) for number, file in files)
+            return (to_named_image(file.name, _read_image(file, "RGB"), number / rate) for number, file in files)
+        return (NamedImage(file.name, _read_image(file), number / rate) for number, file in files)
     return _read_video_frames(path, 1, with_colour, first_frame)
 
 
@@ -144,7 +144,7 @@ def _warn_once(text: str) -> None:
     warnings.warn(text, stacklevel=1)
 
 
-def _read(path: Path, kind: str = "L") -> np.ndarray:
+def _read_image(path: Path, flag: str = "L") -> np.ndarray:
     """Read an image as stored, grey ("L") or "RGB"; EXIF orientation is ignored, as calibrations use stored pixels."""
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path}: is larger than {MAX_FILE_BYTES / 1e6:.0f} MB. Remove it, or write it smaller.")
@@ -155,16 +155,16 @@ def _read(path: Path, kind: str = "L") -> np.ndarray:
                 _check_size(path, *picture.size)
                 if picture.mode.startswith("I"):  # 16 bits
                     grey = (np.asarray(picture) >> 8).astype(np.uint8)
-                    return grey if kind == "L" else np.repeat(grey[..., None], 3, axis=2)
-                return np.asarray(picture.convert(kind))
+                    return grey if flag == "L" else np.repeat(grey[..., None], 3, axis=2)
+                return np.asarray(picture.convert(flag))
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         raise ValueError(f"{path}: {TOO_LARGE_ERROR}") from error
     except (OSError, SyntaxError) as error:
         raise ValueError(f"{path}: is not a readable image. Remove it, or write it again.") from error
 
 
-def _read_video_frames(path: Path, step: int | None, colour: bool = False, first: int = 0) -> Iterator[NamedImage]:
-    """Yield every `step`-th frame of a video from the `first` on; None: a step that gives `MAX_IMAGES` frames."""
+def _read_video_frames(path: Path, step: int | None, colour: bool = False, start: int = 0) -> Iterator[NamedImage]:
+    """Yield every `step`-th frame of a video from the `start` on; None: a step that gives `MAX_IMAGES` frames."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file. {REMEDY}")
     video = _open_video(path)
@@ -185,7 +185,7 @@ def _read_video_frames(path: Path, step: int | None, colour: bool = False, first
         every = step or (-(-count // MAX_IMAGES) if count > 0 else VIDEO_STRIDE)
         number = 0
         while video.grab():
-            if number >= first and (number - first) % every == 0:
+            if number >= start and (number - start) % every == 0:
                 time = 1e-3 * video.get(cv2.CAP_PROP_POS_MSEC)
                 good, frame = video.retrieve()
                 if good and colour:
@@ -221,7 +221,7 @@ def _describe_flaw(path: Path) -> str:
     )
 
 
-def _spread(count: int) -> list[int]:
+def _compute_spread(count: int) -> list[int]:
     """Return at most `MAX_IMAGES` integers below `count`, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, MAX_IMAGES)).round().astype(int)).tolist()
 

@@ -79,7 +79,7 @@ def read_newest_images(images: Generator[NamedImage | None], timeout: float) -> 
     ended: list[BaseException | None] = []
     came, left = threading.Condition(), threading.Event()
 
-    def take() -> None:
+    def read_images() -> None:
         failure: BaseException | None = None
         try:
             for picture in images:
@@ -96,7 +96,7 @@ def read_newest_images(images: Generator[NamedImage | None], timeout: float) -> 
             ended.append(failure)
             came.notify()
 
-    threading.Thread(target=take, name="camera", daemon=True).start()
+    threading.Thread(target=read_images, name="camera", daemon=True).start()
     try:
         while True:
             with came:

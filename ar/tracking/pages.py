@@ -153,8 +153,8 @@ def _draw_cube_page(target: Target) -> PrintedPage:
     page, ink = _create_page(A4)
     placed = tuple(PlacedFace(face, x + border, y + border, turns) for face, x, y, turns in cells)
     for each, (face, x, y, _) in zip(placed, cells, strict=True):
-        _print(page, each)
-        _write(ink, to_face_name(face), x + 0.8, y + 0.4, NAME_HEIGHT)
+        _paste_face(page, each)
+        _write_text(ink, to_face_name(face), x + 0.8, y + 0.4, NAME_HEIGHT)
     right, below, flap = left + wide, top + wide, 10.0
     folds = [((left, below), (right, below)), ((right, below), (right, below + wide)), ((right, top), (right, below))]
     for start, end in folds:
@@ -163,7 +163,7 @@ def _draw_cube_page(target: Target) -> PrintedPage:
     around = [*tab, (right, below), (right + wide, below), (right + wide, below + wide), (left, below + wide)]
     for start, end in zip([*around, (left, top)], [*around[1:], (left, top), (right, top)], strict=True):
         _draw_line(ink, start, end, 3.0)
-    _write(ink, "tab", right + 2.5, top + 0.5 * wide - 2.0, TEXT_HEIGHT)
+    _write_text(ink, "tab", right + 2.5, top + 0.5 * wide - 2.0, TEXT_HEIGHT)
     said = (
         f"A cube of {wide:.0f} mm with three faces along +x, +y and +z; their names stand in their borders.",
         *_describe_sizes(target),
@@ -186,7 +186,7 @@ def _draw_plate_page(target: Target) -> PrintedPage:
     left, top = 0.5 * (A4[0] - wide), 110.0
     page, ink = _create_page(A4)
     placed = PlacedFace(face, left + border, top + border)
-    _print(page, placed)
+    _paste_face(page, placed)
     corners = [(left, top), (left + wide, top), (left + wide, top + wide), (left, top + wide)]
     for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
         _draw_line(ink, start, end, 3.0)
@@ -206,10 +206,10 @@ def _draw_board_page(target: Target) -> PrintedPage:
     (face,) = target.faces
     page, ink = _create_page((A4[1], A4[0]))
     placed = PlacedFace(face, 0.5 * (A4[1] - _to_millimetres(face.size[0])) + 20.0, 7.0)
-    _print(page, placed)
+    _paste_face(page, placed)
     said = (*_describe_sizes(target), *PRINT_INSTRUCTIONS)
-    _write(ink, f"sulcus: {target.name}", 15.0, 176.0, TITLE_HEIGHT)
-    _write(ink, "Glue it onto a stiff, flat plate: a bent board calibrates wrongly.", 60.5, 178.5, TEXT_HEIGHT)
+    _write_text(ink, f"sulcus: {target.name}", 15.0, 176.0, TITLE_HEIGHT)
+    _write_text(ink, "Glue it onto a stiff, flat plate: a bent board calibrates wrongly.", 60.5, 178.5, TEXT_HEIGHT)
     _write_paragraph(ink, said, 15.0, 183.0)
     _draw_ruler(ink, 15.0, 40.0, down=True)
     _draw_ruler(ink, 180.0, 192.0, down=False)
@@ -217,15 +217,15 @@ def _draw_board_page(target: Target) -> PrintedPage:
 
 
 def _compose_page(
-    target: Target, page: Image.Image, ink: ImageDraw.ImageDraw, placed: tuple[PlacedFace, ...], said: Sequence[str],
+    target: Target, page: Image.Image, canvas: ImageDraw.ImageDraw, faces: tuple[PlacedFace, ...], lines: Sequence[str],
     rulers: tuple[tuple[float, float], tuple[float, float]],
 ) -> PrintedPage:  # fmt: skip
     """Complete a portrait page: add the title, the text and two rulers, which start at the positions `rulers` [mm]."""
-    _write(ink, f"sulcus: {target.name}", 15.0, 14.0, TITLE_HEIGHT)
-    _write_paragraph(ink, said, 15.0, 25.0)
-    _draw_ruler(ink, *rulers[0], down=True)
-    _draw_ruler(ink, *rulers[1], down=False)
-    return PrintedPage(target.name, _read_pixels(page), placed)
+    _write_text(canvas, f"sulcus: {target.name}", 15.0, 14.0, TITLE_HEIGHT)
+    _write_paragraph(canvas, lines, 15.0, 25.0)
+    _draw_ruler(canvas, *rulers[0], down=True)
+    _draw_ruler(canvas, *rulers[1], down=False)
+    return PrintedPage(target.name, _read_pixels(page), faces)
 
 
 def _describe_sizes(target: Target) -> tuple[str, str]:
@@ -244,52 +244,52 @@ def _create_page(size: tuple[float, float]) -> tuple[Image.Image, ImageDraw.Imag
     return page, ImageDraw.Draw(page)
 
 
-def _print(page: Image.Image, placed: PlacedFace) -> None:
-    picture = np.rot90(placed.face.draw(_to_pixels(_to_millimetres(placed.face.square))), -placed.quarter_turns)
-    page.paste(Image.fromarray(np.ascontiguousarray(picture)), (_to_pixels(placed.left), _to_pixels(placed.top)))
+def _paste_face(page: Image.Image, face: PlacedFace) -> None:
+    picture = np.rot90(face.face.draw(_to_pixels(_to_millimetres(face.face.square))), -face.quarter_turns)
+    page.paste(Image.fromarray(np.ascontiguousarray(picture)), (_to_pixels(face.left), _to_pixels(face.top)))
 
 
-def _write(ink: ImageDraw.ImageDraw, text: str, left: float, top: float, size: float) -> None:
-    ink.text((_to_pixels(left), _to_pixels(top)), text, fill=0, font=ImageFont.load_default(_to_pixels(size)))
+def _write_text(canvas: ImageDraw.ImageDraw, text: str, left: float, top: float, size: float) -> None:
+    canvas.text((_to_pixels(left), _to_pixels(top)), text, fill=0, font=ImageFont.load_default(_to_pixels(size)))
 
 
-def _write_paragraph(ink: ImageDraw.ImageDraw, lines: Sequence[str], left: float, top: float) -> None:
+def _write_paragraph(canvas: ImageDraw.ImageDraw, lines: Sequence[str], left: float, top: float) -> None:
     for number, line in enumerate(lines):
-        _write(ink, line, left, top + LINE_SPACING * number, TEXT_HEIGHT)
+        _write_text(canvas, line, left, top + LINE_SPACING * number, TEXT_HEIGHT)
 
 
 def _draw_line(
-    ink: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[float, float], dash: float = 0.0
+    canvas: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[float, float], dash: float = 0.0
 ) -> None:
     """Draw a line between two positions [mm]; `dash` is the length [mm] of dashes and gaps, 0 for a solid line."""
     start_, end_ = np.array(start), np.array(end)
     pieces = max(2 * round(np.hypot(*(end_ - start_)) / (2.0 * dash)) + 1, 1) if dash else 1
     at = start_ + np.linspace(0.0, 1.0, pieces + 1)[:, None] * (end_ - start_)
     for one, other in zip(at[:-1:2], at[1::2], strict=True):
-        ink.line([*map(_to_pixels, one), *map(_to_pixels, other)], fill=0, width=_to_pixels(LINE_WIDTH))
+        canvas.line([*map(_to_pixels, one), *map(_to_pixels, other)], fill=0, width=_to_pixels(LINE_WIDTH))
 
 
-def _draw_ruler(ink: ImageDraw.ImageDraw, left: float, top: float, down: bool) -> None:
+def _draw_ruler(canvas: ImageDraw.ImageDraw, left: float, top: float, down: bool) -> None:
     """Draw a ruler with a mark every 10 mm, from a position downwards or to the right."""
     along, across = (
         (np.array([0.0, 1.0]), np.array([1.0, 0.0])) if down else (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     )
     origin = np.array([left, top])
-    _draw_bar(ink, origin, origin + RULER_LENGTH * along)
+    _draw_bar(canvas, origin, origin + RULER_LENGTH * along)
     for at in np.arange(0.0, RULER_LENGTH + 1.0, 10.0):
         ends = at in (0.0, 0.5 * RULER_LENGTH, RULER_LENGTH)
         mark = origin + at * along
-        _draw_bar(ink, mark, mark + (5.0 if ends else 3.0) * across)
+        _draw_bar(canvas, mark, mark + (5.0 if ends else 3.0) * across)
         if ends:
             x, y = mark + (6.0 * across - 1.8 * along if down else 5.5 * across - 1.0 * along)
-            _write(ink, f"{at:.0f}" if at < RULER_LENGTH else f"{at:.0f} mm", x, y, TEXT_HEIGHT)
+            _write_text(canvas, f"{at:.0f}" if at < RULER_LENGTH else f"{at:.0f} mm", x, y, TEXT_HEIGHT)
 
 
-def _draw_bar(ink: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> None:
+def _draw_bar(canvas: ImageDraw.ImageDraw, start: np.ndarray, end: np.ndarray) -> None:
     """Draw a line parallel to a page side, centred exactly, as `LINE_WIDTH` is a multiple of two pixels."""
     half = _to_pixels(LINE_WIDTH) // 2
     low, high = np.minimum(start, end), np.maximum(start, end)
-    ink.rectangle([*(_to_pixels(at) - half for at in low), *(_to_pixels(at) + half - 1 for at in high)], fill=0)
+    canvas.rectangle([*(_to_pixels(at) - half for at in low), *(_to_pixels(at) + half - 1 for at in high)], fill=0)
 
 
 def _to_pixels(mm: float) -> int:

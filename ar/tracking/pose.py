@@ -109,11 +109,11 @@ def find_pose(
     limit = squares + settings.min_chi2_excess * variance
     rivals = [T for T, other in fits[1:] if other < limit and not _is_same_pose(T, best, settings)]
     if rivals:
-        near = sorted([best, *rivals], key=lambda T: np.inf if previous is None else _turn(T, previous))
+        near = sorted([best, *rivals], key=lambda T: np.inf if previous is None else _compute_rotation(T, previous))
         if (
             previous is None
-            or _turn(near[0], previous) > settings.max_pose_turn
-            or _turn(near[1], previous) < 2.0 * _turn(near[0], previous)
+            or _compute_rotation(near[0], previous) > settings.max_pose_turn
+            or _compute_rotation(near[1], previous) < 2.0 * _compute_rotation(near[0], previous)
         ):
             return PoseStatus.AMBIGUOUS, None
         best = near[0]
@@ -176,14 +176,14 @@ def _build_rigid(turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
     return T
 
 
-def _turn(one: np.ndarray, other: np.ndarray) -> float:
+def _compute_rotation(pose: np.ndarray, reference: np.ndarray) -> float:
     """Compute the rotation angle [rad] between two poses."""
-    return float(compute_rotation_angles(one[:3, :3] @ other[:3, :3].T))
+    return float(compute_rotation_angles(pose[:3, :3] @ reference[:3, :3].T))
 
 
-def _is_same_pose(one: np.ndarray, other: np.ndarray, settings: PoseSettings) -> bool:
-    shift = float(np.linalg.norm(one[:3, 3] - other[:3, 3]))
-    return _turn(one, other) < settings.turn_tolerance and shift < settings.shift_tolerance
+def _is_same_pose(pose: np.ndarray, reference: np.ndarray, settings: PoseSettings) -> bool:
+    shift = float(np.linalg.norm(pose[:3, 3] - reference[:3, 3]))
+    return _compute_rotation(pose, reference) < settings.turn_tolerance and shift < settings.shift_tolerance
 
 
 @dataclass(frozen=True)
@@ -266,20 +266,20 @@ class Tracker:
         return TrackedTargets(number, verdicts, poses, last)
 
     def _detect_corners(
-        self, grey: np.ndarray, number: int, last: Mapping[str, tuple[np.ndarray, int]]
+        self, grey: np.ndarray, number: int, previous: Mapping[str, tuple[np.ndarray, int]]
     ) -> dict[str, DetectedCorners]:
         """Detect corners near the last poses; search lost targets in the whole image, at once and at intervals."""
         settings, found = self.settings, dict[str, DetectedCorners]()
         for target in self.targets:
-            if target.name in last:
-                T = last[target.name][0]
+            if target.name in previous:
+                T = previous[target.name][0]
                 outline = target.outline @ T[:3, :3].T + T[:3, 3]
                 window = find_window(self.camera, outline, settings.search_margin, settings.min_search_margin)
                 seen = None if window is None else self._detector.detect_in_window(target, grey, window)
                 if seen is not None and len(seen.points) >= settings.pose.min_corners:
                     found[target.name] = seen
         missing = [target.name for target in self.targets if target.name not in found]
-        just_left = any(last.get(name, (None, -2))[1] == number - 1 for name in missing)
+        just_left = any(previous.get(name, (None, -2))[1] == number - 1 for name in missing)
         if missing and (just_left or number % settings.search_interval == 0):
             found |= self._detector.detect(grey, missing)
         return found

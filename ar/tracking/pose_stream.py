@@ -178,10 +178,7 @@ def estimate_clock_offset(
         )
     tried = np.arange(low, high + settings.offset_step, settings.offset_step).clip(low, high)
     squares = np.array(
-        [
-            _sum_squares(_compute_differences(times + offset, positions, tracker_times, tracker_positions))
-            for offset in tried
-        ]
+        [_sum_squares(_compute_errors(times + offset, positions, tracker_times, tracker_positions)) for offset in tried]
     )
     if not np.isfinite(squares).any():
         raise ValueError(f"the poses have gaps of more than {MAX_GAP:g} s wherever the images are.")
@@ -200,17 +197,17 @@ def estimate_clock_offset(
 
 
 def _refine_offset(
-    offset: float, times: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray,
+    offset: float, times: np.ndarray, positions: np.ndarray, tracker_times: np.ndarray, tracked: np.ndarray,
     settings: ClockSettings,
 ) -> tuple[Clock, float]:  # fmt: skip
     """Refine an offset by Gauss-Newton; return the clock and the remaining sum of squares [m^2]."""
-    low, high = samples[0] - times[0], samples[-1] - times[-1]
-    speed, off = np.zeros_like(places), np.zeros_like(places)
+    low, high = tracker_times[0] - times[0], tracker_times[-1] - times[-1]
+    speed, off = np.zeros_like(positions), np.zeros_like(positions)
     for _ in range(settings.max_iterations):
-        off = _compute_differences(times + offset, places, samples, others)
+        off = _compute_errors(times + offset, positions, tracker_times, tracked)
         ahead, behind = min(offset + settings.offset_step, high), max(offset - settings.offset_step, low)
-        speed = _compute_differences(times + ahead, places, samples, others) - _compute_differences(
-            times + behind, places, samples, others
+        speed = _compute_errors(times + ahead, positions, tracker_times, tracked) - _compute_errors(
+            times + behind, positions, tracker_times, tracked
         )
         speed /= max(ahead - behind, np.finfo(float).tiny)
         step = -float((speed * off).sum() / max((speed**2).sum(), np.finfo(float).tiny))
@@ -220,20 +217,20 @@ def _refine_offset(
     moved = float(np.sqrt((speed**2).sum(axis=1).mean())) * float(times[-1] - times[0])
     if not moved > settings.min_motion:
         raise ValueError(f"the tool moves by {1e3 * moved:.1f} mm only: that says nothing of the clocks. {REMEDY}")
-    left = _sum_squares(_compute_differences(times + offset, places, samples, others))
+    left = _sum_squares(_compute_errors(times + offset, positions, tracker_times, tracked))
     scatter = np.sqrt(left / max(off.size - 4, 1))
     return Clock(offset, float(scatter / np.sqrt((speed**2).sum()))), left
 
 
-def _compute_differences(at: np.ndarray, places: np.ndarray, samples: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Compute differences (n, 3) of interpolated samples and `places` at times (n,), minus their mean; NaN in gaps."""
-    there = np.column_stack([np.interp(at, samples, column) for column in others.T])
-    after = np.searchsorted(samples, at).clip(1, len(samples) - 1)
+def _compute_errors(times: np.ndarray, positions: np.ndarray, samples: np.ndarray, tracked: np.ndarray) -> np.ndarray:
+    """Compute differences (n, 3) of tracker and `positions` at times (n,), minus their mean; NaN in gaps."""
+    there = np.column_stack([np.interp(times, samples, column) for column in tracked.T])
+    after = np.searchsorted(samples, times).clip(1, len(samples) - 1)
     there[samples[after] - samples[after - 1] > MAX_GAP] = np.nan
-    off = there - places
+    off = there - positions
     return off - off.mean(axis=0)
 
 
-def _sum_squares(off: np.ndarray) -> float:
-    total = float((off**2).sum())
+def _sum_squares(differences: np.ndarray) -> float:
+    total = float((differences**2).sum())
     return total if np.isfinite(total) else np.inf

@@ -114,7 +114,7 @@ def register_points(
     _check_fit(scan_points, patient_points, off, settings)
     centre = scan_points.mean(axis=0)
     freedom = 3 * len(scan_points) - 6
-    J = compute_jacobian(T, scan_points, centre) / _scatter(off, freedom, settings)
+    J = compute_jacobian(T, scan_points, centre) / _compute_scatter(off, freedom, settings)
     return Registration(T, _widen_covariance(J.T @ J, freedom), centre, _compute_rms(off), len(scan_points))
 
 
@@ -140,14 +140,14 @@ def refine_registration(
     start = register_points(scan_points, patient_points, settings)
     T, centre = start.T_patient_scan, start.centre
     freedom = 3 * len(scan_points) - 6
-    touched = _scatter(scan_points @ T[:3, :3].T + T[:3, 3] - patient_points, freedom, settings)
+    touched = _compute_scatter(scan_points @ T[:3, :3].T + T[:3, 3] - patient_points, freedom, settings)
     normal, off, away = np.eye(6), np.zeros((1, 3)), np.zeros(1)
     for _ in range(settings.max_iterations):
         off = scan_points @ T[:3, :3].T + T[:3, 3] - patient_points
         place, outward = find_nearest((surface_points - T[:3, 3]) @ T[:3, :3])
         turned = outward @ T[:3, :3].T
         away = np.einsum("ni,ni->n", turned, place @ T[:3, :3].T + T[:3, 3] - surface_points)
-        traced = _scatter(away, len(surface_points), settings)
+        traced = _compute_scatter(away, len(surface_points), settings)
         J = compute_jacobian(T, scan_points, centre) / touched
         K = np.einsum("ni,nij->nj", turned, compute_jacobian(T, place, centre).reshape(-1, 3, 6)) / traced
         normal = J.T @ J + K.T @ K
@@ -187,9 +187,9 @@ def _check_shape(scan: np.ndarray, patient: np.ndarray, settings: RegistrationSe
         )
 
 
-def _check_fit(scan: np.ndarray, patient: np.ndarray, off: np.ndarray, settings: RegistrationSettings) -> None:
+def _check_fit(scan: np.ndarray, patient: np.ndarray, residuals: np.ndarray, settings: RegistrationSettings) -> None:
     """Raise ValueError for a mirrored set, a single wrong pair, two swapped pairs, or pairs that do not fit."""
-    rms = _compute_rms(off)
+    rms = _compute_rms(residuals)
     mirrored = _compute_rms(_fit_rigid(scan * [-1.0, 1.0, 1.0], patient)[1])
     if settings.min_residual_ratio * max(mirrored, settings.min_rms) < rms:
         raise ValueError("the scan's points fit their mirror image only: one frame is left-handed. Give RAS.")
@@ -247,19 +247,19 @@ def compute_jacobian(T: np.ndarray, points: np.ndarray, centre: np.ndarray) -> n
     ).reshape(-1, 6)
 
 
-def _widen_covariance(normal: np.ndarray, freedom: int) -> np.ndarray:
-    """Invert a normal matrix to a covariance (6, 6), widened as its scatter has few degrees of freedom (`freedom`)."""
-    inverse = 3.0 * f.ppf(LEVEL, 3, freedom) / chi2.ppf(LEVEL, 3) * np.linalg.inv(normal)
+def _widen_covariance(normal: np.ndarray, dof: int) -> np.ndarray:
+    """Invert a normal matrix to a covariance (6, 6), widened as its scatter has few degrees of freedom (`dof`)."""
+    inverse = 3.0 * f.ppf(LEVEL, 3, dof) / chi2.ppf(LEVEL, 3) * np.linalg.inv(normal)
     return 0.5 * (inverse + inverse.T)
 
 
-def _scatter(off: np.ndarray, freedom: int, settings: RegistrationSettings) -> float:
+def _compute_scatter(residuals: np.ndarray, dof: int, settings: RegistrationSettings) -> float:
     """Estimate the standard deviation [m] of residuals along an axis, at least `RegistrationSettings.min_rms`."""
-    return max(float(np.sqrt((off**2).sum() / freedom)), settings.min_rms)
+    return max(float(np.sqrt((residuals**2).sum() / dof)), settings.min_rms)
 
 
-def _compute_rms(off: np.ndarray) -> float:
-    return float(np.sqrt((off**2).sum(axis=1).mean()))
+def _compute_rms(residuals: np.ndarray) -> float:
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
 
 
 FALSE_ALARM_RATE = 0.05  # Share of valid point sets in which a pair is reported as an outlier.

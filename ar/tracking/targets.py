@@ -275,9 +275,9 @@ def _build_dictionary(targets: Sequence[Target]) -> cv2.aruco.Dictionary:
     return cv2.aruco.Dictionary(whole.bytesList[_list_numbers(targets)], whole.markerSize)
 
 
-def _build_parameters(least: int, most: int) -> cv2.aruco.DetectorParameters:
-    """Build detector parameters with the threshold window widths `least` and `most` [pixel]."""
+def _build_parameters(min_width: int, max_width: int) -> cv2.aruco.DetectorParameters:
+    """Build detector parameters with the threshold window widths `min_width` and `max_width` [pixel]."""
     found = cv2.aruco.DetectorParameters()
-    found.adaptiveThreshWinSizeMin, found.adaptiveThreshWinSizeMax = least, most
-    found.adaptiveThreshWinSizeStep = max(most - least, 1)
+    found.adaptiveThreshWinSizeMin, found.adaptiveThreshWinSizeMax = min_width, max_width
+    found.adaptiveThreshWinSizeStep = max(max_width - min_width, 1)
     return found

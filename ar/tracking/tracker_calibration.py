@@ -100,12 +100,12 @@ def solve_hand_eye(poses_a: np.ndarray, poses_b: np.ndarray, settings: HandEyeSe
 
 
 def _select_motions(
-    first: np.ndarray, second: np.ndarray, settings: HandEyeSettings
+    poses_a: np.ndarray, poses_b: np.ndarray, settings: HandEyeSettings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Select the motions (m, 4, 4) of both bodies with the largest rotations; return also their pose indices (2, m)."""
-    kept = np.unique(np.linspace(0, len(first) - 1, min(len(first), settings.max_poses)).round().astype(int))
+    kept = np.unique(np.linspace(0, len(poses_a) - 1, min(len(poses_a), settings.max_poses)).round().astype(int))
     start, end = np.triu_indices(len(kept), 1)
-    A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (first, second))
+    A, B = (np.linalg.inv(poses[kept])[start] @ poses[kept][end] for poses in (poses_a, poses_b))
     angles = np.array([compute_rotation_angles(M[:, :3, :3]) for M in (A, B)])
     good = np.flatnonzero((angles.min(axis=0) > settings.min_turn) & (angles.max(axis=0) < settings.max_turn))
     if len(good) < settings.min_poses:

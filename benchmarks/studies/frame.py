@@ -70,7 +70,7 @@ def time_frames(player: Player, count: int) -> Iterator[tuple[float, ...]]:
             stage = player.stage.select_stage(loads)
             for layer in (stage.build_visible_cortex(positions), stage.build_tumour(positions)):
                 page.move(layer.name, layer.vertices, layer.triangles)
-            page.put_sight(code, f"frame {number}")
+            page.send_image_element(code, f"frame {number}")
             sent = clock.perf_counter()
             if done >= 0:
                 rendered = frame.seconds["render"]

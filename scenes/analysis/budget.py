@@ -37,14 +37,14 @@ def choose_within(
     if not recorded:
         notify(f"families of models are not offered: no figures for {scene.name} on this anatomy. {REMEDY}")
 
-    def offer(name: str, error_mm: float | None, of: str) -> None:
+    def add_candidate(name: str, error_mm: float | None, remark: str) -> None:
         player = patient.build_player_of(stage, patient.build_deformer(name, scene), name)
         error_mm = 1e3 * _get_reported_error(player.deformer) if error_mm is None else error_mm
         if not np.isnan(error_mm):
-            offers.append(ModelCandidate(name, error_mm, _time_frames(player), of))
+            offers.append(ModelCandidate(name, error_mm, _time_frames(player), remark))
 
     for name in patient.list_deformers(scene):
-        offer(name, None, f"; error relative to {'converged ' * (name == 'fem')}FEM")
+        add_candidate(name, None, f"; error relative to {'converged ' * (name == 'fem')}FEM")
     of = {name: f"; error relative to p2 in 95 % of {one.loads} recorded pushes" for name, one in recorded.items()}
     waiting = {
         name: ModelCandidate(name, one.p95_mm, one.median_ms, f"{of[name]}; time of {one.machine.partition(',')[0]}")
@@ -54,7 +54,7 @@ def choose_within(
         name = choice.candidate.name
         notify(f"timing {waiting.pop(name)}, where its preparation took {recorded[name].preparation_s:.2g} s")
         try:
-            offer(name, recorded[name].p95_mm, of[name])
+            add_candidate(name, recorded[name].p95_mm, of[name])
         except InputError as error:
             notify(f"{name} cannot be chosen: {error}")
     return choice

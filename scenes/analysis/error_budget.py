@@ -157,19 +157,19 @@ def _generate_samples(
     target = build_patient_reference()
     corners = sum(len(face.corners) for face in target.faces)
 
-    def of(name: str, value: np.ndarray) -> np.ndarray:
+    def mask_error(name: str, value: np.ndarray) -> np.ndarray:
         return value if name in contributors else np.zeros_like(value)
 
     for number in range(count):
         random, time, body = _sample_time_and_body(filmed, seed, number)
-        late = float(of(LATENCY, np.array(filmed.latency + filmed.clock * random.standard_normal())))
+        late = float(mask_error(LATENCY, np.array(filmed.latency + filmed.clock * random.standard_normal())))
         drawn = int(random.integers(CALIBRATION_COUNT))
         taken = filmed.sampled_calibrations[drawn] if CALIBRATION in contributors else filmed.calibration
-        off = of(MARKERS, filmed.corner * random.standard_normal((corners, 2)))
-        aside = of(SURROGATE, filmed.surrogate / np.sqrt(RADIUS_SQUARED) * random.standard_normal(3))
-        shift = of(REGISTRATION, _sample_registration_error(filmed, random.standard_normal(6)))
-        wide = of(SEGMENTATION, SEGMENTATION_PRIOR.range[1] * random.standard_normal(1))
-        mesh = of(MESH, (filmed.meshes if PARAMETERS in contributors else filmed.own_mesh)[body])
+        off = mask_error(MARKERS, filmed.corner * random.standard_normal((corners, 2)))
+        aside = mask_error(SURROGATE, filmed.surrogate / np.sqrt(RADIUS_SQUARED) * random.standard_normal(3))
+        shift = mask_error(REGISTRATION, _sample_registration_error(filmed, random.standard_normal(6)))
+        wide = mask_error(SEGMENTATION, SEGMENTATION_PRIOR.range[1] * random.standard_normal(1))
+        mesh = mask_error(MESH, (filmed.meshes if PARAMETERS in contributors else filmed.own_mesh)[body])
         readout = filmed.calibration.readout if SHUTTER in contributors else 0.0
         motion = filmed.field + (filmed.differences[body] if PARAMETERS in contributors else 0.0)
         surface = filmed.rest + (1.0 + mesh) * motion
@@ -196,13 +196,13 @@ def _sample_time_and_body(filmed: FilmedScene, seed: int, number: int) -> tuple[
 
 
 def _build_cameras(
-    filmed: FilmedScene, time: float, late: float, readout: float, middle: np.ndarray
+    filmed: FilmedScene, time: float, delay: float, readout: float, point: np.ndarray
 ) -> tuple[Camera, Camera]:
-    """Return the true camera of the image row that shows `middle` (3,) [m] at a time [s], and the tracked camera."""
+    """Return the true camera of the image row that shows `point` (3,) [m] at a time [s], and the tracked camera."""
     true = _build_delayed_camera(filmed, time, 0.0)
-    then = _build_delayed_camera(filmed, time, -late) if late else true
+    then = _build_delayed_camera(filmed, time, -delay) if delay else true
     if readout:
-        row = float(true.project(middle[None])[0][0, 1])
+        row = float(true.project(point[None])[0][0, 1])
         true = _build_delayed_camera(filmed, time, readout * compute_row_delay(true, row))
     return true, then
 
@@ -232,12 +232,12 @@ def _compute_registration_shift(filmed: FilmedScene, error: np.ndarray, points: 
 
 
 def _compare_tumours(
-    true: Camera, believed: Camera, surface: np.ndarray, shown: np.ndarray
+    true: Camera, estimated: Camera, surface: np.ndarray, drawn_surface: np.ndarray
 ) -> tuple[float, float, float, float]:
     """Return errors of the drawn tumour: centre across [m], along [m], in the image [pixel]; maximum on surface [m]."""
-    here, there = (np.vstack([points.mean(axis=0), points]) for points in (surface, shown))
+    here, there = (np.vstack([points.mean(axis=0), points]) for points in (surface, drawn_surface))
     pixels, depth = true.project(here)
-    drawn, farther = believed.project(there)
+    drawn, farther = estimated.project(there)
     away = np.linalg.norm(drawn - pixels, axis=1)
     # One pixel at the depth of the place: across the line of sight.
     across = away * depth / np.sqrt(true.K[0, 0] * true.K[1, 1])
@@ -285,21 +285,21 @@ def compute_budget(
     within = sample_errors(test_scene, CLINICAL, count, seed + 1).worst <= budget.band
     return replace(
         budget,
-        coverage=_share(within, [_sample_time_and_body(test_scene, seed + 1, number)[2] for number in range(count)]),
+        coverage=_mean(within, [_sample_time_and_body(test_scene, seed + 1, number)[2] for number in range(count)]),
     )
 
 
-def _share(within: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | None]:
+def _mean(mask: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | None]:
     """Return the share of True samples (S,), and its standard deviation with `bodies` (S,) as clusters.
 
     Ratio estimator: Cochran (1977), "Sampling techniques", equation 2.46.
     """
-    share, numbers = float(within.mean()), np.unique(bodies, return_inverse=True)[1]
-    excess = np.bincount(numbers, weights=within - share)
+    share, numbers = float(mask.mean()), np.unique(bodies, return_inverse=True)[1]
+    excess = np.bincount(numbers, weights=mask - share)
     clusters = len(excess)
     if clusters < 2:
         return share, None
-    return share, float(np.sqrt(np.square(excess).sum() * clusters / (clusters - 1))) / len(within)
+    return share, float(np.sqrt(np.square(excess).sum() * clusters / (clusters - 1))) / len(mask)
 
 
 def find_largest_spread(

@@ -88,13 +88,13 @@ def compute_variance_shares(cells: Sequence[FactorCombination], response: str = 
     kept = [cell.levels for cell, one in zip(cells, good, strict=True) if one]
     names = [name for name in kept[0] if len({levels[name] for levels in kept}) > 1]
 
-    def explained(*factors: str) -> float:
+    def compute_share(*factors: str) -> float:
         keys = [tuple(levels[name] for name in factors) for levels in kept]
         means = {key: np.mean([v for v, k in zip(values, keys, strict=True) if k == key]) for key in set(keys)}
         return float(sum(means[key] ** 2 for key in keys) / np.square(values).sum())
 
-    own = {name: explained(name) for name in names}
-    pairs = {f"{a} x {b}": explained(a, b) - own[a] - own[b] for a, b in combinations(names, 2)}
+    own = {name: compute_share(name) for name in names}
+    pairs = {f"{a} x {b}": compute_share(a, b) - own[a] - own[b] for a, b in combinations(names, 2)}
     return dict(sorted({**own, **pairs}.items(), key=lambda item: -item[1]))
 
 
@@ -120,5 +120,5 @@ def build_panels(combinations: Sequence[FactorCombination]) -> list[ChartPanel]:
     return out
 
 
-def _list_levels(found: Sequence[FactorCombination], name: str) -> list[str | float]:
-    return list(dict.fromkeys(cell.levels[name] for cell in found))
+def _list_levels(cells: Sequence[FactorCombination], name: str) -> list[str | float]:
+    return list(dict.fromkeys(cell.levels[name] for cell in cells))

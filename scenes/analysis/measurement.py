@@ -66,11 +66,11 @@ def watch_gpu_memory(device: str) -> Iterator[list[int]]:
         return
     before, ended = where.free_memory, threading.Event()
 
-    def watch() -> None:
+    def record_memory() -> None:
         while not ended.wait(0.02):
             taken.append(before - where.free_memory)
 
-    watcher = threading.Thread(target=watch, daemon=True)
+    watcher = threading.Thread(target=record_memory, daemon=True)
     watcher.start()
     try:
         yield taken

@@ -108,7 +108,7 @@ def perturb_loads(loads: Loads, perturbation: LoadPerturbation, patch: Patch) ->
 
 
 @dataclass(frozen=True)
-class Change:
+class MotionChange:
     """Difference of the tumour's displacement from the default model, over `solves` converged loads; `failed` failed.
 
     Parameters
@@ -138,8 +138,8 @@ class SensitivityRow:
     """Variant with its changes under prescribed tool forces, and under prescribed tool motions."""
 
     variant: Variant
-    force: Change
-    motion: Change
+    force: MotionChange
+    motion: MotionChange
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +196,7 @@ def measure_variants(study: SensitivityStudy, variants: Sequence[Variant]) -> It
         yield SensitivityRow(variant, *found)
 
 
-def compute_change(result: Deformation, default: Deformation, reference: np.ndarray) -> Change:
+def compute_change(result: Deformation, default: Deformation, reference: np.ndarray) -> MotionChange:
     """Compute the change of `result`, k blocks of the loads of `default`, from displacements `reference` (B, n, 3) [m].
 
     Only loads that converged in `result` and in `default` count.
@@ -205,14 +205,14 @@ def compute_change(result: Deformation, default: Deformation, reference: np.ndar
     sound, good = (np.array([outcome.good for outcome in one.outcome]) for one in (default, result))
     good = good & np.tile(sound, ways)
     if not good.any():
-        return Change(0, len(good), *[np.nan] * 6)
+        return MotionChange(0, len(good), *[np.nan] * 6)
     now, then, reference = (
         1e3 * field[good]
         for field in (result.displacement, *(np.tile(one, (ways, 1, 1)) for one in (default.displacement, reference)))
     )
     distance = np.linalg.norm(now - reference, axis=2)
     motion, before = (np.linalg.norm(field, axis=2).mean(axis=1) for field in (now, then))
-    return Change(
+    return MotionChange(
         int(good.sum()),
         int(len(good) - good.sum()),
         float(distance.mean()),

@@ -98,17 +98,17 @@ def apply_sample(scene: Scene, sample: PatientSample) -> Scene:
     """
     tissue = get_tissue(scene)
 
-    def drawn(one: Material, times: float = 1.0) -> Material:
-        return replace(one, young=times * sample.stiffness * one.young, poisson=sample.poisson)
+    def scale(material: Material, factor: float = 1.0) -> Material:
+        return replace(material, young=factor * sample.stiffness * material.young, poisson=sample.poisson)
 
-    regions = {label: drawn(one) for label, one in scene.elasticity.regions.items() if isinstance(one, Material)}
-    elasticity = Elasticity(drawn(tissue), {**regions, TUMOUR_LABEL: drawn(get_tumour_tissue(scene), sample.ratio)})
+    regions = {label: scale(one) for label, one in scene.elasticity.regions.items() if isinstance(one, Material)}
+    elasticity = Elasticity(scale(tissue), {**regions, TUMOUR_LABEL: scale(get_tumour_tissue(scene), sample.ratio)})
     skull = SKULLS[choose_name(sample.skull, list_skulls(scene))]
 
-    def other(effect: Effect) -> Effect:
+    def replace_effect(effect: Effect) -> Effect:
         return elasticity if isinstance(effect, Elasticity) else skull if isinstance(effect, SKULL_EFFECTS) else effect
 
-    return replace(scene, effects=tuple(map(other, scene.effects)), path=_shift_path(scene.path, sample.tip))
+    return replace(scene, effects=tuple(map(replace_effect, scene.effects)), path=_shift_path(scene.path, sample.tip))
 
 
 def list_skulls(scene: Scene) -> tuple[str, ...]:
@@ -177,11 +177,11 @@ def get_tumour_tissue(scene: Scene) -> Material:
 def _shift_path(path: Path, tip: Sequence[float]) -> Path:
     """Return a tool path shifted by `tip` (3,) [m]: to the right, upwards and inwards."""
 
-    def aside(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         touch = path(time)
         return replace(touch, x=touch.x + tip[0], y=touch.y + tip[1], depth=touch.depth + tip[2])
 
-    return aside
+    return get_touch
 
 
 def list_solved_times(scene: Scene) -> tuple[float, ...]:
@@ -217,7 +217,7 @@ def solve_scene(patient: PatientSetup, scene: Scene) -> Answer:
     fem, stage = patient.build_fem(scene, ACCURACY, batch=1), Stage(scene, patient.site)
     last, found, before, inverted = None, [], 0.0, 0
 
-    def gone_to(times: Sequence[float], start: Deformation | None) -> Deformation | None:
+    def solve_times(times: Sequence[float], start: Deformation | None) -> Deformation | None:
         for time in times:
             start = fem.deform(scene.build_loads(patient.site, scene.path(time), time), start=start)
             if not start.outcome[0].good:
@@ -225,9 +225,9 @@ def solve_scene(patient: PatientSetup, scene: Scene) -> Answer:
         return start
 
     for time in list_solved_times(scene):
-        result = gone_to([time], last)
+        result = solve_times([time], last)
         if result is None and time > before:
-            result = gone_to(np.linspace(before, time, 1 + ENSEMBLE.load_steps)[1:].tolist(), last)
+            result = solve_times(np.linspace(before, time, 1 + ENSEMBLE.load_steps)[1:].tolist(), last)
         if result is None:
             return None
         last, before, inverted = result, time, max(inverted, int(result.inverted[0]))

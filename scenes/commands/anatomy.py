@@ -170,25 +170,25 @@ def _summarise_anatomy(
     }
 
 
-def _describe_position(subject: Subject, place: np.ndarray) -> dict[str, Any]:
+def _describe_position(subject: Subject, position: np.ndarray) -> dict[str, Any]:
     """Return the position of a point (3,) [m] for JSON, in millimetres and in words."""
     low, high = subject.cortex.min(axis=0), subject.cortex.max(axis=0)
-    return {"at_mm": [round(1e3 * value, 1) for value in place.tolist()], "side": describe_side(place, low, high)}
+    return {"at_mm": [round(1e3 * value, 1) for value in position.tolist()], "side": describe_side(position, low, high)}
 
 
-def _format_place(place: dict[str, Any]) -> str:
-    at = ", ".join(f"{value:g}" for value in place["at_mm"])
-    return f"{place['side']}, at {at} mm (right, anterior, superior)"
+def _format_position(position: dict[str, Any]) -> str:
+    at = ", ".join(f"{value:g}" for value in position["at_mm"])
+    return f"{position['side']}, at {at} mm (right, anterior, superior)"
 
 
-def _format_pieces(pieces: list[dict[str, Any]], over: str) -> list[str]:
+def _format_pieces(pieces: list[dict[str, Any]], opened_piece: str) -> list[str]:
     if len(pieces) == 1:
-        return [f"tumour: {_format_place(pieces[0])}"]
+        return [f"tumour: {_format_position(pieces[0])}"]
     listed = [
-        f"  piece {number}: {piece['ml']:g} ml, {_format_place(piece)}{', not in the mesh' if piece['lost'] else ''}"
+        f"  piece {number}: {piece['ml']:g} ml, {_format_position(piece)}{', not in the mesh' if piece['lost'] else ''}"
         for number, piece in enumerate(pieces, start=1)
     ]
-    return [f"tumour: {len(pieces)} pieces; the skull is opened over {over}", *listed]
+    return [f"tumour: {len(pieces)} pieces; the skull is opened over {opened_piece}", *listed]
 
 
 def _format_region(name: str, volume: float, figures: dict) -> str:
@@ -206,7 +206,7 @@ def _format_report(figures: dict) -> str:
         *(_format_region(name, volume, figures) for name, volume in figures["regions_ml"].items()),
         *(f"{name} {held} nodes that do not move" for name, held in figures["septa_nodes"].items()),
         *_format_pieces(figures["tumour_pieces"], figures["opening"]["over"]),
-        f"opening: {_format_place(figures['opening'])}",
+        f"opening: {_format_position(figures['opening'])}",
         "craniotomy {craniotomy_nodes} nodes free, {sliding_nodes} at the skull, {held_nodes} fixed",
         "written to {mesh}" + (", intensities to {t1}" if figures["t1"] else "") + " in {seconds} s",
     ]

@@ -229,13 +229,13 @@ def _compute_model_bound(patient: PatientSetup, scene: Scene, time: float) -> fl
 
 
 def _collect_figures(
-    args: argparse.Namespace, filmed: FilmedScene, found: ErrorBudget, split: dict[str, float]
+    args: argparse.Namespace, filmed: FilmedScene, found: ErrorBudget, shares: dict[str, float]
 ) -> dict[str, Any]:
     """Collect the results for JSON, in millimetres and pixels."""
     from ..analysis.error_budget import PARAMETERS
 
-    calibration, rows = filmed.calibration, found.alone | {"technical": found.technical, "clinical": found.clinical}
-    inside = {name: 1e3 * split[name] for name in sorted(split, key=lambda name: -split[name]) if name not in rows}
+    calibration, rows = (filmed.calibration, found.alone | {"technical": found.technical, "clinical": found.clinical})
+    inside = {name: 1e3 * shares[name] for name in sorted(shares, key=lambda name: -shares[name]) if name not in rows}
     return {
         "scene": args.scene, "time_s": filmed.time,
         "moved_mm": 1e3 * float(np.linalg.norm(filmed.field, axis=1).mean()),

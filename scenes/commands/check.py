@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if passed else 1
 
 
-def _check_tracking(args: argparse.Namespace, patient: PatientSetup, table: TextIO) -> dict[str, object]:
+def _check_tracking(args: argparse.Namespace, patient: PatientSetup, stream: TextIO) -> dict[str, object]:
     """Check the overlay on a synthetic video whose markers disappear and return; return metrics for JSON."""
     from ..tracked.rendered_video import render_synthetic_video
     from ..tracked.tracking_checks import build_default_pipeline, measure_tracking
@@ -112,10 +112,10 @@ def _check_tracking(args: argparse.Namespace, patient: PatientSetup, table: Text
         f"{TRACKING:11s} {'FAILS' if broken else 'passes'}  markers covered; images repeated, late and missing: "
         f"{figures.confident} of {figures.pictures} images draw a lost or old position as valid, {figures.unsaid} do "
         f"not report it. Error of valid positions {figures.off:.1f} px; valid again after {figures.back:g} images",
-        file=table,
+        file=stream,
     )
     for sentence in broken:
-        print(f"{'':11s} {sentence}", file=table)
+        print(f"{'':11s} {sentence}", file=stream)
     return {**figures.to_row(), "broken": broken}
 
 
@@ -136,9 +136,9 @@ def _describe_compared(scene: Scene, name: str) -> str:
     return f"{name}: the tumour" if scene.observation_model is None else f"{name} is the reference; tumour estimate"
 
 
-def _describe_bond(share: float) -> str:
+def _describe_bond(strength_ratio: float) -> str:
     """Describe the largest traction of the bond to the skull as a share of its strength; empty without bond."""
-    return f", bond at {share:.0%} of its strength" if math.isfinite(share) else ""
+    return f", bond at {strength_ratio:.0%} of its strength" if math.isfinite(strength_ratio) else ""
 
 
 def _summarise_estimates(figures: SceneFigures) -> str:

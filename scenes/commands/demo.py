@@ -79,16 +79,16 @@ def play_demo(args: argparse.Namespace, kernel_loader: ThreadPoolExecutor, exit_
 
     patient = open_patient(args, *([] if args.scene is None else [args.scene]))
 
-    def asked(scene: str) -> Scene:
-        return apply_camera_options(args, build_requested_scene(args, scene, patient))
+    def get_scene(name: str) -> Scene:
+        return apply_camera_options(args, build_requested_scene(args, name, patient))
 
-    scene = asked(args.scene or patient.select_default_scene())
+    scene = get_scene(args.scene or patient.select_default_scene())
     name = choose_deformer(args, patient, scene)
     anatomy = "the average of 152 healthy adults (ICBM 152)" if args.anatomy is None else args.anatomy.name
     try:
         demo = Demo(
             patient, scene, name, args.host, args.port,
-            anatomy=anatomy, get_scene=asked, style=args.style, origins=list_addresses(args),
+            anatomy=anatomy, get_scene=get_scene, style=args.style, origins=list_addresses(args),
         )  # fmt: skip
     except ViserError as error:
         raise InputError(str(error)) from error

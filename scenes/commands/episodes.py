@@ -63,13 +63,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
-def _parse_integer(text: str, least: int) -> int:
+def _parse_integer(text: str, minimum: int) -> int:
     try:
         number = int(text)
     except ValueError:
-        number = least - 1
-    if number < least:
-        raise argparse.ArgumentTypeError(f"{text!r:.40} is no whole number from {least} on")
+        number = minimum - 1
+    if number < minimum:
+        raise argparse.ArgumentTypeError(f"{text!r:.40} is no whole number from {minimum} on")
     return number
 
 
@@ -138,14 +138,14 @@ def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_
     return int(tally.failed + tally.lost > 0)
 
 
-def _update_card(out: Path, numbers: Set[int], changed: bool) -> str | None:
+def _update_card(folder: Path, numbers: Set[int], changed: bool) -> str | None:
     """Update the card of the data set; return the reason if this fails, else None."""
     from tqdm import tqdm
 
     from ..episodes.exports.card import update_card
 
     bar = partial(tqdm, unit="episode", desc="data sheet", file=sys.stderr, leave=False, mininterval=1.0, disable=None)
-    return update_card(out, numbers, changed, bar)
+    return update_card(folder, numbers, changed, bar)
 
 
 def _start_workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
@@ -166,7 +166,7 @@ def _start_workers(args: argparse.Namespace, device: str) -> AbstractContextMana
 
 @contextmanager
 def _show_progress(
-    out: Path, there: RunStatistics, total: int, stop_if_asked: Callable[[], None]
+    folder: Path, statistics: RunStatistics, total: int, stop_if_asked: Callable[[], None]
 ) -> Iterator[ProgressListener]:
     """Yield a listener that shows the progress (frames/s, failures), and records task durations in the folder."""
     from tqdm import tqdm
@@ -175,13 +175,13 @@ def _show_progress(
     from ..episodes.rates import write_rates
     from ..episodes.tasks import TaskOutcome
 
-    done, begun = there, time.perf_counter()
+    done, begun = statistics, time.perf_counter()
     pause = 0.5 if sys.stderr.isatty() else 30.0
     words = {
-        "total": total, "initial": there.skipped + there.failed, "unit": "episode", "file": sys.stderr,
+        "total": total, "initial": statistics.skipped + statistics.failed, "unit": "episode", "file": sys.stderr,
         "mininterval": pause, "maxinterval": pause, "smoothing": 0.05,
     }  # fmt: skip
-    with write_rates(out) as written, tqdm(**words) as bar:
+    with write_rates(folder) as written, tqdm(**words) as bar:
 
         def heard(kind: str, outcome: TaskOutcome | None, workers: int) -> None:
             nonlocal done
@@ -202,7 +202,7 @@ def _show_progress(
         yield heard
 
 
-def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: float, where: str, card: bool) -> None:
+def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: float, pool: str, card: bool) -> None:
     from ..episodes.bodies import describe_weak, list_model_errors, to_weak_json
     from ..episodes.run_folder import list_failed, read_failure
 
@@ -218,7 +218,7 @@ def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: 
             "frames": tally.frames,
             "bytes": tally.bytes,
             "seconds": seconds,
-            "where": where,
+            "where": pool,
             "card": card,
             "bodies_with_a_model": len(models),
             "weak_bodies": to_weak_json(models),
@@ -228,7 +228,7 @@ def _report(args: argparse.Namespace, out: Path, tally: RunStatistics, seconds: 
     print(f"{out}: {tally.made + tally.skipped} of {args.count} episodes are there; {tally.made} were made now.")
     if tally.made:
         print(
-            f"{tally.frames} frames, {tally.bytes / 1e6:.3g} MB in {seconds:.3g} s by {where}: "
+            f"{tally.frames} frames, {tally.bytes / 1e6:.3g} MB in {seconds:.3g} s by {pool}: "
             f"{tally.made / seconds:.3g} episodes and {tally.frames / seconds:.3g} frames a second."
         )
     print("".join(f"{line}\n" for line in describe_weak(models)), end="")

@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     player = patient.build_player(choose_deformer(args, patient, scene, "fem"), scene)
     mounts = mount_targets(player)
     shots: list[VideoFrame] = []
-    film = _write_film(args, render_frames(player, mounts, taking, args.every), shots, player)
+    film = _save_video(args, render_frames(player, mounts, taking, args.every), shots, player)
     write_calibration(paths["camera.yaml"], replace(calibration, name=f"sulcus film: {scene.name}"))
     write_exact_intrinsics(paths["camera.json"], calibration)
     write_registration(paths["registration.json"], register_with_error(player.site, mounts, shift, turn, args.seed))
@@ -158,15 +158,15 @@ def _build_scene(args: argparse.Namespace, patient: PatientSetup) -> Scene:
     return scene if args.seconds is None else replace(scene, duration=min(args.seconds, scene.duration))
 
 
-def _write_film(args: argparse.Namespace, taken: Iterator[VideoFrame], shots: list[VideoFrame], player: Player) -> Path:
-    """Write the images, and append each frame without its image to `shots`; return the path of the video or folder."""
+def _save_video(args: argparse.Namespace, video: Iterator[VideoFrame], shots: list[VideoFrame], player: Player) -> Path:
+    """Write the video, and append each frame without its image to `shots`; return the path of the video or folder."""
     from tqdm import tqdm
 
     from ar.screen import FrameFolder, write_movie
 
-    def noted() -> Iterator[np.ndarray]:
+    def record_frames() -> Iterator[np.ndarray]:
         total = len(range(0, len(player.scene.times), args.every))
-        for shot in tqdm(taken, total=total, unit="picture", file=sys.stderr):
+        for shot in tqdm(video, total=total, unit="picture", file=sys.stderr):
             shots.append(replace(shot, image=shot.image[:0]))
             yield shot.image
 
@@ -174,13 +174,13 @@ def _write_film(args: argparse.Namespace, taken: Iterator[VideoFrame], shots: li
         if not args.png:
             args.out.mkdir(parents=True, exist_ok=True)
             film = check_output_path(args.out / "film.mp4", ".mp4", args.force)
-            write_movie(film, noted(), player.scene.frames_per_second / args.every)
+            write_movie(film, record_frames(), player.scene.frames_per_second / args.every)
             return film
         frames = check_output_folder(args.out / "frames", "pictures")
         for path in check_output_frames(frames, args.force):
             path.unlink()
         screen = FrameFolder(frames)
-        for number, colour in enumerate(noted()):
+        for number, colour in enumerate(record_frames()):
             screen.show(number, colour)
         return frames
     except OSError as error:

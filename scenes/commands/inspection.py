@@ -176,29 +176,29 @@ def describe_axes(affine: np.ndarray) -> str:
     return "".join(letters)
 
 
-def _find_warnings(found: Inspection, subject: Subject, limits: InspectionLimits) -> Iterator[str]:
-    if not limits.min_brain_ml <= found.brain <= limits.max_brain_ml:
-        small = found.brain < limits.min_brain_ml
+def _find_warnings(result: Inspection, subject: Subject, limits: InspectionLimits) -> Iterator[str]:
+    if not limits.min_brain_ml <= result.brain <= limits.max_brain_ml:
+        small = result.brain < limits.min_brain_ml
         word, ask = ("small", "is the mask whole") if small else ("large", "does the mask hold the skull")
-        yield f"a brain of {found.brain:.0f} ml is {word} for an adult: {ask}?"
-    if found.tumour > limits.max_tumour_share * found.brain:
-        yield f"the tumour has {100.0 * found.tumour / found.brain:.0f} % of the brain: are these its labels?"
-    if found.depth <= max(found.voxel):
+        yield f"a brain of {result.brain:.0f} ml is {word} for an adult: {ask}?"
+    if result.tumour > limits.max_tumour_share * result.brain:
+        yield f"the tumour has {100.0 * result.tumour / result.brain:.0f} % of the brain: are these its labels?"
+    if result.depth <= max(result.voxel):
         yield "the tumour touches the cortex"
     for septum in subject.septa:
-        if found.parts[septum.name] > limits.max_sheet_ml:
-            yield f"a {septum.name} of {found.parts[septum.name]:.0f} ml is no sheet: are these its labels?"
-        if KDTree(septum.points).query(subject.interface)[0].min() <= 1e-3 * max(found.voxel):
+        if result.parts[septum.name] > limits.max_sheet_ml:
+            yield f"a {septum.name} of {result.parts[septum.name]:.0f} ml is no sheet: are these its labels?"
+        if KDTree(septum.points).query(subject.interface)[0].min() <= 1e-3 * max(result.voxel):
             yield f"the tumour touches the {septum.name}, where it does not move"
-    if len(found.pieces) > 1:
+    if len(result.pieces) > 1:
         yield (
-            f"the tumour lies in {len(found.pieces)} pieces, and the skull is opened over one of them: --opening-over "
+            f"the tumour lies in {len(result.pieces)} pieces, and the skull is opened over one of them: --opening-over "
             "chooses another"
         )
-    if 1e-3 * found.distance > limits.max_tumour_distance:
-        yield f"the opening lies {found.distance:.0f} mm from the tumour: pressing there will hardly move it"
-    if max(found.voxel) > limits.max_voxel_ratio * min(found.voxel):
-        yield f"voxels are up to {max(found.voxel):.1f} mm long: surfaces have steps of that size"
+    if 1e-3 * result.distance > limits.max_tumour_distance:
+        yield f"the opening lies {result.distance:.0f} mm from the tumour: pressing there will hardly move it"
+    if max(result.voxel) > limits.max_voxel_ratio * min(result.voxel):
+        yield f"voxels are up to {max(result.voxel):.1f} mm long: surfaces have steps of that size"
     if subject.intensity is not None:
         covered = compute_inside_fraction(subject.intensity.values.shape, subject.intensity.affine, subject.cortex)
         if covered < limits.min_t1_coverage:

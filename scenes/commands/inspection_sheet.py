@@ -123,19 +123,19 @@ def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.
     index = np.rint(points @ inverse[:3, :3].T + inverse[:3, 3]).astype(int)
     there = ((index >= 0) & (index < masks.brain.shape)).all(axis=1)
 
-    def marked(mask: np.ndarray) -> np.ndarray:
+    def sample_mask(mask: np.ndarray) -> np.ndarray:
         found = np.zeros(len(points), bool)
         found[there] = mask[tuple(index[there].T)]
         return found
 
     solid, kept = subject.brain(points), subject.tumour(points)
-    tumour = marked(masks.tumour)
+    tumour = sample_mask(masks.tumour)
     voxel = float(np.linalg.norm(masks.affine[:3, :3], axis=0).max())
     layers = {
         "brain": solid < 0.0,
-        **{name: marked(mask) for name, mask in masks.parts.items() if name != "necrosis"},
+        **{name: sample_mask(mask) for name, mask in masks.parts.items() if name != "necrosis"},
         "tumour": tumour,
-        **{name: marked(mask) & tumour for name, mask in masks.parts.items() if name == "necrosis"},
+        **{name: sample_mask(mask) & tumour for name, mask in masks.parts.items() if name == "necrosis"},
         "left out": tumour & ((kept > voxel) | (solid > voxel)),
     }
     colour = np.tile(np.array(GROUND_COLOUR, float), (len(points), 1))
@@ -157,9 +157,9 @@ def _slice(view: InspectionView, masks: HeadMasks, subject: Subject, opened: np.
     return np.rint(colour).astype(np.uint8).reshape(SIDE, SIDE, 3), drawn
 
 
-def _blend_colour(ground: np.ndarray, colour: Colour, share: float) -> np.ndarray:
+def _blend_colour(background: np.ndarray, colour: Colour, opacity: float) -> np.ndarray:
     """Blend colours (..., 3) with a share (0 to 1) of another colour."""
-    return (1.0 - share) * ground + share * np.array(colour)
+    return (1.0 - opacity) * background + opacity * np.array(colour)
 
 
 def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.ndarray:
@@ -235,22 +235,22 @@ def _draw_frame(colour: np.ndarray, view: InspectionView) -> np.ndarray:
     return np.asarray(picture)
 
 
-def _write_text(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -> None:
+def _write_text(canvas: ImageDraw.ImageDraw, inspection: Inspection, labels: list[str]) -> None:
     """Draw the numbers, the warnings and the colour legend into the right column of the sheet."""
     left, top = 2 * SIDE + PAD, PAD
     rows: list[tuple[str, Colour]] = [("Model to be built", TEXT_COLOUR)]
-    for text in found.format_lines():
+    for text in inspection.format_lines():
         rows += [(part, TEXT_COLOUR) for part in textwrap.wrap(text, MAX_LINE_LENGTH, subsequent_indent="    ")]
     rows += [
         ("", TEXT_COLOUR),
-        ("Warnings" if found.warnings else "No warnings", WARNING_COLOUR if found.warnings else TEXT_COLOUR),
+        ("Warnings" if inspection.warnings else "No warnings", WARNING_COLOUR if inspection.warnings else TEXT_COLOUR),
     ]
-    for text in found.warnings:
+    for text in inspection.warnings:
         rows += [(part, WARNING_COLOUR) for part in textwrap.wrap(f"- {text}", MAX_LINE_LENGTH, subsequent_indent="  ")]
     rows += [("", TEXT_COLOUR), ("Research only; not a medical device.", FAINT_COLOUR)]
     for number, (text, colour) in enumerate(rows):
-        ink.text((left, top + LINE_SPACING * number), text, colour, ImageFont.load_default(FONT_SIZE))
-    legend = [("tumour that is left out" if name == "left out" else name, [COLOURS[name]]) for name in shown]
+        canvas.text((left, top + LINE_SPACING * number), text, colour, ImageFont.load_default(FONT_SIZE))
+    legend = [("tumour that is left out" if name == "left out" else name, [COLOURS[name]]) for name in labels]
     grounds = np.array([COLOURS["opening"], CORTEX])
     legend.append(
         (
@@ -263,5 +263,5 @@ def _write_text(ink: ImageDraw.ImageDraw, found: Inspection, shown: list[str]) -
         for part, colour in enumerate(colours):
             wide = 16 // len(colours)
             at = left + wide * part
-            ink.rectangle([at, row + 3, at + wide - 1, row + 18], fill=tuple(int(value) for value in colour))
-        ink.text((left + 24, row), label, TEXT_COLOUR, ImageFont.load_default(FONT_SIZE))
+            canvas.rectangle([at, row + 3, at + wide - 1, row + 18], fill=tuple(int(value) for value in colour))
+        canvas.text((left + 24, row), label, TEXT_COLOUR, ImageFont.load_default(FONT_SIZE))

@@ -88,8 +88,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _get_physics(stated: Mapping[str, str]) -> dict[str, object]:
+def _get_physics(facts: Mapping[str, str]) -> dict[str, object]:
     """Return the properties that must agree in a comparison of models and data: tissue of all regions, and element."""
     from surrogate.data.solution_rows import TISSUE_KEY, read_tissue_text
 
-    return {"tissue": read_tissue_text(stated) if TISSUE_KEY in stated else None, "element": stated.get("element")}
+    return {"tissue": read_tissue_text(facts) if TISSUE_KEY in facts else None, "element": facts.get("element")}

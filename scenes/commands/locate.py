@@ -85,48 +85,48 @@ def run(args: argparse.Namespace) -> int:
         }
         write_mesh(out, anatomy.mesh, fields, "RAS")
     if args.json:
-        print(to_json_line(_summarise_result(found, len(observation.now), locator.regions, out)))
+        print(to_json_line(_summarise(found, len(observation.now), locator.regions, out)))
     else:
         print(_format_result(found, out))
     return 0
 
 
-def _summarise_result(found: Location, points: int, regions: tuple[Region, ...], out: Path | None) -> dict[str, object]:
+def _summarise(result: Location, points: int, regions: tuple[Region, ...], out: Path | None) -> dict[str, object]:
     return {
-        "centroid_mm": (1e3 * found.centroid).tolist(),
-        "covariance_mm2": (1e6 * found.centroid_covariance).tolist(),
-        "p95_mm": 1e3 * found.p95,
-        "explained": found.explained,
-        "explained_by_rigid_error": found.rigid_alone.share,
-        "causes": found.causes,
-        "cause_groups": [asdict(share) for share in found.cause_shares],
-        "within_errors": found.within_errors,
-        "bias_mm": (1e3 * found.bias).tolist(),
-        "bias_degrees": np.degrees(found.rotation).tolist(),
+        "centroid_mm": (1e3 * result.centroid).tolist(),
+        "covariance_mm2": (1e6 * result.centroid_covariance).tolist(),
+        "p95_mm": 1e3 * result.p95,
+        "explained": result.explained,
+        "explained_by_rigid_error": result.rigid_alone.share,
+        "causes": result.causes,
+        "cause_groups": [asdict(share) for share in result.cause_shares],
+        "within_errors": result.within_errors,
+        "bias_mm": (1e3 * result.bias).tolist(),
+        "bias_degrees": np.degrees(result.rotation).tolist(),
         "points": points,
-        "outliers": found.outliers.tolist(),
-        "tips_left_out": found.outlier_tips.tolist(),
-        "slipped": found.slipped,
-        "calibrated": found.calibrated,
-        "warnings": _list_warnings(found),
+        "outliers": result.outliers.tolist(),
+        "tips_left_out": result.outlier_tips.tolist(),
+        "slipped": result.slipped,
+        "calibrated": result.calibrated,
+        "warnings": _list_warnings(result),
         "regions": {name_region(one.label): one.ratio for one in regions},
-        "milliseconds": 1e3 * found.seconds,
+        "milliseconds": 1e3 * result.seconds,
         "of": "the tumour, as far as the causes that were tried go; not of a model",
         "out": None if out is None else str(out),
     }
 
 
-def _format_result(found: Location, out: Path | None) -> str:
-    x, y, z = (round(value, 1) + 0.0 for value in 1e3 * found.centroid)  # + 0.0 turns -0.0 into 0.0
-    sure = "With a probability of 95 %" if found.calibrated else "As a rough estimate"
+def _format_result(result: Location, out: Path | None) -> str:
+    x, y, z = (round(value, 1) + 0.0 for value in 1e3 * result.centroid)  # + 0.0 turns -0.0 into 0.0
+    sure = "With a probability of 95 %" if result.calibrated else "As a rough estimate"
     lines = [
         f"The centre of the tumour has moved by {x:.1f}, {y:.1f}, {z:.1f} mm (right, anterior, superior).",
-        f"{sure} its error is at most {1e3 * found.p95:.1f} mm.",
-        f"The estimate explains {100 * found.explained:.0f} % of the observed motion (mean square).",
-        f"Causes of the motion: {found.named_causes}.",
-        f"Estimated registration shift of the observation: {1e3 * sum(found.bias**2) ** 0.5:.1f} mm.",
+        f"{sure} its error is at most {1e3 * result.p95:.1f} mm.",
+        f"The estimate explains {100 * result.explained:.0f} % of the observed motion (mean square).",
+        f"Causes of the motion: {result.named_causes}.",
+        f"Estimated registration shift of the observation: {1e3 * sum(result.bias**2) ** 0.5:.1f} mm.",
     ]
-    lines += _list_warnings(found)
+    lines += _list_warnings(result)
     return "\n".join(lines if out is None else [*lines, f"written: {out}"])
 
 

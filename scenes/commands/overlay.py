@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     check_pose_options(args)
     out = None if args.out is None else _check_video_path(args.out, args.force, inputs)
     table = None if args.table is None else check_output_path(args.table, ".csv", args.force, inputs)
-    parts = _read_parts(args, film=True)
+    parts = _build_pipeline(args, is_video=True)
     stage = parts.painter.stage
     truth = None
     if args.truth is not None:
@@ -137,7 +137,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     if table is not None:
         write_tracking_table(table, shown, errors)
-    report = _report(shown, parts.model)
+    report = _summarise_run(shown, parts.model)
     if truth is not None:
         report["off"] = summarise_errors([each.result for each in shown], errors)
     return _print_summary(args, report, shown, out, table)
@@ -159,7 +159,7 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
     table = None if args.table is None else check_output_path(args.table, ".csv", args.force, [args.camera])
     try:
         check_address(HOST, args.port)
-        parts = _read_parts(args, film=not camera)
+        parts = _build_pipeline(args, is_video=not camera)
         shown = (_show_camera if camera else _show_video)(args, parts, closing)
     except (ValueError, OSError, ViserError) as error:
         raise InputError(str(error)) from error
@@ -167,46 +167,46 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
         write_tracking_table(table, shown, [None] * len(shown))
     if not shown:
         return 1
-    return _print_summary(args, _report(shown, parts.model), shown, None, table)
+    return _print_summary(args, _summarise_run(shown, parts.model), shown, None, table)
 
 
-def _show_camera(args: argparse.Namespace, parts: Pipeline, closing: ExitStack) -> list[Overlay]:
+def _show_camera(args: argparse.Namespace, setup: Pipeline, closing: ExitStack) -> list[Overlay]:
     from ar.tracking.live_camera import open_camera, read_camera_images, read_newest_images
 
     from ..tracked.follower import FollowerSettings
 
-    again = partial(open_camera, int(args.pictures), parts.calibration.width, parts.calibration.height)
+    again = partial(open_camera, int(args.pictures), setup.calibration.width, setup.calibration.height)
     name, source = f"camera {args.pictures}", again()
     if not source.isOpened():
         raise InputError(f"{name} cannot be opened: plug it in, see that no other program has it, and give its number.")
     images = read_newest_images(read_camera_images(source, name, again), FollowerSettings().max_gap)
-    return _build_page(args, parts, closing, name).watch(images, args.seconds)
+    return _build_page(args, setup, closing, name).watch(images, args.seconds)
 
 
-def _show_video(args: argparse.Namespace, parts: Pipeline, closing: ExitStack) -> list[Overlay]:
+def _show_video(args: argparse.Namespace, setup: Pipeline, closing: ExitStack) -> list[Overlay]:
     from ..tracked.seekable_video import SeekableVideo
 
     film = SeekableVideo(Path(args.pictures), args.rate)
-    return _build_page(args, parts, closing, film.path.name, film.count).play(film, args.seconds)
+    return _build_page(args, setup, closing, film.path.name, film.count).play(film, args.seconds)
 
 
-def _build_page(args: argparse.Namespace, parts: Pipeline, stack: ExitStack, name: str, frames: int = 0) -> OverlayPage:
+def _build_page(args: argparse.Namespace, setup: Pipeline, stack: ExitStack, name: str, frames: int = 0) -> OverlayPage:
     from ..tracked.page import OverlayPage
 
-    page = OverlayPage(parts.follower, parts.painter, name, parts.model, HOST, args.port, frames, list_addresses(args))
+    page = OverlayPage(setup.follower, setup.painter, name, setup.model, HOST, args.port, frames, list_addresses(args))
     stack.callback(page.close)
-    print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {parts.model}", flush=True)
+    print(f"sulcus: open {page.browser.address} (Ctrl-C ends); motion by {setup.model}", flush=True)
     print_addresses(page.browser)
     return page
 
 
 def _print_summary(
-    args: argparse.Namespace, report: dict[str, object], shown: list[Overlay], out: Path | None, table: Path | None
+    args: argparse.Namespace, report: dict[str, object], overlays: list[Overlay], out: Path | None, table: Path | None
 ) -> int:
     """Print the summary of a run; return 0, or 1 if no image has a reliable tumour position."""
     report |= {"out": None if out is None else str(out), "table": None if table is None else str(table)}
     print(to_json_line(report) if args.json else _format_report(report))
-    return 0 if any(each.result.is_reliable for each in shown) else 1
+    return 0 if any(each.result.is_reliable for each in overlays) else 1
 
 
 def _check_video_path(path: Path, force: bool, inputs: list[str | Path | None]) -> Path:
@@ -215,7 +215,7 @@ def _check_video_path(path: Path, force: bool, inputs: list[str | Path | None]) 
     return check_output_path(path, path.suffix, force, inputs)
 
 
-def _read_parts(args: argparse.Namespace, film: bool) -> Pipeline:
+def _build_pipeline(args: argparse.Namespace, is_video: bool) -> Pipeline:
     """Read the inputs of a run, small files first, and build its tracker and renderer."""
     from ar.overlay.composite import load_kernels
     from sim.accuracy import LIVE
@@ -241,7 +241,7 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Pipeline:
         print(
             f"sulcus overlay: {NO_COVARIANCE_WARNING.format(Path(args.camera).with_suffix('.json'))}", file=sys.stderr
         )
-    if film:
+    if is_video:
         check_video(Path(args.pictures), args.rate, calibration, args.camera)
     tool = None if args.tool is None else read_tool(args.tool)
     elsewhere = open_external_tracker(args, calibration)
@@ -259,7 +259,7 @@ def _read_parts(args: argparse.Namespace, film: bool) -> Pipeline:
     return Pipeline(calibration, follower, Painter(stage, tool, args.style, device), who)
 
 
-def _draw_video(args: argparse.Namespace, parts: Pipeline, out: Path | None) -> list[Overlay]:
+def _draw_video(args: argparse.Namespace, setup: Pipeline, out: Path | None) -> list[Overlay]:
     """Draw the overlay on all images, and write a video if requested; return the overlays without images."""
     from ar.screen import write_movie
     from ar.tracking.image_sequences import read_frame_rate, read_video
@@ -268,19 +268,19 @@ def _draw_video(args: argparse.Namespace, parts: Pipeline, out: Path | None) -> 
 
     shown: list[Overlay] = []
 
-    def pictures() -> Iterator[np.ndarray]:
+    def draw_images() -> Iterator[np.ndarray]:
         masks = None if args.covered is None else read_video(args.covered, args.rate)
         film = read_timed_images(read_video(Path(args.pictures), args.rate, with_colour=True), masks)
-        for each in draw_overlays(film, parts.follower, parts.painter, args.live):
+        for each in draw_overlays(film, setup.follower, setup.painter, args.live):
             shown.append(each.drop_image())
             yield each.image
 
     try:
         if out is None:
-            for _ in pictures():
+            for _ in draw_images():
                 pass
         else:
-            write_movie(out, pictures(), read_frame_rate(Path(args.pictures)) or args.rate)
+            write_movie(out, draw_images(), read_frame_rate(Path(args.pictures)) or args.rate)
     except ValueError as error:
         raise InputError(str(error)) from error
     except OSError as error:
@@ -288,19 +288,19 @@ def _draw_video(args: argparse.Namespace, parts: Pipeline, out: Path | None) -> 
     return shown
 
 
-def _report(shown: list[Overlay], who: str) -> dict[str, object]:
-    """Summarise a run for JSON: numbers of images, states, and latency; `who` describes the deformation model."""
+def _summarise_run(overlays: list[Overlay], model: str) -> dict[str, object]:
+    """Summarise a run for JSON: numbers of images, states, and latency; `model` describes the deformation model."""
     from ..tracked.run import summarise_latencies
 
-    count = len(shown)
-    states = Counter(each.result.state.value for each in shown)
+    count = len(overlays)
+    states = Counter(one.result.state.value for one in overlays)
     return {
         "pictures": count,
-        "motion_by": who,
-        "reference_seen_percent": 100.0 * sum(each.result.reference_time == each.result.time for each in shown) / count,
-        "tool_seen_percent": 100.0 * sum(each.result.T_scan_tool is not None for each in shown) / count,
+        "motion_by": model,
+        "reference_seen_percent": 100.0 * sum(one.result.reference_time == one.result.time for one in overlays) / count,
+        "tool_seen_percent": 100.0 * sum(one.result.T_scan_tool is not None for one in overlays) / count,
         "states": dict(states.most_common()),
-        "latency": summarise_latencies(shown),
+        "latency": summarise_latencies(overlays),
     }
 
 

@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
     if args.inspect:
         return _inspect(args, plan, regions)
     from sim.runtime.device import parse_device_names
-    from surrogate.training.train import check_learners
+    from surrogate.training.train import check_learner_names
 
     from ..cli import main
     from ..play.deformers import to_model_path
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
     for path, suffix in ((data, ".h5"), (model, ".npz")):
         check_output_path(path, suffix, args.force, _list_inputs(args), resumed)
     parse_device_names(args.device)
-    check_learners(parse_learners(args.learners), has_poses=False, source=str(data))
+    check_learner_names(parse_learners(args.learners), has_poses=False, source=str(data))
     if args.count - args.count // CALIBRATION_STRIDE < DiscSettings.min_discs + 1:
         raise InputError(
             f"--count {args.count} is too few to learn from and to leave {DiscSettings.min_discs} discs out: give more."
@@ -220,6 +220,6 @@ def _format_scene_options(args: argparse.Namespace) -> str:
     return tissue + element + ("" if trajectory is None else f" --trajectory {trajectory}")
 
 
-def _format_shares(seconds: Mapping[str, float], whole: float) -> str:
-    rows = [f"  {name:<16}{took:8.1f} s{100.0 * took / whole:6.1f} %" for name, took in seconds.items()]
-    return "\n".join([f"label volume to surrogate in {whole:.1f} s:", *rows])
+def _format_shares(seconds: Mapping[str, float], total: float) -> str:
+    rows = [f"  {name:<16}{took:8.1f} s{100.0 * took / total:6.1f} %" for name, took in seconds.items()]
+    return "\n".join([f"label volume to surrogate in {total:.1f} s:", *rows])

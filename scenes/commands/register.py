@@ -121,18 +121,18 @@ def _build_nearest(anatomy: Anatomy) -> Nearest:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
 
-    def nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def find_nearest(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = find_closest_points(points, corners)
         return found.point, normals[found.triangle]
 
-    return nearest
+    return find_nearest
 
 
-def _compute_tumour_error(found: Registration, anatomy: Anatomy) -> tuple[np.ndarray, float]:
+def _compute_tumour_error(registration: Registration, anatomy: Anatomy) -> tuple[np.ndarray, float]:
     """Compute the tumour centroid's error: deviations (3,) [mm] along the reference's axes, and 95 % radius [m]."""
     from surrogate.locating.locator import compute_confidence_radius
 
     if not len(anatomy.tumour_nodes):
         raise InputError("the anatomy has no tumour: leave out --anatomy, or give one with a tumour.")
-    _, covariance = found.transform_point(anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0))
+    _, covariance = registration.transform_point(anatomy.mesh.nodes[anatomy.tumour_nodes].mean(axis=0))
     return 1e3 * np.sqrt(np.diag(covariance)), compute_confidence_radius(covariance)

@@ -23,7 +23,7 @@ from ..options.shared_options import add_device, add_json, add_seed, to_json_lin
 if TYPE_CHECKING:
     from surrogate.model.learned import Learned
 
-    from ..analysis.sensitivity import Change, SensitivityRow, SensitivityStudy
+    from ..analysis.sensitivity import MotionChange, SensitivityRow, SensitivityStudy
 
 # Column titles of the table.
 COLUMN_TITLES = ("factor", "default", "now", "F mean", "F 95", "F %", "F x", "M mean", "M 95", "M %", "M x")
@@ -171,7 +171,7 @@ def _format_surrogate_row(model: Learned | None) -> list[str]:
     return [_format_row(("surrogate's error", "", model.training.get("learner", "learnt"), *bound, *[""] * 4))]
 
 
-def _format_cells(change: Change) -> tuple[str, ...]:
+def _format_cells(change: MotionChange) -> tuple[str, ...]:
     if not change.solves:
         return ("none", "solved", "", "")
     lengths = (change.mean_mm, change.worst95_mm)
@@ -182,7 +182,7 @@ def _format_row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(f'{cell:<{width}}' for cell, width in zip(cells, COLUMN_WIDTHS, strict=True))} |"
 
 
-def _list_remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned | None, failed: int) -> list[str]:
+def _list_remarks(study: SensitivityStudy, elements: Sequence[str], model: Learned | None, failed: int) -> list[str]:
     """List remarks on the table as sentences: failed solves, meaning of the surrogate's error, missing rows."""
     remarks = []
     if failed:
@@ -196,7 +196,7 @@ def _list_remarks(study: SensitivityStudy, beside: Sequence[str], model: Learned
     else:
         remarks.append("No surrogate error is given: there is no model with a bound next to this anatomy (--model).")
     remarks.append(LOCKING_NOTES[study.body.element])
-    if not beside:
+    if not elements:
         remarks.append("No discretisation error is given: --compare p2 compares quadratic elements on this mesh.")
     if not study.anatomy.slide_normal.any():
         remarks.append("This anatomy has no skull: there is no row for the skull.")

@@ -150,14 +150,14 @@ def run(args: argparse.Namespace) -> int:
             bar.close()  # ends the line of the progress bar
             print(f"stopped; run the same command again to resume from {to_unfinished_path(out)}", file=sys.stderr)
             return INTERRUPTED_CODE
-    _report(args, solver.description, len(loads), solved)
+    _print_report(args, solver.description, len(loads), solved)
     return 0
 
 
-def show_progress(progress_bar: tqdm, done: int, total: int) -> None:
-    """Update a progress bar: `done` of `total` rows are finished."""
+def show_progress(progress_bar: tqdm, completed: int, total: int) -> None:
+    """Update a progress bar: `completed` of `total` rows are finished."""
     progress_bar.total = total
-    progress_bar.update(done - progress_bar.n)
+    progress_bar.update(completed - progress_bar.n)
 
 
 def _sample_loads(args: argparse.Namespace, anatomy: Anatomy, tissue: Tissue) -> tuple[BuiltIn | None, Loads]:
@@ -202,7 +202,7 @@ def _build_requested_tool(args: argparse.Namespace) -> BuiltIn | None:
     return None if args.blade is None else Spatula(*(size / 1e3 for size in args.blade))
 
 
-def _report(args: argparse.Namespace, solver: str, asked: int, solved: SimulatedRows) -> None:
+def _print_report(args: argparse.Namespace, solver: str, count: int, solved: SimulatedRows) -> None:
     with h5py.File(args.out, "r") as file:
         outcomes, units = read_outcomes(file, "answers"), len(read_outcomes(file, "unit"))
     counts = {outcome.name.lower(): outcomes.count(outcome) for outcome in Outcome if outcome in outcomes}
@@ -222,11 +222,11 @@ def _report(args: argparse.Namespace, solver: str, asked: int, solved: Simulated
         }
         print(json.dumps(report))
         return
-    if asked < args.count:
-        print(f"the preset {args.tool_preset} has {asked} loads: all of them were taken.")
-    if len(outcomes) > asked:
+    if count < args.count:
+        print(f"the preset {args.tool_preset} has {count} loads: all of them were taken.")
+    if len(outcomes) > count:
         print(
-            f"{args.out} already holds {len(outcomes)} loads, more than the {asked} asked for: nothing was taken away."
+            f"{args.out} already holds {len(outcomes)} loads, more than the {count} asked for: nothing was taken away."
         )
     listed = ", ".join(f"{number} {name}" for name, number in counts.items())
     print(

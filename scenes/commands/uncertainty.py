@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     read_uncertainties(out)
     fitted = find_fitted_tissue(args.tissue, args.anatomy or get_template_path(), patient.anatomy.digest)
 
-    def draws_of(scene: Scene, count: int, seed: int) -> list[PatientSample]:
+    def draw_samples(scene: Scene, count: int, seed: int) -> list[PatientSample]:
         if fitted is None:
             return sample_priors(count, seed)
         young = get_tissue(scene).young
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     rows, lines = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:
         bar = partial(tqdm, unit="body", desc=scene.name, leave=False, file=sys.stderr)
-        draws, twins = (draws_of(scene, *each) for each in ((args.draws, args.seed), (args.twins, args.seed + 1)))
+        draws, twins = (draw_samples(scene, *each) for each in ((args.draws, args.seed), (args.twins, args.seed + 1)))
         still = solve_nominal(patient, scene)
         found = estimate_uncertainty(
             patient, scene, still, draws, bar(solve_ensemble(patient, scene, draws), total=len(draws)), args.seed
@@ -121,24 +121,24 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _summarise_scene(patient: PatientSetup, scene: Scene, found: Uncertainty) -> dict[str, Any]:
+def _summarise_scene(patient: PatientSetup, scene: Scene, result: Uncertainty) -> dict[str, Any]:
     """Summarise the results of a scene for JSON, at the time of the largest bound on the tumour's error."""
     from ..play.frame_text import format_errors
 
     model = patient.models.get(patient.select_best(scene))
     promised = None if model is None or not np.isfinite(model.bound) else float(model.bound)
-    moment = int(np.argmax(found.worst))
-    error = found.evaluate(found.times[moment], promised or 0.0)
-    parts = {name: 1e3 * values[moment] for name, values in found.parts.items()}
+    moment = int(np.argmax(result.worst))
+    error = result.evaluate(result.times[moment], promised or 0.0)
+    parts = {name: 1e3 * values[moment] for name, values in result.parts.items()}
     ranked = dict(sorted(parts.items(), key=lambda part: -part[1]))
     return {
-        "scene": scene.name, "said": format_errors(promised, error, model is not None), "time_s": found.times[moment],
+        "scene": scene.name, "said": format_errors(promised, error, model is not None), "time_s": result.times[moment],
         "model_mm": None if promised is None else 1e3 * promised, "tumour_mm": 1e3 * (error.bound or 0.0),
-        "middle_mm": 1e3 * found.middle[moment], "moved_mm": 1e3 * found.moved[moment],
-        "largest_part": None if found.has_few_draws else error.main_source,
-        "draws": found.draws, "failed": found.failed, "frames": found.frames, "folded": found.folded,
-        "fitted_numbers": found.numbers, "few": found.has_few_draws, "guess": found.is_rough,
-        "patients": found.patients, "covered": found.covered, "covered_deviation": found.deviation,
+        "middle_mm": 1e3 * result.middle[moment], "moved_mm": 1e3 * result.moved[moment],
+        "largest_part": None if result.has_few_draws else error.main_source,
+        "draws": result.draws, "failed": result.failed, "frames": result.frames, "folded": result.folded,
+        "fitted_numbers": result.numbers, "few": result.has_few_draws, "guess": result.is_rough,
+        "patients": result.patients, "covered": result.covered, "covered_deviation": result.deviation,
         "parts_mm": ranked,
     }  # fmt: skip
 

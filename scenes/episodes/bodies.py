@@ -60,13 +60,13 @@ class EpisodeBody:
         """Tissue of the body."""
         return get_tissue(self.parameters)
 
-    def build_effects(self, *more: Effect, can_separate: bool = False) -> tuple[Effect, ...]:
-        """Return the effects of a scene on the body: tissue, constraints, skull, and the effects `more`.
+    def build_effects(self, *extra_effects: Effect, can_separate: bool = False) -> tuple[Effect, ...]:
+        """Return the effects of a scene on the body: tissue, constraints, skull, and the effects `extra_effects`.
 
         If `can_separate`, the brain can separate from the skull, regardless of the sampled skull model.
         """
         skull = "contact" if can_separate else self.parameters["bodies.tissue.skull"]
-        return self.tissue, Held(), SKULLS[skull], *more
+        return self.tissue, Held(), SKULLS[skull], *extra_effects
 
     def open_patient(self, device: str) -> PatientSetup:
         """Open the body's anatomy, scan and models, or the shipped models for the template without own models.

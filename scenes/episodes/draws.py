@@ -116,8 +116,8 @@ def check_distribution(value: object, name: str, limits: ValueLimits | None, cho
         _check_value(each, name, limits, choices)
 
 
-def _check_choice(spread: Distribution, name: str) -> None:
-    count, weights = len(spread.choice or ()), spread.weights
+def _check_choice(distribution: Distribution, name: str) -> None:
+    count, weights = len(distribution.choice or ()), distribution.weights
     if not count:
         raise InputError(f"{name}: there is nothing to choose from: give one value or more.")
     if weights is None:
@@ -128,10 +128,10 @@ def _check_choice(spread: Distribution, name: str) -> None:
         raise InputError(f"{name}: weights {weights} are none: give numbers that are not below 0, and one above.")
 
 
-def _check_value(value: float | str | bool, name: str, limits: ValueLimits | None, words: tuple[str, ...]) -> None:
+def _check_value(value: float | str | bool, name: str, limits: ValueLimits | None, choices: tuple[str, ...]) -> None:
     if limits is None:
-        if words and value not in words:
-            raise InputError(f"{name}: {value!r} is not known: choose from {', '.join(map(str, words))}.")
+        if choices and value not in choices:
+            raise InputError(f"{name}: {value!r} is not known: choose from {', '.join(map(str, choices))}.")
         return
     if isinstance(value, str | bool) or not limits.low <= value <= limits.high:
         raise InputError(f"{name}: {value!r} may be drawn, and {limits} is possible.")

@@ -118,16 +118,16 @@ def make_episodes(
     failed_before, token = list_failed(folder), uuid4().hex
     tally, count, counted = statistics, workers.count(), monotonic()
 
-    def hand_out(kind: str, number: int, make: Callable[[int], MadeEpisode], *needed: Future) -> Future:
+    def submit(kind: str, number: int, make: Callable[[int], MadeEpisode], *dependencies: Future) -> Future:
         future = workers.client.submit(
-            try_task, make, number, folder, run, *needed,
+            try_task, make, number, folder, run, *dependencies,
             key=f"{kind}-{number}-{token}", retries=MAX_RETRIES, resources=workers.needs,
         )  # fmt: skip
         busy[str(future.key)] = kind, number, future
         future.add_done_callback(ended.put)
         return future
 
-    def note(kind: str, outcome: TaskOutcome) -> None:
+    def record(kind: str, outcome: TaskOutcome) -> None:
         nonlocal tally
         if outcome.halt:
             raise InputError(outcome.halt)
@@ -140,27 +140,27 @@ def make_episodes(
         elif outcome.number in failed_before:
             remove_failure(folder, outcome.number)
 
-    def missing() -> Iterator[int]:
+    def list_missing() -> Iterator[int]:
         for number in numbers:
             if (folder / to_episode_name(number)).exists():  # another client made it meanwhile
-                note(EPISODE, TaskOutcome(number, skipped=True))
+                record(EPISODE, TaskOutcome(number, skipped=True))
             else:
                 yield number
 
-    waiting = missing()
+    waiting = list_missing()
     try:
         while True:
             handed_out = sum(kind == EPISODE for kind, _, _ in busy.values())
             for number in islice(waiting, max(0, TASKS_PER_WORKER * max(count, 1) - handed_out)):
                 body = work.body_of(number)
                 if body not in bodies:
-                    bodies[body] = hand_out(BODY, body, work.make_body)
-                hand_out(EPISODE, number, work.make_episode, bodies[body])
+                    bodies[body] = submit(BODY, body, work.make_body)
+                submit(EPISODE, number, work.make_episode, bodies[body])
             if not busy:
                 return tally
             for future, outcome in _collect_outcomes(_collect_ended(ended), workers, ended):
                 kind, number, _ = busy.pop(str(future.key))
-                note(kind, replace(outcome, number=number))
+                record(kind, replace(outcome, number=number))
             if monotonic() - counted > POLL_INTERVAL:
                 count, counted = workers.count(), monotonic()
                 listener(EPISODE, None, count)

@@ -8,7 +8,7 @@ import numpy as np
 from sim.errors import InputError
 
 from .engine import BODY, EPISODE
-from .rates import Rate
+from .rates import TaskRate
 from .tasks import FIRST, FIRST_OF_BODY, FIRST_OF_PROCESS, NOT_FIRST
 
 DAY = 86400.0  # One day [s].
@@ -19,7 +19,7 @@ PROCESS_COUNTS = (1, 8, 64, 512)
 
 
 @dataclass(frozen=True)
-class Amount:
+class Estimate:
     """Estimated mean or total with its standard error, which is NaN if only one value was measured."""
 
     mean: float
@@ -49,22 +49,22 @@ class RunEstimate:
     bodies: int
     measured: int
     measured_bodies: int
-    seconds: Amount
-    frames: Amount
-    bytes: Amount
-    start: Amount
-    opening: Amount
+    seconds: Estimate
+    frames: Estimate
+    bytes: Estimate
+    start: Estimate
+    opening: Estimate
     apart: bool
 
-    def estimate_duration(self, processes: int) -> Amount:
+    def estimate_duration(self, processes: int) -> Estimate:
         """Return the estimated duration [s] of the run with a number of processes."""
         each = self.episodes / processes
         further = self.bodies * -np.expm1(-each / self.bodies) - 1.0  # bodies that the episodes of one process use
         parts = (self.start, 1.0), (self.opening, max(0.0, further)), (self.seconds, 1.0 / processes)
-        return _add_amounts([Amount(part.mean * by, part.error * by) for part, by in parts if np.isfinite(part.mean)])
+        return _add_amounts([Estimate(part.mean * by, part.error * by) for part, by in parts if np.isfinite(part.mean)])
 
 
-def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEstimate:
+def compute_estimate(rates: Sequence[TaskRate], episodes: int, bodies: int) -> RunEstimate:
     """Estimate the cost of `episodes` episodes on `bodies` bodies from measured `rates`.
 
     Raises
@@ -81,46 +81,46 @@ def compute_estimate(rates: Sequence[Rate], episodes: int, bodies: int) -> RunEs
     by = {first: [rate for rate in own[EPISODE] if rate.first == first] for first in FIRST}
     apart = len(by[NOT_FIRST]) > 1
 
-    def amount(what: str, those: Mapping[str, Sequence[Rate]]) -> Amount:
+    def estimate_total(name: str, rates: Mapping[str, Sequence[TaskRate]]) -> Estimate:
         return _add_amounts(
-            [_compute_total([getattr(one, what) for one in those[kind]], counts[kind]) for kind in those if those[kind]]
+            [_compute_total([getattr(one, name) for one in rates[kind]], counts[kind]) for kind in rates if rates[kind]]
         )
 
     return RunEstimate(
         episodes=episodes, bodies=bodies, measured=len(own[EPISODE]), measured_bodies=len(own[BODY]),
-        seconds=amount("seconds", {**own, EPISODE: by[NOT_FIRST] if apart else own[EPISODE]}),
-        frames=amount("frames", {EPISODE: own[EPISODE]}),
-        bytes=amount("bytes", own),
+        seconds=estimate_total("seconds", {**own, EPISODE: by[NOT_FIRST] if apart else own[EPISODE]}),
+        frames=estimate_total("frames", {EPISODE: own[EPISODE]}),
+        bytes=estimate_total("bytes", own),
         start=_compute_extra_time(by[FIRST_OF_PROCESS], by[NOT_FIRST] if apart else []),
         opening=_compute_extra_time(by[FIRST_OF_BODY], by[NOT_FIRST] if apart else []),
         apart=apart,
     )  # fmt: skip
 
 
-def _compute_extra_time(first: Sequence[Rate], others: Sequence[Rate]) -> Amount:
+def _compute_extra_time(first_rates: Sequence[TaskRate], later_rates: Sequence[TaskRate]) -> Estimate:
     """Return the mean extra time of first episodes [s]; with a single measurement, the error is the extra time."""
-    if not (first and others):
-        return Amount(np.nan, np.nan)
-    one, other = (_compute_mean([rate.seconds for rate in those]) for those in (first, others))
+    if not (first_rates and later_rates):
+        return Estimate(np.nan, np.nan)
+    one, other = (_compute_mean([rate.seconds for rate in those]) for those in (first_rates, later_rates))
     longer, error = max(0.0, one.mean - other.mean), float(np.hypot(one.error, other.error))
-    return Amount(longer, error if np.isfinite(error) else longer)
+    return Estimate(longer, error if np.isfinite(error) else longer)
 
 
-def _compute_mean(values: Sequence[float]) -> Amount:
+def _compute_mean(values: Sequence[float]) -> Estimate:
     """Return the mean of values and its standard error."""
     error = float(np.std(values, ddof=1)) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-    return Amount(float(np.mean(values)), error)
+    return Estimate(float(np.mean(values)), error)
 
 
-def _compute_total(values: Sequence[float], count: int) -> Amount:
+def _compute_total(values: Sequence[float], count: int) -> Estimate:
     """Return the estimated total of `count` values and its standard error, which is 0 if all were measured."""
     mean = _compute_mean(values)
-    return Amount(count * mean.mean, 0.0 if len(values) >= count else count * mean.error)
+    return Estimate(count * mean.mean, 0.0 if len(values) >= count else count * mean.error)
 
 
-def _add_amounts(amounts: Sequence[Amount]) -> Amount:
+def _add_amounts(amounts: Sequence[Estimate]) -> Estimate:
     """Return the sum of independent amounts, with its standard error."""
-    return Amount(sum(one.mean for one in amounts), float(np.hypot.reduce([one.error for one in amounts])))
+    return Estimate(sum(one.mean for one in amounts), float(np.hypot.reduce([one.error for one in amounts])))
 
 
 def format_estimate(estimate: RunEstimate) -> list[str]:
@@ -154,13 +154,13 @@ def format_estimate(estimate: RunEstimate) -> list[str]:
     return said
 
 
-def _format_time(amount: Amount) -> str:
+def _format_time(amount: Estimate) -> str:
     unit, word = next((each for each in UNITS if amount.mean >= 2.0 * each[0]), (1.0, "s"))
     return _format_amount(amount, unit, word)
 
 
-def _format_amount(amount: Amount, unit: float, word: str) -> str:
+def _format_amount(amount: Estimate, unit: float, symbol: str) -> str:
     if not np.isfinite(amount.mean):
         return "not known"
     margin = f"{amount.error / unit:.2g}" if np.isfinite(amount.error) else "not known"
-    return f"{amount.mean / unit:.3g} ± {margin} {word}"
+    return f"{amount.mean / unit:.3g} ± {margin} {symbol}"

@@ -174,10 +174,10 @@ def sample_press_scenario(inputs: ScenarioInputs) -> Scenario:
     aslant = float(tilt * np.cos(angle)), float(tilt * np.sin(angle))
     way = press(inputs.values["force_n"], 0.35 * inputs.seconds, 0.2 * inputs.seconds, at)
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         return replace(way(time), tilt=aslant)
 
-    return Scenario(path, probe)
+    return Scenario(get_touch, probe)
 
 
 def sample_slide_scenario(inputs: ScenarioInputs) -> Scenario:
@@ -195,11 +195,11 @@ def sample_draw_scenario(inputs: ScenarioInputs) -> Scenario:
     way = draw(inputs.values["force_n"], tilt, rise, 0.2 * inputs.seconds, at)
     angle = float(inputs.random.uniform(0.0, 2.0 * np.pi))
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         touch = way(time)
         return replace(touch, tilt=(touch.tilt[0] * float(np.cos(angle)), touch.tilt[0] * float(np.sin(angle))))
 
-    return Scenario(path, probe)
+    return Scenario(get_touch, probe)
 
 
 def sample_reach_scenario(inputs: ScenarioInputs) -> Scenario:
@@ -209,7 +209,7 @@ def sample_reach_scenario(inputs: ScenarioInputs) -> Scenario:
     forces = inputs.values["force_n"] * inputs.random.uniform(0.5, 1.0, count)
     takes = inputs.seconds / count
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         number = min(int(time / takes), count - 1)
         share = time / takes - number
         # In the last part the tool moves to the next place, lifted; before, it presses and releases.
@@ -219,7 +219,7 @@ def sample_reach_scenario(inputs: ScenarioInputs) -> Scenario:
         pressed = smooth_step(share / half) - smooth_step(share / half - 1.0)
         return Touch(float(x), float(y), float(forces[number] * pressed))
 
-    return Scenario(path, probe)
+    return Scenario(get_touch, probe)
 
 
 def sample_walk_scenario(inputs: ScenarioInputs) -> Scenario:
@@ -227,12 +227,12 @@ def sample_walk_scenario(inputs: ScenarioInputs) -> Scenario:
     probe, seed = inputs.probe, int(inputs.random.integers(2**31))
     far, force = 0.5 * inputs.values["spread"] * inputs.reach(probe.radius), inputs.values["force_n"]
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         way = sample_hand_motion(seed, time)
         begun = smooth_step(time / (0.15 * inputs.seconds))
         return Touch(float(far * way[0]), float(far * way[1]), force * begun * float(np.clip(0.6 + 0.2 * way[2], 0, 1)))
 
-    return Scenario(path, probe)
+    return Scenario(get_touch, probe)
 
 
 def sample_palpate_scenario(inputs: ScenarioInputs) -> Scenario:
@@ -277,10 +277,10 @@ FAMILIES: dict[str, Callable[[ScenarioInputs], Scenario]] = {
 def add_tremor(path: Path, seed: int, position_sigma: float, force_sigma: float) -> Path:
     """Return a path with hand tremor: standard deviations of position [m], and of force [N] while the tool pushes."""
 
-    def trembles(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         touch, way = path(time), sample_hand_motion(seed, time)
         pushed = max(0.0, touch.force + force_sigma * float(way[2])) if touch.force > 0.0 else touch.force
         right, up = (position_sigma * way[:2]).tolist()
         return replace(touch, x=touch.x + right, y=touch.y + up, force=pushed)
 
-    return trembles
+    return get_touch

@@ -35,11 +35,11 @@ def resume_data_set(path: Path, inputs: Mapping[str, str], other_folders: Sequen
         The file cannot be written.
     """
     said = json.dumps(dict(inputs), sort_keys=True)
-    if not _is_of(path, said):
+    if not _has_inputs(path, said):
         remove_data_set(path)
         with write_atomically(path.with_suffix(NOTE), NOTE, clean=False) as partial:
             partial.write_text(said, encoding="utf-8")
-    alike = [path, *(each for other in other_folders if _is_of(each := other / path.name, said))]
+    alike = [path, *(each for other in other_folders if _has_inputs(each := other / path.name, said))]
     *_, (whole, size, best) = sorted(max(_find_kept_files(each), default=(False, 0, each)) for each in alike)
     if size:
         _copy(best, path if whole else to_unfinished_path(path))
@@ -84,9 +84,9 @@ def _list_files(data: Path) -> tuple[Path, ...]:
     return data.with_suffix(NOTE), to_unfinished_path(data), data, data.with_suffix(TABLE)
 
 
-def _is_of(data: Path, said: str) -> bool:
+def _has_inputs(data: Path, inputs: str) -> bool:
     with suppress(OSError, ValueError):
-        return data.with_suffix(NOTE).read_text(encoding="utf-8") == said
+        return data.with_suffix(NOTE).read_text(encoding="utf-8") == inputs
     return False
 
 

@@ -166,22 +166,22 @@ def open_body(folder: Path, device: str) -> OpenedBody:
 
 
 def _collect_episode(
-    path: Path, plan: EpisodePlan, seed: int, number: int, place: Path, device: str
+    path: Path, plan: EpisodePlan, seed: int, number: int, body_folder: Path, device: str
 ) -> Mapping[str, Any]:
-    """Play an episode on the body in folder `place`, write its file, and return a summary."""
+    """Play an episode on the body in folder `body_folder`, write its file, and return a summary."""
     contents = plan.contents
-    opened, asked = open_body(place, device), sample_episode(contents, seed, number)
+    opened, asked = open_body(body_folder, device), sample_episode(contents, seed, number)
     body, patient = opened.body, opened.patient
     scene = build_scene(plan, body, patient.site, asked, seed, number)
     name = "fem" if contents.bodies.learner.name == NO_LEARNER else patient.select_best(scene)
     player = replace(patient.build_player(name, scene), composed=contents.overlay)
     noise = asked.group("noise")
 
-    def grain(picture: int, colour: np.ndarray) -> np.ndarray:
-        return add_noise(colour, noise["grey_levels"], build_generator(seed, number, f"noise.picture/{picture}"))
+    def add_image_noise(frame_number: int, colour: np.ndarray) -> np.ndarray:
+        return add_noise(colour, noise["grey_levels"], build_generator(seed, number, f"noise.picture/{frame_number}"))
 
     recording = EpisodeRecording(
-        None if name == "fem" else contents.solved_every, contents.overlay, False, grain,
+        None if name == "fem" else contents.solved_every, contents.overlay, False, add_image_noise,
         lambda columns: add_sensor_noise(columns, noise, seed, number),
         {
             "plan": plan.text, "plan_name": plan.name, "plan_digest": plan.digest, "seed": seed, "episode": number,

@@ -17,7 +17,7 @@ from sim.effects import SKULLS
 from sim.errors import InputError
 from sim.material import LAWS
 from sim.runtime.outside_files import wrap_errors
-from surrogate.training.train import LEARNERS, check_learners
+from surrogate.training.train import LEARNERS, check_learner_names
 
 from ..script.camera_paths import PATHS
 from .draws import Distribution, Number, ValueLimits, Word, check_distribution
@@ -59,14 +59,14 @@ def _join_key(table: str, key: str) -> str:
     return f"{table}.{key}" if table else key
 
 
-def _format_types(words: str) -> str:
+def _format_types(message: str) -> str:
     """Replace the names of types in a message of msgspec by descriptions for users."""
 
-    def kinds(found: re.Match) -> str:
-        names = [one.strip() for one in str(found[1]).split("|")]
+    def describe_types(match: re.Match) -> str:
+        names = [one.strip() for one in str(match[1]).split("|")]
         return " or ".join(TYPE_NAMES.get(name, name) for name in names)
 
-    plain = re.sub(r"`(.*?)`", kinds, words)
+    plain = re.sub(r"`(.*?)`", describe_types, message)
     return plain.replace("Expected ", "give ").replace(", got ", ", and not ")
 
 
@@ -302,7 +302,7 @@ def _check(contents: PlanContents) -> None:
             if not limits.low <= value <= limits.high:
                 raise InputError(f"{f'{table}.{name}'.lstrip('.')}: {value} is outside {limits}.")
     if contents.bodies.learner.name != NO_LEARNER:
-        check_learners([contents.bodies.learner.name], False, "bodies.learner.name")
+        check_learner_names([contents.bodies.learner.name], False, "bodies.learner.name")
     if not any(each.weight > 0.0 for each in contents.motion.named.values()):
         raise InputError("motion: give one family or more, with a weight above 0.")
     if contents.bodies.tumour != TumourPlan() and "drawn" not in _list_anatomies(contents):

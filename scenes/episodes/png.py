@@ -28,11 +28,11 @@ def encode_png(image: np.ndarray) -> np.ndarray:
     return np.frombuffer(code, np.uint8)
 
 
-def _filter_rows(picture: np.ndarray) -> np.ndarray:
+def _filter_rows(image: np.ndarray) -> np.ndarray:
     """Filter the rows: the filter's number, then each byte minus the corresponding byte of the sample to its left."""
-    height, width = picture.shape
-    size = picture.itemsize
-    samples = picture.astype(picture.dtype.newbyteorder(">"), order="C").view(np.uint8).reshape(height, size * width)
+    height, width = image.shape
+    size = image.itemsize
+    samples = image.astype(image.dtype.newbyteorder(">"), order="C").view(np.uint8).reshape(height, size * width)
     rows = np.empty((height, 1 + size * width), np.uint8)
     rows[:, 0] = SUB
     rows[:, 1 : 1 + size] = samples[:, :size]

@@ -18,7 +18,7 @@ COLUMNS = "kind,number,frames,bytes,seconds,first"  # Column names of the table 
 
 
 @dataclass(frozen=True)
-class Rate:
+class TaskRate:
     """Measured task: kind ("episode" or "body"), number, frames, size [bytes], and duration [s] in one worker.
 
     `first`, one of `tasks.FIRST`, is the task's position in the worker: first of the process, first on a body, or not.
@@ -59,7 +59,7 @@ def write_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
         yield note
 
 
-def read_rates(folder: Path) -> list[Rate]:
+def read_rates(folder: Path) -> list[TaskRate]:
     """Read the recorded rates of a folder; incomplete lines, which a killed process may leave, are skipped."""
     found = []
     for path in sorted((folder / RATES).glob("*.csv")):
@@ -68,7 +68,7 @@ def read_rates(folder: Path) -> list[Rate]:
             try:
                 if line.endswith("\n"):
                     kind, number, frames, size, seconds, first = words
-                    found.append(Rate(kind, int(number), int(frames), int(size), float(seconds), first))
+                    found.append(TaskRate(kind, int(number), int(frames), int(size), float(seconds), first))
             except ValueError:
                 continue
     return found

@@ -187,23 +187,23 @@ def _check_empty(folder: Path, force: bool) -> None:
         )
 
 
-def _check_same_run(folder: Path, found: RunSettings, run: RunSettings, force: bool) -> None:
-    if found.digest != run.digest:
+def _check_same_run(folder: Path, stored: RunSettings, run: RunSettings, force: bool) -> None:
+    if stored.digest != run.digest:
         changed = f"of another text or other anatomies of the plan {run.plan}"
-        other = changed if found.plan == run.plan else f"of the plan {found.plan}"
+        other = changed if stored.plan == run.plan else f"of the plan {stored.plan}"
         raise InputError(
             f"{folder}: holds episodes {other}; its {PLAN} has what they were made by. Choose another folder."
         )
-    if found.seed != run.seed:
+    if stored.seed != run.seed:
         raise InputError(
-            f"{folder}: holds episodes of the seed {found.seed}. Give --seed {found.seed}, or choose another folder."
+            f"{folder}: holds episodes of the seed {stored.seed}. Give --seed {stored.seed}, or choose another folder."
         )
-    if found.device != run.device:
+    if stored.device != run.device:
         raise InputError(
-            f"{folder}: holds episodes that were made on {found.device}, whose last digits differ. Give --device "
-            f"{found.device}, or choose another folder."
+            f"{folder}: holds episodes that were made on {stored.device}, whose last digits differ. Give --device "
+            f"{stored.device}, or choose another folder."
         )
-    other = describe_other_versions(found.versions, run.versions)
+    other = describe_other_versions(stored.versions, run.versions)
     if other and not force:
         raise InputError(
             f"{folder}: was begun with {other}: episodes may differ. Choose another folder, or give --force to go on."

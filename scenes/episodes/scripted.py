@@ -91,7 +91,7 @@ def build_scene(
         path = add_tremor(path, first, 1e-3 * hand["tremor_mm"], hand["tremor_n"])
     effects = body.build_effects(*act.effects, can_separate=act.skull_separates)
     if act.is_viscoelastic:
-        effects = tuple(make_relaxing(each) if isinstance(each, Elasticity) else each for each in effects)
+        effects = tuple(make_viscoelastic(each) if isinstance(each, Elasticity) else each for each in effects)
     title = f"{FAMILIES[sample.family].__doc__ or ''} Episode {number} of the plan {plan.name}, seed {seed}."
     return Scene(
         sample.family, title, path, seconds, effects, act.tool, act.lying, act.surgery,
@@ -100,38 +100,38 @@ def build_scene(
     )  # fmt: skip
 
 
-def make_relaxing(tissue: Elasticity) -> Elasticity:
+def make_viscoelastic(tissue: Elasticity) -> Elasticity:
     """Return the tissue with all regions relaxing by the Prony series `PRONY`."""
 
-    def relaxed(each: object) -> Any:
-        return replace(cast(Any, each), prony=PRONY)
+    def add_prony(law: object) -> Any:
+        return replace(cast(Any, law), prony=PRONY)
 
-    regions = {label: relaxed(each) for label, each in tissue.regions.items()}
-    return Elasticity(None if tissue.default is None else relaxed(tissue.default), regions)
+    regions = {label: add_prony(each) for label, each in tissue.regions.items()}
+    return Elasticity(None if tissue.default is None else add_prony(tissue.default), regions)
 
 
-def _build_viewpoint(contents: PlanContents, look: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
-    """Build the viewpoint of an episode from the sampled values of the table `look`."""
+def _build_viewpoint(contents: PlanContents, appearance: Mapping[str, Any], seed: int, number: int) -> Viewpoint:
+    """Build the viewpoint of an episode from the sampled values of the table `appearance`."""
     random = build_generator(seed, number, "look.camera")
     width, height = contents.size
-    path = None if look["path"] == FIXED else PATHS[look["path"]](int(random.integers(2**31)))
-    field = float(np.radians(look["fov_deg"]))
+    path = None if appearance["path"] == FIXED else PATHS[appearance["path"]](int(random.integers(2**31)))
+    field = float(np.radians(appearance["fov_deg"]))
     view = Viewpoint(
-        1e-3 * look["distance_mm"], float(np.radians(look["tilt_deg"])), field, width, height, path=path,
-        eye="left" if random.random() < look["stereo"] else None,
+        1e-3 * appearance["distance_mm"], float(np.radians(appearance["tilt_deg"])), field, width, height, path=path,
+        eye="left" if random.random() < appearance["stereo"] else None,
     )  # fmt: skip
-    if look["bent"] == 0.0:
+    if appearance["bent"] == 0.0:
         return view
     focal = 0.5 * height / np.tan(0.5 * field)
     # Distortion at the image corners, relative to half its diagonal, for any field of view.
     corner = float(np.hypot(width, height) / (2.0 * focal)) ** 2
-    bent = look["bent"] / corner
+    bent = appearance["bent"] / corner
     middle = 0.5 * (width - 1), 0.5 * (height - 1)
     try:
         lens = Lens(k1=0.3 * bent, k2=0.3 * SECOND_RADIAL_RATIO * bent / corner)
         return view.calibrate(Calibration((focal, focal), middle, width, height, lens))
     except ValueError as error:
-        raise InputError(f"look.bent {look['bent']:g}: {error}") from error
+        raise InputError(f"look.bent {appearance['bent']:g}: {error}") from error
 
 
 def _build_appearance(look: Mapping[str, Any], site: CraniotomyFrame, seed: int, number: int) -> Appearance:

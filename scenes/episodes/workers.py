@@ -38,10 +38,10 @@ SCHEDULER_TIMEOUT = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Started:
+class _WorkerProcess:
     process: BaseProcess
-    said: Any  # pipe, of another class on Windows: a message once it is connected
-    times: int
+    connection: Any  # pipe, of another class on Windows: a message once it is connected
+    start_count: int
 
 
 @contextmanager
@@ -57,29 +57,29 @@ def start_processes(
     InputError
         From the yielded function, if a process ended `max_starts` times in a row before it was connected.
     """
-    crew = [_start(address, security, device, 1) for device in devices]
+    crew = [_start_worker(address, security, device, 1) for device in devices]
 
-    def tend() -> None:
+    def restart_ended() -> None:
         for place, one in enumerate(crew):
             if one.process.is_alive():
                 continue
-            times = 1 if _has_served(one) else one.times + 1
+            times = 1 if _has_served(one) else one.start_count + 1
             if times > max_starts:
                 raise InputError(
                     f"a process on {devices[place]} crashed {max_starts} times at start-up "
                     f"(exit code {one.process.exitcode}). Use fewer --workers, or check the free memory."
                 )
-            _close(one)
-            crew[place] = _start(address, security, devices[place], times)
+            _close_worker(one)
+            crew[place] = _start_worker(address, security, devices[place], times)
 
     try:
-        yield tend
+        yield restart_ended
     finally:  # their current results are not needed
         for one in crew:
             one.process.kill()
         for one in crew:
             one.process.join()
-            _close(one)
+            _close_worker(one)
 
 
 def silence_dask() -> None:
@@ -88,30 +88,30 @@ def silence_dask() -> None:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
-def _start(address: str, security: Security, device: str, times: int) -> _Started:
+def _start_worker(address: str, security: Security, device: str, times: int) -> _WorkerProcess:
     ours, theirs = Pipe(duplex=False)
     card = build_gpu_environment(device)
     resources = {GPU_RESOURCE: 1.0} if card else None
     process = start_process(
-        _serve, address, security, resources, theirs, name="worker", variables={**ONE_THREAD_VARIABLES, **card}
+        _run_worker, address, security, resources, theirs, name="worker", variables={**ONE_THREAD_VARIABLES, **card}
     )
     theirs.close()
-    return _Started(process, ours, times)
+    return _WorkerProcess(process, ours, times)
 
 
-def _has_served(one: _Started) -> bool:
+def _has_served(worker: _WorkerProcess) -> bool:
     try:
-        return one.said.poll() and one.said.recv_bytes() is not None
+        return worker.connection.poll() and worker.connection.recv_bytes() is not None
     except (EOFError, OSError):
         return False
 
 
-def _close(one: _Started) -> None:
-    one.process.close()
-    one.said.close()
+def _close_worker(worker: _WorkerProcess) -> None:
+    worker.process.close()
+    worker.connection.close()
 
 
-def _serve(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
+def _run_worker(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
     silence_dask()
     # Profiles keep references to closed files, and HTTP services need no keys.
     with config.set({"distributed.worker.profile.enabled": False, "distributed.worker.http.routes": []}):

@@ -28,7 +28,7 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": ro
 
 
 def open_environment_setting(
-    task: str, observation: str, render_mode: str | None, settings: Mapping[str, Any], together: bool | None = None
+    task: str, observation: str, render_mode: str | None, settings: Mapping[str, Any], batched: bool | None = None
 ) -> TaskSetting:
     """Open the shared setting of environments; `settings` contains the arguments `ARGUMENTS` of `open_setting`.
 
@@ -41,10 +41,10 @@ def open_environment_setting(
         raise InputError(f"observation is {observation!r:.80}: choose one of {', '.join(KINDS)}.")
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise InputError(f"render_mode is {render_mode!r:.80}: choose {', '.join(RENDER_MODES)}, or None.")
-    return open_setting(find_task(task), *check_arguments(settings), together)
+    return open_setting(find_task(task), *check_arguments(settings), batched)
 
 
-class Operation(gymnasium.Env):
+class SurgeryEnv(gymnasium.Env):
     """Single environment: `gymnasium.make("sulcus/Palpate-v0")`.
 
     Parameters
@@ -128,7 +128,7 @@ class Operation(gymnasium.Env):
         return {"rgb": colour[0], "depth": depth[0], "states": step.states}
 
 
-class Operations(VectorEnv):
+class SurgeryVectorEnv(VectorEnv):
     """Vectorised environments: `gymnasium.make_vec("sulcus/Palpate-v0", num_envs=64)`.
 
     The first step after the end of an episode ignores the action, begins an episode, and has the reward 0.
@@ -140,14 +140,14 @@ class Operations(VectorEnv):
     max_episode_steps
         Number of steps after which an episode is truncated.
     task, anatomy, observation, physics, device, size, render_mode
-        See `Operation`.
+        See `SurgeryEnv`.
     together
         See `open_setting`.
 
     Raises
     ------
     InputError
-        See `Operation`; also if the number of environments or of steps is < 1.
+        See `SurgeryEnv`; also if the number of environments or of steps is < 1.
     """
 
     metadata = METADATA | {"autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -202,7 +202,7 @@ class Operations(VectorEnv):
         return self._build_observation(steps), self._stack_infos(steps)
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Move the tools of all environments; return the results of `Operation.step` with a row per environment.
+        """Move the tools of all environments; return the results of `SurgeryEnv.step` with a row per environment.
 
         Raises
         ------
@@ -232,8 +232,8 @@ class Operations(VectorEnv):
             return None
         return tuple(self.pictures.render([episode.view for episode in self.episodes])[0])
 
-    def _take_steps(self, asked: list[TissueRequest]) -> list[EpisodeStep]:
-        answers = self.setting.tissue_model.compute_responses(asked)
+    def _take_steps(self, requests: list[TissueRequest]) -> list[EpisodeStep]:
+        answers = self.setting.tissue_model.compute_responses(requests)
         return [episode.end_step(touched) for episode, touched in zip(self.episodes, answers, strict=True)]
 
     def _build_observation(self, steps: Sequence[EpisodeStep]) -> Any:
@@ -258,12 +258,12 @@ def make_many(task: str, count: int, processes: bool = False, **given: Any) -> V
         True for one process per environment. Since processes are spawned (a process that uses a GPU cannot be forked),
         the script needs `if __name__ == "__main__":`.
     given
-        Other arguments of `Operation`.
+        Other arguments of `SurgeryEnv`.
 
     Raises
     ------
     InputError
-        See `Operation`.
+        See `SurgeryEnv`.
     """
     name = f"{NAMESPACE}/{find_task(task).name.capitalize()}-v0"
     if processes:

@@ -147,11 +147,11 @@ class Episode:
         self.step += 1
         return self._build_request(self.drawn)
 
-    def _build_request(self, drawn: ResetSample) -> TissueRequest:
+    def _build_request(self, sample: ResetSample) -> TissueRequest:
         task = self.setting.task
-        offset = drawn.tremor * self.frame @ sample_hand_motion(drawn.seed, STEP_SECONDS * self.step)[:3]
+        offset = sample.tremor * self.frame @ sample_hand_motion(sample.seed, STEP_SECONDS * self.step)[:3]
         self.actual = shift_pose(self.hand, offset)
-        fluid = 1.0 - (1.0 - drawn.goal.fluid) * smooth_step(self.step / DRAIN_STEPS)
+        fluid = 1.0 - (1.0 - sample.goal.fluid) * smooth_step(self.step / DRAIN_STEPS)
         return TissueRequest(self.actual.compute_pose(task.tool), self.touched, fluid, self.completed_steps)
 
     @property
@@ -194,10 +194,10 @@ class Episode:
             self._build_states(response), reward, success or ended, self._collect_truth(response, target, success)
         )
 
-    def _compute_target(self, touched: Response) -> np.ndarray:
+    def _compute_target(self, response: Response) -> np.ndarray:
         """Compute the target (3,) [m] of the tool: the goal, or the deformed position of the next part to resect."""
         planned = self._compute_planned_target()
-        return planned if self.next_share is None else planned + touched.motion[self.next_share].mean(axis=0)
+        return planned if self.next_share is None else planned + response.motion[self.next_share].mean(axis=0)
 
     @property
     def next_share(self) -> np.ndarray | None:
@@ -211,53 +211,53 @@ class Episode:
         nodes = self.setting.site.anatomy.mesh.nodes
         return self.drawn.goal.position if self.next_share is None else nodes[self.next_share].mean(axis=0)
 
-    def _compute_score(self, touched: Response, target: np.ndarray) -> EpisodeScore:
+    def _compute_score(self, response: Response, target: np.ndarray) -> EpisodeScore:
         assert self.drawn is not None
         task, goal, axis = self.setting.task, self.drawn.goal, self.setting.site.axis
-        size = float(np.linalg.norm(touched.force))
-        load = max(size / task.max_force, touched.pressure / task.max_pressure)
+        size = float(np.linalg.norm(response.force))
+        load = max(size / task.max_force, response.pressure / task.max_pressure)
         if task.resects:
             return EpisodeScore(float(np.linalg.norm(self.actual.position - target)), 0.0, self.cut, load)
         tip = self.actual.position + compute_pivot_distance(task.tool) * axis
         along = float((target - tip) @ axis)
         aside = float(np.linalg.norm(target - tip - along * axis))
         away = float(np.hypot(aside, max(along, 0.0) if size == 0.0 else 0.0))
-        return EpisodeScore(away, abs(self._compute_reached(touched) - goal.amount) / goal.amount, 0, load)
+        return EpisodeScore(away, abs(self._compute_reached(response) - goal.amount) / goal.amount, 0, load)
 
-    def _compute_reached(self, touched: Response) -> float:
+    def _compute_reached(self, response: Response) -> float:
         """Return the reached amount, which the goal prescribes: force [N], shift [m], or number of resected parts."""
         assert self.drawn is not None
         if self.setting.task.resects:
             return float(self.cut)
         if self.setting.task.max_push_angle == 0.0:
-            return float(np.linalg.norm(touched.force))
-        row = np.searchsorted(touched.nodes, self.patch)
-        return float(touched.motion[row].mean(axis=0) @ self.drawn.goal.direction)
+            return float(np.linalg.norm(response.force))
+        row = np.searchsorted(response.nodes, self.patch)
+        return float(response.motion[row].mean(axis=0) @ self.drawn.goal.direction)
 
-    def _build_states(self, touched: Response) -> np.ndarray:
+    def _build_states(self, response: Response) -> np.ndarray:
         assert self.drawn is not None
         task, goal = self.setting.task, self.drawn.goal
-        cortex = touched.motion[np.searchsorted(touched.nodes, self.setting.cortex)].mean(axis=0)
+        cortex = response.motion[np.searchsorted(response.nodes, self.setting.cortex)].mean(axis=0)
         noise = self.random.standard_normal((3, 3))
         tracked = shift_pose(self.actual, POSITION_NOISE * noise[0])
-        sensed = np.stack([touched.force, cortex]) + np.array([[FORCE_NOISE], [MOTION_NOISE]]) * noise[1:]
+        sensed = np.stack([response.force, cortex]) + np.array([[FORCE_NOISE], [MOTION_NOISE]]) * noise[1:]
         done = self.cut / goal.amount if task.resects else self.held / task.hold_steps
         time = STEP_SECONDS * self.step
         planned = replace(goal, position=self._compute_planned_target())
         return compute_states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
 
-    def _collect_truth(self, touched: Response, target: np.ndarray, success: bool) -> dict[str, Any]:
+    def _collect_truth(self, response: Response, target: np.ndarray, success: bool) -> dict[str, Any]:
         """Return the ground truth, which is not observed, by name (see docs/gym.md). Arrays are new in each step."""
         assert self.judged is not None and self.drawn is not None
         setting = self.setting
         tumour = setting.site.anatomy.tumour_nodes
-        now = setting.site.anatomy.mesh.nodes[tumour] + touched.motion[np.searchsorted(touched.nodes, tumour)]
+        now = setting.site.anatomy.mesh.nodes[tumour] + response.motion[np.searchsorted(response.nodes, tumour)]
         left = np.isin(tumour, setting.get_stage(self.shown).anatomy.tumour_nodes)
         return {
             "pose": self.actual.compute_pose(setting.task.tool),
-            "force": touched.force.copy(), "pressure": touched.pressure,
-            "tumour_nodes": now, "tumour_middle": now[left].mean(axis=0), "model_error": touched.error,
+            "force": response.force.copy(), "pressure": response.pressure,
+            "tumour_nodes": now, "tumour_middle": now[left].mean(axis=0), "model_error": response.error,
             "target": target.copy(), "away": self.judged.distance, "asked": float(self.drawn.goal.amount),
-            "reached": self._compute_reached(touched), "load": self.judged.load_ratio, "violations": self.violations,
-            "success": success, "reliable": touched.reliable, "steps_done": self.shown,
+            "reached": self._compute_reached(response), "load": self.judged.load_ratio, "violations": self.violations,
+            "success": success, "reliable": response.reliable, "steps_done": self.shown,
         }  # fmt: skip

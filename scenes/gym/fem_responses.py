@@ -22,10 +22,10 @@ from .tissue_requests import Response, TissueRequest
 
 
 @dataclass(frozen=True, eq=False)
-class PosedFem:
+class ContactFem:
     """FEM model of the contact with a rigid tool.
 
-    The pressure under a ball follows from its force by `Hertz`; under a blade it is the maximum of `compute_pressure`.
+    The pressure under a ball follows by `Hertz`; under a blade it is the maximum of `compute_pressure`.
 
     Parameters
     ----------
@@ -51,9 +51,9 @@ class PosedFem:
                 found |= dict(zip(some, self._solve_poses([requests[row] for row in some]), strict=True))
         return [found[row] for row in range(len(requests))]
 
-    def _solve_poses(self, asked: Sequence[TissueRequest]) -> list[Response]:
-        loads = Loads((Touching(np.stack([each.pose for each in asked])[:, None]),))
-        starts = [each.previous.memory for each in asked if each.previous and each.previous.memory is not None]
+    def _solve_poses(self, requests: Sequence[TissueRequest]) -> list[Response]:
+        loads = Loads((Touching(np.stack([each.pose for each in requests])[:, None]),))
+        starts = [each.previous.memory for each in requests if each.previous and each.previous.memory is not None]
         result = self.fem.deform(loads, join_deformations(starts) if len(starts) > 1 else next(iter(starts), None))
         force = result.reaction[:, 0, :3]
         size = np.linalg.norm(force, axis=1)
@@ -62,8 +62,8 @@ class PosedFem:
         else:
             highest = compute_pressure(self.fem, loads, result).max(axis=1).tolist()
         rows = [result]
-        if len(asked) > 1:
-            rows = [replace(result.select(np.array([row])), warm={}) for row in range(len(asked))]
+        if len(requests) > 1:
+            rows = [replace(result.select(np.array([row])), warm={}) for row in range(len(requests))]
         return [
             Response(row.displacement[0], row.nodes, force[number], highest[number], row.outcome[0].good, memory=row)
             for number, row in enumerate(rows)
@@ -107,9 +107,9 @@ class ResectionFem:
 
     def compute_responses(self, requests: Sequence[TissueRequest]) -> list[Response]:
         """Solve requests, see `TissueModel.compute_responses`; results do not depend on earlier requests."""
-        return [self._solve_touch(each) for each in requests]
+        return [self._solve_request(each) for each in requests]
 
-    def _solve_touch(self, asked: TissueRequest) -> Response:
+    def _solve_request(self, asked: TissueRequest) -> Response:
         level = (1.0 - asked.fluid) / LEVEL_SPACING
         low = int(level)
         share = level - low
@@ -122,25 +122,25 @@ class ResectionFem:
         good = all(self._solve_level(level, asked.completed_steps).outcome[0].good for level in levels)
         return Response(motion, np.arange(len(motion)), force, self.ball.compute_pressure(size), good)
 
-    def _solve_level(self, level: int, done: int) -> Deformation:
+    def _solve_level(self, level: int, completed_steps: int) -> Deformation:
         """Return the solution at a CSF level, whose solve starts from the solution at the level above.
 
         After several resection steps, the solve starts from the solution with one step less.
         """
-        key = level, done
+        key = level, completed_steps
         if key not in self._solved:
             start = None
-            if done > 1:
-                start = self._solve_level(level, done - 1)
+            if completed_steps > 1:
+                start = self._solve_level(level, completed_steps - 1)
             elif level > 0:
-                start = self._solve_level(level - 1, done)
+                start = self._solve_level(level - 1, completed_steps)
             posture = HeadPose(fluid=1.0 - LEVEL_SPACING * level).build_posture(self.site.anatomy.mesh.nodes)
-            self._solved[key] = self.fem.deform(Loads((posture, Resected(np.array([float(done)])))), start)
+            self._solved[key] = self.fem.deform(Loads((posture, Resected(np.array([float(completed_steps)])))), start)
         return self._solved[key]
 
-    def _compute_force(self, pose: np.ndarray, done: int, motion: np.ndarray) -> np.ndarray:
+    def _compute_force(self, pose: np.ndarray, completed_steps: int, motion: np.ndarray) -> np.ndarray:
         """Compute the force (3,) [N] of the ball at a pose (4, 4) on healthy tissue."""
-        healthy, nodes = self._get_healthy(done), self.site.anatomy.mesh.nodes
+        healthy, nodes = self._get_surface(completed_steps), self.site.anatomy.mesh.nodes
         radius = self.ball.radius
         middle = pose[:3, 3] + radius * pose[:3, 2]
         near = find_closest_points(middle[None], (nodes + motion)[healthy.triangles])
@@ -151,14 +151,14 @@ class ResectionFem:
         distance = float(np.copysign(np.linalg.norm(away), away @ outward))
         return -float(self.ball.compute_force(np.array(radius - distance))) * outward
 
-    def _get_healthy(self, done: int) -> RemainingSurface:
-        """Return the surface of the remaining healthy tissue after `done` resection steps."""
-        if done not in self._surfaces:
-            self._surfaces[done] = self._build_healthy(done)
-        return self._surfaces[done]
+    def _get_surface(self, completed_steps: int) -> RemainingSurface:
+        """Return the surface of the remaining healthy tissue after `completed_steps` resection steps."""
+        if completed_steps not in self._surfaces:
+            self._surfaces[completed_steps] = self._build_surface(completed_steps)
+        return self._surfaces[completed_steps]
 
-    def _build_healthy(self, done: int) -> RemainingSurface:
-        body = self.fem.get_remaining_body(done).anatomy
+    def _build_surface(self, completed_steps: int) -> RemainingSurface:
+        body = self.fem.get_remaining_body(completed_steps).anatomy
         left, brain = body.mesh, ~body.in_tumour
         surface = TetMesh(left.nodes, left.tets[brain], left.region[brain]).surface
         tumour = self.site.anatomy.tumour_nodes

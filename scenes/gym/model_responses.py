@@ -67,7 +67,7 @@ class Hertz:
 
 
 @dataclass(frozen=True, eq=False)
-class PressedModel:
+class PushSurrogate:
     """Model trained on forces, with a search for the force under which the predicted cortex touches the ball.
 
     The force acts at the point of the undeformed cortex that is nearest to the ball's centre, away from the centre. The
@@ -121,12 +121,12 @@ class PressedModel:
             )  # fmt: skip
         return answers
 
-    def _build_loads(self, point: np.ndarray, inward: np.ndarray, size: np.ndarray) -> Loads:
+    def _build_loads(self, point: np.ndarray, inward: np.ndarray, force: np.ndarray) -> Loads:
         """Build pushes of sizes (k,) [N]; footprints have the contact radius, clipped to the training range."""
-        return Loads((Pushed(point, size[:, None] * inward, self._compute_footprint(size)),))
+        return Loads((Pushed(point, force[:, None] * inward, self._compute_footprint(force)),))
 
-    def _compute_footprint(self, size: np.ndarray) -> np.ndarray:
-        return np.clip(self.ball.compute_contact_radius(size), *self.model.envelope.footprint)
+    def _compute_footprint(self, force: np.ndarray) -> np.ndarray:
+        return np.clip(self.ball.compute_contact_radius(force), *self.model.envelope.footprint)
 
     def _find_forces(self, point: np.ndarray, inward: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find forces (k,) [N] at points (k, 3) by the secant method; also return True (k,) if the depth is reached."""
@@ -134,27 +134,27 @@ class PressedModel:
         place = find_closest_points(point, patch.points[patch.triangles])
         corners, most = patch.triangles[place.triangle], MAX_FORCE_RATIO * self.model.envelope.force[1]
 
-        def off(size: np.ndarray) -> np.ndarray:
+        def compute_depth_error(force: np.ndarray) -> np.ndarray:
             """Return the signed depth error (k,) [m] of the ball under each trial force."""
-            moved = self.model.deform(self._build_loads(point, inward, size), at=patch.nodes).displacement
+            moved = self.model.deform(self._build_loads(point, inward, force), at=patch.nodes).displacement
             there = np.einsum("kc,kci,ki->k", place.weights, moved[rows[:, None], corners], inward)
-            return there + self.ball.compute_extra_depth(size, self._compute_footprint(size)) - depth
+            return there + self.ball.compute_extra_depth(force, self._compute_footprint(force)) - depth
 
         before, short = np.zeros(len(depth)), -depth
         size = np.minimum(self.ball.compute_force(depth), most)
         for _ in range(MAX_ITERATIONS):
-            now = off(size)
+            now = compute_depth_error(size)
             near = np.abs(now) < DEPTH_TOLERANCE
             if near.all():
                 break
             slope = np.where(near, np.inf, now - short) / np.where(near | (size == before), 1.0, size - before)
             # Converged entries keep their force, so that others in the batch have no influence.
             before, short, size = size, now, np.where(near, size, np.clip(size - now / slope, 0.0, most))
-        return size, np.abs(off(size)) < DEPTH_TOLERANCE
+        return size, np.abs(compute_depth_error(size)) < DEPTH_TOLERANCE
 
 
 @dataclass(frozen=True, eq=False)
-class PosedModel:
+class PoseSurrogate:
     """Model trained on tool poses, which predicts motion, force and error bound; a solution starts from the last.
 
     The pressure under a ball follows from its force by `Hertz`; under a blade it is the maximum of
@@ -178,13 +178,13 @@ class PosedModel:
         """
         return [self._predict_pose(each.pose, each.previous) for each in requests]
 
-    def _predict_pose(self, pose: np.ndarray, last: Response | None) -> Response:
+    def _predict_pose(self, pose: np.ndarray, previous: Response | None) -> Response:
         loads = Loads((Touching(pose[None, None]),))
         try:
-            result = self.model.deform(loads, None if last is None else last.memory)
+            result = self.model.deform(loads, None if previous is None else previous.memory)
         except InputError:
             nodes = self.model.nodes
-            rest = Response(np.zeros((len(nodes), 3)), nodes, np.zeros(3), 0.0) if last is None else last
+            rest = Response(np.zeros((len(nodes), 3)), nodes, np.zeros(3), 0.0) if previous is None else previous
             return replace(rest, reliable=False, error=float("inf"))
         force = result.reaction[0, 0, :3]
         if self.ball is None:

@@ -45,7 +45,7 @@ class ObservationCamera:
             colour[rows], depth[rows] = pictures.colour.numpy(), pictures.depth.numpy()
         return colour, depth
 
-    def _compute_positions(self, touched: Response) -> np.ndarray:
+    def _compute_positions(self, response: Response) -> np.ndarray:
         positions = self.setting.site.anatomy.mesh.nodes.copy()
-        positions[touched.nodes] += touched.motion
+        positions[response.nodes] += response.motion
         return positions

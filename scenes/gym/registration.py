@@ -23,8 +23,8 @@ def register_environments() -> None:
         if known not in registry:
             register(
                 known,
-                "scenes.gym.environment:Operation",
+                "scenes.gym.environment:SurgeryEnv",
                 max_episode_steps=MAX_STEPS,
                 kwargs={"task": name.lower()},
-                vector_entry_point="scenes.gym.environment:Operations",
+                vector_entry_point="scenes.gym.environment:SurgeryVectorEnv",
             )

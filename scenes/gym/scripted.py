@@ -52,6 +52,6 @@ def compute_scripted_actions(task: str, states: np.ndarray, settings: PolicySett
     return _build_action(known, off)
 
 
-def _build_action(task: GymTask, way: np.ndarray) -> np.ndarray:
-    turn = np.zeros_like(way)
-    return np.clip(np.concatenate([way / task.step, turn], axis=-1), -1.0, 1.0).astype(np.float32)
+def _build_action(task: GymTask, translation: np.ndarray) -> np.ndarray:
+    turn = np.zeros_like(translation)
+    return np.clip(np.concatenate([translation / task.step, turn], axis=-1), -1.0, 1.0).astype(np.float32)

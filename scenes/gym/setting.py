@@ -27,8 +27,8 @@ from ..script.craniotomy_frame import CraniotomyFrame
 from ..script.scene import Scene
 from ..script.shipped_files import get_gym_model_path
 from ..script.tool import Blade, Probe
-from .fem_responses import PosedFem, ResectionFem
-from .model_responses import Hertz, PosedModel, PressedModel
+from .fem_responses import ContactFem, ResectionFem
+from .model_responses import Hertz, PoseSurrogate, PushSurrogate
 from .tasks import Goal, GymTask
 from .tissue_requests import TissueModel
 
@@ -163,15 +163,15 @@ def open_setting(
         refused = _list_rejections(task, scene, patient)
         known = [each for name, each in patient.models.items() if refused[name] is None]
         if posed := [each for each in known if each.tool is not None]:
-            return TaskSetting(task, scene, patient, PosedModel(min(posed, key=BOUND_KEY), ball))
+            return TaskSetting(task, scene, patient, PoseSurrogate(min(posed, key=BOUND_KEY), ball))
         if ball is not None and known:
             return TaskSetting(
-                task, scene, patient, PressedModel(patient.site, min(known, key=BOUND_KEY), ball, at_once)
+                task, scene, patient, PushSurrogate(patient.site, min(known, key=BOUND_KEY), ball, at_once)
             )
         _report_no_model(task, anatomy, physics, model, next(iter(refused.values()), None))
     fem = patient.build_fem(scene, LIVE, batch=64 if at_once else 1, live=not at_once)
     if isinstance(fem, Fem):
-        return TaskSetting(task, scene, patient, PosedFem(fem, ball, at_once))
+        return TaskSetting(task, scene, patient, ContactFem(fem, ball, at_once))
     assert ball is not None
     return TaskSetting(task, scene, patient, ResectionFem(patient.site, fem, ball))
 
@@ -211,7 +211,7 @@ def _list_rejections(task: GymTask, scene: Scene, patient: PatientSetup) -> dict
     return found
 
 
-def _report_no_model(task: GymTask, anatomy: str, physics: str, model: str | None, why: str | None) -> None:
+def _report_no_model(task: GymTask, anatomy: str, physics: str, model: str | None, reason: str | None) -> None:
     """Warn that FEM is used, because no trained model is applicable, unless the task resects tissue.
 
     Raises
@@ -221,13 +221,13 @@ def _report_no_model(task: GymTask, anatomy: str, physics: str, model: str | Non
     """
     remedy = "Give physics='fem', or train one: docs/gym.md has the commands."
     if model is not None:
-        raise InputError(f"{model}: is not applicable to the task {task.name}: {why}. {remedy}")
-    because = f": {why or 'there is none'}"
+        raise InputError(f"{model}: is not applicable to the task {task.name}: {reason}. {remedy}")
+    because = f": {reason or 'there is none'}"
     if physics == "model":
         raise InputError(
             f"physics='model': no trained model of {anatomy} is applicable to the task {task.name}{because}. {remedy}"
         )
-    if why is not None and not task.resects:
+    if reason is not None and not task.resects:
         said = f"FEM is used for the task {task.name} on {anatomy}: no trained model is applicable{because}. {remedy}"
         warnings.warn(said, stacklevel=2)
 

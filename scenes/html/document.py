@@ -47,7 +47,7 @@ class ExportedModel:
 
     name: str
     model: Learned
-    sheet: GraphBuilder
+    graph: GraphBuilder
     cortex: bool
 
 
@@ -122,20 +122,20 @@ def build_exported_model(name: str, model: Learned, with_cortex: bool) -> Export
     return ExportedModel(name, model, sheet, with_cortex)
 
 
-def _count_bytes(sheet: GraphBuilder) -> int:
-    return sum(array.nbytes for array in sheet.constants.values())
+def _count_bytes(graph: GraphBuilder) -> int:
+    return sum(array.nbytes for array in graph.constants.values())
 
 
 def build_html(patient: PatientSetup, scene: Scene, exported: ExportedModel) -> str:
     """Build the HTML text of the page with model, surfaces, scripts and style."""
     stage, model = patient.build_stage(scene).without_fine_cortex, exported.model
     nodes = model.nodes if exported.cortex else model.anatomy.tumour_nodes
-    table, packed = pack_arrays({**exported.sheet.constants, **build_arrays(stage, nodes)})
+    table, packed = pack_arrays({**exported.graph.constants, **build_arrays(stage, nodes)})
     described = describe_camera_and_tool(stage, scene.viewpoint.build_camera(stage.site))
     most = described["force"]["most"] = round(FORCE_RANGE * model.envelope.force[1], 2)
     described |= {
         "arrays": table,
-        "graph": exported.sheet.to_json(),
+        "graph": exported.graph.to_json(),
         "bound": model.bound if np.isfinite(model.bound) else None,
         **_describe_errors(patient, scene),
     }
@@ -152,7 +152,7 @@ def build_html(patient: PatientSetup, scene: Scene, exported: ExportedModel) -> 
         "most": f"{most:g}",
     }
     return Template(_read("page.html")).substitute(
-        fields, style=style, style_digest=_digest(style), script=script, script_digest=_digest(script),
+        fields, style=style, style_digest=_compute_digest(style), script=script, script_digest=_compute_digest(script),
         scene=_to_script_json(described), arrays=packed, shaders=_read("shaders.glsl"),
     )  # fmt: skip
 
@@ -208,7 +208,7 @@ def _read(name: str) -> str:
     return files("scenes.html").joinpath(name).read_text(encoding="utf-8")
 
 
-def _digest(text: str) -> str:
+def _compute_digest(text: str) -> str:
     """Compute the digest by which the page's security policy allows an inline script or style."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 

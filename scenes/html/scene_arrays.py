@@ -61,8 +61,8 @@ def find_row_indices(vertices: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     return np.where(nodes[row] == vertices, row, NO_ROW).astype(np.uint16)
 
 
-def _build_surface(name: str, points: np.ndarray, triangles: np.ndarray, kind: type = np.float32) -> dict:
-    return {name: np.asarray(points).astype(kind), f"{name}Triangles": np.asarray(triangles).astype(np.uint16)}
+def _build_surface(name: str, points: np.ndarray, triangles: np.ndarray, dtype: type = np.float32) -> dict:
+    return {name: np.asarray(points).astype(dtype), f"{name}Triangles": np.asarray(triangles).astype(np.uint16)}
 
 
 def _build_texture(stage: Stage, cortex: Layer) -> dict[str, np.ndarray]:

@@ -256,17 +256,17 @@ class LinkClients:
             client.pending = dict(self._newest)
             client.news.set()
 
-    def _count_rejection(self, why: str, text: str = "") -> None:
+    def _count_rejection(self, reason: str, text: str = "") -> None:
         """Count a rejected message, and log the first message that is rejected for this reason."""
-        self.refused[why] += 1
-        if self.refused[why] == 1:
-            self._note(f"rejected: {text or why}")
+        self.refused[reason] += 1
+        if self.refused[reason] == 1:
+            self._note(f"rejected: {text or reason}")
 
 
-def _find_message(newest: Mapping[str, tuple[bytes, ...]], kind: str, name: str) -> bytes | None:
+def _find_message(newest: Mapping[str, tuple[bytes, ...]], message_type: str, name: str) -> bytes | None:
     """Return the message with a type and name, else the newest message of the type; None if there is no such type."""
     every = [(read_header(each[: HEADER.size]), each) for messages in newest.values() for each in messages]
-    alike = [(header, each) for header, each in every if header.kind == kind]
+    alike = [(header, each) for header, each in every if header.kind == message_type]
     named = (each for header, each in alike if header.name == name)
     return next(named, max(alike, key=lambda pair: pair[0].stamp)[1] if alike else None)
 

@@ -17,14 +17,14 @@ def print_safely(line: str) -> None:
         print(f"{PREFIX}{plain}", file=sys.stderr, flush=True)
 
 
-def limit_rate(write: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Callable[[str], None]:
+def limit_rate(write: Callable[[str], None], get_time: Callable[[], float] = time.monotonic) -> Callable[[str], None]:
     """Return a function that writes at most 10 lines in 5 s; the next line reports the number of suppressed lines."""
     begun, count, skipped = -LINE_INTERVAL, 0, 0
 
-    def note(line: str) -> None:
+    def write_line(line: str) -> None:
         nonlocal begun, count, skipped
-        if clock() - begun >= LINE_INTERVAL:
-            begun, count = clock(), 0
+        if get_time() - begun >= LINE_INTERVAL:
+            begun, count = get_time(), 0
         if count == MAX_LINES:
             skipped += 1
             return
@@ -32,7 +32,7 @@ def limit_rate(write: Callable[[str], None], clock: Callable[[], float] = time.m
         write(line + (f" ({skipped} lines left out)" if skipped else ""))
         skipped = 0
 
-    return note
+    return write_line
 
 
 def format_address(host: str, port: int) -> str:

@@ -144,23 +144,23 @@ class ResultEncoder:
             raise BadMessageError(f"{UNTRACKED_POINTS}: {strange}")
         return SentPoints(tuple(names[row] for row in good), positions[good], vertices[good], weights[good], strange)
 
-    def _is_in_tumour(self, held: LocatedPoints, at: np.ndarray) -> np.ndarray:
+    def _is_in_tumour(self, located: LocatedPoints, points: np.ndarray) -> np.ndarray:
         """Return a mask (n,) that is True for points (n, 3) [m] in tetrahedra of the tumour."""
-        there = np.linalg.norm(np.einsum("nk,nkd->nd", held.weights, self._rest[held.vertices]) - at, axis=1)
-        known = np.isin(held.vertices, self.stage.anatomy.tumour_nodes) | (held.weights <= 0.0)
+        there = np.linalg.norm(np.einsum("nk,nkd->nd", located.weights, self._rest[located.vertices]) - points, axis=1)
+        known = np.isin(located.vertices, self.stage.anatomy.tumour_nodes) | (located.weights <= 0.0)
         return known.all(axis=1) & (there <= INSIDE_TOLERANCE)
 
     @property
     def _rest(self) -> np.ndarray:
         return self.stage.anatomy.mesh.nodes
 
-    def _build_point_message(self, known: TrackingResult, places: SentPoints) -> bytes:
+    def _build_point_message(self, tracking: TrackingResult, points: SentPoints) -> bytes:
         """Build the POINT message with the positions of all points whose motion is known."""
-        moved = (known.motion.positions - self._rest)[places.vertices]
-        at = 1e3 * (places.rest + np.einsum("nk,nkd->nd", places.weights, moved))
-        nodes = () if known.motion.solution is None else known.motion.solution.nodes
-        here = np.flatnonzero((np.isin(places.vertices, nodes) | (places.weights <= 0.0)).all(axis=1))
-        return encode_points([places.names[row] for row in here], at[here])
+        moved = (tracking.motion.positions - self._rest)[points.vertices]
+        at = 1e3 * (points.rest + np.einsum("nk,nkd->nd", points.weights, moved))
+        nodes = () if tracking.motion.solution is None else tracking.motion.solution.nodes
+        here = np.flatnonzero((np.isin(points.vertices, nodes) | (points.weights <= 0.0)).all(axis=1))
+        return encode_points([points.names[row] for row in here], at[here])
 
     def _format_distance(self, result: PoseResult) -> str:
         """Describe the distance from tip to tumour with its error and its sources, or state why it is not available."""
@@ -170,13 +170,13 @@ class ResultEncoder:
         inside = "inside the tumour, its edge " if gauge.is_inside else ""
         return f"{inside}{format_millimetres(gauge.distance, gauge.error)} (95 %; {self._source}){_format_doubt(known)}"
 
-    def _format_motion(self, known: TrackingResult) -> str:
+    def _format_motion(self, tracking: TrackingResult) -> str:
         """Describe the tumour's displacement with its error and its sources, or state why it is not available."""
-        if known.bound is None:
-            return f"not known: {known.warning}"
-        moved = format_millimetres(known.motion.distance, known.motion.error)
-        within = format_bound(known.bound, 1)
-        return f"moved {moved}, placed within {within} (95 %; {self._source}){_format_doubt(known)}"
+        if tracking.bound is None:
+            return f"not known: {tracking.warning}"
+        moved = format_millimetres(tracking.motion.distance, tracking.motion.error)
+        within = format_bound(tracking.bound, 1)
+        return f"moved {moved}, placed within {within} (95 %; {self._source}){_format_doubt(tracking)}"
 
     @property
     def _source(self) -> str:
@@ -186,9 +186,9 @@ class ResultEncoder:
         return "of tracking and model; not known of registration, tissue and segmentation"
 
 
-def _format_doubt(known: TrackingResult) -> str:
+def _format_doubt(tracking: TrackingResult) -> str:
     """Describe why a result is unreliable; empty if the result is reliable."""
-    return "" if known.is_reliable else f"; doubtful: {known.warning}"
+    return "" if tracking.is_reliable else f"; doubtful: {tracking.warning}"
 
 
 def _format_names(names: list[str]) -> str:
@@ -197,9 +197,9 @@ def _format_names(names: list[str]) -> str:
     return ", ".join(names[:MAX_NAMED_POINTS]) + (f" and {others} others" if others > 0 else "")
 
 
-def _is_motion_known(known: TrackingResult, vertices: np.ndarray) -> bool:
+def _is_motion_known(tracking: TrackingResult, vertices: np.ndarray) -> bool:
     """Return True if the motion of all given vertices is known."""
-    result = known.motion.solution
+    result = tracking.motion.solution
     return result is not None and bool(np.isin(vertices, result.nodes).all())
 
 

@@ -44,7 +44,7 @@ class CameraPose:
 
 
 def interpolate_camera_pose(
-    received: Sequence[ReceivedTransform], now: float, stamp: int, position: np.ndarray, max_age: float
+    received: Sequence[ReceivedTransform], arrival_time: float, stamp: int, position: np.ndarray, max_age: float
 ) -> CameraPose | str:
     """Interpolate a camera's pose at an image's time stamp `stamp` from its `received` poses (newest last).
 
@@ -56,7 +56,7 @@ def interpolate_camera_pose(
     body = received[-1]
     stamped = bool(stamp and all(sent.stamp for sent in received))
     times = np.array([to_time(sent.stamp) if stamped else sent.arrived for sent in received])
-    time = to_time(stamp) if stamped else now
+    time = to_time(stamp) if stamped else arrival_time
     poses = np.stack([sent.T for sent in received])
     if stamped and len(received) >= MIN_POSES and np.ptp(times[-MIN_POSES:]) <= MAX_GAP * MIN_POSES:
         between = PoseStream(times, poses, np.zeros((len(received), 6, 6))).interpolate(time)
@@ -132,10 +132,10 @@ class PoseResponder:
         """Compute the result at `time` [s], which is `wall_time` [s since 1970]; a solve starts from `previous`."""
         registration = self._find_registration(transforms)
         if isinstance(registration, str):
-            return self._build_unknown(registration, wall_time, previous)
+            return self._build_unknown_pose(registration, wall_time, previous)
         body = transforms.find_relative_transform(transforms.names.tool, time)
         if isinstance(body, str):
-            return self._build_unknown(body, wall_time, previous)
+            return self._build_unknown_pose(body, wall_time, previous)
         stamp = body.stamp or to_stamp(wall_time)
         beside = Pose(body.T, np.diag(np.repeat([self.tracking**2, 0.0], 3)), 0.0, 0)
         pose = np.linalg.inv(registration.T_patient_scan) @ body.T @ self.tool.T_cube_tool
@@ -148,7 +148,7 @@ class PoseResponder:
         known = replace(known, reference_time=known.time, tool_time=wall_time, **self._describe_doubts(known, previous))
         if known.state is TumourState.UNKNOWN:
             return PoseResult(stamp, known)
-        known = self._add_band(known, registration)
+        known = self._add_bound(known, registration)
         if known.is_reliable and registration.scan is None:
             known = replace(known, state=TumourState.UNSURE, warning=UNCHECKED_WARNING)
         stage = self.motion.stage
@@ -176,46 +176,46 @@ class PoseResponder:
             return placed.format(name=name)
         return CameraView(np.linalg.inv(placed.T) @ registration.T_patient_scan, placed.motion_error)
 
-    def _find_registration(self, heard: ReceivedTransforms) -> Registration | str:
+    def _find_registration(self, transforms: ReceivedTransforms) -> Registration | str:
         """Return the registration from the file or from the last message, or the reason why it is not available."""
         if self.registration is not None:
             return self.registration
-        sent = heard.newest.get(heard.names.registration)
+        sent = transforms.newest.get(transforms.names.registration)
         if sent is None:
-            return f"no {heard.names.registration} yet"
+            return f"no {transforms.names.registration} yet"
         return Registration(np.linalg.inv(sent.T), np.zeros((6, 6)), np.zeros(3), 0.0, 0)
 
-    def _describe_doubts(self, known: TrackingResult, before: TrackingResult | None) -> dict[str, object]:
+    def _describe_doubts(self, tracking: TrackingResult, previous: TrackingResult | None) -> dict[str, object]:
         """Return fields to change in a result: `was_near`, and `state` and `warning` if the result is unreliable."""
-        near = before is not None and before.was_near
-        assert known.T_scan_tool is not None
-        doubt, near = describe_misplaced_tool(self.tool, known.T_scan_tool, self.motion.stage, near, OWNER_QUESTION)
-        doubt = doubt or known.motion.warning
+        near = previous is not None and previous.was_near
+        assert tracking.T_scan_tool is not None
+        doubt, near = describe_misplaced_tool(self.tool, tracking.T_scan_tool, self.motion.stage, near, OWNER_QUESTION)
+        doubt = doubt or tracking.motion.warning
         if doubt:
             return {"state": TumourState.UNSURE, "warning": doubt, "was_near": near}
-        if not known.motion.supported:
+        if not tracking.motion.supported:
             return {"state": TumourState.UNKNOWN, "warning": UNKNOWN_WARNING, "was_near": near}
         return {"was_near": near}
 
-    def _add_band(self, known: TrackingResult, registration: Registration) -> TrackingResult:
+    def _add_bound(self, tracking: TrackingResult, registration: Registration) -> TrackingResult:
         """Add the bound on the tumour's error, and its parts by source, to a result if the result is reliable."""
-        if not known.is_reliable:
-            return known
-        middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
+        if not tracking.is_reliable:
+            return tracking
+        middle = tracking.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
         _, covariance = registration.transform_point(middle)
         registered = float(np.sqrt(chi2.ppf(LEVEL, 3) * max(np.linalg.eigvalsh(covariance)[-1], 0.0)))
-        parts = {"registration": registered, "tool": known.motion.tool_error, "model": known.motion.model_error}
-        band = float(np.hypot(registered, known.motion.error))
-        return add_error_bound(known, band, parts)
+        parts = {"registration": registered, "tool": tracking.motion.tool_error, "model": tracking.motion.model_error}
+        band = float(np.hypot(registered, tracking.motion.error))
+        return add_error_bound(tracking, band, parts)
 
-    def _build_unknown(self, why: str, moment: float, before: TrackingResult | None) -> PoseResult:
+    def _build_unknown_pose(self, reason: str, time: float, previous: TrackingResult | None) -> PoseResult:
         """Build the result for an unknown pose, with the reason as warning."""
-        tool_time = None if before is None else before.tool_time
-        near = before is not None and before.was_near
+        tool_time = None if previous is None else previous.tool_time
+        near = previous is not None and previous.was_near
         state = TumourState.NO_TOOL if tool_time is None else TumourState.STALE
-        motion = self.motion.rest_motion if before is None else before.motion
+        motion = self.motion.rest_motion if previous is None else previous.motion
         return PoseResult(
-            to_stamp(moment), TrackingResult(moment, state, why, NO_TARGETS, motion, tool_time=tool_time, was_near=near)
+            to_stamp(time), TrackingResult(time, state, reason, NO_TARGETS, motion, tool_time=tool_time, was_near=near)
         )  # fmt: skip
 
 

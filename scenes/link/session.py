@@ -194,7 +194,7 @@ class LinkSession:
 
     async def _work(self, seconds: float) -> None:
         self.clients.publish("scan", (self._speaks.build_scan(0),))
-        self._show(self._solved, self._speaks.build_messages(self._solved))
+        self._publish(self._solved, self._speaks.build_messages(self._solved))
         with ThreadPoolExecutor(1, "answer") as answering, ThreadPoolExecutor(1, "draw") as drawing:
             work = [self._keep_reporting(), self._keep_solving(answering)]
             work += [] if self._eye is None else [self._keep_drawing(self._eye, drawing)]
@@ -226,7 +226,7 @@ class LinkSession:
             self._arrived = np.inf if isinstance(body, str) else body.arrived
             current = self._get_current_result(self._loop.time())
             # A pose may have grown old while its solution was computed.
-            self._show(current, messages if current is result else self._speaks.build_messages(current, places))
+            self._publish(current, messages if current is result else self._speaks.build_messages(current, places))
 
     async def _keep_reporting(self) -> None:
         """Report repeatedly, independent of the solver, if a pose or its result is too old, and publish a STATUS."""
@@ -235,7 +235,7 @@ class LinkSession:
         while True:
             now, kinds = self._loop.time(), frozenset(self.clients.refused)
             if (result := self._get_current_result(now)) is not self._shown:
-                self._show(result, self._speaks.build_messages(result, self._places))
+                self._publish(result, self._speaks.build_messages(result, self._places))
             known = result.tracking
             # A growing number alone is not reported again.
             saying = known.state, re.sub(r"[\d.]+", "", known.warning), kinds, tuple(self._others)
@@ -244,11 +244,11 @@ class LinkSession:
                 self.clients.publish("status", (self._speaks.build_status(result, self._format_rejected(known)),))
             await asyncio.sleep(CHECK_INTERVAL)
 
-    def _get_current_result(self, now: float) -> PoseResult:
+    def _get_current_result(self, time: float) -> PoseResult:
         """Return the last result; if it is not valid at a time [s], return a result with the reason."""
-        if isinstance(self._heard.find_relative_transform(self._heard.names.tool, now), str):
-            return self._answers.compute_result(self._heard, now, clock.time(), self._shown.tracking)
-        result, waited = mark_late(self._solved, now - self._arrived, self._heard.max_age), now - self._begun
+        if isinstance(self._heard.find_relative_transform(self._heard.names.tool, time), str):
+            return self._answers.compute_result(self._heard, time, clock.time(), self._shown.tracking)
+        result, waited = mark_late(self._solved, time - self._arrived, self._heard.max_age), time - self._begun
         if (
             result is self._solved
             and result.tracking.state in (TumourState.NO_TOOL, TumourState.STALE)
@@ -259,24 +259,24 @@ class LinkSession:
         return result
 
     def _compute_messages(
-        self, heard: ReceivedTransforms, places: SentPoints | None, now: float
+        self, transforms: ReceivedTransforms, points: SentPoints | None, time: float
     ) -> tuple[PoseResult, tuple[bytes, ...]]:
         """Compute a result and its messages; called in the solver's thread."""
-        result = self._answers.compute_result(heard, now, clock.time(), self._shown.tracking)
-        return result, self._speaks.build_messages(result, places)
+        result = self._answers.compute_result(transforms, time, clock.time(), self._shown.tracking)
+        return result, self._speaks.build_messages(result, points)
 
-    def _show(self, result: PoseResult, messages: tuple[bytes, ...]) -> None:
+    def _publish(self, result: PoseResult, messages: tuple[bytes, ...]) -> None:
         self._shown = result
         if result.tracking.state not in self._states:
             self._states.add(result.tracking.state)
             self._note(f"the tumour is {_describe_state(result.tracking)}")
         self.clients.publish("answer", messages)
 
-    def _format_rejected(self, known: TrackingResult) -> str:
+    def _format_rejected(self, tracking: TrackingResult) -> str:
         """Describe rejected messages, and, if the tool's transform is missing, list other received transforms."""
         parts = [f"{number} {why}" for why, number in self.clients.refused.most_common(MAX_OTHERS)]
         words = f"; rejected: {', '.join(parts)}" if parts else ""
-        if self._others and known.state in (TumourState.NO_TOOL, TumourState.STALE):
+        if self._others and tracking.state in (TumourState.NO_TOOL, TumourState.STALE):
             words += f"; other transforms received: {', '.join(self._others)}"
         return words
 
@@ -292,13 +292,13 @@ class LinkSession:
             drawn = await self._loop.run_in_executor(thread, eye.draw, colour, self._shown.tracking, camera)
             self.clients.publish("picture", (pack_message("IMAGE", "Overlay", encode_image(drawn), stamp),))
 
-    def _get_max_size(self, kind: str) -> int:
+    def _get_max_size(self, message_type: str) -> int:
         """Return the maximum size [bytes] of a message of a type; 0 if the type is not used."""
-        if kind == "IMAGE" and self._eye is not None:
+        if message_type == "IMAGE" and self._eye is not None:
             return IMAGE.size + 4 * self._eye.calibration.width * self._eye.calibration.height + MAX_SHORT_BYTES
-        if kind == "POINT":
+        if message_type == "POINT":
             return MAX_PLACES * POINT.size + MAX_SHORT_BYTES
-        return MAX_SHORT_BYTES if kind in ("TRANSFORM", "POSITION", *UNANSWERED) else 0
+        return MAX_SHORT_BYTES if message_type in ("TRANSFORM", "POSITION", *UNANSWERED) else 0
 
     def _receive(self, number: int, header: Header, content: bytes) -> None:
         """Process the content of a message from a client; raise `BadMessageError` if the content is invalid."""
@@ -336,8 +336,8 @@ class LinkSession:
             self._posed.set()
 
 
-def _describe_state(known: TrackingResult) -> str:
+def _describe_state(tracking: TrackingResult) -> str:
     """Describe the state of the tumour for the console."""
-    if known.is_reliable:
-        return f"known, {known.state.value}"
-    return f"{'doubtful' if known.state is TumourState.UNSURE else 'not known'}: {known.warning}"
+    if tracking.is_reliable:
+        return f"known, {tracking.state.value}"
+    return f"{'doubtful' if tracking.state is TumourState.UNSURE else 'not known'}: {tracking.warning}"

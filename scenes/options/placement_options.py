@@ -118,11 +118,11 @@ def place_craniotomy(subject: Subject, args: argparse.Namespace) -> Subject:
     return replace(subject, site=find_opening_over(subject.cortex, place, _compute_depth(subject, place)))
 
 
-def _compute_depth(subject: Subject, place: np.ndarray) -> float:
+def _compute_depth(subject: Subject, position: np.ndarray) -> float:
     """Return the depth [m] of a point (3,) below the brain surface; negative outside."""
     # Beyond a few voxels from the surface, the field of a volume gives only the side.
-    apart = float(np.linalg.norm(subject.cortex - place, axis=1).min())
-    return -apart if subject.brain(place[None])[0] > 0.0 else apart
+    apart = float(np.linalg.norm(subject.cortex - position, axis=1).min())
+    return -apart if subject.brain(position[None])[0] > 0.0 else apart
 
 
 def _place_opening(subject: Subject, markup: Markup) -> Subject:

@@ -63,14 +63,14 @@ def check_pose_options(args: argparse.Namespace) -> None:
         _parse_clock(args.clock)
 
 
-def _parse_clock(words: list[str]) -> tuple[float, float]:
+def _parse_clock(text: list[str]) -> tuple[float, float]:
     """Parse the time offset [s] and its standard deviation [s] from the words of --clock."""
     try:
-        offset, error = float(words[0]), float(words[1]) if len(words) > 1 else 0.0
+        offset, error = float(text[0]), float(text[1]) if len(text) > 1 else 0.0
     except ValueError:
         offset, error = np.nan, np.nan
-    if len(words) > 2 or not np.isfinite([offset, error]).all() or error < 0.0:
-        raise InputError(f"--clock {' '.join(words)}: give seconds, and by how much they are off; or {AUTO}.")
+    if len(text) > 2 or not np.isfinite([offset, error]).all() or error < 0.0:
+        raise InputError(f"--clock {' '.join(text)}: give seconds, and by how much they are off; or {AUTO}.")
     return offset, error
 
 
@@ -98,21 +98,21 @@ def open_external_tracker(args: argparse.Namespace, calibration: Calibration) ->
     return elsewhere
 
 
-def _report_mismatch(args: argparse.Namespace, elsewhere: ExternalTracker) -> None:
+def _report_mismatch(args: argparse.Namespace, tracker: ExternalTracker) -> None:
     """Print the times of poses and video if the video begins outside the time range of the poses."""
     from ar.tracking.image_sequences import read_video
 
     from ..tracked.run import read_timed_images
 
     first = next(read_timed_images(read_video(Path(args.pictures), args.rate))).source.time
-    outside = elsewhere.describe_mismatch(first)
+    outside = tracker.describe_mismatch(first)
     if not outside:
         return
     when = [
         f"the {name}'s poses of {each.times[0]:.2f} to {each.times[-1]:.2f} s"
-        for name, each in elsewhere.pose_streams.items()
+        for name, each in tracker.pose_streams.items()
     ]
-    clock = f"; --clock is {elsewhere.clock.offset:g} s" if elsewhere.clock.offset else ""
+    clock = f"; --clock is {tracker.clock.offset:g} s" if tracker.clock.offset else ""
     message = f"{outside}. It is of {first:.2f} s, {', '.join(when)}{clock}. Give --clock S, or {AUTO}"
     print(f"sulcus overlay: {message}", file=sys.stderr)
 

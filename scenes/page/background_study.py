@@ -52,7 +52,7 @@ def build_studies(
 ) -> tuple[BackgroundStudy, ...]:
     """Build two studies, the costs of a scene's effects and the refined error of the requested load, for a page."""
 
-    def refine() -> Iterator[str]:
+    def start_refinement() -> Iterator[str]:
         number, _, touch, _ = requests.read_current()
         time = float(scene.times[number])
         registered_scene = replace(scene, registration=requests.registration or scene.registration)
@@ -64,5 +64,5 @@ def build_studies(
 
     return (
         BackgroundStudy(lambda: measure_costs(patient, scene), lock, show_costs),
-        BackgroundStudy(refine, lock, lambda texts: get_browser().write(REFINED_ERROR, texts)),
+        BackgroundStudy(start_refinement, lock, lambda texts: get_browser().write(REFINED_ERROR, texts)),
     )

@@ -60,10 +60,10 @@ def compare_with_fem(fem: FemResult, player: Player, is_fem: bool, solution: Def
     )
 
 
-def compute_node_errors(fem: FemResult, player: Player, shown: Deformation) -> np.ndarray:
-    """Return the distance (n,) [m] of each tumour node between the solution `shown` and the FEM solution."""
+def compute_node_errors(fem: FemResult, player: Player, deformation: Deformation) -> np.ndarray:
+    """Return the distance (n,) [m] of each tumour node between the solution `deformation` and the FEM solution."""
     nodes = player.stage.select_stage(fem.loads).anatomy.tumour_nodes
-    displacements = (solution.restrict(nodes).displacement[0] for solution in (fem.deformation, shown))
+    displacements = (solution.restrict(nodes).displacement[0] for solution in (fem.deformation, deformation))
     return np.linalg.norm(np.subtract(*displacements), axis=1)
 
 

@@ -54,11 +54,11 @@ def build_controls(
     """Build all controls of a scene; `deformers` are the names of the available deformers.
 
     Callbacks: `set_mode` receives the control mode of the tool, `move` receives changed values of the tool input (see
-    `Requests.take_over`), and `refine_error` starts the refinement of the error.
+    `Requests.set_manual_input`), and `refine_error` starts the refinement of the error.
     """
     cameras = "scene default", STATIC_CAMERA, *PATHS
 
-    def set_path(name: str) -> None:
+    def select_path(name: str) -> None:
         requests.set(path="" if name == cameras[0] else name)
 
     models = {describe_deformer(name): name for name in deformers}
@@ -75,7 +75,7 @@ def build_controls(
             "FEM solves every load; the fast models were trained on FEM",
         ),
         build_style_controls(requests.style, lambda style: requests.set(style=style)),
-        Dropdown("camera", cameras, requests.path or cameras[0], set_path, hint="motion of the camera"),
+        Dropdown("camera", cameras, requests.path or cameras[0], select_path, hint="motion of the camera"),
         *tool_controls[:1],
         effect_switches,
         *tool_controls[1:],

@@ -60,13 +60,13 @@ def _format_name(row: ComparisonRow) -> str:
     return "FEM (reference)" if row.name == "fem" else row.name
 
 
-def _scale_axis(values: Sequence[float], start: float, end: float) -> tuple[list[float], list[tuple[float, float]]]:
-    """Return positions of values on a logarithmic axis from `start` to `end`, and pairs (power of ten, position)."""
+def _scale_axis(values: Sequence[float], start: float, stop: float) -> tuple[list[float], list[tuple[float, float]]]:
+    """Return positions of values on a logarithmic axis from `start` to `stop`, and pairs (power of ten, position)."""
     low, high = np.floor(np.log10(min(values))), np.ceil(np.log10(max(values)))
     span = max(high - low, 1.0)
 
     def locate(value: float) -> float:
-        return float(start + (end - start) * (np.log10(value) - low) / span)
+        return float(start + (stop - start) * (np.log10(value) - low) / span)
 
     return [locate(x) for x in values], [(tick, locate(tick)) for tick in 10.0 ** np.arange(low, low + span + 0.5)]
 

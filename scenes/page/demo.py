@@ -181,7 +181,7 @@ class Demo:
             scene = self.first if name == self.first.name else self.find(name)
             deformer = self.patient.select_default(scene)
             self._set_scene(scene, deformer)
-            look = previous[2].look
+            look = previous[2].display
             self.wish.set(style=look.style, path=look.path, through=look.through, registration=look.registration)
             parts = self._build_contents(deformer)
         except InputError as error:
@@ -206,7 +206,7 @@ class Demo:
             with run_in_foreground():
                 self._draw(state, solution)
             return 1
-        if state.frame is not None and (self.wish.look != state.look or (state.coarse and state.is_still)):
+        if state.frame is not None and (self.wish.display != state.look or (state.coarse and state.is_still)):
             self._draw_in_style(state)
         return 0
 
@@ -249,7 +249,7 @@ class Demo:
     def _draw(self, state: PageState, solution: FemResult) -> None:
         """Draw a solution on the page, and request the FEM solution for comparison unless FEM computed the solution."""
         number, name, touch, disabled = self.asked
-        look = self.wish.look
+        look = self.wish.display
         player = replace(self._get_player(self.asked, look), coarse=state.choose_resolution())
         tool_touch = touch or player.get_touch(solution.number)
         self.reached, state.goal, state.request = solution.number, self.asked, (solution.number, name, touch, disabled)
@@ -282,7 +282,7 @@ class Demo:
     def _draw_in_style(self, state: PageState) -> None:
         """Render the shown solution again with the current display settings."""
         assert state.frame is not None and state.request is not None
-        frame, state.look, state.coarse = state.frame, self.wish.look, False
+        frame, state.look, state.coarse = state.frame, self.wish.display, False
         player, seconds = self._get_player(state.request, state.look), frame.seconds["deform"]
         state.frame = player.draw_frame(frame.number, frame.touch, frame.loads, frame.deformation, seconds)
         state.image = render_page_image(state.frame)
@@ -296,7 +296,7 @@ class Demo:
     def _show_side_panels(self, frame: Frame, player: Player) -> None:
         """Show slices of a frame and the chart of recent values, as soon as the browser has time."""
         through, history = self.wish.through, self.history
-        self.browser.show_beside(lambda: (render_slices(frame, player, through), history.draw_chart()))
+        self.browser.show_side_panels(lambda: (render_slices(frame, player, through), history.draw_chart()))
 
     def _update_comparison(self, state: PageState) -> None:
         """Compare the displayed frame with the newest FEM solution; show the result, marked if the loads differ."""
@@ -352,7 +352,7 @@ class Demo:
         """Build the contents of the page: surfaces, playback, controls, title and caption."""
         scene, names = self.stage.scene, self.patient.list_deformers(self.stage.scene)
         effects = build_effect_switches(self.patient, scene, self.wish, self.studies[0].start)
-        actions = self._set_control, self._take_over, effects, self.studies[1].start
+        actions = self._set_control, self._take_control, effects, self.studies[1].start
         return (
             build_page_bodies(self.stage),
             Playback(len(scene.times), self._play, lambda number: self._set_control(SCRIPT, number=number)),
@@ -379,11 +379,11 @@ class Demo:
         if self.stage.scene.tool is not None:
             self.browser.put("tool", tool)
 
-    def _take_over(self, **values: float) -> None:
+    def _take_control(self, **values: float) -> None:
         """Switch to manual control with the values of a moved slider."""
         self._start_manual_control()
         self.wish.set(holder=self._get_user())
-        self.wish.take_over(**values)
+        self.wish.set_manual_input(**values)
         self._show_touch(self.wish.touch, lambda: True)
         self.browser.put("tool", HAND)
 

@@ -79,15 +79,15 @@ class FemWorker:
         with self.wake:
             self.newest = None
 
-    def wait_for_newer(self, request: FrameRequest, previous: FemResult | None, seconds: float) -> FemResult | None:
+    def wait_for_result(self, request: FrameRequest, previous: FemResult | None, seconds: float) -> FemResult | None:
         """Wait up to `seconds` for a solution of `request` other than `previous`; return None after that time."""
 
-        def find_newer() -> FemResult | None:
+        def find_newer_result() -> FemResult | None:
             result = self.truth
             return result if result is not None and result.request == request and result is not previous else None
 
         with self.wake:
-            return self.wake.wait_for(find_newer, seconds)
+            return self.wake.wait_for(find_newer_result, seconds)
 
     def stop_soon(self) -> None:
         """Tell the thread to end after the current solve; return without waiting."""

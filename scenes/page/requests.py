@@ -56,10 +56,11 @@ class Requests:
             for name, value in values.items():
                 setattr(self, name, value)
 
-    def take_over(self, right: float | None = None, up: float | None = None, **values: float) -> None:
-        """Switch to manual control with changed values of the tool input; `right` and `up` tilt the force [rad]."""
+    def set_manual_input(self, tilt_right: float | None = None, tilt_up: float | None = None, **values: float) -> None:
+        """Switch to manual control with changed tool input; `tilt_right` and `tilt_up` tilt the force [rad]."""
         with self.lock:
-            tilt = self.touch.tilt[0] if right is None else right, self.touch.tilt[1] if up is None else up
+            right, up = self.touch.tilt
+            tilt = right if tilt_right is None else tilt_right, up if tilt_up is None else tilt_up
             self.touch, self.tool = replace(self.touch, tilt=tilt, **values), HAND
             self.plays = self.plays and self.clocked
 
@@ -76,7 +77,7 @@ class Requests:
             self.off = self.off - {effect} if enabled else self.off | {effect}
 
     @property
-    def look(self) -> Display:
+    def display(self) -> Display:
         """Current display settings."""
         with self.lock:
             return Display(self.style, self.path, self.through, self.tilt, self.distance, self.registration)

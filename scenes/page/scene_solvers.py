@@ -121,17 +121,17 @@ class SceneSolvers:
         deformation = self.last[model_name] = player.compute_deformation(loads, self.last.get(model_name))
         return FemResult(request[0], loads, deformation, clock.perf_counter() - start, request)
 
-    def compare_models(self, reference: FemResult, table: AccuracyTimeTable, excluded_model: str) -> None:
-        """Record in `table` times and errors of FEM and the models except `excluded_model`, for `reference`'s load."""
+    def compare_models(self, reference: FemResult, costs: AccuracyTimeTable, excluded_model: str) -> None:
+        """Record in `costs` times and errors of FEM and the models except `excluded_model`, for `reference`'s load."""
         digest, scene = compute_loads_digest(reference.loads), self.get_stage().scene
-        table.record_time("fem", digest, reference.deformation.cost.total)
-        table.record_error("fem", digest, 0.0)
+        costs.record_time("fem", digest, reference.deformation.cost.total)
+        costs.record_error("fem", digest, 0.0)
         for name in self.patient.select_models(scene):
             player = self.get_player(name)
             if name != excluded_model and not player.follows:
                 solution = player.compute_deformation(reference.loads)
-                table.record_time(name, digest, solution.cost.total)
-                table.record_error(name, digest, float(compute_node_errors(reference, player, solution).mean()))
+                costs.record_time(name, digest, solution.cost.total)
+                costs.record_error(name, digest, float(compute_node_errors(reference, player, solution).mean()))
 
     def solve(
         self, disabled_effects: frozenset[str], request: FrameRequest, previous: FemResult | None, timeout: float
@@ -158,7 +158,7 @@ class SceneSolvers:
             if not worker.thread.is_alive():
                 del self.solvers[disabled_effects]
             raise worker.failure
-        result = worker.wait_for_newer(request, previous, timeout)
+        result = worker.wait_for_result(request, previous, timeout)
         self.playable = self.playable or worker.player is not None
         return result
 

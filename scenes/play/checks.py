@@ -163,14 +163,14 @@ def measure_frames(
     )
 
 
-def _compute_coverage(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
+def _compute_coverage(player: Player, frames: Sequence[Frame], true_solutions: Deformation) -> float:
     """Compute the share of frames whose ellipsoid contains the FEM tumour's centroid; NaN without estimates."""
     if not any(frame.estimate for frame in frames):
         return np.nan
     anatomy, held = player.site.anatomy, []
     for row, frame in enumerate(frames):
         ellipsoid = None if frame.estimate is None else frame.estimate.build_ellipsoid()
-        middle = compute_centroid_motion(anatomy, player.compute_positions(truth, row)[None])[0]
+        middle = compute_centroid_motion(anatomy, player.compute_positions(true_solutions, row)[None])[0]
         held.append(ellipsoid is not None and is_within_surface(ellipsoid, middle))
     return float(np.mean(held))
 

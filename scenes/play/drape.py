@@ -60,8 +60,8 @@ def fold_cloth(
     corners, triangles = np.unique(points[triangles].reshape(-1, 3).round(9), axis=0, return_inverse=True)
     hole = HOLE_RATIO * site.clearance
 
-    def target(places: np.ndarray) -> np.ndarray:
-        beyond = np.linalg.norm(places - site.origin, axis=1) - hole - CLOTH_WIDTH
+    def compute_edge_length(points: np.ndarray) -> np.ndarray:
+        beyond = np.linalg.norm(points - site.origin, axis=1) - hole - CLOTH_WIDTH
         return CLOTH_EDGE + CLOTH_GROWTH * np.maximum(beyond, 0.0)
 
     smooth = trimesh.Trimesh(corners, triangles.reshape(-1, 3), process=False)
@@ -69,7 +69,7 @@ def fold_cloth(
     trimesh.smoothing.filter_taubin(smooth, iterations=SMOOTHING_STEPS)  # cloth spans sulci
     smooth.vertices[rim] = corners[rim]
     corners = np.asarray(smooth.vertices)
-    fine = build_embedded_surface(corners, triangles.reshape(-1, 3), target)
+    fine = build_embedded_surface(corners, triangles.reshape(-1, 3), compute_edge_length)
     arm = fine.interpolate(corners) - site.origin
     height = compute_fold_heights(np.linalg.norm(arm, axis=1) - hole, np.arctan2(arm @ site.up, arm @ site.right))
     at = replace(fine, depth=-FOLD_HEIGHT * height, max_height=1.1 * FOLD_HEIGHT).compute_vertices(corners)

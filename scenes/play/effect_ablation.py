@@ -158,18 +158,18 @@ def list_arrays() -> list[wp.array]:
     return [thing for thing in gc.get_objects() if type(thing) is wp.array and thing.deleter is not None]
 
 
-def _build_row(patient: PatientSetup, name: str, whole: AblationRun, less: AblationRun) -> AblationRow:
+def _build_row(patient: PatientSetup, name: str, full_run: AblationRun, reduced_run: AblationRun) -> AblationRow:
     anatomy = patient.anatomy
 
-    def apart(nodes: np.ndarray) -> float:
-        difference = (whole.displacement - less.displacement)[:, nodes]
+    def compute_change(nodes: np.ndarray) -> float:
+        difference = (full_run.displacement - reduced_run.displacement)[:, nodes]
         return 1e3 * float(np.nanmean(np.linalg.norm(difference, axis=2), axis=1).max())
 
     return AblationRow(
         name,
-        whole.milliseconds - less.milliseconds,
-        1e-6 * (whole.memory_bytes - less.memory_bytes),
-        apart(anatomy.tumour_nodes),
-        apart(np.unique(anatomy.open_surface)),
-        unphysical=less.unphysical,
+        full_run.milliseconds - reduced_run.milliseconds,
+        1e-6 * (full_run.memory_bytes - reduced_run.memory_bytes),
+        compute_change(anatomy.tumour_nodes),
+        compute_change(np.unique(anatomy.open_surface)),
+        unphysical=reduced_run.unphysical,
     )

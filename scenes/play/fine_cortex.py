@@ -36,11 +36,11 @@ def build_fine_cortex(
     """
     vertices, triangles = np.unique(surface, return_inverse=True)
 
-    def target(points: np.ndarray) -> np.ndarray:
+    def compute_edge_length(points: np.ndarray) -> np.ndarray:
         beyond = site.compute_axis_distance(points) - site.clearance
         return np.clip(edge + EDGE_GROWTH * beyond, edge, max(edge, MAX_EDGE_LENGTH))
 
-    fine = build_embedded_surface(mesh.nodes[vertices], triangles, target)
+    fine = build_embedded_surface(mesh.nodes[vertices], triangles, compute_edge_length)
     maps = build_cortex_maps(site, intensity).sample(site, fine.interpolate(mesh.nodes[vertices]))
     cut = fine.interpolate((~np.isin(vertices, site.anatomy.mesh.surface))[:, None].astype(float))
     depth = CROWN_DEPTH + (1.0 - cut[:, 0]) * maps[:, 0]

@@ -46,7 +46,7 @@ def format_active_loads(loads: Loads, solution: Deformation, nodes: np.ndarray) 
     return ", ".join(words for words in (_describe_cause(cause, solution, nodes) for cause in loads.causes) if words)
 
 
-def _describe_cause(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str:
+def _describe_cause(cause: Cause, deformation: Deformation, nodes: np.ndarray) -> str:
     match cause:
         case Pushed():
             return f"force {np.linalg.norm(cause.force[0]):.2f} N" if cause.force[0].any() else "the tool does not push"
@@ -55,11 +55,11 @@ def _describe_cause(cause: Cause, answer: Deformation, nodes: np.ndarray) -> str
         case Resected():
             steps = round(float(cause.done[0]))
             return f"resection: {steps} step{'' if steps == 1 else 's'} done"
-        case Touching() | Retracted() if answer.reaction.shape[1]:  # some trained models do not predict it
-            bound = float(answer.reaction_bound[0, 0])
-            known = answer.outcome[0].good and np.isfinite(bound)
+        case Touching() | Retracted() if deformation.reaction.shape[1]:  # some trained models do not predict it
+            bound = float(deformation.reaction_bound[0, 0])
+            known = deformation.outcome[0].good and np.isfinite(bound)
             within = f" +- {round_up(bound, 2):.2f} N (surrogate)" if known else " N"
-            return f"tool force {np.linalg.norm(answer.reaction[0, -1, :3]):.2f}{within}"
+            return f"tool force {np.linalg.norm(deformation.reaction[0, -1, :3]):.2f}{within}"
         case _:
             return ""
 

@@ -96,7 +96,7 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
         found = compute_vessel_absorption(np.linspace(-half, half, count), random, thin)
         return np.clip(1.5 * warp(found / thin.max_absorption, 1.6e-3, tortuosity) - 0.2, 0.0, 1.0)
 
-    fluid = _read_fluid(site, intensity, half, count // COARSE_STEP)
+    fluid = _compute_darkness(site, intensity, half, count // COARSE_STEP)
     field = _solve_swift_hohenberg(random, fluid, GYRI.wavelength / MAP_SPACING / COARSE_STEP)
     field = warp(np.asarray(zoom(field, COARSE_STEP, order=3, mode="grid-wrap", grid_mode=True)), 2.5e-3, GYRI.meander)
     field /= np.sqrt(2.0 * gaussian_filter(field**2, 0.5 * GYRI.wavelength / MAP_SPACING, mode="wrap"))
@@ -153,14 +153,14 @@ def _find_sulci(field: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.nd
     return np.arctan2(k * slope, curvature) / k, np.clip(1.3 * curvature / k**2, 0.0, 1.0)
 
 
-def _read_fluid(site: CraniotomyFrame, intensity: Intensity | None, half: float, count: int) -> np.ndarray:
+def _compute_darkness(site: CraniotomyFrame, intensity: Intensity | None, half_width: float, count: int) -> np.ndarray:
     """Compute the darkness (n, n) of the scan below the surface [standard deviations]; zero without a scan."""
     if intensity is None:
         return np.zeros((count, count))
     mesh = site.anatomy.mesh
     nodes = mesh.nodes[np.unique(mesh.surface)] - site.origin
-    nodes = nodes[np.linalg.norm(nodes, axis=1) < 2.0 * half]
-    x, y = np.meshgrid(*[np.linspace(-half, half, count)] * 2, indexing="ij")
+    nodes = nodes[np.linalg.norm(nodes, axis=1) < 2.0 * half_width]
+    x, y = np.meshgrid(*[np.linspace(-half_width, half_width, count)] * 2, indexing="ij")
     depth = griddata(np.stack([nodes @ site.right, nodes @ site.up], axis=1), nodes @ site.axis, (x, y), fill_value=0.0)
     grey, T = intensity.apply_window(mesh), np.linalg.inv(intensity.affine)
     total = np.zeros((count, count))

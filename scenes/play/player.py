@@ -275,25 +275,25 @@ class Player:
             seconds=took, estimate=estimate,
         )  # fmt: skip
 
-    def _measure_tip_gauge(self, held: PlacedTool, loads: Loads, answer: Deformation, tumour: Layer) -> DistanceGauge:
+    def _measure_tip_gauge(self, tool: PlacedTool, loads: Loads, result: Deformation, tumour: Layer) -> DistanceGauge:
         """Measure the distance from tip to tumour, with the deformer's error bound if it is available."""
-        gauge = measure_tip_gauge(held.tip, tumour)
-        if held.bone_penetration > CARRIED_DEPTH:
+        gauge = measure_tip_gauge(tool.tip, tumour)
+        if tool.bone_penetration > CARRIED_DEPTH:
             return gauge
-        read = predict_tip_distance(self.deformer, loads, answer, self.scene.tool, gauge.distance)
+        read = predict_tip_distance(self.deformer, loads, result, self.scene.tool, gauge.distance)
         return gauge if read is None else replace(gauge, reading=read.distance, error=read.bound)
 
-    def _get_model_error(self, answer: Deformation) -> float | None:
+    def _get_model_error(self, deformation: Deformation) -> float | None:
         """Return a trained model's error bound relative to FEM [m], of this load if available; None without bound."""
-        model = find_first_model(self.deformer, answer)
+        model = find_first_model(self.deformer, deformation)
         if model is None:
             return None
-        of_load = float(answer.bound[0, 0])
+        of_load = float(deformation.bound[0, 0])
         bound = of_load if np.isfinite(of_load) else model.bound
         return bound if np.isfinite(bound) else None
 
     def _compute_tumour_error(
-        self, touch: Touch, loads: Loads, motion: float, promised: float, estimate: TumourEstimate | None
+        self, touch: Touch, loads: Loads, motion: float, model_bound: float, estimate: TumourEstimate | None
     ) -> TumourError:
         """Return the tumour position error: from the ensemble if the tool follows its script, else from the motion [m].
 
@@ -303,9 +303,9 @@ class Player:
         scripted = self.uncertainty is not None and touch == self.scene.path(time)
         error, registration = NOT_KNOWN, self.scene.registration
         if self.uncertainty is not None and scripted:
-            error = self.uncertainty.evaluate(time, promised, registration)
+            error = self.uncertainty.evaluate(time, model_bound, registration)
         elif self.motion_error is not None:
-            error = self.motion_error.evaluate(motion, promised, registration)
+            error = self.motion_error.evaluate(motion, model_bound, registration)
         if estimate is None:
             return error
         deviation, bound = REGISTRATIONS[registration], estimate.error_bound

@@ -88,11 +88,11 @@ class StereoObserver:
         """One stage for each camera, because a stage caches the background of its last camera."""
         return replace(self.stage), replace(self.stage)
 
-    def _add_noise(self, picture: np.ndarray, number: int, eye: int) -> np.ndarray:
+    def _add_noise(self, image: np.ndarray, number: int, eye: int) -> np.ndarray:
         """Add camera noise to an image (H, W, 3) uint8, and darken the image of the right eye (1)."""
         random = np.random.default_rng([self.observation_model.seed, 2 + number, eye])
-        noise = self.observation_model.noise * random.standard_normal(picture.shape, np.float32)
-        lit = np.float32(1.0 - eye * self.observation_model.darker) * picture + noise
+        noise = self.observation_model.noise * random.standard_normal(image.shape, np.float32)
+        lit = np.float32(1.0 - eye * self.observation_model.darker) * image + noise
         return np.clip(np.rint(lit), 0.0, 255.0).astype(np.uint8)
 
     def _build_microscope(self, number: int) -> MicroscopeTrackingError:
@@ -106,6 +106,6 @@ class MicroscopeTrackingError:
     error: RigidError
     centre: np.ndarray
 
-    def __call__(self, places: np.ndarray) -> np.ndarray:
+    def __call__(self, positions: np.ndarray) -> np.ndarray:
         """Add the tracking error to positions (n, 3) [m]."""
-        return self.error.apply(places, self.centre)
+        return self.error.apply(positions, self.centre)

@@ -33,12 +33,12 @@ class Approach:
     def shift_path(self, path: Path) -> Path:
         """Return a tool path moved from the centre of the craniotomy to the entry point, with the approach's tilt."""
 
-        def along(time: float) -> Touch:
+        def get_touch(time: float) -> Touch:
             touch = path(time)
             right, up = (float(np.arctan(np.tan(a) + np.tan(b))) for a, b in zip(self.tilt, touch.tilt, strict=True))
             return replace(touch, x=self.x + touch.x, y=self.y + touch.y, tilt=(right, up))
 
-        return along
+        return get_touch
 
     def align_tool(self, tool: Instrument) -> Instrument:
         """Return the tool with its shaft along the trajectory, if `along_line`.
@@ -101,27 +101,27 @@ def parse_approach(markup: Markup, site: CraniotomyFrame) -> Approach:
     return replace(_compute_approach(site, entry, way), along_line=True)
 
 
-def _compute_approach(site: CraniotomyFrame, entry: np.ndarray, way: np.ndarray) -> Approach:
+def _compute_approach(site: CraniotomyFrame, entry: np.ndarray, direction: np.ndarray) -> Approach:
     """Compute the approach with an entry point (3,) [m] on the cortex and a direction (3,)."""
     axes = np.stack([site.right, site.up])
     place = axes @ (entry - site.origin)
     for _ in range(ITERATIONS):
         place = place + axes @ (entry - site.find_nearest(site.origin + place @ axes).point)
-    right, up = np.arctan(axes @ way / (way @ site.axis)).tolist()
+    right, up = np.arctan(axes @ direction / (direction @ site.axis)).tolist()
     return Approach(float(place[0]), float(place[1]), (right, up))
 
 
-def _find_entry(corners: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarray | None:
+def _find_entry(corners: np.ndarray, start: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
     """Compute the first intersection (3,) [m] of a line with triangles (S, 3, 3) [m]; None if there is no intersection.
 
     Möller, Trumbore 1997, J. Graphics Tools 2:21-28.
     """
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    across, arm = np.cross(way, second), start - corners[:, 0]
+    across, arm = np.cross(direction, second), start - corners[:, 0]
     turned = np.cross(arm, first)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 1.0 / np.einsum("si,si->s", first, across)
-        u, v = scale * np.einsum("si,si->s", arm, across), scale * (turned @ way)
+        u, v = scale * np.einsum("si,si->s", arm, across), scale * (turned @ direction)
         far = scale * np.einsum("si,si->s", second, turned)
     met = np.isfinite(scale) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
-    return start + far[met].min() * way if met.any() else None
+    return start + far[met].min() * direction if met.any() else None

@@ -57,8 +57,8 @@ def build_drained_turn(drain_time: float, pause_time: float, turn_time: float, a
     """
     falling = build_drainage(drain_time, level)
 
-    def lie(time: float) -> HeadPose:
+    def get_pose(time: float) -> HeadPose:
         turned = angle * smooth_step((time - drain_time - pause_time) / turn_time)
         return HeadPose((-float(np.sin(turned)), -float(np.cos(turned)), 0.0), falling(time).fluid)
 
-    return lie
+    return get_pose

@@ -140,13 +140,13 @@ def sample_priors(count: int, seed: int = 0) -> list[PatientSample]:
     """Draw `count` samples by Latin hypercube sampling of the priors (McKay, Beckman, Conover 1979)."""
     random = np.random.default_rng(seed)
 
-    def shares() -> np.ndarray:
+    def sample() -> np.ndarray:
         return (random.permutation(count) + random.uniform(size=count)) / count
 
     columns = [
-        prior.compute_quantiles(shares()).tolist() for prior in (STIFFNESS, POISSON, RATIO, SKULL_PRIOR, TIP, TIP, TIP)
+        prior.compute_quantiles(sample()).tolist() for prior in (STIFFNESS, POISSON, RATIO, SKULL_PRIOR, TIP, TIP, TIP)
     ]
-    columns.append(ndtri(shares()).tolist())
+    columns.append(ndtri(sample()).tolist())
     rows = zip(*columns, strict=True)
     return [PatientSample(young, nu, ratio, skull, tuple(tip), mesh) for young, nu, ratio, skull, *tip, mesh in rows]
 
@@ -187,6 +187,6 @@ def sample_rigid_errors(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarr
     return shift, SEGMENTATION_PRIOR.range[1] * random.standard_normal(count)
 
 
-def choose_name(probability: float, names: Sequence[str]) -> str:
+def choose_name(probability: float, choices: Sequence[str]) -> str:
     """Return the name that a number in [0, 1) selects; all names have equal probability."""
-    return names[min(int(probability * len(names)), len(names) - 1)]
+    return choices[min(int(probability * len(choices)), len(choices) - 1)]

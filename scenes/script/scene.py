@@ -159,14 +159,14 @@ class Scene:
         if tissue is None:
             return self if element is None else replace(self, element=element)
 
-        def made(effect: Effect) -> Effect:
+        def change(effect: Effect) -> Effect:
             if not isinstance(effect, Elasticity):
                 return effect
             relaxes = () if effect.default is None else effect.default.prony
             series = {"prony": relaxes} if relaxes and not tissue.prony else {}
             return replace(effect, default=replace(cast(Any, tissue), **series))
 
-        return replace(self, effects=tuple(made(effect) for effect in self.effects), element=element or self.element)
+        return replace(self, effects=tuple(change(effect) for effect in self.effects), element=element or self.element)
 
     @property
     def elasticity(self) -> Elasticity:
@@ -176,11 +176,11 @@ class Scene:
     def replace_regions(self, regions: Mapping[int, Tissue]) -> Scene:
         """Return the scene with other tissues of some regions, given by label."""
 
-        def made(effect: Effect) -> Effect:
+        def change(effect: Effect) -> Effect:
             own = isinstance(effect, Elasticity)
             return replace(effect, regions={**effect.regions, **regions}) if own else effect
 
-        return replace(self, effects=tuple(map(made, self.effects))) if regions else self
+        return replace(self, effects=tuple(map(change, self.effects))) if regions else self
 
     @property
     def times(self) -> np.ndarray:

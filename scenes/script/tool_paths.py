@@ -70,10 +70,10 @@ def press(force: float, rise: float = 1.5, hold: float = 1.0, at: tuple[float, f
     [0.0, 0.15, 0.3, 0.3, 0.0]
     """
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         return Touch(*at, force * (smooth_step(time / rise) - smooth_step((time - rise - hold) / rise)))
 
-    return path
+    return get_touch
 
 
 def slide(
@@ -81,24 +81,24 @@ def slide(
 ) -> Path:
     """Build a path that presses with `force` [N], moves from `start` to `end` [m] within `seconds`, and releases."""
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         share = smooth_step((time - rise) / seconds)
         x, y = (1.0 - share) * np.array(start) + share * np.array(end)
         pressed = smooth_step(time / rise) - smooth_step((time - rise - seconds) / rise)
         return Touch(float(x), float(y), force * pressed)
 
-    return path
+    return get_touch
 
 
 def draw(force: float, tilt: float, rise: float = 1.5, hold: float = 2.0, at: tuple[float, float] = (0.0, 0.0)) -> Path:
     """Build a path that presses, tilts the force by `tilt` [rad] towards x, stays for `hold` [s], and releases."""
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         drawn = smooth_step((time - 0.5 * rise) / rise)
         let_go = smooth_step((time - 1.5 * rise - hold) / rise)
         return Touch(*at, force * (smooth_step(time / rise) - let_go), (tilt * drawn, 0.0))
 
-    return path
+    return get_touch
 
 
 def palpate(
@@ -107,11 +107,11 @@ def palpate(
     """Build a path that lowers to `depth` [m] in `rise` [s], slides from `start` to `end` [m], and lifts off."""
     stroke = slide(1.0, start, end, seconds, rise)
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         touch = stroke(time)
         return Touch(touch.x, touch.y, depth=_interpolate_depth(touch.force, depth))
 
-    return path
+    return get_touch
 
 
 def lay(
@@ -119,16 +119,16 @@ def lay(
 ) -> Path:
     """Build a path that lowers to `depth` [m] in `rise` [s] with a `tilt` [rad] towards x, stays, and lifts off."""
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         share = smooth_step(time / rise) - smooth_step((time - rise - hold) / rise)
         return Touch(*at, tilt=(tilt, 0.0), depth=_interpolate_depth(share, depth))
 
-    return path
+    return get_touch
 
 
-def _interpolate_depth(share: float, depth: float) -> float:
+def _interpolate_depth(fraction: float, depth: float) -> float:
     """Return the depth [m] of a tool after a share (0 to 1) of the distance from `IDLE_HEIGHT` to `depth` [m]."""
-    return share * (IDLE_HEIGHT + depth) - IDLE_HEIGHT
+    return fraction * (IDLE_HEIGHT + depth) - IDLE_HEIGHT
 
 
 def stroke_cortex(force: float, radius: float, speed: float) -> Path:
@@ -139,10 +139,10 @@ def stroke_cortex(force: float, radius: float, speed: float) -> Path:
     turn = np.pi * (3.0 - np.sqrt(5.0))
     stroke = 2.0 * radius * np.sin(turn / 2.0)
 
-    def path(time: float) -> Touch:
+    def get_touch(time: float) -> Touch:
         number, share = divmod(speed * time / stroke, 1.0)
         start, end = (radius * np.array([np.cos(k * turn), np.sin(k * turn)]) for k in (number, number + 1.0))
         x, y = (1.0 - share) * start + share * end
         return Touch(float(x), float(y), force)
 
-    return path
+    return get_touch

@@ -71,15 +71,15 @@ def _compute_target_position(target: Pose, body: Pose) -> np.ndarray:
     return (np.linalg.inv(body.T_camera_target) @ target.T_camera_target)[:3, 3]
 
 
-def _describe_doubt(name: str, places: np.ndarray, swapped: np.ndarray | None, settings: AgreementSettings) -> str:
+def _describe_doubt(name: str, positions: np.ndarray, swapped: np.ndarray | None, settings: AgreementSettings) -> str:
     """Describe the inconsistency of positions (n, 3) [m] of a target on its body, oldest first; empty if consistent."""
-    away = float(np.linalg.norm(places[-1]))
+    away = float(np.linalg.norm(positions[-1]))
     nearer = swapped is not None and settings.swap_ratio * np.linalg.norm(swapped) < away
     if nearer and away > settings.min_swap_distance:
         return f"the {name}'s target is seen {1e3 * away:.0f} mm from its poses: are the two files of --poses swapped?"
     if away > settings.max_target_distance:
         return f"the {name}'s target is seen {1e3 * away:.0f} mm from its poses: {REMEDY}"
-    moved = np.percentile(np.linalg.norm(places - np.median(places, axis=0), axis=1), settings.motion_percentile)
-    if len(places) >= settings.min_images and moved > settings.max_target_motion:
+    moved = np.percentile(np.linalg.norm(positions - np.median(positions, axis=0), axis=1), settings.motion_percentile)
+    if len(positions) >= settings.min_images and moved > settings.max_target_motion:
         return f"the {name}'s target moves by {1e3 * moved:.0f} mm on the body that its poses have: {REMEDY}"
     return ""

@@ -73,18 +73,18 @@ def track_video(path: Path, calibration: Calibration, body: str, reference: str,
         raise InputError(f"{path}: holds no image. {REMEDY}")
 
 
-def _set_stamped_time(picture: NamedImage) -> NamedImage:
+def _set_stamped_time(image: NamedImage) -> NamedImage:
     """Return an image with the time of its time stamp; without a stamp, the image is unchanged."""
-    stamp = read_time_stamp(picture.grey)
-    return picture if stamp is None else replace(picture, time=stamp)
+    stamp = read_time_stamp(image.grey)
+    return image if stamp is None else replace(image, time=stamp)
 
 
-def _select_pose(state: TrackedTargets, wanted: list[str]) -> tuple[PoseStatus, Pose | None, str]:
+def _select_pose(state: TrackedTargets, names: list[str]) -> tuple[PoseStatus, Pose | None, str]:
     """Return status, pose of the first target (relative to the second, if any) and name of a missing target."""
-    for name in wanted:
+    for name in names:
         if name not in state.poses:
             return state.statuses[name], None, name
-    pose, *others = (state.poses[name] for name in wanted)
+    pose, *others = (state.poses[name] for name in names)
     return PoseStatus.GOOD, pose.transform_to(others[0]) if others else pose, ""
 
 

@@ -156,7 +156,7 @@ class Follower:
         wanted = (build_patient_reference(),) if self.tool is None else (build_patient_reference(), build_tool_cube())
         return Tracker(self.calibration.build_camera(np.eye(4)), wanted)
 
-    def step(self, grey_image: np.ndarray, time: float, previous: TrackingResult | None = None) -> TrackingResult:
+    def track(self, grey_image: np.ndarray, time: float, previous: TrackingResult | None = None) -> TrackingResult:
         """Compute the tracking result of an image (H, W) uint8 taken at a time [s]; `previous` is the last result.
 
         Raises
@@ -171,38 +171,38 @@ class Follower:
         known = replace(known, was_near=known.was_near or previous.was_near)
         return replace(known, interval=min(previous.interval, apart) if apart > 0.0 else previous.interval)
 
-    def _compare_targets(self, known: TrackingResult, before: TrackingResult | None) -> TrackingResult:
+    def _compare_targets(self, result: TrackingResult, previous: TrackingResult | None) -> TrackingResult:
         """Compare external poses with printed targets; if they are inconsistent, mark the result as unreliable."""
         if self.external is None:
-            return known
-        agreement = Agreement() if before is None else before.agreement
-        known = replace(known, agreement=self.external.compare_targets(known.time, known.targets.poses, agreement))
-        if not known.agreement.inconsistency or not (known.is_reliable or known.state is TumourState.UNSURE):
-            return known
-        return replace(known, state=TumourState.UNSURE, warning=known.agreement.inconsistency, bound=None, sources={})
+            return result
+        agreement = Agreement() if previous is None else previous.agreement
+        result = replace(result, agreement=self.external.compare_targets(result.time, result.targets.poses, agreement))
+        if not result.agreement.inconsistency or not (result.is_reliable or result.state is TumourState.UNSURE):
+            return result
+        return replace(result, state=TumourState.UNSURE, warning=result.agreement.inconsistency, bound=None, sources={})
 
-    def _compute_result(self, grey: np.ndarray, time: float, before: TrackingResult | None) -> TrackingResult:
+    def _compute_result(self, grey: np.ndarray, time: float, previous: TrackingResult | None) -> TrackingResult:
         """Compute the tracking result of one image, without updating `interval` and `agreement`."""
-        apart = None if before is None else time - before.time
-        usual = 0.0 if before is None else before.interval
+        apart = None if previous is None else time - previous.time
+        usual = 0.0 if previous is None else previous.interval
         longest = max(self.settings.max_gap, self.settings.max_gap_intervals * usual)
         stale = apart is not None and not 0.0 < apart <= longest
-        forgotten = before is None or (apart is not None and not 0.0 <= apart <= longest)
-        tracked = self.tracker.track(grey, None if before is None or forgotten else before.targets)
+        forgotten = previous is None or (apart is not None and not 0.0 <= apart <= longest)
+        tracked = self.tracker.track(grey, None if previous is None or forgotten else previous.targets)
         other, reference = self.external, tracked.poses.get(PATIENT)
         if other is not None and other.mount is not None:
             reference = other.find_reference_pose(time)
         if reference is None:
-            return self._build_without_reference(tracked, time, before)
+            return self._build_without_reference(tracked, time, previous)
         T_patient_scan = self.registration.T_patient_scan
         camera = self.calibration.build_camera(reference.T_camera_target @ T_patient_scan)
-        pace = self._compute_pace(reference, time, None if forgotten else before)
+        pace = self._compute_speed(reference, time, None if forgotten else previous)
         shutter = self.settings.shutter_factor * self.calibration.readout * (pace or 0.0)
-        known = self._compute_motion(tracked, reference, time, before, shutter)
+        known = self._compute_motion(tracked, reference, time, previous, shutter)
         middle = known.motion.positions[self.motion.stage.tumour_vertices].mean(axis=0)
-        band, parts = self._compute_band(reference, middle, known.motion, shutter)
+        band, parts = self._compute_bound(reference, middle, known.motion, shutter)
         known = replace(known, camera=camera, bound=band, sources=parts, reference_time=time, image_speed=pace)
-        doubt, near = self._describe_implausible(camera, known.T_scan_tool, before)
+        doubt, near = self._describe_implausible(camera, known.T_scan_tool, previous)
         known = replace(known, was_near=near)
         if known.is_reliable and pace is None and self.calibration.readout > 0.0:
             known = replace(known, state=TumourState.UNSURE, warning=NO_PACE_WARNING)
@@ -220,10 +220,10 @@ class Follower:
         return known
 
     def _describe_implausible(
-        self, camera: Camera, tool: np.ndarray | None, before: TrackingResult | None
+        self, camera: Camera, tool: np.ndarray | None, previous: TrackingResult | None
     ) -> tuple[str, bool]:
         """Return why the registration is implausible for this patient (or ""), and the updated `was_near`."""
-        stage, near = self.motion.stage, before is not None and before.was_near
+        stage, near = self.motion.stage, previous is not None and previous.was_near
         theirs = "is this its registration?" if self.external is None else "are these its poses and registration?"
         misplaced, near = ("", near) if tool is None else describe_misplaced_tool(self.tool, tool, stage, near, theirs)
         doubt = describe_implausible_registration(self.registration, stage, camera) or misplaced
@@ -244,24 +244,24 @@ class Follower:
             tool_time=None if before is None else before.tool_time,
         )  # fmt: skip
 
-    def _compute_pace(self, reference: Pose, time: float, before: TrackingResult | None) -> float | None:
+    def _compute_speed(self, reference: Pose, time: float, previous: TrackingResult | None) -> float | None:
         """Return the recent maximum speed of the brain across the image [m/s]; None if not available.
 
         A maximum is used because, with hand tremor, the speed during one image may exceed the speed between images.
         """
-        last = None if before is None else before.targets.poses.get(PATIENT)
-        if before is None or last is None or not time > before.time:
+        last = None if previous is None else previous.targets.poses.get(PATIENT)
+        if previous is None or last is None or not time > previous.time:
             return None
         scan = self.registration.T_patient_scan @ np.append(self.motion.stage.site.origin, 1.0)
         now, then = ((pose.T_camera_target @ scan)[:2] for pose in (reference, last))
-        speed = float(np.linalg.norm(now - then)) / (time - before.time)
-        return max(speed, self.settings.speed_decay ** (time - before.time) * (before.image_speed or 0.0))
+        speed = float(np.linalg.norm(now - then)) / (time - previous.time)
+        return max(speed, self.settings.speed_decay ** (time - previous.time) * (previous.image_speed or 0.0))
 
     def _compute_motion(
-        self, tracked: TrackedTargets, reference: Pose, time: float, before: TrackingResult | None, shutter: float
+        self, tracked: TrackedTargets, reference: Pose, time: float, previous: TrackingResult | None, shutter: float
     ) -> TrackingResult:
         """Compute the brain's motion from the tool's pose relative to the reference; `shutter` adds an error [m]."""
-        tool_time, last = (None, None) if before is None else (before.tool_time, before.motion)
+        tool_time, last = (None, None) if previous is None else (previous.tool_time, previous.motion)
         beside = self._find_tool(tracked, reference, time)
         if self.tool is None or beside is None:
             if self.motion.deformer is None:
@@ -298,11 +298,11 @@ class Follower:
             return f"not known, {outside} (see --clock)"
         return f"stale, no pose for {age:.1f} s" if np.isfinite(age) else "not seen yet by the other tracker"
 
-    def _compute_band(
-        self, reference: Pose, middle: np.ndarray, motion: BrainMotion, shutter: float
+    def _compute_bound(
+        self, reference: Pose, centroid: np.ndarray, motion: BrainMotion, shutter: float
     ) -> tuple[float, dict[str, float]]:
-        """Compute the error bound [m] of the tumour centroid `middle` (3,) [m] across the line of sight, by source."""
-        place, beside = self.registration.transform_point(middle)
+        """Compute the error bound [m] of the tumour's `centroid` (3,) [m] across the line of sight, by source."""
+        place, beside = self.registration.transform_point(centroid)
         at, tracked = reference.transform_point(place)
         turned = reference.T_camera_target[:3, :3]
         registered = turned @ beside @ turned.T

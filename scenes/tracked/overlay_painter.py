@@ -93,10 +93,10 @@ class Painter:
         share = hidden / max(np.count_nonzero(mask), 1)
         return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= MIN_REPORTED_SHARE else ()
 
-    def _build_layers(self, known: TrackingResult) -> list[Layer]:
+    def _build_layers(self, tracking: TrackingResult) -> list[Layer]:
         """Build the layers to render: open cortex, drape around the craniotomy, and tool if its pose is available."""
-        tool = self.build_tool_layer(known)
-        return [*self.stage.build_layers(known.motion.positions, None), *([] if tool is None else [tool])]
+        tool = self.build_tool_layer(tracking)
+        return [*self.stage.build_layers(tracking.motion.positions, None), *([] if tool is None else [tool])]
 
     def build_tool_layer(self, tracking: TrackingResult, with_cube: bool = True) -> Layer | None:
         """Return the tool's surface, with its marker cube if `with_cube`; None if the pose is not available."""
@@ -114,23 +114,23 @@ class Painter:
         spread = BOUND_DEVIATIONS * float(np.sqrt(along @ tracking.tip_covariance @ along))
         return DistanceGauge(gauge.tip, gauge.nearest_point, error=float(np.hypot(spread, tracking.motion.error)))
 
-    def _draw_grey(self, colour: np.ndarray, known: TrackingResult, covered: np.ndarray | None) -> Overlaid:
+    def _draw_grey(self, colour: np.ndarray, tracking: TrackingResult, covered: np.ndarray | None) -> Overlaid:
         """Draw the warning and, if a camera pose is available, a grey outline at the last tumour position."""
         over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
-        if known.camera is not None and self.style != "none":
-            self._draw_dotted(over, known.camera, self.stage.build_tumour(known.motion.positions))
+        if tracking.camera is not None and self.style != "none":
+            self._draw_dotted(over, tracking.camera, self.stage.build_tumour(tracking.motion.positions))
             if covered is not None:
                 over.colour[covered] = colour[covered]
         write_header(over, [])
-        write_warning(over, known.warning)
+        write_warning(over, tracking.warning)
         return over
 
-    def _draw_dotted(self, over: Overlaid, camera: Camera, tumour: Layer) -> None:
+    def _draw_dotted(self, overlaid: Overlaid, camera: Camera, tumour: Layer) -> None:
         box = find_pixel_box(camera, tumour.vertices)
         if box is None:
             return
         mask = compute_silhouette(camera.crop_to(*box), tumour.vertices, tumour.triangles)
-        draw_dashes(over.colour[box], find_outlines(mask), average_colour(BEFORE_COLOUR), BEFORE_STROKES)
+        draw_dashes(overlaid.colour[box], find_outlines(mask), average_colour(BEFORE_COLOUR), BEFORE_STROKES)
 
 
 def format_top_lines(tracking: TrackingResult) -> Sequence[str]:

@@ -153,7 +153,7 @@ class OverlayPage:
                 due = now + min(max(apart, 0.0), MAX_INTERVAL)
                 self.interval = min(self.interval, one.result.interval)
                 known = replace(one.result, interval=self.interval)
-                self._show(taken, one, wanted, f"image {wanted} of {video.count - 1}, {taken.source.time:.2f} s")
+                self._show_image(taken, one, wanted, f"image {wanted} of {video.count - 1}, {taken.source.time:.2f} s")
         return list(self.overlays)
 
     def _find_next_number(self, count: int, due: bool) -> int | None:
@@ -191,7 +191,7 @@ class OverlayPage:
                     one = overlay_image(TimedImage(picture, False), 0.0, known, self.follower, self._build_painter())
                     known, came = one.result, now
                     self.browser.show_status("")
-                    self._show(TimedImage(picture, False), one, 0, f"live from {self.name}")
+                    self._show_image(TimedImage(picture, False), one, 0, f"live from {self.name}")
         return list(self.overlays)
 
     def _report_silence(self, seconds: float) -> None:
@@ -202,43 +202,43 @@ class OverlayPage:
             self._mark_outdated(f"no image for {seconds:.0f} s", f"Is {self.name} plugged in? This page waits for it.")
 
     @contextmanager
-    def _show_failure(self, end: float) -> Iterator[None]:
-        """Show a ValueError on the page for `FAILURE_TIME`, at most until `end`; then raise the error again."""
+    def _show_failure(self, deadline: float) -> Iterator[None]:
+        """Show a ValueError on the page for `FAILURE_TIME`, at most until `deadline`; then raise the error again."""
         try:
             yield
         except ValueError as error:
             self.notice.end_work()
             self._mark_outdated(str(error))
-            clock.sleep(min(FAILURE_TIME, max(0.0, end - clock.perf_counter())))
+            clock.sleep(min(FAILURE_TIME, max(0.0, deadline - clock.perf_counter())))
             raise
 
     def _build_painter(self) -> Painter:
         """Return the painter with the overlay style that the user selected."""
         return replace(self.painter, style=self.style)
 
-    def _show(self, taken: TimedImage, one: Overlay, number: int, place: str) -> None:
+    def _show_image(self, source: TimedImage, overlay: Overlay, number: int, image_name: str) -> None:
         """Show an image with its report, and record its values for the charts."""
         before = self.number
-        self.source, self.newest, self.number, self.image_name = taken, one, number, place
-        self.overlays.append(one.drop_mesh())
+        self.source, self.newest, self.number, self.image_name = source, overlay, number, image_name
+        self.overlays.append(overlay.drop_mesh())
         now = clock.monotonic()
         if number not in (before, before + 1):
             self.history.interrupt_lines(now)
-        self.history.add(build_history_sample(one.result, self._measure_gauge(one.result), self.has_tool, now))
-        self._draw(one)
+        self.history.add(build_history_sample(overlay.result, self._measure_gauge(overlay.result), self.has_tool, now))
+        self._draw_overlay(overlay)
 
-    def _measure_gauge(self, known: TrackingResult) -> DistanceGauge | None:
+    def _measure_gauge(self, tracking: TrackingResult) -> DistanceGauge | None:
         """Measure the distance from tip to tumour; None if the tumour is not drawn in colour."""
-        if known.state in GREY_STATES:
+        if tracking.state in GREY_STATES:
             return None
-        return self.painter.measure_tip_distance(known, self.painter.stage.build_tumour(known.motion.positions))
+        return self.painter.measure_tip_distance(tracking, self.painter.stage.build_tumour(tracking.motion.positions))
 
-    def _draw(self, one: Overlay) -> None:
+    def _draw_overlay(self, overlay: Overlay) -> None:
         """Show an overlay's image, text, 3-D surfaces, slices and chart on the page."""
-        known, look, painter = one.result, self.through, self.painter
+        known, look, painter = overlay.result, self.through, self.painter
         self.drawn_style = self.style, self.through
-        said = format_report(one, self._measure_gauge(known), self.has_tool, self.image_name)
-        self.browser.show(max(self.number, 0), one.image, said)
+        said = format_report(overlay, self._measure_gauge(known), self.has_tool, self.image_name)
+        self.browser.show(max(self.number, 0), overlay.image, said)
         self.browser.move("tumour", painter.stage.build_tumour(known.motion.positions).vertices)
         grey = known.state in GREY_STATES
         self._set_tint("tumour", STALE_COLOUR if grey else TUMOUR_COLOUR if known.is_reliable else DOUBTFUL_COLOUR)
@@ -247,7 +247,7 @@ class OverlayPage:
             self.browser.move("tool", tool.vertices)
         if self.has_tool:
             self._set_tint("tool", STALE_COLOUR if grey or tool is None else TOOL_COLOUR)
-        self.browser.show_beside(lambda: (render_slices(known, painter, look), self.history.draw_chart()))
+        self.browser.show_side_panels(lambda: (render_slices(known, painter, look), self.history.draw_chart()))
 
     def _set_tint(self, name: str, colour: tuple[float, float, float]) -> None:
         if self.tints.get(name) != colour:
@@ -261,22 +261,22 @@ class OverlayPage:
         assert self.source.source.colour is not None
         colour = self._build_painter().paint(self.source.source.colour, self.newest.result).colour
         self.newest = replace(self.newest, image=colour)
-        self._draw(self.newest)
+        self._draw_overlay(self.newest)
 
-    def _mark_outdated(self, why: str, hint: str = "") -> None:
-        """Mark the last image as old for the reason `why`, unless it is already marked so."""
-        said = f"{why}: what is shown is old"
+    def _mark_outdated(self, reason: str, hint: str = "") -> None:
+        """Mark the last image as old for a `reason`, unless it is already marked so."""
+        said = f"{reason}: what is shown is old"
         if self.drawn_style == (said, self.style, self.through):
             return
         self.browser.show_status(escape(said))
         if self.newest is None or self.source is None:
-            self.browser.report(f'<p class="warn">{escape(why)}</p><p>{escape(hint)}</p>')
+            self.browser.report(f'<p class="warn">{escape(reason)}</p><p>{escape(hint)}</p>')
         else:
             assert self.source.source.colour is not None
             known = replace(self.newest.result, state=TumourState.STALE, warning=said)
             dim = (FADED_BRIGHTNESS * self.source.source.colour).astype(np.uint8)
             self.image_name = f"{hint} The last image" if hint else "the last image"
-            self._draw(
+            self._draw_overlay(
                 replace(self.newest, result=known, image=self._build_painter().paint(dim, known).colour, latency=None)
             )
         self.drawn_style = said, self.style, self.through

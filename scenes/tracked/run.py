@@ -104,13 +104,13 @@ def read_timed_images(images: Iterator[NamedImage], masks: Iterator[NamedImage] 
         raise ValueError("there are more masks than images. Give one for each image, in order.")
 
 
-def _get_mask(masks: Iterator[NamedImage], picture: NamedImage, number: int) -> np.ndarray:
+def _get_mask(masks: Iterator[NamedImage], image: NamedImage, number: int) -> np.ndarray:
     """Return the foreground mask (H, W) bool of image `number`."""
     mask = next(masks, None)
     if mask is None:
-        raise ValueError(f"{picture.name} has no mask: there are {number}. Give one for each image, in order.")
-    if mask.grey.shape != picture.grey.shape:
-        raise ValueError(f"the mask {mask.name} is {mask.grey.shape}, its image {picture.grey.shape}.")
+        raise ValueError(f"{image.name} has no mask: there are {number}. Give one for each image, in order.")
+    if mask.grey.shape != image.grey.shape:
+        raise ValueError(f"the mask {mask.name} is {mask.grey.shape}, its image {image.grey.shape}.")
     return mask.grey >= (1 if mask.name.lower().endswith(".png") else MIN_OCCLUDER_GREY)
 
 
@@ -163,7 +163,7 @@ def overlay_image(
     """
     arrived, picture = clock.perf_counter(), image.source
     assert picture.colour is not None
-    known = follower.step(picture.grey, picture.time, previous)
+    known = follower.track(picture.grey, picture.time, previous)
     drawn = known if start_time is None else mark_stale(known, clock.perf_counter() - start_time - picture.time)
     colour = painter.paint(picture.colour, drawn, image.occluded).colour
     ready = clock.perf_counter()
@@ -207,22 +207,22 @@ def write_tracking_table(path: Path, overlays: Sequence[Overlay], errors: Sequen
         table.writerows(_format_row(each, error) for each, error in zip(overlays, errors, strict=True))
 
 
-def _format_row(shown: Overlay, error: OverlayError | None) -> list[str]:
-    known = shown.result
+def _format_row(overlay: Overlay, error: OverlayError | None) -> list[str]:
+    known = overlay.result
     placed = known.camera is not None
-    lengths: list[float | None] = [*shown.centroid, known.motion.distance if known.motion.supported else None]
+    lengths: list[float | None] = [*overlay.centroid, known.motion.distance if known.motion.supported else None]
     lengths.append(known.motion.error if known.motion.supported else None)
     lengths += [
         known.bound,
         *(known.sources.get(name) for name in ("tracking", "camera", "registration", "tool", "model", "shutter")),
     ]
     cells = [_format_number(None if value is None or not placed else 1e3 * value) for value in lengths]
-    late = None if shown.latency is None else 1e3 * shown.latency
+    late = None if overlay.latency is None else 1e3 * overlay.latency
     against = (None,) * 4
     if error is not None:
         against = error.outline, error.overlap, 1e3 * error.centroid, 1e3 * error.maximum
     return [
-        f"{known.time:.6f}", known.state.name.lower(), *cells, f"{1e3 * shown.seconds:.1f}", _format_number(late, 1),
+        f"{known.time:.6f}", known.state.name.lower(), *cells, f"{1e3 * overlay.seconds:.1f}", _format_number(late, 1),
         known.warning, *(_format_number(value, 3) for value in against), "RAS",
     ]  # fmt: skip
 

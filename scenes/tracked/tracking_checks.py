@@ -137,19 +137,19 @@ def measure_tracking(video: RenderedVideo, follower: Follower, painter: Painter)
     return TrackingFigures(count, confident, unsaid, np.inf if waiting else max(waits), worst)
 
 
-def _has_warning(colour: np.ndarray, words: str, wanted: str) -> bool:
-    """Return True if the text `words` begins with `wanted`, and the image shows this text as a warning."""
-    lines = format_warning(words, colour.shape[1])
-    return words.startswith(wanted) and all(
+def _has_warning(colour: np.ndarray, text: str, prefix: str) -> bool:
+    """Return True if `text` begins with `prefix`, and the image shows this text as a warning."""
+    lines = format_warning(text, colour.shape[1])
+    return text.startswith(prefix) and all(
         has_text(colour, line, TEXT_SCALE, average_colour(WARNING_COLOUR)) for line in lines
     )
 
 
-def _measure_outline_error(film: RenderedVideo, shot: VideoFrame, colour: np.ndarray) -> float:
+def _measure_outline_error(video: RenderedVideo, frame: VideoFrame, colour: np.ndarray) -> float:
     """Compute the distance [pixel] between the outline in an image and the true outline of the tumour."""
-    camera, rest = film.calibration.build_camera(shot.T_camera_scan), film.stage.tumour_at_rest
-    mask = compute_silhouette(camera, rest.vertices + shot.displacement, rest.triangles)
-    tool = compute_silhouette(camera, *film.targets.tool.build_surface(shot.T_scan_tool))
+    camera, rest = video.calibration.build_camera(frame.T_camera_scan), video.stage.tumour_at_rest
+    mask = compute_silhouette(camera, rest.vertices + frame.displacement, rest.triangles)
+    tool = compute_silhouette(camera, *video.targets.tool.build_surface(frame.T_scan_tool))
     words = find_colour(colour, WHITE, 0)
     return measure_outline_distance(
         colour, average_colour(TUMOUR_COLOUR), mask, tool | words, gap_length=HIDDEN_STROKES[1] + SOFT_LENGTH

@@ -158,15 +158,15 @@ def compute_overlay_error(
     )
 
 
-def _compute_lateral_lengths(apart: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _compute_lateral_lengths(vectors: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Compute lengths (n,) of vectors (n, 3) across the lines of sight to points (n, 3) in camera coordinates."""
-    rays = seen / np.linalg.norm(seen, axis=1, keepdims=True)
-    return np.linalg.norm(apart - np.sum(apart * rays, axis=1, keepdims=True) * rays, axis=1)
+    rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+    return np.linalg.norm(vectors - np.sum(vectors * rays, axis=1, keepdims=True) * rays, axis=1)
 
 
-def _compute_edge_distance(true: np.ndarray, drawn: np.ndarray) -> float:
+def _compute_edge_distance(true_mask: np.ndarray, drawn_mask: np.ndarray) -> float:
     """Compute the mean distance [pixel] between the edges of two masks; infinite if a mask is empty."""
-    edges = [mask & (np.asarray(binary_erosion(mask)) == 0) for mask in (true, drawn)]
+    edges = [mask & (np.asarray(binary_erosion(mask)) == 0) for mask in (true_mask, drawn_mask)]
     if not all(edge.any() for edge in edges):
         return np.inf
     there, back = (np.asarray(distance_transform_edt(edge == 0)) for edge in edges)

@@ -31,21 +31,21 @@ NODE_TOLERANCE = 1e-6  # Largest distance of corresponding nodes in two meshes o
 
 
 @dataclass(frozen=True, eq=False)
-class Cause:
+class DeformationCause:
     """Cause of a displacement: a description, and a record for JSON with its `kind` and properties."""
 
     description: str
     record: Mapping[str, Any]
 
 
-def describe_scene_cause(scene: Scene, number: int) -> Cause:
+def describe_scene_cause(scene: Scene, number: int) -> DeformationCause:
     """Return frame `number` of a scene as cause of a displacement."""
     time = float(scene.times[number])
     record = {"kind": "scene", "scene": scene.name, "frame": number, "time_s": time}
-    return Cause(f"scene {scene.name}, frame {number}, {time:.2f} s", record)
+    return DeformationCause(f"scene {scene.name}, frame {number}, {time:.2f} s", record)
 
 
-def describe_load_cause(loads: Loads) -> Cause:
+def describe_load_cause(loads: Loads) -> DeformationCause:
     """Return the push in a load case as cause of a displacement; `loads` contain exactly one push."""
     (pushed,) = loads.get_all(Pushed)
     place, force = 1e3 * pushed.point[0], pushed.force[0]
@@ -61,7 +61,7 @@ def describe_load_cause(loads: Loads) -> Cause:
     x, y, z = (f"{value + 0.0:.1f}" for value in np.round(place, 1))
     right, anterior, superior = (f"{value + 0.0:.2f}" for value in np.round(direction, 2))
     words = f"a load of {newton:g} N at {x}, {y}, {z} mm towards {right}, {anterior}, {superior} (RAS)"
-    return Cause(words, record)
+    return DeformationCause(words, record)
 
 
 def _round_values(values: np.ndarray) -> list[float]:
@@ -88,7 +88,7 @@ class DeformedAnatomy:
         Position (3,) [m] of the tool's tip; None without a tool.
     """
 
-    cause: Cause
+    cause: DeformationCause
     anatomy: Anatomy
     remaining: Anatomy
     displacement: np.ndarray
@@ -133,13 +133,13 @@ class PlayedScene:
             self.patient, self.scene, [self._build_loads(number) for number in needed], progress, fem
         )
         rows = {number: row for row, number in enumerate(needed)}
-        return [self._build_moment(number, answers.select(np.array([rows[number]])), fem) for number in frames]
+        return [self._build_deformed(number, answers.select(np.array([rows[number]])), fem) for number in frames]
 
     def _build_loads(self, number: int):
         scene, time = self.scene, float(self.scene.times[number])
         return scene.build_loads(self.patient.site, scene.path(time), time)
 
-    def _build_moment(self, number: int, result: Deformation, fem: Fem | ResectedFem) -> DeformedAnatomy:
+    def _build_deformed(self, number: int, result: Deformation, fem: Fem | ResectedFem) -> DeformedAnatomy:
         scene, site, time = self.scene, self.patient.site, float(self.scene.times[number])
         moved = result.displacement[0]
         # Nothing is located here, so that no locator is needed.
@@ -176,7 +176,7 @@ def read_deformed_anatomy(path: Path, anatomy: Anatomy) -> DeformedAnatomy:
     same = file.mesh.nodes.shape == mesh.nodes.shape and np.array_equal(file.mesh.tets, mesh.tets)
     if not same or np.abs(file.mesh.nodes - mesh.nodes).max() > NODE_TOLERANCE:
         raise InputError(f"{path}: is of another mesh than the anatomy. Give the anatomy that it was made with.")
-    cause = Cause(f"displacement of {path.name}", {"kind": "file", "file": path.name})
+    cause = DeformationCause(f"displacement of {path.name}", {"kind": "file", "file": path.name})
     if "covariance" not in file.point_data:
         return DeformedAnatomy(cause, anatomy, anatomy, np.asarray(moved, np.float64))
     xx, yy, zz, xy, yz, xz = np.asarray(file.point_data["covariance"])[np.unique(anatomy.tumour_surface)].T

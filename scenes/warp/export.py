@@ -92,34 +92,34 @@ def _compute_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _write_surfaces(place: Path, moment: DeformedAnatomy) -> None:
+def _write_surfaces(folder: Path, deformed: DeformedAnatomy) -> None:
     triangles = {
-        "brain": moment.remaining.mesh.surface,
-        "cortex": moment.remaining.open_surface,
-        "tumour": moment.remaining.tumour_surface,
+        "brain": deformed.remaining.mesh.surface,
+        "cortex": deformed.remaining.open_surface,
+        "tumour": deformed.remaining.tumour_surface,
     }
-    nodes = moment.anatomy.mesh.nodes
+    nodes = deformed.anatomy.mesh.nodes
     meshes = [
-        build_surface_mesh(name, which, nodes, moment.displacement, MESH_COLOURS[name])
+        build_surface_mesh(name, which, nodes, deformed.displacement, MESH_COLOURS[name])
         for name, which in triangles.items()
         if len(which)
     ]
     for mesh in meshes:
-        write_vtp(place / f"{mesh.name}.vtp", mesh)
-        write_stl(place / f"{mesh.name}.stl", mesh)
-    write_glb(place / "deformed.glb", meshes)
+        write_vtp(folder / f"{mesh.name}.vtp", mesh)
+        write_stl(folder / f"{mesh.name}.stl", mesh)
+    write_glb(folder / "deformed.glb", meshes)
 
 
-def _write_points(place: Path, moment: DeformedAnatomy, marks: Sequence[Landmark]) -> None:
-    points = list_named_points(moment, marks)
+def _write_points(folder: Path, deformed: DeformedAnatomy, landmarks: Sequence[Landmark]) -> None:
+    points = list_named_points(deformed, landmarks)
     if points:
-        write_markups(place / "landmarks.mrk.json", "Fiducial", points)
-    gap = moment.find_gap()
-    if gap is not None and moment.tip is not None:
-        write_markups(place / "tip_to_tumour.mrk.json", "Line", {"tip": moment.tip, "tumour": gap[0]})
-    tumour = moment.remaining.mesh.tets[moment.remaining.in_tumour]
+        write_markups(folder / "landmarks.mrk.json", "Fiducial", points)
+    gap = deformed.find_gap()
+    if gap is not None and deformed.tip is not None:
+        write_markups(folder / "tip_to_tumour.mrk.json", "Line", {"tip": deformed.tip, "tumour": gap[0]})
+    tumour = deformed.remaining.mesh.tets[deformed.remaining.in_tumour]
     if len(tumour):
-        write_segmentation(place / "tumour.seg.nrrd", moment.positions, tumour, moment.bound)
+        write_segmentation(folder / "tumour.seg.nrrd", deformed.positions, tumour, deformed.bound)
 
 
 def list_named_points(deformed: DeformedAnatomy, landmarks: Sequence[Landmark]) -> dict[str, np.ndarray]:

@@ -165,7 +165,7 @@ def read_patient_image(path: Path, anatomy: Anatomy, is_label_map: bool, axes: s
         See `read_volume`; also if the image does not overlap this brain, or labels are not integers.
     """
     volume = read_volume(path, VoxelSpec(axes=axes), require_finite=False)
-    image = _as_nifti(path, volume)
+    image = _to_nifti(path, volume)
     values = volume.values
     if is_label_map and not has_integers(values):
         raise InputError(f"{path}: holds values that are not whole, so it is no label map. Give it by --image.")
@@ -180,7 +180,7 @@ def read_patient_image(path: Path, anatomy: Anatomy, is_label_map: bool, axes: s
     return PatientImage(path, image, volume, is_label_map, tuple(warnings))
 
 
-def _as_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
+def _to_nifti(path: Path, volume: Volume) -> nibabel.Nifti1Image:
     """Return the image in a file as NIfTI image.
 
     Other formats are converted; values and positions stay the same, and integers stay integers.
@@ -275,20 +275,20 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
     return out, Counts(moved, outside, resected, blank)
 
 
-def _find_moving(fields: WarpFields, now: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_moving(fields: WarpFields, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return nonzero backward displacements (m, 3) [m] at points (n, 3) [m], and the numbers (m,) of these points."""
-    index = fields.grid.to_indices(now)
+    index = fields.grid.to_indices(points)
     held = np.flatnonzero(((index > 0.0) & (index < np.array(fields.grid.shape) - 1)).all(axis=1))
-    went = fields.grid.interpolate(fields.backward, now[held])
+    went = fields.grid.interpolate(fields.backward, points[held])
     moves = np.abs(went).max(axis=1) > MOTION_TOLERANCE
     return went[moves], held[moves]
 
 
-def _cast_values(values: np.ndarray, kind: np.dtype) -> np.ndarray:
-    if kind.kind not in "iu":
-        return values.astype(kind)
-    limits = np.iinfo(kind)
-    return np.clip(np.rint(values), limits.min, limits.max).astype(kind)
+def _cast_values(values: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    if dtype.kind not in "iu":
+        return values.astype(dtype)
+    limits = np.iinfo(dtype)
+    return np.clip(np.rint(values), limits.min, limits.max).astype(dtype)
 
 
 def _format_millimetres(point: np.ndarray) -> str:

@@ -14,8 +14,8 @@ SCHEMA = (  # Address of Slicer's schema of markups.
 )
 
 
-def write_markups(path: Path, kind: str, points: Mapping[str, np.ndarray]) -> None:
-    """Write labelled points (3,) [m, RAS]; `kind` is "Fiducial" for a list of points, or "Line" for two points."""
+def write_markups(path: Path, markup_type: str, points: Mapping[str, np.ndarray]) -> None:
+    """Write labelled points (3,) [m, RAS]; `markup_type` is "Fiducial" for a list of points, "Line" for two."""
     controls = [
         {
             "id": str(number),
@@ -29,13 +29,13 @@ def write_markups(path: Path, kind: str, points: Mapping[str, np.ndarray]) -> No
         for number, (label, point) in enumerate(points.items(), 1)
     ]
     markup: dict[str, object] = {
-        "type": kind,
+        "type": markup_type,
         "coordinateSystem": "LPS",
         "coordinateUnits": "mm",
         "locked": True,
         "controlPoints": controls,
     }
-    if kind == "Line":
+    if markup_type == "Line":
         first, second = points.values()
         length = 1e3 * float(np.linalg.norm(second - first))
         markup["measurements"] = [

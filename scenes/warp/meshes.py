@@ -72,10 +72,10 @@ def write_vtp(path: Path, mesh: NamedSurface) -> None:
     )
 
 
-def _format_array(name: str, kind: str, components: int, values: np.ndarray) -> str:
+def _format_array(name: str, vtk_type: str, components: int, values: np.ndarray) -> str:
     data = values.tobytes()
     text = base64.b64encode(struct.pack("<I", len(data)) + data).decode()
-    head = f'<DataArray type="{kind}" Name="{name}" NumberOfComponents="{components}" format="binary">'
+    head = f'<DataArray type="{vtk_type}" Name="{name}" NumberOfComponents="{components}" format="binary">'
     return f"{head}{text}</DataArray>"
 
 

@@ -72,7 +72,7 @@ def list_points(deformed: DeformedAnatomy) -> SamplePoints:
     within, on = len(INNER_WEIGHTS) * len(mesh.tets), len(FACE_WEIGHTS) * len(body.open_surface)
     part = np.repeat(np.arange(4), [len(used), within, on, len(marks)])
 
-    def at(values: np.ndarray, landmarks: list[np.ndarray]) -> np.ndarray:
+    def evaluate_points(values: np.ndarray, landmarks: list[np.ndarray]) -> np.ndarray:
         between = (
             (INNER_WEIGHTS @ values[mesh.tets]).reshape(-1, 3),
             (FACE_WEIGHTS @ values[body.open_surface]).reshape(-1, 3),
@@ -83,8 +83,8 @@ def list_points(deformed: DeformedAnatomy) -> SamplePoints:
     tumour[part == 0] = np.isin(used, body.tumour_nodes)
     tumour[part == 1] = np.repeat(body.in_tumour, len(INNER_WEIGHTS))
     cortex[part == 0], cortex[part == 2] = np.isin(used, body.open_surface), True
-    rest = at(mesh.nodes, [one.rest for one in marks])
-    moved = at(deformed.displacement, [one.deformed - one.rest for one in marks])
+    rest = evaluate_points(mesh.nodes, [one.rest for one in marks])
+    moved = evaluate_points(deformed.displacement, [one.deformed - one.rest for one in marks])
     return SamplePoints(rest, moved, tumour, cortex, part == 3, marks)
 
 
@@ -173,9 +173,9 @@ def find_finer_spacing(
     return settings.step * steps if steps < round(now / settings.step) else None
 
 
-def _count_nodes(moment: DeformedAnatomy, spacing: float) -> float:
-    return float(np.prod(build_warp_grid(moment.anatomy, moment.displacement[None], spacing).shape, dtype=float))
+def _count_nodes(deformed: DeformedAnatomy, spacing: float) -> float:
+    return float(np.prod(build_warp_grid(deformed.anatomy, deformed.displacement[None], spacing).shape, dtype=float))
 
 
-def _compute_fields(moment: DeformedAnatomy, spacing: float, step: Callable[[int], object]) -> WarpFields:
-    return compute_warp_fields(moment.anatomy, moment.displacement, spacing, moment.remaining, lambda: step(1))
+def _compute_fields(deformed: DeformedAnatomy, spacing: float, step: Callable[[int], object]) -> WarpFields:
+    return compute_warp_fields(deformed.anatomy, deformed.displacement, spacing, deformed.remaining, lambda: step(1))

@@ -86,7 +86,7 @@ def write_readme(report: dict, images: Sequence[WarpedImage]) -> str:
         between=len(INNER_WEIGHTS),
         faint=report["faint_mm"],
         landmarks=error["landmarks_worst"],
-        bound=_bound(report),
+        bound=_describe_bound(report),
     )
     failed = [] if report["converged"] else ["THE SOLUTION DID NOT CONVERGE: do not rely on it."]
     trust = "\n".join([*failed, *(f"WARNING: {warning}" for warning in report["warnings"])])
@@ -105,7 +105,7 @@ def _describe_folds(report: dict) -> str:
     return f"{said} All are above 0: nothing folds."
 
 
-def _bound(report: dict) -> str:
+def _describe_bound(report: dict) -> str:
     if report["bound_mm"] is None:
         return f"not known ({report['bound_of']})."
     return f"with 95 %, no point of it by more than {report['bound_mm']:.1f} mm. Of: {report['bound_of']}."

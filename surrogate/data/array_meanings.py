@@ -94,8 +94,8 @@ def describe_arrays(file: h5py.File) -> None:
     for name, text in GROUP_DESCRIPTIONS.items():
         file.require_group(name).attrs["meaning"] = text
 
-    def each(name: str, item: h5py.Group | h5py.Dataset) -> None:
+    def describe_item(name: str, item: h5py.Group | h5py.Dataset) -> None:
         if isinstance(item, h5py.Dataset) and name in MEANINGS:
             MEANINGS[name].write_to(item)
 
-    file.visititems(each)
+    file.visititems(describe_item)

@@ -73,12 +73,12 @@ class Patch:
         """Compute the distances (B,) [m] of `points` (B, 3) from the patch's edge."""
         return compute_edge_distances(self.boundary_edges, points)
 
-    def place_points(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def place_points(self, random_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Map uniform random numbers (n, 3) to area-uniform points (n, 3) [m] and their unit inward normals (n, 3)."""
         total = np.cumsum(self.areas)
-        triangle = self.triangles[np.searchsorted(total, uniform[:, 0] * total[-1], side="right")]
-        root = np.sqrt(uniform[:, 1])
-        share = np.stack([1.0 - root, root * (1.0 - uniform[:, 2]), root * uniform[:, 2]], axis=1)
+        triangle = self.triangles[np.searchsorted(total, random_numbers[:, 0] * total[-1], side="right")]
+        root = np.sqrt(random_numbers[:, 1])
+        share = np.stack([1.0 - root, root * (1.0 - random_numbers[:, 2]), root * random_numbers[:, 2]], axis=1)
         point, normal = (np.einsum("nc,nci->ni", share, field[triangle]) for field in (self.points, self.normals))
         return point, normal / np.linalg.norm(normal, axis=1, keepdims=True)
 

@@ -160,17 +160,17 @@ class Dataset:
         """
         return self._read_rows("unit", nodes, self.unit_good, CHECK_FORCE)
 
-    def _read_rows(self, group: str, nodes: np.ndarray, good: np.ndarray, force: float) -> np.ndarray:
-        """Read displacements of `nodes`; check that `good` rows move less than is possible under `force` [N]."""
+    def _read_rows(self, group: str, nodes: np.ndarray, is_converged: np.ndarray, force: float) -> np.ndarray:
+        """Read displacements of `nodes`; check that converged rows move less than is possible under `force` [N]."""
         size = float(np.linalg.norm(np.ptp(self.anatomy.mesh.nodes, axis=0)))
         chosen, damaged, absurd = [], [], []
         with wrap_errors(self.path, "a data set", REMEDY), h5py.File(self.path, "r") as file:
-            for first in range(0, max(len(good), 1), CHUNK_ROWS):
+            for first in range(0, max(len(is_converged), 1), CHUNK_ROWS):
                 rows, whole = read_rows(file, group, len(self.anatomy.mesh.nodes), first, first + CHUNK_ROWS)
                 field = rows["displacement"]
                 far = np.abs(field).max(axis=(1, 2)) > MAX_DISPLACEMENT * size / force
                 damaged.append(first + np.flatnonzero(~whole | ~np.isfinite(field).all(axis=(1, 2))))
-                absurd.append(first + np.flatnonzero(far & good[first : first + CHUNK_ROWS]))
+                absurd.append(first + np.flatnonzero(far & is_converged[first : first + CHUNK_ROWS]))
                 chosen.append(field[:, nodes])
         lost, strange = np.concatenate(damaged), np.concatenate(absurd)
         if len(lost):

@@ -9,7 +9,7 @@ from sim.loads import Pushed
 
 from ..array_functions import round_to_half
 from .cortex_patch import Patch
-from .indentation import Indented, get_relaxation
+from .indentation import IndentationPushes, get_relaxation
 
 Encoder = Callable[[Patch, Pushed], np.ndarray]
 
@@ -53,7 +53,7 @@ def compute_tool_features(patch: Patch, pushes: Pushed) -> np.ndarray:
     """
     magnitude, direction = split_forces(pushes)
     found = [pushes.point, direction, magnitude, pushes.footprint]
-    if isinstance(pushes, Indented):
+    if isinstance(pushes, IndentationPushes):
         x, first, second = pushes.axes[:, :, 0], *np.triu_indices(3)
         found += [pushes.axes[:, :, 2], x[:, first] * x[:, second]]
     return np.column_stack([*found, *_list_relaxation(pushes)])
@@ -69,7 +69,7 @@ def compute_core_features(patch: Patch, pushes: Pushed) -> np.ndarray:
     TypeError
         The loads are not `Indented`.
     """
-    if not isinstance(pushes, Indented):
+    if not isinstance(pushes, IndentationPushes):
         raise TypeError("only rods and blades have a core that stands: give `Indented`.")
     magnitude, direction = split_forces(pushes)
     middle = pushes.point + pushes.force + pushes.offset
@@ -78,9 +78,9 @@ def compute_core_features(patch: Patch, pushes: Pushed) -> np.ndarray:
     return np.column_stack([*found, *_list_relaxation(pushes)])
 
 
-def _list_relaxation(pushed: Pushed) -> list[np.ndarray]:
+def _list_relaxation(pushes: Pushed) -> list[np.ndarray]:
     """Return a list of the tissue's relaxed shares (B,); empty if the tissue does not relax."""
-    known = get_relaxation(pushed)
+    known = get_relaxation(pushes)
     return [] if known is None else [known]
 
 

@@ -21,7 +21,7 @@ MAX_ROD_SAMPLES = 6  # Number of samples along a rod from its end.
 
 
 @dataclass(frozen=True, eq=False)
-class Indented(Pushed):
+class IndentationPushes(Pushed):
     """Indentations by a rod or a blade, which also depend on the tool's orientation.
 
     `axes` (B, 3, 3) has the tool's axes as columns. `offset` (B, 3) [m] points from the indented point, `point` +
@@ -33,14 +33,14 @@ class Indented(Pushed):
 
 
 @dataclass(frozen=True, eq=False)
-class Relaxing(Pushed):
+class RelaxingPushes(Pushed):
     """Indentations of tissue that has lost the share `relaxed` (B,) of its shear resistance."""
 
     relaxed: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class RelaxingIndented(Indented):
+class RelaxingIndentationPushes(IndentationPushes):
     """Indentations of relaxing tissue by a rod or a blade."""
 
     relaxed: np.ndarray
@@ -48,13 +48,13 @@ class RelaxingIndented(Indented):
 
 def add_relaxation(pushes: Pushed, relaxed_share: np.ndarray) -> Pushed:
     """Return the same indentations in tissue that has relaxed by the shares `relaxed_share` (B,)."""
-    kind = RelaxingIndented if isinstance(pushes, Indented) else Relaxing
+    kind = RelaxingIndentationPushes if isinstance(pushes, IndentationPushes) else RelaxingPushes
     return kind(**vars(pushes), relaxed=relaxed_share)
 
 
 def get_relaxation(pushes: Pushed) -> np.ndarray | None:
     """Return the relaxed shares (B,) of the tissue; None if the tissue does not relax."""
-    return pushes.relaxed if isinstance(pushes, Relaxing | RelaxingIndented) else None
+    return pushes.relaxed if isinstance(pushes, RelaxingPushes | RelaxingIndentationPushes) else None
 
 
 def get_poses(loads: Loads, tool: BuiltIn) -> np.ndarray:
@@ -107,7 +107,7 @@ def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
         axes = build_rotations_about(axes[:, :, 2])
     middle = pose[:, :3, 3] + pose[:, :3, :3] @ core.centre
     wide = np.full(len(pose), core.radius if isinstance(tool, Capsule) else compute_extent(tool))
-    return Indented(point, force, wide, axes, middle - point - force)
+    return IndentationPushes(point, force, wide, axes, middle - point - force)
 
 
 def _compute_signed_distances(patch: Patch, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

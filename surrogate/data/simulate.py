@@ -167,16 +167,16 @@ def simulate(
     run = {**stated, "number of loads": str(len(work.loads)), "hash of the loads": compute_loads_digest(work.loads)}
     with listen_to_stages() as seconds, open_journal(partial, run) as journal:
         try:
-            solved = _fill(journal, work, deformer, finished, progress)
+            solved = _fill_journal(journal, work, deformer, finished, progress)
         except LostProcessError as error:
             raise InputError(f"{error} What was solved is kept: the same command resumes.") from error
         with time_stage(STAGES["answers"]):
-            _write(path, work, {**stated, **_compute_rates(path, solved, seconds)}, journal)
+            _write_data_set(path, work, {**stated, **_compute_rates(path, solved, seconds)}, journal)
     partial.unlink(missing_ok=True)
     return SimulatedRows(solved["unit"], solved["answers"], *(seconds[name] for name in STAGES.values()))
 
 
-def _fill(
+def _fill_journal(
     journal: Journal, work: SimulationPlan, deformer: Deformer | SolverPool, finished: set[Batch],
     progress: Callable[[int, int], None],
 ) -> dict[str, int]:  # fmt: skip
@@ -220,7 +220,7 @@ def _compute_rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, 
     return rates
 
 
-def _write(path: Path, work: SimulationPlan, stated: Mapping[str, str], journal: Journal) -> None:
+def _write_data_set(path: Path, work: SimulationPlan, provenance: Mapping[str, str], journal: Journal) -> None:
     """Write the data set from batches in the journal and in the finished file that it replaces."""
     with write_stream_atomically(path, path.suffix) as stream, h5py.File(stream, "w", libver=HDF5_VERSIONS) as file:
         facts = {
@@ -228,12 +228,12 @@ def _write(path: Path, work: SimulationPlan, stated: Mapping[str, str], journal:
             "length_unit": "m",
             "force_unit": "N",
             "frame": "RAS",
-            "tool": _describe_tool(work.loads, stated),
+            "tool": _describe_tool(work.loads, provenance),
             "compression": "none: packed, displacements are a sixth smaller",
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "sulcus version": get_version("sulcus"),
         }
-        write_provenance(file, {**facts, **stated})
+        write_provenance(file, {**facts, **provenance})
         write_embedded_anatomy(file, work.anatomy)
         write_loads(file, work.loads)
 
@@ -261,14 +261,14 @@ def _write(path: Path, work: SimulationPlan, stated: Mapping[str, str], journal:
             arrays[batch[0], "checksum"][here] = sums
 
 
-def _compute_ahead(made: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
+def _compute_ahead(compute: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
     """Yield each batch with its result, in order, while a second thread computes the next result."""
     with ThreadPoolExecutor(1) as maker:
-        coming = [maker.submit(made, batch) for batch in batches[:1]]
+        coming = [maker.submit(compute, batch) for batch in batches[:1]]
         for batch, following in zip(batches, [*batches[1:], None], strict=True):
             ready = coming.pop().result()
             if following is not None:
-                coming.append(maker.submit(made, following))
+                coming.append(maker.submit(compute, following))
             yield batch, ready
 
 
@@ -281,11 +281,11 @@ def _read_kept_rows(path: Path, work: SimulationPlan, batch: Batch) -> np.ndarra
     return rows
 
 
-def _describe_tool(loads: Loads, stated: Mapping[str, str]) -> str:
+def _describe_tool(loads: Loads, provenance: Mapping[str, str]) -> str:
     """Describe the tool or the force of the loads, as text for the file."""
     if loads.get(Touching) is None:
         return "a force on a round footprint that stays with the tissue: see loads/Pushed"
-    return f"the rigid tool {stated.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
+    return f"the rigid tool {provenance.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
 
 
 def _read_batch(file: h5py.File, work: SimulationPlan, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
@@ -294,13 +294,13 @@ def _read_batch(file: h5py.File, work: SimulationPlan, batch: Batch) -> tuple[np
     return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
 
 
-def _read_earlier_loads(path: Path, stated: Mapping[str, str], loads: Loads) -> Loads:
+def _read_earlier_loads(path: Path, provenance: Mapping[str, str], loads: Loads) -> Loads:
     """Read the loads of a finished file; check that its first loads and provenance equal those of this call."""
     with wrap_errors(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
         recorded = read_provenance(file)
         if recorded.get("format") == OLD_FORMAT:
             raise InputError(f"{path}: is of an earlier version, whose files do not go on: choose another --out.")
-        check_same_description(path, recorded, stated, "made", "")
+        check_same_description(path, recorded, provenance, "made", "")
         before = read_loads(file)
     shared = np.arange(min(len(before), len(loads)))
     if compute_loads_digest(before.select(shared)) != compute_loads_digest(loads.select(shared)):

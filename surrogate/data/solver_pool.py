@@ -130,8 +130,8 @@ def choose_even_batch(max_batch: int, load_count: int, device_count: int) -> int
     return max(1, -(-load_count // (max(rounds, 1) * device_count)))
 
 
-def _check_all_fit(needed: Sequence[MemoryEstimate | None], said: Callable[[str], object]) -> None:
-    for each in dict.fromkeys(map(str, filter(None, needed))):
-        said(f"{each}.")
-    for each in filter(None, needed):
+def _check_all_fit(estimates: Sequence[MemoryEstimate | None], report: Callable[[str], object]) -> None:
+    for each in dict.fromkeys(map(str, filter(None, estimates))):
+        report(f"{each}.")
+    for each in filter(None, estimates):
         each.check_fits()

@@ -153,7 +153,7 @@ def describe_rejected(preset: str) -> str:
 
 def _sample_block(tools: list[ToolLoadRange], patch: Patch, key: int, block: range) -> np.ndarray:
     """Sample the loads of a block as rows (n, 7): point [m], force [N], footprint radius [m]."""
-    kind = (len(tools) * _generate_uniform(key, 0, block)[:, -1]).astype(int)
+    kind = (len(tools) * _generate_random_numbers(key, 0, block)[:, -1]).astype(int)
     out = np.zeros((len(block), 7))
     for number, tool in enumerate(tools):
         rows = np.flatnonzero(kind == number)
@@ -161,7 +161,7 @@ def _sample_block(tools: list[ToolLoadRange], patch: Patch, key: int, block: ran
     return out
 
 
-def _generate_uniform(key: int, attempt: int, block: range) -> np.ndarray:
+def _generate_random_numbers(key: int, attempt: int, block: range) -> np.ndarray:
     """Generate uniform random numbers (n, NUMBERS_PER_LOAD) in [0, 1), one row for each load of a block.
 
     Salmon, Moraes, Dror, Shaw 2011, "Parallel random numbers: as easy as 1, 2, 3": a counter-based generator, so that a
@@ -178,7 +178,7 @@ def _sample_tool(tool: ToolLoadRange, patch: Patch, key: int, block: range, rows
     for attempt in range(MAX_ATTEMPTS):
         if not len(waiting):
             return out[rows]
-        uniform = _generate_uniform(key, attempt, block)[waiting]
+        uniform = _generate_random_numbers(key, attempt, block)[waiting]
         footprint = interpolate_range(tool.radius_range, uniform[:, 0])
         force = (
             interpolate_range(tool.force_range, uniform[:, 1])
@@ -199,15 +199,15 @@ def _sample_tool(tool: ToolLoadRange, patch: Patch, key: int, block: range, rows
     )
 
 
-def interpolate_range(limits: tuple[float, float] | np.ndarray, uniform: np.ndarray) -> np.ndarray:
+def interpolate_range(limits: tuple[float, float] | np.ndarray, random_numbers: np.ndarray) -> np.ndarray:
     """Map uniform random numbers (n,) in [0, 1) linearly to the range between two limits."""
-    return limits[0] + (limits[1] - limits[0]) * uniform
+    return limits[0] + (limits[1] - limits[0]) * random_numbers
 
 
-def _sample_in_cone(axis: np.ndarray, angle: float, uniform: np.ndarray) -> np.ndarray:
+def _sample_in_cone(axis: np.ndarray, angle: float, random_numbers: np.ndarray) -> np.ndarray:
     """Sample unit vectors (n, 3) within `angle` [rad] of unit vectors `axis` (n, 3), uniformly by solid angle."""
-    cosine = (1.0 - uniform[:, 0] * (1.0 - np.cos(angle)))[:, None]
-    around = (2.0 * np.pi * uniform[:, 1])[:, None]
+    cosine = (1.0 - random_numbers[:, 0] * (1.0 - np.cos(angle)))[:, None]
+    around = (2.0 * np.pi * random_numbers[:, 1])[:, None]
     first, second = find_perpendiculars(axis)
     sideways = np.cos(around) * first + np.sin(around) * second
     return cosine * axis + np.sqrt(1.0 - cosine**2) * sideways

@@ -62,12 +62,12 @@ def choose_model(
     )
 
 
-def _get_error(offer: ModelCandidate) -> tuple[float, float]:
-    return offer.error_mm, offer.median_ms
+def _get_error(candidate: ModelCandidate) -> tuple[float, float]:
+    return candidate.error_mm, candidate.median_ms
 
 
-def _get_time(offer: ModelCandidate) -> tuple[float, float]:
-    return offer.median_ms, offer.error_mm
+def _get_time(candidate: ModelCandidate) -> tuple[float, float]:
+    return candidate.median_ms, candidate.error_mm
 
 
 def find_pareto_front(points: Mapping[str, tuple[float, float]]) -> frozenset[str]:

@@ -91,11 +91,11 @@ def _check_load_count(loads: Loads) -> None:
         raise InputError(f"{len(loads)} loads have no tenths: simulate at least {FORCE_CLASSES}.")
 
 
-def measure_coverage_shares(error: np.ndarray, bound: np.ndarray) -> Shares:
-    """Compute the share of errors (B,) within `bound` (levels, B) for each level; None if all bounds are infinite."""
-    promised = ~np.isposinf(bound)
+def measure_coverage_shares(error: np.ndarray, bounds: np.ndarray) -> Shares:
+    """Compute the share of errors (B,) within `bounds` (levels, B) for each level; None if all bounds are infinite."""
+    promised = ~np.isposinf(bounds)
     return tuple(
-        float((error <= row)[some].mean()) if some.any() else None for row, some in zip(bound, promised, strict=True)
+        float((error <= row)[some].mean()) if some.any() else None for row, some in zip(bounds, promised, strict=True)
     )
 
 
@@ -108,22 +108,22 @@ def format_coverage(covered: Shares) -> str:
     )
 
 
-def measure_coverage(force: np.ndarray, error: np.ndarray, bound: np.ndarray, extrapolated: int) -> Coverage:
+def measure_coverage(force: np.ndarray, error: np.ndarray, bounds: np.ndarray, extrapolated: int) -> Coverage:
     """Compute the coverage of errors (B,) [m] by bounds (2, B) [m], for all loads and by decile of force (B,) [N]."""
-    covered = error <= bound[0]
+    covered = error <= bounds[0]
     by_force = np.array_split(np.argsort(force, kind="stable"), FORCE_CLASSES)
     return Coverage(
         len(error),
-        measure_coverage_shares(error, bound),
+        measure_coverage_shares(error, bounds),
         tuple(float(covered[rows].mean()) for rows in by_force),
-        1e3 * float(np.median(bound[0])),
+        1e3 * float(np.median(bounds[0])),
         1e3 * float(np.median(error)),
         extrapolated,
     )
 
 
 def _measure_coverage(
-    model: Learned, loads: Loads, result: Deformation, error: np.ndarray, bound: np.ndarray
+    model: Learned, loads: Loads, result: Deformation, error: np.ndarray, bounds: np.ndarray
 ) -> Coverage:
     force = split_forces(model.to_input(loads))[0]
-    return measure_coverage(force, error, bound, result.outcome.count(Outcome.EXTRAPOLATED))
+    return measure_coverage(force, error, bounds, result.outcome.count(Outcome.EXTRAPOLATED))

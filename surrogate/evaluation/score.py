@@ -96,7 +96,7 @@ def compute_force_errors(predicted: np.ndarray, reference: np.ndarray) -> np.nda
     return np.linalg.norm(predicted - reference, axis=1)
 
 
-def score_forces(error: np.ndarray, reference: np.ndarray, bound: np.ndarray | None = None) -> ForceScore:
+def score_forces(error: np.ndarray, reference: np.ndarray, bounds: np.ndarray | None = None) -> ForceScore:
     """Score errors (B,) [N] of forces, given the FEM forces `reference` (B, 3) [N] and bounds (2, B) [N], if any.
 
     Raises
@@ -111,16 +111,16 @@ def score_forces(error: np.ndarray, reference: np.ndarray, bound: np.ndarray | N
             "no tool presses under any of these loads, so that no force can be judged: give poses that do."
         )
     share = 100.0 * error[some] / size[some]
-    if bound is not None and np.isnan(bound).all():
-        bound = None
+    if bounds is not None and np.isnan(bounds).all():
+        bounds = None
     return ForceScore(
         int(some.sum()),
         float(size[some].mean()),
         float(error[some].mean()),
         float(share.mean()),
         float(np.percentile(share, 95.0)),
-        measure_coverage_shares(error[some], bound[:, some]) if bound is not None else None,
-        float(np.median(bound[0, some])) if bound is not None else None,
+        measure_coverage_shares(error[some], bounds[:, some]) if bounds is not None else None,
+        float(np.median(bounds[0, some])) if bounds is not None else None,
     )
 
 

@@ -88,7 +88,7 @@ def estimate_young_moduli(
 
 
 def _compute_log_likelihood(
-    anatomy: Anatomy, tool: Tool, evidence: Evidence, tissue: FittedTissue, pressed: Responses, own: slice,
+    anatomy: Anatomy, tool: Tool, evidence: Evidence, tissue: FittedTissue, responses: Responses, frame_rows: slice,
     device: str, settings: ModulusSettings,
 ) -> np.ndarray:  # fmt: skip
     """Compute the log-likelihood (len(YOUNGS),) of one force reading for each candidate modulus."""
@@ -98,7 +98,7 @@ def _compute_log_likelihood(
     lower, _ = factorise_errors(evidence)
     value = whiten_columns(lower, evidence.motion)
     way = np.linalg.lstsq(
-        whiten_columns(lower, predict_observation(pressed, skull, evidence)[nearest][own].T), value, rcond=None
+        whiten_columns(lower, predict_observation(responses, skull, evidence)[nearest][frame_rows].T), value, rcond=None
     )[0]
     force, direction = TOOL_FORCE * float(np.linalg.norm(way)), way / np.linalg.norm(way)
     reading = float(tool.force or 0.0)
@@ -106,9 +106,9 @@ def _compute_log_likelihood(
     asked = np.log(YOUNG * np.maximum(reading + sigma * READING_QUANTILES, 0.1 * reading)[:, None] / YOUNGS)
     shapes, inside = [], []
     for exponent in EXPONENTS:
-        group = Group(list(SKULLS).index(skull), skull, poisson, ratio, exponent, pressed.regions)
+        group = Group(list(SKULLS).index(skull), skull, poisson, ratio, exponent, responses.regions)
         sizes, rows = _solve_dents(
-            anatomy, tool, group, evidence, pressed, force * np.array(settings.force_multiples), direction, device
+            anatomy, tool, group, evidence, responses, force * np.array(settings.force_multiples), direction, device
         )
         inside.append((asked >= np.log(sizes[0])) & (asked <= np.log(sizes[-1])))
         shapes.append(CubicSpline(np.log(sizes), rows)(np.clip(asked, *np.log(sizes[[0, -1]]))))
@@ -123,7 +123,7 @@ def _compute_log_likelihood(
 
 
 def _solve_dents(
-    anatomy: Anatomy, tool: Tool, group: Group, evidence: Evidence, pressed: Responses, sizes: np.ndarray,
+    anatomy: Anatomy, tool: Tool, group: Group, evidence: Evidence, responses: Responses, sizes: np.ndarray,
     direction: np.ndarray, device: str,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Solve forces on tissue of modulus `YOUNG`; return the converged forces (k,) [N] and observed dents (k, m) [m]."""
@@ -134,7 +134,7 @@ def _solve_dents(
     good = np.array([outcome.good for outcome in result.outcome])
     if good.sum() < 3:
         raise InputError(f"a force of {tool.force:g} N cannot be what dents this brain so: check its unit and frame.")
-    motion = Responses(pressed.nodes, {group.skull: result.displacement[good][None, None][..., pressed.nodes, :]})
+    motion = Responses(responses.nodes, {group.skull: result.displacement[good][None, None][..., responses.nodes, :]})
     return sizes[good], predict_observation(motion, group.skull, evidence)[0, 0]
 
 

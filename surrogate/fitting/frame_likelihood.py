@@ -98,9 +98,9 @@ def whiten_columns(cholesky: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return solve_triangular(cholesky, columns, lower=True, check_finite=False)
 
 
-def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, seen: float) -> np.ndarray:
+def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, scale: float) -> np.ndarray:
     """Compute log evidence (poissons, ratios) of motions (poissons, ratios, loads, m), scaled to a mean size of 1."""
-    motion = seen * whiten_columns(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
+    motion = scale * whiten_columns(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
     gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(lower, evidence.motion)
     logs = []
     for times in LIKELIHOOD.motion_sizes:

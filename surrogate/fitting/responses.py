@@ -111,8 +111,8 @@ def _get_motions(
     law = build_tissue(build_linear_tissue, poisson, ratio, regions)
     effects = (law, Held(), SKULLS[skull], ToolForce(), Gravity())
 
-    def solved() -> dict[str, np.ndarray]:
+    def compute_motion() -> dict[str, np.ndarray]:
         result = Fem(anatomy, effects, ACCURACY, device).deform(loads)
         return {"motion": result.displacement[:, nodes].astype(np.float32)}
 
-    return load_cached_arrays(path, "motions of one tissue", ["motion"], solved)["motion"]
+    return load_cached_arrays(path, "motions of one tissue", ["motion"], compute_motion)["motion"]

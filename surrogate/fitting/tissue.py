@@ -108,8 +108,8 @@ class FittedTissue:
     drawn = sample  # Former names, for one release.
 
 
-def _compute_quantiles(values: np.ndarray, share: np.ndarray) -> np.ndarray:
-    return np.interp(INTERVAL_PROBABILITIES, np.cumsum(share) - 0.5 * share, values)
+def _compute_quantiles(values: np.ndarray, probabilities: np.ndarray) -> np.ndarray:
+    return np.interp(INTERVAL_PROBABILITIES, np.cumsum(probabilities) - 0.5 * probabilities, values)
 
 
 def to_tissue_path(anatomy: str | Path) -> Path:

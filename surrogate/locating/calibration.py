@@ -78,7 +78,7 @@ def run_trials(
                 posterior, _ = match_and_update(prior, observation)
             except InputError:
                 continue
-            found.append([*compute_similarity_features(posterior.evidence), _square(prior, posterior, middle)])
+            found.append([*compute_similarity_features(posterior.evidence), _square_distance(prior, posterior, middle)])
     progress(count, count)
     return np.array(found)
 
@@ -172,7 +172,7 @@ def sample_observed_patch(
     return build_motion_evidence(place, at, moved, np.full(count, SIGMA))
 
 
-def _square(prior: MotionPrior, found: Posterior, middle: np.ndarray) -> float:
-    """Return the squared Mahalanobis distance between the estimated and the true centroid motion `middle` (3,) [m]."""
-    off = found.shape_weights @ prior.centroid_motion - middle
-    return float(off @ np.linalg.solve(found.compute_covariance(prior.centroid_motion[:, None])[0], off))
+def _square_distance(prior: MotionPrior, posterior: Posterior, centroid_motion: np.ndarray) -> float:
+    """Return the squared Mahalanobis distance between the estimated and the true `centroid_motion` (3,) [m]."""
+    off = posterior.shape_weights @ prior.centroid_motion - centroid_motion
+    return float(off @ np.linalg.solve(posterior.compute_covariance(prior.centroid_motion[:, None])[0], off))

@@ -181,10 +181,10 @@ def _build_idle(anatomy: Anatomy, count: int) -> Pushed:
     return Pushed(np.tile(open_cortex(anatomy).origin, (count, 1)), np.zeros((count, 3)), np.full(count, FORCE_RADIUS))
 
 
-def _build_posture(anatomy: Anatomy, down: np.ndarray, left: float) -> Posture:
-    """Build postures with gravity along `down` (n, 3) and a share `left` of the fluid."""
-    level = np.array([compute_fluid_level(anatomy.mesh.nodes, one, left) for one in down])
-    return Posture(down, level, np.ones(len(down)))
+def _build_posture(anatomy: Anatomy, directions: np.ndarray, fluid_share: float) -> Posture:
+    """Build postures with gravity along `directions` (n, 3) and a share `fluid_share` of the fluid."""
+    level = np.array([compute_fluid_level(anatomy.mesh.nodes, one, fluid_share) for one in directions])
+    return Posture(directions, level, np.ones(len(directions)))
 
 
 def sample_gravity_directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:

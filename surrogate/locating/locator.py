@@ -319,22 +319,22 @@ def _sample_normal() -> np.ndarray:
     return np.random.default_rng(0).standard_normal((SAMPLE_COUNT, 3))
 
 
-def _is_slip_likely(anatomy: Anatomy, found: Posterior) -> bool:
+def _is_slip_likely(anatomy: Anatomy, posterior: Posterior) -> bool:
     """Return True if a slip explains the observation nearly as well as a motion does, and is not like a sinking brain.
 
     A brain that sinks by a centimetre resembles a registration shift, but it moves uniformly and mostly along the
     craniotomy's axis. A slip moves the brain across this axis, or rotates it.
     """
-    if found.slip_log_odds < LIMITS.min_slip_log_odds or found.evidence.rigid_ratio <= LIMITS.max_rigid_ratio:
+    if posterior.slip_log_odds < LIMITS.min_slip_log_odds or posterior.evidence.rigid_ratio <= LIMITS.max_rigid_ratio:
         return False
-    evidence, axis = found.evidence, open_cortex(anatomy).axis
+    evidence, axis = posterior.evidence, open_cortex(anatomy).axis
     shift, turn = np.split(evidence.rigid_fit, 2)
     sunk = axis @ shift
     other = shift - sunk * axis + np.cross(turn, evidence.positions - evidence.centroid)
     return bool((other**2).sum(axis=1).mean() > sunk**2)
 
 
-def _check_explained(found: Posterior, outliers: int, points: int) -> None:
+def _check_explained(posterior: Posterior, outliers: int, points: int) -> None:
     """Check that the ensemble explains the observation.
 
     Raises
@@ -347,8 +347,8 @@ def _check_explained(found: Posterior, outliers: int, points: int) -> None:
             f"{outliers} of {points} points lie off the open cortex, or fit no motion of the others: check that "
             "they are of this brain. If they are less sure, raise sigma."
         )
-    if found.surprise > LIMITS.max_surprise:
+    if posterior.surprise > LIMITS.max_surprise:
         raise InputError(
-            f"the observation fits no cause: point errors of {np.sqrt(found.surprise):.1f} times their sigma. "
+            f"the observation fits no cause: point errors of {np.sqrt(posterior.surprise):.1f} times their sigma. "
             "Check units, frame (RAS) and sigma, or that nothing was cut out."
         )

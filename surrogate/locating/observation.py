@@ -192,11 +192,11 @@ def _build_normal_rows(
 
 
 def _join_evidence(parts: list[Evidence]) -> Evidence:
-    def joined(of, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-        return {name: np.concatenate([getattr(of(part), name) for part in parts]) for name in names}
+    def join_fields(get_part, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        return {name: np.concatenate([getattr(get_part(part), name) for part in parts]) for name in names}
 
-    place = LocatedPoints(**joined(lambda part: part.location, ("vertices", "weights")))
-    arrays = joined(lambda part: part, ("positions", "axis", "motion", "sigma", "point"))
+    place = LocatedPoints(**join_fields(lambda part: part.location, ("vertices", "weights")))
+    arrays = join_fields(lambda part: part, ("positions", "axis", "motion", "sigma", "point"))
     return Evidence(location=place, shift_sigma=parts[0].shift_sigma, **arrays)
 
 
@@ -258,15 +258,15 @@ def _check_motions(length: np.ndarray) -> None:
         )
 
 
-def _check_spread(where: np.ndarray, near: np.ndarray) -> None:
-    """Raise InputError if points (n, 3) [m] have too few distinct positions, or if those `near` (n,) are on a line."""
-    places = len(np.unique(np.round(where / LIMITS.place_tolerance), axis=0))
+def _check_spread(points: np.ndarray, is_near: np.ndarray) -> None:
+    """Raise InputError if points (n, 3) [m] have too few distinct positions, or if those of `is_near` are on a line."""
+    places = len(np.unique(np.round(points / LIMITS.place_tolerance), axis=0))
     if places < LIMITS.min_points:
         raise InputError(
             f"{places} places a millimetre apart say too little: give {LIMITS.min_points} at least, spread over the "
             "open cortex."
         )
-    some = where[near]
+    some = points[is_near]
     along, across, _ = np.linalg.svd(some - some.mean(axis=0), compute_uv=False)
     if not across > LIMITS.min_spread_ratio * along:
         raise InputError("the points lie on a line: spread them over the open cortex.")
@@ -282,16 +282,16 @@ def _compute_surface_distances(anatomy: Anatomy, points: np.ndarray) -> np.ndarr
     return away
 
 
-def _is_mostly_far(off: np.ndarray, near: float) -> bool:
-    """Return True if more than half of the distances `off` (n,) exceed `near` [m]."""
-    return bool(np.count_nonzero(off > near) > 0.5 * len(off))
+def _is_mostly_far(distances: np.ndarray, limit: float) -> bool:
+    """Return True if more than half of the distances `distances` (n,) exceed `limit` [m]."""
+    return bool(np.count_nonzero(distances > limit) > 0.5 * len(distances))
 
 
-def _describe_mismatch(anatomy: Anatomy, points: np.ndarray, off: float, near: float) -> str:
-    """Describe the likely reason why half of the points (n, 3) are `off` [m] from the open cortex, above `near` [m]."""
-    start = f"half of the points lie more than {1e3 * off:.3g} mm from the open cortex"
+def _describe_mismatch(anatomy: Anatomy, points: np.ndarray, distance: float, limit: float) -> str:
+    """Describe the likely reason why half of the points (n, 3) are beyond `limit` [m] from the open cortex."""
+    start = f"half of the points lie more than {1e3 * distance:.3g} mm from the open cortex"
     for (scale, unit_meant), (turned, frame_meant) in product(UNIT_ERRORS, FRAME_ERRORS):
-        if not _is_mostly_far(_compute_surface_distances(anatomy, scale * points * turned), near):
+        if not _is_mostly_far(_compute_surface_distances(anatomy, scale * points * turned), limit):
             meant = " and ".join(filter(None, (unit_meant, frame_meant)))
             return f"{start}, and would lie on it {meant}. Give mm and RAS."
     span, own = (float(np.linalg.norm(np.ptp(some, axis=0))) for some in (points, open_cortex(anatomy).corners))

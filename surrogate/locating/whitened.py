@@ -40,10 +40,10 @@ class NormalEquations:
     place_products: np.ndarray
     log_evidence: np.ndarray
 
-    def eliminate_unknowns(self, kind: int, is_last: bool = False) -> NormalEquations:
+    def eliminate_unknowns(self, unknown_type: int, is_last: bool = False) -> NormalEquations:
         """Eliminate the unknowns of one kind; if `is_last`, products of other remaining unknowns are dropped."""
-        first = int(np.argmax(self.kind == kind))
-        end = first + np.count_nonzero(self.kind == kind)
+        first = int(np.argmax(self.kind == unknown_type))
+        end = first + np.count_nonzero(self.kind == unknown_type)
         own, left = slice(first, end), np.delete(self.kind, slice(first, end))
         block = self.products[..., own, own]
         rows = np.concatenate([self.products[..., own, :first], self.products[..., own, end:]], axis=-1)
@@ -61,9 +61,9 @@ class NormalEquations:
             table[..., there, first:] += self.products[..., here, end:]
         return NormalEquations(left, table, place, evidence)
 
-    def scale_unknowns(self, kind: int, deviations: np.ndarray) -> NormalEquations:
+    def scale_unknowns(self, unknown_type: int, deviations: np.ndarray) -> NormalEquations:
         """Return equations (..., b) with b prior standard deviations for the unknowns of one kind, instead of 1."""
-        own = np.flatnonzero(self.kind == kind)
+        own = np.flatnonzero(self.kind == unknown_type)
         size = np.ones((len(deviations), self.products.shape[-1]))
         size[:, own] = deviations[:, None]
         rows = size[:, : len(self.kind), None]

@@ -79,11 +79,11 @@ def find_rejection(model: Learned, effects: Iterable[Effect], element: str | Non
     return f"it was trained under {', '.join(sorted(trained))}, {' and '.join(differences)}"
 
 
-def _is_same_tool(one: Tool, other: BuiltIn) -> bool:
+def _is_same_tool(tool: Tool, reference: BuiltIn) -> bool:
     """Return True if two built-in tools have the same class and equal sizes, within round-off."""
-    if not isinstance(one, BuiltIn) or type(one) is not type(other):
+    if not isinstance(tool, BuiltIn) or type(tool) is not type(reference):
         return False
-    return bool(np.allclose(astuple(one), astuple(other), rtol=SIZE_TOLERANCE, atol=0.0))
+    return bool(np.allclose(astuple(tool), astuple(reference), rtol=SIZE_TOLERANCE, atol=0.0))
 
 
 def _get_moved_tools(effect: Effect) -> tuple[Tool, ...]:

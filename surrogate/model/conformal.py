@@ -125,11 +125,11 @@ def fit_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.nd
     Parameters
     ----------
     near, far
-        Ratios (n,) of error to a bound without growth, and distances (n,) [m] from the nearest training load. `near`:
-        loads sampled as the training loads. `far`: other loads; with fewer than 19, `USUAL_GROWTH` is returned.
+        Ratios (n,) of error to a bound without growth, and distances (n,) [m] from the nearest training load.
+        `near`: loads sampled as those. `far`: others; with fewer than 19, `USUAL_GROWTH` is returned.
     """
 
-    def larger(growth: float) -> bool:
+    def is_too_small(growth: float) -> bool:
         asked, promised = (
             compute_conformal_quantile(ratio / (1.0 + growth * away), LEVELS[0]) for ratio, away in (far, near)
         )
@@ -140,7 +140,7 @@ def fit_growth(near: tuple[np.ndarray, np.ndarray], far: tuple[np.ndarray, np.nd
     least, most = 0.0, MAX_GROWTH
     for _ in range(40):
         middle = 0.5 * (least + most)
-        least, most = (middle, most) if larger(middle) else (least, middle)
+        least, most = (middle, most) if is_too_small(middle) else (least, middle)
     return most
 
 
@@ -170,6 +170,6 @@ def _compute_monomials(x: np.ndarray) -> np.ndarray:
     return np.concatenate([np.ones_like(x[:, :1]), x, x[:, first] * x[:, second]], axis=1)
 
 
-def _mask_monomials(count: int, curved: int) -> np.ndarray:
-    """Return the mask (t,) of the monomials to fit: 1, x_i of the load, and x_i x_j of the first `curved` features."""
-    return np.concatenate([[True], np.arange(count) < LOAD_FEATURES, np.triu_indices(count)[1] < curved])
+def _mask_monomials(count: int, quadratic: int) -> np.ndarray:
+    """Return the mask (t,) of the monomials to fit: 1, x_i of the load, and x_i x_j of `quadratic` features."""
+    return np.concatenate([[True], np.arange(count) < LOAD_FEATURES, np.triu_indices(count)[1] < quadratic])

@@ -110,8 +110,8 @@ def find_first_model(deformer: Deformer, result: Deformation) -> Learned | None:
     return find_model(deformer) if result.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
 
 
-def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation, pushed: bool) -> Deformation:
-    """Replace `rows` (k,) of predictions by the k FEM solutions; if `pushed`, the reactions are not replaced.
+def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation, keep_reaction: bool) -> Deformation:
+    """Replace `rows` (k,) of predictions by the k FEM solutions; if `keep_reaction`, the reactions are not replaced.
 
     If the model does not predict the reaction of a pose, the reaction is not available in any row.
     """
@@ -120,7 +120,7 @@ def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation,
     ours = replace(predicted, cost=Cost({"predict": predicted.cost.total, "solve": 0.0}))
     theirs = solved.restrict(predicted.nodes)
     cost = Cost({"predict": 0.0, "solve": solved.cost.total})
-    known = solved.reaction.shape[1] == predicted.reaction.shape[1] and not pushed
+    known = solved.reaction.shape[1] == predicted.reaction.shape[1] and not keep_reaction
     theirs = replace(theirs, reaction=theirs.reaction if known else predicted.reaction[rows], cost=cost)
     source = predicted.source
     if len(rows):

@@ -140,13 +140,13 @@ class Learned:
         return open_patch(self.anatomy)
 
     @cached_property
-    def _modes_at(self) -> Callable[[bytes], tuple[tuple[list[ModelPart], np.ndarray], ...]]:
+    def _restrict_modes(self) -> Callable[[bytes], tuple[tuple[list[ModelPart], np.ndarray], ...]]:
         """Function from vertices (int64 bytes) to the parts of each basis, with its modes (r, 3 n) at the vertices."""
         groups: dict[int, list[ModelPart]] = {}
         for part in self.parts:
             groups.setdefault(id(part.basis.modes), []).append(part)
 
-        def modes_at(nodes: bytes) -> tuple[tuple[list[ModelPart], np.ndarray], ...]:
+        def restrict_modes(nodes: bytes) -> tuple[tuple[list[ModelPart], np.ndarray], ...]:
             asked, found = np.frombuffer(nodes, np.int64), []
             for parts in groups.values():
                 basis = parts[0].basis
@@ -157,7 +157,7 @@ class Learned:
                     found.append((parts, modes.reshape(len(modes), -1)))
             return tuple(found)
 
-        return lru_cache(maxsize=4)(modes_at)
+        return lru_cache(maxsize=4)(restrict_modes)
 
     @cached_property
     def _is_predicted(self) -> np.ndarray:
@@ -166,18 +166,18 @@ class Learned:
         known[self.nodes] = True
         return known
 
-    def _check_in_range(self, pushed: Pushed, doubtful: np.ndarray) -> None:
+    def _check_in_range(self, pushes: Pushed, uncertain_rows: np.ndarray) -> None:
         """Raise InputError for loads outside the open cortex, or far beyond the training range.
 
-        Only the rows `doubtful` (k,) can fail the contact test: a load inside the training range touches the cortex,
+        Only `uncertain_rows` (k,) can fail the contact test: a load inside the training range touches the cortex,
         unless its radius is too small.
         """
-        if not len(doubtful):
+        if not len(uncertain_rows):
             return
         force = ("a force", 1.0, "N") if self.tool is None else ("a depth", 1e3, "mm")
         for (name, unit, symbol), size, (_, most) in (
-            (force, split_forces(pushed)[0], self.envelope.force),
-            (("a footprint", 1e3, "mm"), pushed.footprint, self.envelope.footprint),
+            (force, split_forces(pushes)[0], self.envelope.force),
+            (("a footprint", 1e3, "mm"), pushes.footprint, self.envelope.footprint),
         ):
             far = np.flatnonzero(size > MAX_TRAINING_RATIO * most)
             if len(far):
@@ -186,9 +186,9 @@ class Learned:
                     f"{unit * most:.3g} {symbol} at most: give up to {MAX_TRAINING_RATIO:g} times that, or ask the "
                     "finite elements."
                 )
-        away = find_nearest(pushed.point[doubtful], self._patch.points)[1]
-        if (away > pushed.footprint[doubtful]).any():  # away from nodes, but perhaps not from triangles
-            self._patch.contact_surface.check_contact(pushed.point, pushed.footprint)
+        away = find_nearest(pushes.point[uncertain_rows], self._patch.points)[1]
+        if (away > pushes.footprint[uncertain_rows]).any():  # away from nodes, but perhaps not from triangles
+            self._patch.contact_surface.check_contact(pushes.point, pushes.footprint)
 
     def _check_nodes(self, nodes: np.ndarray) -> None:
         inside = (nodes >= 0) & (nodes < len(self._is_predicted))
@@ -228,46 +228,46 @@ class Learned:
             return self._sum_parts(loads, pushed, nodes, begun, past, build_warm_encoders(self._regressors, start))
 
     def _sum_parts(
-        self, loads: Loads, pushed: Pushed, nodes: np.ndarray, begun: float, past: RelaxationState | None,
+        self, loads: Loads, pushes: Pushed, nodes: np.ndarray, start_time: float, relaxation: RelaxationState | None,
         encoders: Mapping[str, Encoder],
     ) -> Deformation:  # fmt: skip
-        """Sum the predictions of the parts and build the result; the computation began at `begun` [s]."""
-        known = measure_loads(self._patch, pushed)
-        outside = self.envelope.compute_excess(pushed, known)
-        far, small = outside.excess > 0.0, pushed.footprint < self.envelope.reach + STORED_TOLERANCE
-        self._check_in_range(pushed, np.flatnonzero(far | small))
-        promised = self.compute_bounds(self.bounds, pushed, known, outside)
-        if past is not None:
-            far = far | past.outside_training
-        motion = self.predict_motion(pushed, nodes, encoders)
-        answer = build_prediction(motion, nodes, loads, far, begun, promised, self.source)
-        if past is not None:
-            answer = replace(answer, memory={MEMORY_KEY: past.memory})
+        """Sum the predictions of the parts and build the result; the computation began at `start_time` [s]."""
+        known = measure_loads(self._patch, pushes)
+        outside = self.envelope.compute_excess(pushes, known)
+        far, small = outside.excess > 0.0, pushes.footprint < self.envelope.reach + STORED_TOLERANCE
+        self._check_in_range(pushes, np.flatnonzero(far | small))
+        promised = self.compute_bounds(self.bounds, pushes, known, outside)
+        if relaxation is not None:
+            far = far | relaxation.outside_training
+        motion = self.predict_motion(pushes, nodes, encoders)
+        answer = build_prediction(motion, nodes, loads, far, start_time, promised, self.source)
+        if relaxation is not None:
+            answer = replace(answer, memory={MEMORY_KEY: relaxation.memory})
         if self.tool is not None:
             answer = replace(
                 answer,
-                warm=collect_contact_state(self._regressors, self._patch, self.clip_to_range(pushed)[1], encoders),
+                warm=collect_contact_state(self._regressors, self._patch, self.clip_to_range(pushes)[1], encoders),
             )
         if self.force is None or self.tool is None:
             return answer
         return replace(
             answer,
-            reaction=compute_wrench(self.predict_force(pushed, encoders), get_poses(loads, self.tool), self.tool),
-            reaction_bound=self.compute_bounds(self.force.bound, pushed, known, outside),
-            cost=Cost({"predict": time.perf_counter() - begun}),
+            reaction=compute_wrench(self.predict_force(pushes, encoders), get_poses(loads, self.tool), self.tool),
+            reaction_bound=self.compute_bounds(self.force.bound, pushes, known, outside),
+            cost=Cost({"predict": time.perf_counter() - start_time}),
         )
 
     def predict_motion(
-        self, pushed: Pushed, nodes: np.ndarray, encoders: Mapping[str, Encoder] = ENCODERS
+        self, pushes: Pushed, nodes: np.ndarray, encoders: Mapping[str, Encoder] = ENCODERS
     ) -> np.ndarray:
         """Predict displacements (B, n, 3) [m] of mesh vertices `nodes` (n,), without range checks and bound.
 
         Outside the range of training forces, the response per newton of the nearest training force is used.
         """
-        magnitude, asked = self.clip_to_range(pushed)
+        magnitude, asked = self.clip_to_range(pushes)
         if not len(nodes):
             return np.zeros((len(magnitude), 0, 3))
-        groups = self._modes_at(np.asarray(nodes, np.int64).tobytes())
+        groups = self._restrict_modes(np.asarray(nodes, np.int64).tobytes())
         names = {part.encoder for parts, _ in groups for part in parts}
         features = {name: encoders[name](self._patch, asked) for name in sorted(names)}
         responses = [
@@ -276,12 +276,12 @@ class Learned:
         ]
         return magnitude[:, None, None] * reduce(add, responses).reshape(-1, len(nodes), 3)
 
-    def clip_to_range(self, pushed: Pushed) -> tuple[np.ndarray, Pushed]:
+    def clip_to_range(self, pushes: Pushed) -> tuple[np.ndarray, Pushed]:
         """Return forces [N] or depths [m] (B,), and the loads with these clipped to the training range."""
-        magnitude, direction = split_forces(pushed)
-        return magnitude, replace(pushed, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
+        magnitude, direction = split_forces(pushes)
+        return magnitude, replace(pushes, force=np.clip(magnitude, *self.envelope.force)[:, None] * direction)
 
-    def predict_force(self, pushed: Pushed, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
+    def predict_force(self, pushes: Pushed, encoders: Mapping[str, Encoder] = ENCODERS) -> np.ndarray:
         """Predict the tool's forces (B, 3) [N] at indentations, proportional to depth beyond the training's depths.
 
         Raises
@@ -291,21 +291,21 @@ class Learned:
         """
         if self.force is None:
             raise InputError("this model does not know its tool's force: train it again, on newly simulated poses.")
-        magnitude, asked = self.clip_to_range(pushed)
-        found = np.zeros(pushed.force.shape) + self.force.predict_remainder(self._patch, asked)
+        magnitude, asked = self.clip_to_range(pushes)
+        found = np.zeros(pushes.force.shape) + self.force.predict_remainder(self._patch, asked)
         for part in self.parts:
             if isinstance(part.regressor, RigidContact):
                 found += part.regressor.predict_force(encoders[part.encoder](self._patch, asked))
         return magnitude[:, None] * found
 
-    def compute_bounds(self, bound: Bound | None, pushed: Pushed, known: LoadMeasures, outside: Excess) -> np.ndarray:
+    def compute_bounds(self, bound: Bound | None, pushes: Pushed, measures: LoadMeasures, excess: Excess) -> np.ndarray:
         """Compute error bounds (2, B) of loads, in [m], or in [N] for a force; NaN if `bound` is None."""
         if bound is None:
-            return np.stack([np.nan * outside.excess] * len(LEVELS))
+            return np.stack([np.nan * excess.excess] * len(LEVELS))
         # The error, like the motion, is in proportion to a force below the training's smallest.
-        weaker = np.minimum(known.magnitude / self.envelope.force[0], 1.0)
-        features = compute_scale_features(pushed, self.envelope.clip_to_range(known))
-        return np.where(weaker > 0.0, bound.evaluate(features, known.magnitude, outside), 0.0) * weaker
+        weaker = np.minimum(measures.magnitude / self.envelope.force[0], 1.0)
+        features = compute_scale_features(pushes, self.envelope.clip_to_range(measures))
+        return np.where(weaker > 0.0, bound.evaluate(features, measures.magnitude, excess), 0.0) * weaker
 
     def predict_distance(
         self, loads: Loads, answer: Deformation | None = None, apart: np.ndarray | None = None

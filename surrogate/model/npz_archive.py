@@ -96,14 +96,14 @@ class Archive:
     def _build_error(self, reason: str) -> InputError:
         return InputError(f"{reason}: it is damaged. {self._remedy}".rstrip())
 
-    def _check_names(self, names: list[str], most: int) -> None:
+    def _check_names(self, names: list[str], max_bytes: int) -> None:
         held = {info.filename: info for info in self._zip.infolist()}
         missing = [name for name in names if f"{name}.npy" not in held]
         if missing:
             raise self._build_error(f"lacks the array {missing[0]!r}")
         size = sum(held[f"{name}.npy"].file_size for name in names)
-        if size > most:
-            reason = f"has arrays of {size / 1e6:,.0f} MB: {most / 1e6:,.0f} MB are the most that are read."
+        if size > max_bytes:
+            reason = f"has arrays of {size / 1e6:,.0f} MB: {max_bytes / 1e6:,.0f} MB are the most that are read."
             raise InputError(f"{reason} {self._remedy}".rstrip())
 
     def _read_array(self, name: str) -> np.ndarray:

@@ -61,16 +61,16 @@ def register_learner(name: str, encoder: str | Encoder = "tool") -> Callable[[K]
     elif encoder not in ENCODERS:
         raise InputError(f"no encoder is called {encoder!r}: choose one of {', '.join(ENCODERS)}, or give a function.")
 
-    def register(kind: K) -> K:
-        missing = [what for what in ("fit", "predict", "state", "restored") if not hasattr(kind, what)]
+    def register(regressor: K) -> K:
+        missing = [what for what in ("fit", "predict", "state", "restored") if not hasattr(regressor, what)]
         if missing:
             raise InputError(f"the learner {name} has no {', '.join(missing)}: see surrogate.Regressor.")
         if name in RESERVED_NAMES | PLAYER_NAMES or (
-            name in OWN_LEARNERS and _get_file(OWN_LEARNERS[name].regressor) != _get_file(kind)
+            name in OWN_LEARNERS and _get_file(OWN_LEARNERS[name].regressor) != _get_file(regressor)
         ):
             raise InputError(f"the name {name!r} is taken: give the learner another.")
-        OWN_LEARNERS[name] = OwnLearner(encoder, kind)
-        return kind
+        OWN_LEARNERS[name] = OwnLearner(encoder, regressor)
+        return regressor
 
     return register
 
@@ -101,6 +101,6 @@ def find_learner_name(regressor_class: type) -> str | None:
     return next((name for name, own in OWN_LEARNERS.items() if own.regressor is regressor_class), None)
 
 
-def _get_file(kind: type) -> str | None:
+def _get_file(regressor: type) -> str | None:
     """Return the path of the file that defines a class, since an edited file may register its learner again."""
-    return getattr(sys.modules.get(kind.__module__), "__file__", None)
+    return getattr(sys.modules.get(regressor.__module__), "__file__", None)

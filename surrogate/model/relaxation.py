@@ -68,7 +68,7 @@ def update_relaxation(
     depth, (g, tau) = split_forces(pushes)[0], np.array(series).T
     if start is None:
         left = compute_decayed_coefficients(series, times) * depth[:, None]
-        return _compute_relaxed(g, pushes, depth, pushes.point, left, min_depth)
+        return _compute_state(g, pushes, depth, pushes.point, left, min_depth)
     past = start.memory.get(MEMORY_KEY)
     if past is None or past.shape != (len(depth), 4 + len(series)):
         raise InputError(
@@ -80,16 +80,16 @@ def update_relaxation(
     half = np.exp(-steps[:, None] / (2.0 * tau))
     left = half * (half * past[:, 4:] + g * (depth - past[:, 0])[:, None])
     first = np.where((past[:, 0] > 0.0)[:, None], past[:, 1:4], pushes.point)
-    return _compute_relaxed(g, pushes, depth, first, left, min_depth)
+    return _compute_state(g, pushes, depth, first, left, min_depth)
 
 
-def _compute_relaxed(
-    g: np.ndarray, pushed: Pushed, depth: np.ndarray, first: np.ndarray, left: np.ndarray, shallowest: float
+def _compute_state(
+    g: np.ndarray, pushes: Pushed, depth: np.ndarray, first_points: np.ndarray, history: np.ndarray, min_depth: float
 ) -> RelaxationState:
     """Compute the state from h (B, n) [m] of each Prony pair, and the points of first contact (B, 3) [m]."""
     touching = depth > 0.0
-    share = (g - left / np.where(touching, depth, 1.0)[:, None]).sum(axis=1)
-    back = (left < -MAX_BACK_SHARE * g * np.maximum(depth, shallowest)[:, None]).any(axis=1)
-    slid = np.linalg.norm(pushed.point - first, axis=1) > MAX_SLIDE_SHARE * pushed.footprint
-    memory = np.column_stack([depth, first, left])
+    share = (g - history / np.where(touching, depth, 1.0)[:, None]).sum(axis=1)
+    back = (history < -MAX_BACK_SHARE * g * np.maximum(depth, min_depth)[:, None]).any(axis=1)
+    slid = np.linalg.norm(pushes.point - first_points, axis=1) > MAX_SLIDE_SHARE * pushes.footprint
+    memory = np.column_stack([depth, first_points, history])
     return RelaxationState(np.clip(np.where(touching, share, 0.0), 0.0, g.sum()), back | (slid & touching), memory)

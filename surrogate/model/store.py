@@ -63,7 +63,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
         raise InputError(f"{path}: a file holds models of one anatomy, not of {len(digests)}.")
     arrays: dict[str, np.ndarray] = {}
 
-    def put(array: np.ndarray) -> str:
+    def store(array: np.ndarray) -> str:
         if not isinstance(array, np.ndarray) or array.dtype.hasobject:
             raise InputError(f"{path}: a learner's state holds a {type(array).__name__} that is no array of numbers.")
         name = compute_digest(array)  # parts that models share are stored once
@@ -75,7 +75,7 @@ def save(path: str | Path, models: Mapping[str, Learned]) -> None:
         "anatomy": digests.pop(),
         "space": "RAS [m]",
         "versions": {name: get_version(name) for name in ("sulcus", "numpy")},
-        "models": {name: _describe_model(model, put) for name, model in models.items()},
+        "models": {name: _describe_model(model, store) for name, model in models.items()},
     }
     header["seal"] = compute_seal(header, {})  # array names are their digests
     with write_atomically(path, ".npz") as partial:
@@ -202,33 +202,33 @@ def _find_type(name: str) -> type[FittedRegressor]:
     return own.regressor
 
 
-def _describe_model(model: Learned, put: Any) -> dict[str, Any]:
+def _describe_model(model: Learned, store: Any) -> dict[str, Any]:
     parts = [
         {
             "encoder": part.encoder,
-            **_describe_regressor(part.regressor, put),
-            "nodes": put(part.basis.nodes),
-            "modes": put(part.basis.modes),
+            **_describe_regressor(part.regressor, store),
+            "nodes": store(part.basis.nodes),
+            "modes": store(part.basis.modes),
         }
         for part in model.parts
     ]
-    envelope = {**asdict(model.envelope), "points": put(model.envelope.points)}
+    envelope = {**asdict(model.envelope), "points": store(model.envelope.points)}
     return {
         "parts": parts,
         "envelope": envelope,
         "bound": model.bound,
-        "bounds": _put_bound(model.bounds, put),
+        "bounds": _describe_bound(model.bounds, store),
         "training": dict(model.training),
         "tool": None if model.tool is None else repr(model.tool),
-        "tip": None if model.tip is None else _describe_tip(model.tip, put),
+        "tip": None if model.tip is None else _describe_tip(model.tip, store),
         "left_out": None if model.held_out is None else asdict(model.held_out),
-        "force": None if model.force is None else _describe_force(model.force, put),
+        "force": None if model.force is None else _describe_force(model.force, store),
     }
 
 
-def _describe_regressor(regressor: FittedRegressor, put: Any) -> dict[str, Any]:
+def _describe_regressor(regressor: FittedRegressor, store: Any) -> dict[str, Any]:
     names = {kind: name for name, kind in FITTED.items()}
-    state = {name: put(array) for name, array in regressor.state().items()}
+    state = {name: store(array) for name, array in regressor.state().items()}
     return {"regressor": names.get(type(regressor)) or _get_own_name(regressor), "state": state}
 
 
@@ -238,13 +238,13 @@ def _rebuild_regressor(description: dict[str, Any], arrays: Mapping[str, np.ndar
     return _find_type(description["regressor"]).restored(state)
 
 
-def _describe_force(force: ForceModel, put: Any) -> dict[str, Any]:
-    learned = None if force.regressor is None else _describe_regressor(force.regressor, put)
-    return {"encoder": force.encoder, "learned": learned, "bound": _put_bound(force.bound, put)}
+def _describe_force(force: ForceModel, store: Any) -> dict[str, Any]:
+    learned = None if force.regressor is None else _describe_regressor(force.regressor, store)
+    return {"encoder": force.encoder, "learned": learned, "bound": _describe_bound(force.bound, store)}
 
 
 def _rebuild_force(
-    description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], reach: float
+    description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], near: float
 ) -> ForceModel | None:
     if description is None:
         return None
@@ -252,36 +252,36 @@ def _rebuild_force(
     return ForceModel(
         description["encoder"],
         None if learned is None else _rebuild_regressor(learned, arrays),
-        _rebuild_bound(description["bound"], arrays, reach),
+        _rebuild_bound(description["bound"], arrays, near),
     )
 
 
-def _describe_tip(tip: TipModel, put: Any) -> dict[str, Any]:
+def _describe_tip(tip: TipModel, store: Any) -> dict[str, Any]:
     known = tip.correction
-    correction = None if known is None else {name: put(array) for name, array in known.state().items()}
-    return {"correction": correction, "bound": _put_bound(tip.bound, put)}
+    correction = None if known is None else {name: store(array) for name, array in known.state().items()}
+    return {"correction": correction, "bound": _describe_bound(tip.bound, store)}
 
 
-def _rebuild_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], reach: float) -> TipModel | None:
+def _rebuild_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], near: float) -> TipModel | None:
     if description is None:
         return None
     known = description["correction"]
     state = {} if known is None else {name: arrays[key] for name, key in known.items()}
     check_finite_state(state)
     correction = None if known is None else Gp.restored(state)
-    return TipModel(correction, _rebuild_bound(description["bound"], arrays, reach))
+    return TipModel(correction, _rebuild_bound(description["bound"], arrays, near))
 
 
-def _put_bound(bound: Bound | None, put: Any) -> dict[str, str] | None:
-    return None if bound is None else {name: put(array) for name, array in vars(bound).items()}
+def _describe_bound(bound: Bound | None, store: Any) -> dict[str, str] | None:
+    return None if bound is None else {name: store(array) for name, array in vars(bound).items()}
 
 
-def _rebuild_bound(names: dict[str, str] | None, arrays: Mapping[str, np.ndarray], reach: float) -> Bound | None:
-    """Rebuild a bound; a bound in an older file grows only beyond `reach` [m] of the training loads."""
-    if names is None:
+def _rebuild_bound(keys: dict[str, str] | None, arrays: Mapping[str, np.ndarray], near: float) -> Bound | None:
+    """Rebuild a bound; a bound in an older file grows only beyond `near` [m] of the training loads."""
+    if keys is None:
         return None
-    older = {"growth": np.array(1e3 * GROWTH), "near": np.array(reach)}
-    return Bound(**(older | {name: arrays[key] for name, key in names.items() if name != "profile"}))
+    older = {"growth": np.array(1e3 * GROWTH), "near": np.array(near)}
+    return Bound(**(older | {name: arrays[key] for name, key in keys.items() if name != "profile"}))
 
 
 def _rebuild_model(description: dict[str, Any], arrays: Mapping[str, np.ndarray], anatomy: Anatomy) -> Learned:

@@ -61,10 +61,10 @@ def build_warm_encoders(regressors: Sequence[FittedRegressor], start: Deformatio
         return ENCODERS
     core = ENCODERS["core"]
 
-    def followed(patch: Patch, pushed: Pushed) -> np.ndarray:
-        return np.hstack([core(patch, pushed), held])
+    def encode_contact(patch: Patch, pushes: Pushed) -> np.ndarray:
+        return np.hstack([core(patch, pushes), held])
 
-    return {**ENCODERS, "core": followed}
+    return {**ENCODERS, "core": encode_contact}
 
 
 def collect_contact_state(

@@ -13,7 +13,7 @@ from sim.loads import Pushed
 from ..array_functions import compute_squared_distances
 from ..data.cortex_patch import Patch
 from ..data.encode import split_forces
-from ..data.indentation import Indented
+from ..data.indentation import IndentationPushes
 
 # Tolerance of lengths [m], angles [rad] and relative forces, so that no training load is outside by round-off.
 RANGE_TOLERANCE = 1e-6
@@ -134,7 +134,7 @@ def measure_loads(patch: Patch, pushes: Pushed) -> LoadMeasures:
     """Compute the measures of loads; the angle of a rod or a blade is the larger of its force's and its shaft's."""
     (magnitude, direction), inward = split_forces(pushes), patch.find_normals(pushes.point)
     cosine = np.einsum("bi,bi->b", direction, inward)
-    if isinstance(pushes, Indented):
+    if isinstance(pushes, IndentationPushes):
         cosine = np.minimum(cosine, -np.einsum("bi,bi->b", pushes.axes[:, :, 2], inward))
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     return LoadMeasures(magnitude, angle, pushes.footprint - patch.compute_edge_distance(pushes.point))

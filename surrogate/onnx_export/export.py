@@ -89,7 +89,7 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> GraphBuilder
     )
 
     @cache
-    def weight() -> Any:
+    def add_weight_input() -> Any:
         """Add the input `weight` once, for all parts that use it."""
         sample = np.full((2, len(patch.nodes)), 1.0 / len(patch.nodes))
         sheet.add_output(sheet.add_constant(patch.nodes), Port("pressed", np.int64, patch.nodes.shape, "of the mesh"))
@@ -97,8 +97,8 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> GraphBuilder
 
     encoders = {
         "tool": compute_tool_features,
-        "nodal": lambda _, pushed: distribute_forces(weight(), pushed),
-        "rooted": lambda _, pushed: scale_by_root_force(distribute_forces(weight(), pushed), pushed),
+        "nodal": lambda _, pushed: distribute_forces(add_weight_input(), pushed),
+        "rooted": lambda _, pushed: scale_by_root_force(distribute_forces(add_weight_input(), pushed), pushed),
     }
     displacement: Any = model.predict_motion(pushed, nodes, encoders)
     known = measure_loads(patch, pushed)

@@ -216,7 +216,7 @@ class GraphBuilder:
         with require_extra("onnx", "an ONNX graph needs"):
             from onnx import helper, numpy_helper
 
-        def described(ports: list[Port]) -> list:
+        def describe_ports(ports: list[Port]) -> list:
             kinds = [KINDS[np.dtype(port.dtype)] for port in ports]
             return [
                 helper.make_tensor_value_info(port.name, kind, port.shape, port.description)
@@ -226,8 +226,8 @@ class GraphBuilder:
         graph = helper.make_graph(
             [helper.make_node(node.operator, node.inputs, [node.output], **node.attributes) for node in self._nodes],
             name,
-            described(self._inputs),
-            described(self._outputs),
+            describe_ports(self._inputs),
+            describe_ports(self._outputs),
             [numpy_helper.from_array(array, name) for name, array in self._constants.items()],
         )
         model = helper.make_model(
@@ -251,30 +251,30 @@ def _sample(operand: Operand) -> np.ndarray | float:
     return operand.sample if isinstance(operand, Tensor) else operand
 
 
-def _concatenate(sheet: GraphBuilder, arrays: Sequence[Operand], axis: int = 0) -> Tensor:
+def _concatenate(graph: GraphBuilder, arrays: Sequence[Operand], axis: int = 0) -> Tensor:
     sample = np.concatenate([_sample(each) for each in arrays], axis)
-    return sheet.add_node("Concat", sample, *sheet.to_common_type(arrays), axis=axis)
+    return graph.add_node("Concat", sample, *graph.to_common_type(arrays), axis=axis)
 
 
-def _stack_columns(sheet: GraphBuilder, arrays: Sequence[Tensor]) -> Tensor:
-    return _concatenate(sheet, [each if len(each.shape) > 1 else each[:, None] for each in arrays], 1)
+def _stack_columns(graph: GraphBuilder, arrays: Sequence[Tensor]) -> Tensor:
+    return _concatenate(graph, [each if len(each.shape) > 1 else each[:, None] for each in arrays], 1)
 
 
-def _stack(sheet: GraphBuilder, arrays: Sequence[Tensor]) -> Tensor:
-    return _concatenate(sheet, [each[None] for each in arrays])
+def _stack(graph: GraphBuilder, arrays: Sequence[Tensor]) -> Tensor:
+    return _concatenate(graph, [each[None] for each in arrays])
 
 
-def _select_where(sheet: GraphBuilder, condition: Tensor, yes: Operand, no: Operand) -> Tensor:
+def _select_where(graph: GraphBuilder, condition: Tensor, yes: Operand, no: Operand) -> Tensor:
     sample = np.where(condition.sample, _sample(yes), _sample(no))
-    return sheet.add_node("Where", sample, condition, *sheet.to_common_type([yes, no]))
+    return graph.add_node("Where", sample, condition, *graph.to_common_type([yes, no]))
 
 
-def _sum_products(sheet: GraphBuilder, equation: str, *operands: Any) -> Tensor:
+def _sum_products(graph: GraphBuilder, equation: str, *operands: Any) -> Tensor:
     (first, second), out = equation.partition("->")[0].split(","), equation.partition("->")[2]
     if first == out + second[-1] and first.endswith(second):  # product and sum: ten times as fast in runtimes
         return (operands[0] * operands[1]).sum(axis=len(out))
     sample = np.einsum(equation, *map(_sample, operands))
-    return sheet.add_node("Einsum", sample, *sheet.to_common_type(operands), equation=equation)
+    return graph.add_node("Einsum", sample, *graph.to_common_type(operands), equation=equation)
 
 
 def _search_sorted(_: GraphBuilder, sites: np.ndarray, values: Tensor) -> Tensor:

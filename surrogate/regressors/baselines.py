@@ -81,15 +81,15 @@ class Svr(StoredRegressor):
         dual = np.zeros((len(X), Y.shape[1]))
         intercept = np.zeros(Y.shape[1])
 
-        def trained(mode: int) -> SVR:
+        def fit_output(column: int) -> SVR:
             # Outputs are divided by their interquartile range, as libsvm's stopping tolerance is absolute.
             return SVR(C=self.penalty, epsilon=self.epsilon, gamma=1.0 / X.shape[1]).fit(
-                scaled, Y[:, mode] / spread[mode]
+                scaled, Y[:, column] / spread[column]
             )
 
         modes = np.flatnonzero(spread > 0.0)
         with ThreadPoolExecutor() as pool:
-            machines = list(pool.map(trained, modes))
+            machines = list(pool.map(fit_output, modes))
         for mode, machine in zip(modes, machines, strict=True):
             dual[machine.support_, mode] = spread[mode] * machine.dual_coef_[0]
             intercept[mode] = spread[mode] * machine.intercept_[0]
@@ -167,7 +167,7 @@ class Ann:
         ]
         biases = [torch.zeros(b, dtype=torch.float64, requires_grad=True) for b in widths[1:]]
 
-        def loss() -> torch.Tensor:
+        def compute_loss() -> torch.Tensor:
             misfit = (compute_outputs(inputs, weights, biases, torch.tanh) - targets).square().sum(dim=1).mean()
             return (
                 misfit + self.weight_decay / len(X) * torch.stack([weight.square().sum() for weight in weights]).sum()
@@ -183,7 +183,7 @@ class Ann:
 
         def closure() -> torch.Tensor:
             search.zero_grad()
-            value = loss()
+            value = compute_loss()
             value.backward()
             return value
 

@@ -77,7 +77,7 @@ class Series:
         return predict_in_chunks(self._compute_prediction, X)
 
     def _compute_prediction(self, X: np.ndarray) -> np.ndarray:
-        place, share = self._locate_places(X[:, :3])
+        place, share = self._locate_points(X[:, :3])
         radius, weight = self._interpolate_radii(X[:, 7])
         count = place.shape[1] * radius.shape[1]
         row = (place[:, :, None] * len(self.radii) + radius[:, None]).reshape(-1, count)
@@ -113,7 +113,7 @@ class Series:
         """The maps `_frames` as one matrix (4, 4 S)."""
         return np.ascontiguousarray(self._frames.transpose(2, 1, 0).reshape(4, -1))
 
-    def _locate_places(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _locate_points(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find the positions (B, 6) of the triangle nearest to each point (B, 3) [m], and their weights (B, 6)."""
         local = (point @ self._columns[:3] + self._columns[3]).reshape(-1, 4, len(self.triangles))
         miss = np.absolute(local[:, 3]) - HEIGHT_EQUIVALENT * np.minimum(local[:, :3].min(axis=1), 0.0)
@@ -258,14 +258,14 @@ def interpolate_table(points: np.ndarray, table: np.ndarray, held_out: np.ndarra
     _, size, axes = np.linalg.svd(known - middle, full_matrices=False)
     axes = axes[size > FLAT_TOLERANCE * max(size[0], np.finfo(float).tiny)]
 
-    def at(where: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        tail = np.column_stack([np.ones(len(where)), (where - middle) @ axes.T / length])
-        return (cdist(where, known) / length) ** 3, tail
+    def build_kernel(sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        tail = np.column_stack([np.ones(len(sites)), (sites - middle) @ axes.T / length])
+        return (cdist(sites, known) / length) ** 3, tail
 
-    kernel, tail = at(known)
+    kernel, tail = build_kernel(known)
     corner = np.zeros((tail.shape[1], tail.shape[1]))
     matrix = np.block([[kernel, tail], [tail.T, corner]])
-    weights = np.linalg.solve(matrix, np.hstack(at(points[held_out])).T)[: len(known)].T
+    weights = np.linalg.solve(matrix, np.hstack(build_kernel(points[held_out])).T)[: len(known)].T
     out = table.copy()
     out[held_out] = (weights @ table[~held_out].reshape(len(known), -1)).reshape(-1, *table.shape[1:])
     return out

@@ -230,10 +230,10 @@ class RigidContact:
         axes = np.column_stack([x[11:14], np.cross(x[14:17], x[11:14]), x[14:17]])
         return PlacedBox(x[8:11], axes, self.core[:3])
 
-    def _solve_contact(self, stations: list[PlacedBox], radius: float, begun: np.ndarray | None) -> np.ndarray:
+    def _solve_contact(self, stations: list[PlacedBox], radius: float, initial: np.ndarray | None) -> np.ndarray:
         """Solve the contact of a tool of `radius` [m] at the last station of its path; return a row of `_find_contact`.
 
-        `begun` is the contact at the first station; None: the path starts without contact.
+        `initial` is the contact at the first station; None: the path starts without contact.
         """
         from sim.discretisation.nearest_points import NearestSearch
 
@@ -245,13 +245,13 @@ class RigidContact:
         tolerance = SEARCH.rod_tolerance if len(self.core) else SEARCH.ball_tolerance
         moved, force = np.zeros((len(nodes), 3)), np.zeros(len(rows))
         facet, share, bears = np.zeros(0, int), np.zeros((0, 3)), np.zeros(0)
-        if begun is not None:
-            stations, moved = stations[1:], (compliance @ begun[rows]).reshape(-1, 3)
-            places = begun[len(self.compliance) :].reshape(MAX_STORED_POINTS, 4)
+        if initial is not None:
+            stations, moved = stations[1:], (compliance @ initial[rows]).reshape(-1, 3)
+            places = initial[len(self.compliance) :].reshape(MAX_STORED_POINTS, 4)
             places = places[np.isin(places[:, 0], facets)]
             facet, share = np.searchsorted(facets, places[:, 0]), places[:, 1:]
         for station in stations:
-            settled = begun is None
+            settled = initial is None
             for iteration in range(SEARCH.max_iterations if station is stations[-1] else SEARCH.path_iterations):
                 corners = (self.points[nodes] + moved)[table]
                 near = nearest.find_nearest(station, corners)
@@ -294,13 +294,13 @@ class RigidContact:
         return some[near], nodes, table, (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
-def _fit_line(terms: np.ndarray, found: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Fit coefficients (k,) of terms (B, k) whose sum is the factor that scales `found` (B, r) to `wanted` (B, r)."""
-    factor = np.einsum("br,br->b", found, wanted) / np.square(found).sum(axis=1)
+def _fit_line(terms: np.ndarray, predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Fit coefficients (k,) of terms (B, k) whose sum is the factor that scales `predicted` to `target` (B, r)."""
+    factor = np.einsum("br,br->b", predicted, target) / np.square(predicted).sum(axis=1)
     return np.linalg.lstsq(terms, factor, rcond=None)[0]
 
 
-def _compute_bearing_forces(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _compute_bearing_forces(gain: np.ndarray, penetration: np.ndarray) -> np.ndarray:
     """Compute the least-energy forces b (i,) >= 0 [N] with gain (i, i) b >= wanted (i,) [m]; gain is semi-definite.
 
     Block pivoting: most points remain active. Points with tension are released, and released points that are penetrated
@@ -310,17 +310,17 @@ def _compute_bearing_forces(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """
     count = len(gain)
     if not count:
-        return wanted
+        return penetration
     mean = np.trace(gain) / count
     for apart in SEARCH.regularisations:
         firm = gain + apart * mean * np.eye(count)
         bearing = np.ones(count, bool)
         for _ in range(SEARCH.max_exchanges):
             free, bears = np.flatnonzero(bearing), np.zeros(count)
-            _, bears[free], failed = SOLVE_POSITIVE(firm[np.ix_(free, free)], wanted[free])
+            _, bears[free], failed = SOLVE_POSITIVE(firm[np.ix_(free, free)], penetration[free])
             if failed:
                 break
-            wrong = np.where(bearing, bears < 0.0, wanted - firm @ bears > SEARCH.inactive_tolerance)
+            wrong = np.where(bearing, bears < 0.0, penetration - firm @ bears > SEARCH.inactive_tolerance)
             if not wrong.any():
                 return bears
             bearing ^= wrong
@@ -328,5 +328,5 @@ def _compute_bearing_forces(gain: np.ndarray, wanted: np.ndarray) -> np.ndarray:
                 break
         lower, failed = FACTORISE(firm, lower=True)
         if not failed:
-            return nnls(lower.T, SOLVE_TRIANGULAR(lower, wanted, lower=True)[0])[0]
+            return nnls(lower.T, SOLVE_TRIANGULAR(lower, penetration, lower=True)[0])[0]
     raise np.linalg.LinAlgError("places that a tool touches do not give way")

@@ -119,61 +119,61 @@ def collect_bound_examples(model: Learned, patch: Patch, pushes: Pushed, error: 
 
 
 def calibrate_bound(
-    near: BoundExamples, settings: BoundSettings, growth: float, examples: BoundExamples | None = None
+    near_loads: BoundExamples, settings: BoundSettings, growth: float, examples: BoundExamples | None = None
 ) -> Bound:
-    """Calibrate a bound on loads `near` the training loads; it grows by `growth` [1/m] with the distance from them.
+    """Calibrate a bound on loads near the training loads; it grows by `growth` [1/m] with the distance from them.
 
     One in `SCALE_STRIDE` of these loads fits the bound's scale. The others, to whose distribution the guarantee
     applies, give its quantiles. With fewer than `MIN_SCALE_LOADS` loads and given `examples`, all loads give the
     quantiles, and `examples` fit the scale.
     """
-    if examples is None or len(near.error) >= MIN_SCALE_LOADS:
-        fits = _select_scale_loads(near)
-        examples, near = near.select(fits), near.select(~fits)
-    known = near.features, near.force, near.error
+    if examples is None or len(near_loads.error) >= MIN_SCALE_LOADS:
+        fits = _mask_scale_loads(near_loads)
+        examples, near_loads = near_loads.select(fits), near_loads.select(~fits)
+    known = near_loads.features, near_loads.force, near_loads.error
     return fit_bound(
-        (examples.features, examples.error), *known, settings, distance=near.excess.distance, growth=growth
+        (examples.features, examples.error), *known, settings, distance=near_loads.excess.distance, growth=growth
     )
 
 
-def compute_growth(near: BoundExamples, far: BoundExamples, settings: BoundSettings) -> float:
-    """Compute the growth [1/m] with which a bound has equal coverage on loads `far` from and `near` training loads."""
-    return fit_growth(*_compute_relative_errors(near, far, settings))
+def compute_growth(near_loads: BoundExamples, far_loads: BoundExamples, settings: BoundSettings) -> float:
+    """Compute the growth [1/m] with which a bound has equal coverage far from and near training loads."""
+    return fit_growth(*_compute_relative_errors(near_loads, far_loads, settings))
 
 
 def compute_held_out_bounds(
-    model: Learned, near: BoundExamples, far: BoundExamples, split: DiscSplit, settings: BoundSettings
+    model: Learned, near_loads: BoundExamples, far_loads: BoundExamples, split: DiscSplit, settings: BoundSettings
 ) -> np.ndarray:
     """Compute bounds (2, B) [m] of loads on held-out discs; the other discs determine the growth for each disc."""
-    known, (ratio, away) = _compute_relative_errors(near, far, settings)
-    disc, bound = split.disc_index[split.test_mask], np.empty((2, len(far.error)))
+    known, (ratio, away) = _compute_relative_errors(near_loads, far_loads, settings)
+    disc, bound = split.disc_index[split.test_mask], np.empty((2, len(far_loads.error)))
     for each in np.unique(disc):
         here = disc == each
-        own = calibrate_bound(near, settings, fit_growth(known, (ratio[~here], away[~here])))
-        some = far.select(here)
+        own = calibrate_bound(near_loads, settings, fit_growth(known, (ratio[~here], away[~here])))
+        some = far_loads.select(here)
         bound[:, here] = model.compute_bounds(own, some.pushes, some.measures, some.excess)
     return bound
 
 
-def measure_bound_coverage(bound: np.ndarray, examples: BoundExamples) -> Coverage:
+def measure_bound_coverage(bounds: np.ndarray, examples: BoundExamples) -> Coverage:
     """Compute the empirical coverage of the examples' errors by bounds (2, B) of the same unit."""
-    return measure_coverage(examples.force, examples.error, bound, int(examples.extrapolated.sum()))
+    return measure_coverage(examples.force, examples.error, bounds, int(examples.extrapolated.sum()))
 
 
 def _compute_relative_errors(
-    near: BoundExamples, far: BoundExamples, way: BoundSettings
+    near_loads: BoundExamples, far_loads: BoundExamples, settings: BoundSettings
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return errors over a bound without growth, and distances [m] from training loads, for `near` and `far`."""
-    plain = calibrate_bound(near, way, 0.0)
+    """Return errors over a bound without growth, and distances [m] from training loads: near and far."""
+    plain = calibrate_bound(near_loads, settings, 0.0)
     return [
         (each.error / plain.evaluate(each.features, each.force, each.excess.zero)[0], each.excess.distance)
-        for each in (near.select(~_select_scale_loads(near)), far)
+        for each in (near_loads.select(~_mask_scale_loads(near_loads)), far_loads)
     ]
 
 
-def _select_scale_loads(near: BoundExamples) -> np.ndarray:
+def _mask_scale_loads(near_loads: BoundExamples) -> np.ndarray:
     """Return the mask (B,) of the loads that fit a bound's scale."""
-    return np.arange(len(near.error)) % SCALE_STRIDE == 0
+    return np.arange(len(near_loads.error)) % SCALE_STRIDE == 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,13 +235,13 @@ class TrainingSolutions:
         """Compute a model's errors on the rows of a mask (B,); `tumour` and `tip` (k,) [m] are used if given."""
         asked = select_cases(self.pushes, rows)
 
-        def of(error: np.ndarray) -> BoundExamples:
+        def collect(error: np.ndarray) -> BoundExamples:
             return collect_bound_examples(model, self.patch, asked, error)
 
         return ModelErrors(
-            of(self.compute_vertex_errors(model, rows).max(axis=1) if tumour is None else tumour),
-            of(compute_distance_errors(model, self.distances.select(rows)) if tip is None else tip),
-            None if self.force is None else of(compute_force_errors(model.predict_force(asked), self.force[rows])),
+            collect(self.compute_vertex_errors(model, rows).max(axis=1) if tumour is None else tumour),
+            collect(compute_distance_errors(model, self.distances.select(rows)) if tip is None else tip),
+            None if self.force is None else collect(compute_force_errors(model.predict_force(asked), self.force[rows])),
         )
 
 

@@ -83,7 +83,7 @@ class SharedInputs:
 
 
 @dataclass(frozen=True)
-class SelectionSettings:
+class TuningSettings:
     """Settings of the selection of regressor settings by `TunedRegressor`."""
 
     inner_discs: int = 6  # Number of distant discs that inner fits hold out.
@@ -108,7 +108,7 @@ class TunedRegressor:
     """
 
     settings: tuple[Callable[[], RegressorFactory], ...]
-    selection: SelectionSettings = SelectionSettings()
+    selection: TuningSettings = TuningSettings()
 
     def fit(self, X: np.ndarray, Y: np.ndarray) -> FittedRegressor:
         """Fit the best candidate to features X (n, f) of `compute_tool_features` and coefficients Y (n, r)."""
@@ -129,7 +129,7 @@ class TunedRegressor:
         return int(np.argmin(errors))
 
 
-def find_inner_discs(points: np.ndarray, selection: SelectionSettings = SelectionSettings()) -> np.ndarray:
+def find_inner_discs(points: np.ndarray, selection: TuningSettings = TuningSettings()) -> np.ndarray:
     """Return the mask (n,) of points (n, 3) in discs round `inner_discs` distant points, with `inner_share` of all."""
     distance = find_nearest(points, points[select_spread(points, selection.inner_discs)])[1]
     return distance <= np.quantile(distance, selection.inner_share)
@@ -195,7 +195,7 @@ def fit_force_model(name: str, parts: Sequence[ModelPart], patch: Patch, example
             left = left - part.regressor.predict_force(ENCODERS[part.encoder](patch, examples.loads))
     learned = make().fit(X, left)
     if find_learner_name(type(learned)) is not None:
-        _check_own(learned, X, left)
+        _check_own_learner(learned, X, left)
     return ForceModel(encoder, learned)
 
 
@@ -208,36 +208,36 @@ def _find_model_type(name: str) -> tuple[str, Callable[[], RegressorFactory]]:
     return own.encoder, own.regressor
 
 
-def _fit_contact(known: Expansion, examples: Examples) -> tuple[ModelPart, list[tuple[np.ndarray, np.ndarray]]]:
+def _fit_contact(series: Expansion, examples: Examples) -> tuple[ModelPart, list[tuple[np.ndarray, np.ndarray]]]:
     """Fit the contact part to examples; return it, and the vertices and residuals (B, n, 3) [m] of each basis."""
-    contact, bases, _ = known.contact
+    contact, bases, _ = series.contact
     encoder = "core" if len(contact.core) else "tool"
-    features, size = ENCODERS[encoder](known.patch, examples.loads), split_forces(examples.loads)[0][:, None, None]
+    features, size = ENCODERS[encoder](series.patch, examples.loads), split_forces(examples.loads)[0][:, None, None]
     truth = [examples.tumour, examples.cortex][: len(bases)]
     coefficients = np.hstack([basis.encode(each / size) for basis, each in zip(bases, truth, strict=True)])
     alike = np.repeat(np.arange(len(bases)), [len(basis.modes) for basis in bases])
     force = None if examples.force is None else examples.force / size[:, 0]
     part = ModelPart(encoder, contact.fit_lines(features, coefficients, alike, force), join_bases(bases))
-    answered = np.split(size * part.compute_response(features), [len(known.tumour)], axis=1)
+    answered = np.split(size * part.compute_response(features), [len(series.tumour)], axis=1)
     return part, [(basis.nodes, one - other) for basis, one, other in zip(bases, truth, answered, strict=False)]
 
 
 def _fit_part(
-    patch: Patch, loads: Pushed, kind: tuple[str, Callable[[], RegressorFactory]], before: Sequence[ModelPart],
-    on: Basis | np.ndarray, truth: np.ndarray,
+    patch: Patch, loads: Pushed, model_type: tuple[str, Callable[[], RegressorFactory]], previous: Sequence[ModelPart],
+    support: Basis | np.ndarray, motion: np.ndarray,
 ) -> ModelPart:  # fmt: skip
-    """Fit a part to the residual of `truth` (B, n, 3) [m] after the parts `before`; `on` is a basis or vertices."""
-    response = compute_residual_responses(before, patch, loads, truth)
-    basis = on if isinstance(on, Basis) else fit_basis(on, response, *COARSE_BASIS)
-    encoder, make = kind
+    """Fit a part to the residual of `motion` (B, n, 3) [m] after `previous`; `support` is a basis or vertices."""
+    response = compute_residual_responses(previous, patch, loads, motion)
+    basis = support if isinstance(support, Basis) else fit_basis(support, response, *COARSE_BASIS)
+    encoder, make = model_type
     X, Y = ENCODERS[encoder](patch, loads), basis.encode(response)
     regressor = make().fit(X, Y)
     if find_learner_name(type(regressor)) is not None:
-        _check_own(regressor, X, Y)
+        _check_own_learner(regressor, X, Y)
     return ModelPart(encoder, regressor, basis)
 
 
-def _check_own(regressor: FittedRegressor, X: np.ndarray, Y: np.ndarray) -> None:
+def _check_own_learner(regressor: FittedRegressor, X: np.ndarray, Y: np.ndarray) -> None:
     """Check that a user-defined regressor predicts finite coefficients of the right shape for its training loads."""
     found = np.asarray(regressor.predict(X))
     if found.shape != Y.shape or not np.isfinite(found).all():

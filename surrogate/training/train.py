@@ -76,7 +76,7 @@ def list_learners(data: Dataset) -> tuple[str, ...]:
     return tuple(name for name in kinds if stated or name not in (*SERIES_MODELS, *CONTACT_MODELS))
 
 
-def check_learners(names: Sequence[str], has_poses: bool, source: str) -> None:
+def check_learner_names(names: Sequence[str], has_poses: bool, source: str) -> None:
     """Check that data of poses, or of pushes, can train the model types; `source` names the data in the message.
 
     Raises
@@ -129,7 +129,7 @@ def train(
         than `Pushed` or `Touching` of one tool, no tumour, too few loads, or unit responses that did not converge.
     """
     wanted = list_learners(data) if learners is None else tuple(dict.fromkeys(learners))
-    check_learners(wanted, has_poses=data.tool is not None, source=str(data.path))
+    check_learner_names(wanted, has_poses=data.tool is not None, source=str(data.path))
     if most is not None and most < 1:
         raise InputError(f"{most} loads train nothing: give at least 1.")
     with time_stage("read"):
@@ -140,7 +140,7 @@ def train(
         apart[len(apart) - min(len(apart) // CALIBRATION_STRIDE, MAX_CALIBRATION_LOADS) :] = True
         split = _extend_split(hold_out_discs(answers.pushes.point[~apart], answers.patch), apart)
     chosen = [_select_first(split.training_mask, most), *([_select_first(~apart, most)] if apart.any() else [])]
-    fits = [_fit_of(answers, rows, shared, left) for rows, left in zip(chosen, (split, None), strict=False)]
+    fits = [_build_fit(answers, rows, shared, left) for rows, left in zip(chosen, (split, None), strict=False)]
     results = {}
     for name in wanted:
         results[name] = _train_and_score(name, data, answers, split, apart, fits)
@@ -187,72 +187,72 @@ class TrainingResult:
     force: ForceScore | None
 
 
-def _fit_of(answers: TrainingSolutions, rows: np.ndarray, shared: Expansion, left: DiscSplit | None) -> ModelFit:
-    examples = answers.select_examples(rows)
+def _build_fit(solved: TrainingSolutions, rows: np.ndarray, shared: Expansion, split: DiscSplit | None) -> ModelFit:
+    examples = solved.select_examples(rows)
     return ModelFit(
-        rows, examples, SharedInputs(examples, shared, left), compute_training_range(answers.patch, examples.loads)
+        rows, examples, SharedInputs(examples, shared, split), compute_training_range(solved.patch, examples.loads)
     )
 
 
 def _train_and_score(
-    name: str, data: Dataset, answers: TrainingSolutions, split: DiscSplit, apart: np.ndarray, fits: Sequence[ModelFit]
+    name: str, data: Dataset, solved: TrainingSolutions, split: DiscSplit, spare: np.ndarray, fits: Sequence[ModelFit]
 ) -> TrainingResult:
     """Fit a model type outside the discs and score it inside; then fit it to all loads that are not for calibration."""
-    outside, patch = fits[0], answers.patch
+    outside, patch = fits[0], solved.patch
     parts, force = outside.fit_parts(name, patch)
     training = {"learner": name, **data.provenance}
     model = Learned(data.anatomy, parts, outside.envelope, training=training, tool=data.tool, force=force)
     with time_stage("score"):
-        test = answers.loads.select(np.flatnonzero(split.test_mask))
+        test = solved.loads.select(np.flatnonzero(split.test_mask))
         solves = outside.inputs.count_solves(name, outside.examples)
-        scored = score(name, model, test, answers.tumour[split.test_mask], answers.nodes, solves)
-        distance = answers.compute_vertex_errors(model, split.test_mask)
-        trained, held_out = (answers.distances.select(rows) for rows in (outside.rows, split.test_mask))
+        scored = score(name, model, test, solved.tumour[split.test_mask], solved.nodes, solves)
+        distance = solved.compute_vertex_errors(model, split.test_mask)
+        trained, held_out = (solved.distances.select(rows) for rows in (outside.rows, split.test_mask))
         model, off = improve_distances(model, patch, trained, held_out)
-        far = answers.compute_errors(model, split.test_mask, distance.max(axis=1), off)
+        far = solved.compute_errors(model, split.test_mask, distance.max(axis=1), off)
         model = replace(
             model, bound=min(compute_conformal_quantile(far.tumour.error, LEVELS[0]), float(far.tumour.error.max()))
         )
     growth = dict.fromkeys(BOUND_FITS, USUAL_GROWTH)
     of_tumour = of_tip = None
-    promised, beside = None, apart & ~split.is_covered(answers.pushes.point)
+    promised, beside = None, spare & ~split.is_covered(solved.pushes.point)
     if beside.sum() >= 2 * MIN_CALIBRATION_LOADS and len(test) >= FORCE_CLASSES:
         with time_stage("calibrate"):
-            near, there = answers.compute_errors(model, beside).list_available(), far.list_available()
+            near, there = solved.compute_errors(model, beside).list_available(), far.list_available()
             growth = {way: compute_growth(near[way], there[way], BOUND_FITS[way]) for way in near}
             bound = {way: compute_held_out_bounds(model, near[way], there[way], split, BOUND_FITS[way]) for way in near}
             of_tumour, of_tip = (
                 measure_bound_coverage(bound["tumour"], far.tumour),
                 measure_bound_coverage(bound["tip"], far.tip),
             )
-            motion = _compute_motion(answers, split.test_mask)
+            motion = _compute_motion(solved, split.test_mask)
             model = replace(
                 model, held_out=measure_held_out(distance, motion, bound["tumour"][0], far.tumour.extrapolated)
             )
             promised = bound.get("force")
     forces = None
-    if far.force is not None and answers.force is not None:
-        forces = score_forces(far.force.error, answers.force[split.test_mask], promised)
-    if apart.any():
-        model = _fit_on_all(name, model, answers, fits[1])
-    if apart.sum() >= MIN_CALIBRATION_LOADS:
+    if far.force is not None and solved.force is not None:
+        forces = score_forces(far.force.error, solved.force[split.test_mask], promised)
+    if spare.any():
+        model = _fit_on_all(name, model, solved, fits[1])
+    if spare.sum() >= MIN_CALIBRATION_LOADS:
         with time_stage("calibrate"):
-            model = _add_bounds(model, answers.compute_errors(model, apart), growth, far)
+            model = _add_bounds(model, solved.compute_errors(model, spare), growth, far)
     return TrainingResult(model, scored, of_tumour, of_tip, forces)
 
 
-def _fit_on_all(name: str, model: Learned, answers: TrainingSolutions, fit: ModelFit) -> Learned:
+def _fit_on_all(name: str, model: Learned, solutions: TrainingSolutions, fit: ModelFit) -> Learned:
     """Fit the model type to the rows of `fit`; add a distance correction if `model` has one."""
-    parts, force = fit.fit_parts(name, answers.patch)
+    parts, force = fit.fit_parts(name, solutions.patch)
     fitted = replace(model, parts=parts, envelope=fit.envelope, force=force)
     if model.tip is None or model.tip.correction is None:
         return fitted
     with time_stage(f"learn {name}"):
-        return add_distance_correction(fitted, answers.patch, answers.distances.select(fit.rows))
+        return add_distance_correction(fitted, solutions.patch, solutions.distances.select(fit.rows))
 
 
 def _add_bounds(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:
-    """Return the model with bounds calibrated on errors `near` training loads; each grows by its `growth` [1/m]."""
+    """Return the model with bounds calibrated on errors near training loads; each grows by its `growth` [1/m]."""
     seen = far.list_available()
     bounds = {
         way: calibrate_bound(here, BOUND_FITS[way], growth[way], seen[way])
@@ -267,18 +267,18 @@ def _add_bounds(model: Learned, near: ModelErrors, growth: Mapping[str, float], 
     )
 
 
-def _compute_motion(answers: TrainingSolutions, rows: np.ndarray) -> np.ndarray:
+def _compute_motion(solutions: TrainingSolutions, rows: np.ndarray) -> np.ndarray:
     """Compute the tumour's mean displacement [m] for each selected row of a mask (B,)."""
-    return np.linalg.norm(answers.tumour[rows], axis=2).mean(axis=1)
+    return np.linalg.norm(solutions.tumour[rows], axis=2).mean(axis=1)
 
 
-def _select_first(rows: np.ndarray, most: int | None) -> np.ndarray:
-    """Keep the first `most` rows of a mask (B,); None: keep all."""
-    return rows if most is None else rows & (np.cumsum(rows) <= most)
+def _select_first(rows: np.ndarray, max_rows: int | None) -> np.ndarray:
+    """Keep the first `max_rows` rows of a mask (B,); None: keep all."""
+    return rows if max_rows is None else rows & (np.cumsum(rows) <= max_rows)
 
 
-def _extend_split(split: DiscSplit, apart: np.ndarray) -> DiscSplit:
-    """Extend a split of the rows that are not `apart` (B,) to all rows; the rows `apart` get the disc index -2."""
-    disc = np.full(len(apart), -2)
-    disc[~apart] = split.disc_index
+def _extend_split(split: DiscSplit, spare: np.ndarray) -> DiscSplit:
+    """Extend a split to all rows (B,); the rows `spare` get the disc index -2."""
+    disc = np.full(len(spare), -2)
+    disc[~spare] = split.disc_index
     return replace(split, disc_index=disc)

@@ -193,12 +193,12 @@ def get_array(group: h5py.Group, name: str) -> h5py.Dataset:
     return found
 
 
-def _find_arrays(file: h5py.Group, inside: str = "", depth: int = 0) -> Iterator[tuple[str, h5py.Dataset]]:
+def _find_arrays(file: h5py.Group, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, h5py.Dataset]]:
     """Yield the names and arrays of a file; raise InputError for links and for data in other files."""
     if len(file) > MAX_NAMES or depth > MAX_DEPTH:
         raise InputError(f"it holds more groups or names than an episode has. {REMEDY}")
     for name in file:
-        full = f"{inside}{name}"
+        full = f"{prefix}{name}"
         if not isinstance(file.get(name, getlink=True), h5py.HardLink):
             raise InputError(f"{full!r} is a link and no array: episodes with links are not read. {REMEDY}")
         item = file[name]
@@ -247,9 +247,9 @@ def _check_shapes(arrays: Mapping[str, h5py.Dataset]) -> dict[str, tuple[int, ..
     return shapes
 
 
-def _check_shape(name: str, shape: tuple[int, ...], wanted: ArraySpec, sizes: dict[str, int]) -> None:
+def _check_shape(name: str, shape: tuple[int, ...], spec: ArraySpec, sizes: dict[str, int]) -> None:
     """Raise InputError if a shape contradicts known axis lengths in `sizes`; add new axis lengths to `sizes`."""
-    axes = wanted.axes
+    axes = spec.axes
     if axes[-1] is None:
         axes = (*axes[:-1], *shape[len(axes) - 1 :])
     needed = tuple(axis if isinstance(axis, int) else sizes.get(str(axis)) for axis in axes)

@@ -55,16 +55,16 @@ def solve_frames_again(report: Report, count: int, device: str = "auto") -> Repo
     return replace(report, problems=[*report.problems, *broken], again_mm=float(off.max()), again=len(frames))
 
 
-def _add_skipped(report: Report, words: str) -> Report:
-    return replace(report, skipped=[*report.skipped, words])
+def _add_skipped(report: Report, reason: str) -> Report:
+    return replace(report, skipped=[*report.skipped, reason])
 
 
 def _solve_again(
-    said: Mapping[str, Any], opened: OpenedBody, solved: np.ndarray, count: int
+    attributes: Mapping[str, Any], opened: OpenedBody, solved: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve frames again; return frame numbers (k,), and displacements (k, n, 3) [m] of the tumour's vertices."""
-    plan = parse_plan(str(said["plan"]), str(said.get("plan_name", "plan")), Path())
-    seed, number = int(said["seed"]), int(said["episode"])
+    plan = parse_plan(str(attributes["plan"]), str(attributes.get("plan_name", "plan")), Path())
+    seed, number = int(attributes["seed"]), int(attributes["episode"])
     body, patient = opened.body, opened.patient
     scene = build_scene(plan, body, patient.site, sample_episode(plan.contents, seed, number), seed, number)
     fem = build_reference_fem(patient, scene)
@@ -96,10 +96,10 @@ def validate_files(
                 yield Report(path, ["reading it crashes the process: it is damaged. Make it again, or leave it out."])
 
 
-def _run_limited(look: Callable[[Path], Report], path: Path) -> Report:
+def _run_limited(validate: Callable[[Path], Report], path: Path) -> Report:
     find_device("cpu", "float32")  # keeps Warp's notes out of the report
     try:
         with limit_memory(MAX_MEMORY):
-            return look(path)
+            return validate(path)
     except InputError as error:
         return Report(path, [str(error)])
