@@ -308,6 +308,8 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         return out
 
     return ToolFunctions(
-        forces, get_motion, get_positions, to_core_axes, add_forces, get_stiffness, bound_norm, bound_spacing,
-        bound_distance, is_near, compute_shapes, sum_row_energy, sum_row_forces, add_row_matrix, bound_row_step,
+        forces=forces, get_motion=get_motion, get_positions=get_positions, to_core_axes=to_core_axes,
+        add_forces=add_forces, get_stiffness=get_stiffness, bound_norm=bound_norm, bound_spacing=bound_spacing,
+        bound_distance=bound_distance, is_near=is_near, compute_shapes=compute_shapes, sum_row_energy=sum_row_energy,
+        sum_row_forces=sum_row_forces, add_row_matrix=add_row_matrix, bound_row_step=bound_row_step,
     )  # fmt: skip

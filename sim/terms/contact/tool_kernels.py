@@ -253,6 +253,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
                         wp.atomic_min(out, k, c, compute_core_distance(x, half, radius).distance)
 
     return ToolKernels(
-        add_energy, add_gradient, add_curvature, add_diagonal, add_matrix, add_reaction, bound_step, bound_clearance,
-        measure_depth,
+        add_energy=add_energy, add_gradient=add_gradient, add_curvature=add_curvature, add_diagonal=add_diagonal,
+        add_matrix=add_matrix, add_reaction=add_reaction, bound_step=bound_step, bound_clearance=bound_clearance,
+        measure_depth=measure_depth,
     )  # fmt: skip
