@@ -178,26 +178,26 @@ class Deformation:
 def join_deformations(parts: Sequence[Deformation]) -> Deformation:
     """Concatenate results at the same vertices; costs are added, and only history variables common to all are kept."""
 
-    def stacked(name: str) -> np.ndarray:
+    def stack_arrays(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    def shared(name: str) -> dict[str, np.ndarray]:
+    def stack_common(name: str) -> dict[str, np.ndarray]:
         held = [getattr(part, name) for part in parts]
         return {key: np.concatenate([one[key] for one in held]) for key in sorted(set.intersection(*map(set, held)))}
 
     stages = parts[0].cost.seconds
     return Deformation(
-        displacement=stacked("displacement"),
+        displacement=stack_arrays("displacement"),
         nodes=parts[0].nodes,
         outcome=tuple(outcome for part in parts for outcome in part.outcome),
-        iterations=stacked("iterations"),
-        residual=stacked("residual"),
-        time=stacked("time"),
-        reaction=stacked("reaction"),
-        memory=shared("memory"),
-        warm=shared("warm"),
+        iterations=stack_arrays("iterations"),
+        residual=stack_arrays("residual"),
+        time=stack_arrays("time"),
+        reaction=stack_arrays("reaction"),
+        memory=stack_common("memory"),
+        warm=stack_common("warm"),
         cost=Cost({stage: sum(part.cost.seconds[stage] for part in parts) for stage in stages}),
-        **{name: stacked(name) for name in ROWS},
+        **{name: stack_arrays(name) for name in ROWS},
         **{name: np.concatenate([getattr(part, name) for part in parts], axis=1) for name in COLUMNS},
         source=parts[0].source,
     )

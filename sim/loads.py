@@ -200,7 +200,7 @@ class Loads:
     def scale(self, fraction: float | np.ndarray) -> Loads:
         """Return the loads with the magnitudes of all causes multiplied by `fraction`, a scalar or (B,)."""
 
-        def grown(cause: Cause) -> Any:
+        def scale_cause(cause: Cause) -> Any:
             name = MAGNITUDE.get(type(cause)) if isinstance(cause, BuiltIn) else cause.magnitude
             if name is None:
                 return cause
@@ -208,7 +208,7 @@ class Loads:
             factor = np.broadcast_to(fraction, len(array)).reshape(-1, *[1] * (array.ndim - 1))
             return replace(cause, **{name: factor * array})
 
-        return Loads(tuple(grown(cause) for cause in self.causes), self.times)
+        return Loads(tuple(scale_cause(cause) for cause in self.causes), self.times)
 
     # Former names, for one release.
     of, every, without_kind, only, rows, scaled = get, get_all, drop, get_only, select, scale
@@ -231,13 +231,13 @@ def stack(parts: Sequence[Loads]) -> Loads:
     if len(kinds) != 1:
         raise InputError(f"loads of {len(kinds)} different sets of causes cannot be stacked: give them the same kinds.")
 
-    def joined(causes: Sequence[Cause]) -> Cause:
+    def join(causes: Sequence[Cause]) -> Cause:
         names = [item.name for item in fields(causes[0])]
         return replace(
             causes[0], **{name: np.concatenate([getattr(cause, name) for cause in causes]) for name in names}
         )
 
-    causes = tuple(joined(same) for same in zip(*(part.causes for part in parts), strict=True))
+    causes = tuple(join(same) for same in zip(*(part.causes for part in parts), strict=True))
     return Loads(causes, np.concatenate([part.times for part in parts]))
 
 

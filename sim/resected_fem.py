@@ -197,10 +197,10 @@ def build_fem(
     # vertices without remaining tissue are fixed, even if the user has no `Held`
     others = [effect for effect in effects if not isinstance(effect, Resection | Held)]
 
-    def make(body: Anatomy) -> Fem:
+    def build(body: Anatomy) -> Fem:
         return Fem(body, (*_restrict_effects(others, anatomy, body), Held()), accuracy, device, batch, element, live)
 
-    return ResectedFem(list_remaining_bodies(anatomy, effects), make, ahead=live)
+    return ResectedFem(list_remaining_bodies(anatomy, effects), build, ahead=live)
 
 
 def _restrict_effects(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
@@ -208,10 +208,10 @@ def _restrict_effects(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) 
     present = set(body.mesh.region.tolist())
     removed = set(whole.mesh.region.tolist()) - present
 
-    def kept(effect: Effect) -> Effect | None:
+    def restrict(effect: Effect) -> Effect | None:
         if isinstance(effect, Pulsation) and effect.regions is not None:
             left = tuple(label for label in effect.regions if label not in removed)
             return replace(effect, regions=left) if left else None
         return effect.restrict(present | set(effect.regions) - removed) if isinstance(effect, Elasticity) else effect
 
-    return tuple(effect for effect in map(kept, effects) if effect is not None)
+    return tuple(effect for effect in map(restrict, effects) if effect is not None)

@@ -55,19 +55,7 @@ def test_install_hint_names_an_existing_extra(extra):
     assert extra in EXTRAS and install_hint(extra).endswith(f"pip install -e '.[{extra}]'.")
 
 
-FOREIGN = {
-    "onnx",
-    "TensorProto",
-    "trainbr",
-    "fitrsvm",
-    "eig3",
-    "DataLoader",
-    "PATH",
-    "cov_00",
-    "cov_55",
-    "python",
-    "_in_row",
-}
+FOREIGN = {"onnx", "TensorProto", "trainbr", "fitrsvm", "eig3", "DataLoader", "PATH", "cov_00", "cov_55", "python"}
 """Names of other programs, and parts of names."""
 
 

@@ -36,7 +36,7 @@ TOOLS = cost(
     "contact.barrier contact.enclosure contact.reduced contact.tool_blocks contact.tool_contact contact.tool_functions "
     "contact.tool_kernels contact.tool_path",
     "contact.enclosure:add_angle contact.tool_kernels:add_gradient contact.tool_kernels:add_reaction "
-    "contact.tool_kernels:clearance contact.tool_kernels:nearest",
+    "contact.tool_kernels:bound_clearance contact.tool_kernels:measure_depth",
     "ContactSampling ReducedToolBarrier ToolContactTerm ToolFunctions ToolKernels",
 )
 # A new effect adds one line.
@@ -49,12 +49,14 @@ OF_EFFECT = {
     "Held": cost(),
     "Bonded": cost(),
     "Slide": cost(),
-    "ToolForce": cost("dead_force", "dead_force:spread dead_force:subtract", "DeadForce DeadForceKernels NodalForces"),
+    "ToolForce": cost(
+        "dead_force", "dead_force:distribute dead_force:subtract_forces", "DeadForce DeadForceKernels NodalForces"
+    ),
     "ToolDisplacement": cost(),
     "NodalForce": cost("dead_force", "", "DeadForce DeadForceKernels"),
-    "Gravity": cost("dead_force gravity", "dead_force:subtract", "DeadForce DeadForceKernels NodalForces"),
+    "Gravity": cost("dead_force gravity", "dead_force:subtract_forces", "DeadForce DeadForceKernels NodalForces"),
     "Inertia": cost("inertia", "inertia:add_force", "InertiaKernels InertiaTerm"),
-    "Pulsation": cost("swelling", "swelling:fill element_kernels:spread", "Swelling SwellingKernels"),
+    "Pulsation": cost("swelling", "swelling:write_ratio element_kernels:copy_coefficients", "Swelling SwellingKernels"),
     "Resection": cost(),
     "ToolContact": TOOLS,
     "Retraction": TOOLS,
@@ -72,7 +74,8 @@ OF_LAW = {
     "ogden": cost("laws.ogden laws.spectral"),
     "prony": cost(
         "laws.isochoric_split laws.neo_hookean viscoelastic",
-        "element_kernels:measure element_kernels:spread viscoelastic:advance viscoelastic:fade",
+        "element_kernels:compute_gradients element_kernels:copy_coefficients viscoelastic:update_history "
+        "viscoelastic:write_relaxation",
         "LawSplit Prony ViscoelasticKernels",
     ),
 }
@@ -82,8 +85,8 @@ ANY = {f"element_kernels:{name}" for name in ("add_energy", "add_curvature", "ad
     "inertia:add_energy",
     "inertia:add_blocks",
     "contact.tool_kernels:add_matrix",
-    "strain_kernels:strain",
-    "strain_kernels:stiffen",
+    "strain_kernels:update_max_strain",
+    "strain_kernels:add_stiffening",
     *(
         f"{name}:{kernel}"
         for name in ("contact.tool_kernels", "contact.skull_contact")
@@ -182,4 +185,4 @@ def test_frame_kernels_are_precompiled(witnessed):
     """Launched kernels are a subset of the compiled ones, and a scene without tools compiles no footprint."""
     press, sinking = witnessed("press"), witnessed("brain_shift")
     assert press["launched"] <= press["compiled"] and len(press["launched"]) > 10
-    assert not {name for name in sinking["compiled"] if "footprint" in name or name.endswith("dead_force:spread")}
+    assert not {name for name in sinking["compiled"] if "footprint" in name or name.endswith("dead_force:distribute")}

@@ -13,7 +13,7 @@ from sim.discretisation.footprint import (
     ContactSurface,
     EdgeSubdivision,
     compute_footprint_weights,
-    find_nearest_on,
+    find_nearest_point,
 )
 from sim.errors import InputError
 from sim.runtime.device import find_device
@@ -195,7 +195,7 @@ def test_nearest_point_agrees_with_sampled_search(aspect: float) -> None:
     share = rng.dirichlet([0.5, 0.5, 0.5], 4000)
     samples = np.einsum("qc,sci->sqi", share, corners).reshape(-1, 3)
     for point in rng.normal(size=(30, 3)):
-        found = find_nearest_on(corners, point)
+        found = find_nearest_point(corners, point)
         best = np.linalg.norm(samples - point, axis=1).min()
         length = np.linalg.norm(found - point)
         assert length <= best + 1e-9

@@ -30,7 +30,10 @@ def test_step_kernels_for_one_and_many_columns_agree():
     t.fill_(0.3)
     for spread, out in ((ONE, one), (MANY, many)):
         DEVICE.launch(
-            lbfgs_trial_kernels.build_kernels(DEVICE, spread).step, (spread.count_threads(ROWS), 1), [u, t, d], [out]
+            lbfgs_trial_kernels.build_kernels(DEVICE, spread).compute_trial,
+            (spread.count_threads(ROWS), 1),
+            [u, t, d],
+            [out],
         )
     np.testing.assert_array_equal(one.numpy(), many.numpy())
 
@@ -44,7 +47,10 @@ def test_gradient_kernels_for_one_and_many_columns_agree():
     inputs = [constant, held, normal, d]
     for spread, out in ((ONE, [one, sums]), (MANY, [many, other])):
         DEVICE.launch(
-            lbfgs_trial_kernels.build_kernels(DEVICE, spread).finish, (spread.count_threads(NODES), 1), inputs, out
+            lbfgs_trial_kernels.build_kernels(DEVICE, spread).project_gradient,
+            (spread.count_threads(NODES), 1),
+            inputs,
+            out,
         )
     np.testing.assert_array_equal(one.numpy(), many.numpy())
     np.testing.assert_allclose(sums.numpy(), other.numpy(), rtol=1e-12)
@@ -57,6 +63,6 @@ def test_pair_product_kernels_for_one_and_many_columns_agree(count):
     one, many = double(2 * PAIRS + PRODUCTS, 1), double(2 * PAIRS + PRODUCTS, 1)
     inputs, dim = [known, s, w, *vectors], (len(one), ONE.count_threads(ROWS))
     DEVICE.launch(build_multiply_kernel(DEVICE, PAIRS), dim, inputs, [one])
-    DEVICE.launch(build_kernels(DEVICE, PAIRS).multiply, (-(-ROWS // ROWS_PER_THREAD), 1), inputs, [many])
+    DEVICE.launch(build_kernels(DEVICE, PAIRS).compute_products, (-(-ROWS // ROWS_PER_THREAD), 1), inputs, [many])
     np.testing.assert_allclose(one.numpy(), many.numpy(), rtol=1e-9, atol=1e-9)
     assert np.count_nonzero(one.numpy()) == 2 * count + PRODUCTS

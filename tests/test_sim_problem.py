@@ -169,4 +169,4 @@ def test_solve_integrates_its_tools_once(launches: list[str]) -> None:
     fem = Fem(ANATOMY, [Elasticity(), Held(), ToolForce()], TIGHT, "cpu", element="p1")
     launches.clear()
     fem.deform(Loads((Pushed(np.array([[0.03, 0.03, 0.1]]), np.array([[0.0, 0.0, -0.1]]), np.array([0.02])),)))
-    assert launches.count("_press") == 1
+    assert launches.count("_integrate_footprint") == 1

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from sim.runtime.device import Precision, find_device
-from sim.terms.laws.spectral import principal_axes
+from sim.terms.laws.spectral import compute_principal_axes
 
 
 def matrices() -> np.ndarray:
@@ -36,7 +36,7 @@ def test_principal_axes_diagonalise_the_matrix(precision: Precision, digit: floa
         axes: wp.array(dtype=mat),
     ):
         i = wp.tid()
-        e, N = principal_axes(A[i])
+        e, N = compute_principal_axes(A[i])
         value[i] = e
         axes[i] = N
 

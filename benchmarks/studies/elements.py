@@ -8,7 +8,7 @@ import numpy as np
 from scenes.analysis.measurement import time_work
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
-from sim.discretisation.footprint import find_nearest_on
+from sim.discretisation.footprint import find_nearest_point
 from sim.effects import build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
@@ -99,7 +99,7 @@ def find_point_above_tumour(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
         raise InputError("the anatomy has no tumour, or no open cortex above it: make one with `sulcus anatomy`.")
     nodes = anatomy.mesh.nodes
     centre = nodes[anatomy.tumour_nodes].mean(axis=0)
-    return find_nearest_on(nodes[anatomy.open_surface], centre), centre
+    return find_nearest_point(nodes[anatomy.open_surface], centre), centre
 
 
 def _measured(anatomy: Anatomy, element: str, poisson: float, press: PressCase, device: str) -> ElementRow:

@@ -13,7 +13,7 @@ from sim.bodies.refine import refine
 from sim.bodies.subject import MeshPlan, make_anatomy
 from sim.bodies.template import Tumour, build_template_subject
 from sim.deformation import Deformation, Deformer, Outcome
-from sim.discretisation.footprint import find_nearest_on
+from sim.discretisation.footprint import find_nearest_point
 from sim.effects import Elasticity, build_push_effects
 from sim.errors import InputError
 from sim.families.registry import build_family
@@ -230,5 +230,5 @@ def move_pushes_onto(body: Anatomy, loads: Loads) -> Loads:
     (pushed,) = loads.get_all(Pushed)
     corners = body.mesh.nodes[body.open_surface]
     return Loads(
-        (replace(pushed, point=np.array([find_nearest_on(corners, point) for point in pushed.point])),), loads.time
+        (replace(pushed, point=np.array([find_nearest_point(corners, point) for point in pushed.point])),), loads.time
     )

@@ -53,5 +53,5 @@ def _find_crossings(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return column[met], height[met]
 
 
-def _compute_cross_products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
+def _compute_cross_products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -187,7 +187,7 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     mixed = (inner > 0) & (outer > 0)
     lone, keys = mixed & ((inner == 1) | (outer == 1)), edges[:, 0] * len(side) + edges[:, 1]
 
-    def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def get_edge_node(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return the node on edge a-b: the crossing, or the end b if b is on the surface."""
         key = np.minimum(a, b) * len(side) + np.maximum(a, b)
         crossing = np.searchsorted(keys, key) + len(side)
@@ -197,7 +197,7 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     wanted = np.where(inner == 1, -1, 1)[lone]
     turned = np.take_along_axis(tets[lone], LONE_FIRST[np.argmax(sides[lone] == wanted[:, None], axis=1)], axis=1)
     apex, *others = turned.T
-    base = [between(apex, other) for other in others]
+    base = [get_edge_node(apex, other) for other in others]
     tips = np.stack([apex, *base], axis=1)
     stumps, stump_of = _split_prisms(np.stack([*base, *others], axis=1))
 
@@ -206,7 +206,7 @@ def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.nd
     code = (sides[pairs] < 0) @ (1 << np.arange(4))
     order = np.array([PAIR_FIRST.get(number, [0, 1, 2, 3]) for number in range(16)])[code]
     a, b, c, d = np.take_along_axis(tets[pairs], order, axis=1).T
-    ac, ad, bc, bd = between(a, c), between(a, d), between(b, c), between(b, d)
+    ac, ad, bc, bd = get_edge_node(a, c), get_edge_node(a, d), get_edge_node(b, c), get_edge_node(b, d)
     within, _ = _split_prisms(np.stack([a, ac, ad, b, bc, bd], axis=1))
     beyond, _ = _split_prisms(np.stack([c, ac, bc, d, ad, bd], axis=1))
 

@@ -115,16 +115,16 @@ def build_contradiction_check(label_map: LabelMap, chosen: Convention) -> Callab
     contacts = count_label_contacts(label_map)
     rivals = [one for one in CONVENTIONS.values() if one is not chosen and one.is_compatible(label_map.labels)]
 
-    def reason(one: Convention) -> str:
-        found = find_contradiction(contacts, one)
-        if found is None or not (found.is_certain or one is not chosen or any(map(shown, rivals))):
+    def find_reason(candidate: Convention) -> str:
+        found = find_contradiction(contacts, candidate)
+        if found is None or not (found.is_certain or candidate is not chosen or any(map(is_supported, rivals))):
             return ""
         return found.reason
 
-    def shown(one: Convention) -> bool:
-        return not reason(one) and _has_oedema_outside(contacts, one)
+    def is_supported(candidate: Convention) -> bool:
+        return not find_reason(candidate) and _has_oedema_outside(contacts, candidate)
 
-    return reason
+    return find_reason
 
 
 def _has_oedema_outside(contacts: LabelContacts, convention: Convention) -> bool:

@@ -48,10 +48,10 @@ def check_hdf5_storage(path: Path, limits: MeshSizeLimits) -> None:
     most = limits.limit_bytes(path.stat().st_size)
     left, seen = most, set()
 
-    def look(group: h5py.Group, within: str) -> None:
+    def check_group(group: h5py.Group, prefix: str) -> None:
         nonlocal left
         for name in group:
-            here = f"{within}/{name}"
+            here = f"{prefix}/{name}"
             if not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 raise InputError(f"`{here}` is a link of {path.name} to another place. Store the array itself there.")
             found = group[name]
@@ -59,7 +59,7 @@ def check_hdf5_storage(path: Path, limits: MeshSizeLimits) -> None:
                 continue
             seen.add(found)
             if isinstance(found, h5py.Group):
-                look(found, here)
+                check_group(found, here)
             elif isinstance(found, h5py.Dataset) and found.shape is not None:
                 if found.is_virtual or found.external:
                     raise InputError(f"`{here}` of {path.name} lies in another file. Store the array itself there.")
@@ -70,7 +70,7 @@ def check_hdf5_storage(path: Path, limits: MeshSizeLimits) -> None:
                     raise build_too_large_error(most)
 
     with h5py.File(path, "r") as file:
-        look(file, "")
+        check_group(file, "")
 
 
 def _find_references(path: Path) -> set[Path]:

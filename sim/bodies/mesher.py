@@ -176,10 +176,10 @@ def cut_lattice(solids: Solids, max_edge: float, settings: Meshing = Meshing()) 
     wanted = ((KDTree(solids.interface), min(fine, radius / settings.cells_per_radius)), (KDTree(solids.opening), fine))
     levels = min(int(np.rint(np.log2(max_edge / wanted[0][1]))), settings.max_halvings)
 
-    def size(points: np.ndarray) -> np.ndarray:
+    def compute_size(points: np.ndarray) -> np.ndarray:
         return settings.rounding * np.min([least + growth * tree.query(points)[0] for tree, least in wanted], axis=0)
 
-    lattice = build_graded_lattice(solids.low - max_edge, solids.high + max_edge, max_edge, levels, size)
+    lattice = build_graded_lattice(solids.low - max_edge, solids.high + max_edge, max_edge, levels, compute_size)
     body = cut_mesh(build_uncut_mesh(lattice), solids.brain, settings=settings.stuffing)
     if not body.inside.any():
         raise InputError(TOO_COARSE)
@@ -247,11 +247,11 @@ def _build_projection(solids: Solids, pieces: CutMesh, slack: float) -> Projecti
     interface[np.setdiff1d(pieces.tets[pieces.inside], pieces.tets[~pieces.inside])] = False  # tumour cortex
     levels = solids.brain(pieces.nodes), solids.tumour(pieces.nodes)
 
-    def project(points: np.ndarray, of: np.ndarray) -> np.ndarray:
+    def project(points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         placed = points.copy()
         for solid, level, on in ((solids.tumour, levels[1], interface), (solids.brain, levels[0], surface)):
-            rows = on[of]
-            aim = level[of[rows]]
+            rows = on[nodes]
+            aim = level[nodes[rows]]
             placed[rows] = project_onto_level(
                 solid, placed[rows], np.clip(solid(placed[rows]), aim - slack, aim + slack)
             )

@@ -74,8 +74,8 @@ def check_not_negated(grid: VoxelGrid, other: VoxelGrid) -> None:
         raise InputError(f"{other.path}: has the grid of {grid.path}, but with x and y negated: {EXPORT_REMEDY}")
 
 
-def _is_same_grid(one: VoxelGrid, other: VoxelGrid) -> bool:
-    return one.shape == other.shape and np.allclose(one.affine, other.affine, rtol=0.0, atol=1e-6)
+def _is_same_grid(grid: VoxelGrid, other: VoxelGrid) -> bool:
+    return grid.shape == other.shape and np.allclose(grid.affine, other.affine, rtol=0.0, atol=1e-6)
 
 
 def _thin_points(points: np.ndarray) -> np.ndarray:

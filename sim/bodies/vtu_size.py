@@ -84,15 +84,15 @@ def _parse_blocks(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[by
     `inside` contains raw bytes, or header and blocks in base64.
     """
 
-    def part(place: int, size: int) -> bytes:
+    def read_part(start: int, size: int) -> bytes:
         if isinstance(inside, bytes):
-            return inside[place : place + size]
-        return base64.b64decode(inside[place : place + _count_base64_characters(size)])
+            return inside[start : start + size]
+        return base64.b64decode(inside[start : start + _count_base64_characters(size)])
 
-    count = int(np.frombuffer(part(0, word.itemsize), word, 1)[0])
+    count = int(np.frombuffer(read_part(0, word.itemsize), word, 1)[0])
     header = word.itemsize * (3 + count)
-    size, _, *sizes = map(int, np.frombuffer(part(0, header), word)[1 : 3 + count])
-    packed = part(header if isinstance(inside, bytes) else _count_base64_characters(header), sum(sizes))
+    size, _, *sizes = map(int, np.frombuffer(read_part(0, header), word)[1 : 3 + count])
+    packed = read_part(header if isinstance(inside, bytes) else _count_base64_characters(header), sum(sizes))
     ends = [0, *accumulate(sizes)]
     return count * size, (packed[start:end] for start, end in pairwise(ends))
 

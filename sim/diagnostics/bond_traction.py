@@ -19,33 +19,33 @@ def build_kernel(device: Device) -> wp.Kernel:
     scalar = device.scalar
 
     @forward_kernel(module="unique")
-    def strain(
+    def compute_ratios(
         force: wp.array2d(dtype=scalar),
-        first: wp.array(dtype=wp.int32),
+        patch_start: wp.array(dtype=wp.int32),
         nodes: wp.array(dtype=wp.int32),
         normal: wp.array(dtype=wp.vec3d),
         area: wp.array(dtype=wp.float64),
         tension: wp.float64,
         shear: wp.float64,
         # outputs
-        share: wp.array2d(dtype=wp.float64),
-        most: wp.array(dtype=wp.float64),
+        ratios: wp.array2d(dtype=wp.float64),
+        max_ratio: wp.array(dtype=wp.float64),
     ):
         """Compute s = |(max(t.n, 0) / tension, (t - (t.n) n) / shear)| per patch, t = force / area, and max(s)."""
         p, c = wp.tid()
         t = wp.vec3d()
-        for k in range(first[p], first[p + 1]):
+        for k in range(patch_start[p], patch_start[p + 1]):
             for i in range(3):
                 t[i] += wp.float64(force[3 * nodes[k] + i, c])
         t /= area[p]
         pull = wp.dot(t, normal[p])
         along = wp.length(t - pull * normal[p]) / shear
         s = wp.sqrt(wp.pow(wp.max(pull, wp.float64(0.0)) / tension, wp.float64(2.0)) + along * along)
-        wp.atomic_max(most, c, s)
-        if share:
-            share[p, c] = s
+        wp.atomic_max(max_ratio, c, s)
+        if ratios:
+            ratios[p, c] = s
 
-    return strain
+    return compute_ratios
 
 
 class BondTraction:

@@ -46,11 +46,11 @@ def build_kernel(device: Device) -> wp.Kernel:
     scalar = device.scalar
 
     @forward_kernel(module="unique")
-    def sweep(
+    def add_swept_volume(
         u: wp.array2d(dtype=scalar),
-        first: wp.array(dtype=wp.int32),
+        patch_start: wp.array(dtype=wp.int32),
         nodes: wp.array(dtype=wp.int32),
-        vector: wp.array(dtype=wp.vec3d),
+        vectors: wp.array(dtype=wp.vec3d),
         covered: wp.array(dtype=wp.int32),
         # outputs
         out: wp.array2d(dtype=wp.float64),
@@ -58,15 +58,15 @@ def build_kernel(device: Device) -> wp.Kernel:
         """Compute v = sum a_i . u_i of a patch; add max(v, 0) to out_0 if skull covers the patch, else |v| to out_1."""
         s, c = wp.tid()
         v = wp.float64(0.0)
-        for i in range(first[s], first[s + 1]):
+        for i in range(patch_start[s], patch_start[s + 1]):
             for k in range(3):
-                v += vector[i][k] * wp.float64(u[3 * nodes[i] + k, c])
+                v += vectors[i][k] * wp.float64(u[3 * nodes[i] + k, c])
         if covered[s] == 0:
             wp.atomic_add(out, 1, c, wp.abs(v))
         elif v > wp.float64(0.0):
             wp.atomic_add(out, 0, c, v)
 
-    return sweep
+    return add_swept_volume
 
 
 class SkullLeak:

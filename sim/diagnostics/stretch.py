@@ -28,14 +28,14 @@ def build_kernel(device: Device) -> wp.Kernel:
     )
 
     @forward_kernel(module="unique")
-    def measure(
+    def measure_stretch(
         u: wp.array2d(dtype=scalar),
-        size: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        weight: wp.array2d(dtype=wp.float64),
+        sizes: wp.array(dtype=wp.int32),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
+        weights: wp.array2d(dtype=wp.float64),
         # outputs: least and most square stretch, volume
-        found: wp.array2d(dtype=wp.float64),
+        extremes: wp.array2d(dtype=wp.float64),
     ):
         """Compute the extreme eigenvalues of C = F^T F: q + 2 p cos(phi) and q + 2 p cos(phi + 2 pi / 3).
 
@@ -43,28 +43,28 @@ def build_kernel(device: Device) -> wp.Kernel:
         3 x 3 matrix", Commun. ACM 4:168. For most elements the bounds q +- 2 p suffice.
         """
         e, c = wp.tid()
-        for k in range(gradient.shape[1]):
+        for k in range(gradients.shape[1]):
             H = mat()
-            for a in range(size[e]):
-                i = 3 * table[e, a]
-                H += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]), gradient[e, k, a])
+            for a in range(sizes[e]):
+                i = 3 * elements[e, a]
+                H += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]), gradients[e, k, a])
             F = wp.identity(n=3, dtype=wp.float64) + wp.mat33d(H)
             C = wp.transpose(F) * F
             q = wp.trace(C) / wp.float64(3.0)
             B = C - q * wp.identity(n=3, dtype=wp.float64)
             p = wp.sqrt(wp.ddot(B, B) / wp.float64(6.0))
             above, below = q + wp.float64(2.0) * p, q - wp.float64(2.0) * p
-            if above > found[1, c] or below < found[0, c] or above > high or below < low:
+            if above > extremes[1, c] or below < extremes[0, c] or above > high or below < low:
                 phi = wp.acos(wp.clamp(wp.determinant(B / p) / wp.float64(2.0), wp.float64(-1.0), wp.float64(1.0)))
                 phi /= wp.float64(3.0)
                 above = q + wp.float64(2.0) * p * wp.cos(phi)
                 below = q + wp.float64(2.0) * p * wp.cos(phi + wp.float64(2.0 * wp.pi / 3.0))
-                wp.atomic_max(found, 1, c, above)
-                wp.atomic_min(found, 0, c, below)
+                wp.atomic_max(extremes, 1, c, above)
+                wp.atomic_min(extremes, 0, c, below)
                 if above > high or below < low:
-                    wp.atomic_add(found, 2, c, weight[e, k])
+                    wp.atomic_add(extremes, 2, c, weights[e, k])
 
-    return measure
+    return measure_stretch
 
 
 class TissueStretch:

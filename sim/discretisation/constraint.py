@@ -39,8 +39,8 @@ class ConstraintKernels:
 
     project: wp.Kernel
     close_gap: wp.Kernel
-    average: wp.Kernel
-    spread: wp.Kernel
+    compute_mean: wp.Kernel
+    distribute: wp.Kernel
 
 
 @cache
@@ -50,7 +50,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
     chunk = CHUNK
 
     @forward_kernel(module="unique")
-    def project(
+    def project_nodes(
         fixed: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
         # outputs
@@ -64,7 +64,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
             v[3 * i + k, c] = wp.where(fixed[i, k] == wp.int8(0), x[k], scalar(0.0))
 
     @forward_kernel(module="unique")
-    def close(
+    def close_gap(
         fixed: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
         drag: wp.array(dtype=vec),
@@ -83,8 +83,8 @@ def build_kernels(device: Device) -> ConstraintKernels:
             gap[r, c] = wp.where(fixed[i, k] == wp.int8(0), slip[k], value[r, c] - x[k])
 
     @forward_kernel(module="unique")
-    def average(
-        weight: wp.array2d(dtype=scalar),
+    def compute_mean(
+        weights: wp.array2d(dtype=scalar),
         v: wp.array2d(dtype=scalar),
         # outputs
         out: wp.array2d(dtype=scalar),
@@ -92,24 +92,24 @@ def build_kernels(device: Device) -> ConstraintKernels:
         """Add the weighted sum over a chunk of nodes to the mean motion: out_kc += sum of w_ic v_(3i+k)c."""
         block, c = wp.tid()
         total = vec()
-        for i in range(block * chunk, wp.min((block + 1) * chunk, weight.shape[0])):
-            total += weight[i, c] * vec(v[3 * i, c], v[3 * i + 1, c], v[3 * i + 2, c])
+        for i in range(block * chunk, wp.min((block + 1) * chunk, weights.shape[0])):
+            total += weights[i, c] * vec(v[3 * i, c], v[3 * i + 1, c], v[3 * i + 2, c])
         for k in range(3):
             wp.atomic_add(out, k, c, total[k])
 
     @forward_kernel(module="unique")
-    def spread(
-        weight: wp.array2d(dtype=scalar),
-        amount: wp.array2d(dtype=scalar),
+    def distribute(
+        weights: wp.array2d(dtype=scalar),
+        vectors: wp.array2d(dtype=scalar),
         # outputs
         v: wp.array2d(dtype=scalar),
     ):
         """Distribute amounts to nodes: v_(3i+k)c += w_ic amount_kc."""
         i, c = wp.tid()
         for k in range(3):
-            v[3 * i + k, c] += weight[i, c] * amount[k, c]
+            v[3 * i + k, c] += weights[i, c] * vectors[k, c]
 
-    return ConstraintKernels(project, close, average, spread)
+    return ConstraintKernels(project_nodes, close_gap, compute_mean, distribute)
 
 
 class Constraint:
@@ -184,7 +184,7 @@ class Constraint:
         """Project v (3N, b) onto the admissible motions, in place."""
         self.project_nodes(v)
         if self._weight is not None:
-            self._spread(-self._average(v), v)
+            self._distribute_mean(-self._compute_mean(v), v)
             self.project_nodes(v)
 
     def project_nodes(self, v: wp.array) -> None:
@@ -199,8 +199,8 @@ class Constraint:
         inputs = [self._fixed, self._normal, self._drag, value, u]
         self.device.launch(build_kernels(self.device).close_gap, (len(self.fixed), u.shape[1]), inputs, [gap])
         if self._weight is not None:
-            rest, reached = self.device.allocate(*u.shape), self._average(u) + self._average(gap)
-            self._spread(self._target - reached, rest)
+            rest, reached = self.device.allocate(*u.shape), self._compute_mean(u) + self._compute_mean(gap)
+            self._distribute_mean(self._target - reached, rest)
             self.project_nodes(rest)
             combine_columns(self.device, gap, 1.0, rest, gap)
         return gap, np.abs(gap.numpy()).max(axis=0, initial=0.0)
@@ -213,7 +213,7 @@ class Constraint:
         if self._weight is None:
             return None
         self.project_nodes(gradient)
-        return self._solve_gram(self._average(gradient))
+        return self._solve_gram(self._compute_mean(gradient))
 
     def build_basis(self) -> sp.csc_array:
         """Return a sparse orthonormal basis (3N, n) of the motions that the fixed and sliding nodes admit."""
@@ -234,29 +234,29 @@ class Constraint:
         data = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
         return sp.csc_array(sp.coo_array(data, shape=(self.fixed.size, count)))
 
-    def _average(self, v: wp.array) -> np.ndarray:
+    def _compute_mean(self, v: wp.array) -> np.ndarray:
         assert self._weight is not None
         out = self.device.allocate(3, v.shape[1])
         dim = (-(-len(self.fixed) // CHUNK), v.shape[1])
-        self.device.launch(build_kernels(self.device).average, dim, [self._weight, v], [out])
+        self.device.launch(build_kernels(self.device).compute_mean, dim, [self._weight, v], [out])
         return out.numpy().astype(np.float64)
 
     def _solve_gram(self, mean: np.ndarray) -> np.ndarray:
         return np.linalg.solve(self._gram, mean.T[:, :, None])[:, :, 0].T
 
-    def _spread(self, mean: np.ndarray, v: wp.array) -> None:
+    def _distribute_mean(self, mean: np.ndarray, v: wp.array) -> None:
         inputs = [self._weight, self.device.upload(self._solve_gram(mean))]
-        self.device.launch(build_kernels(self.device).spread, (len(self.fixed), v.shape[1]), inputs, [v])
+        self.device.launch(build_kernels(self.device).distribute, (len(self.fixed), v.shape[1]), inputs, [v])
 
 
-def _restrict_normals(fixed: np.ndarray, normal: np.ndarray, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slide normals (N, 3) without their fixed components, normalised; zero if their norm is below `least`.
+def _restrict_normals(fixed: np.ndarray, normal: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slide normals (N, 3) without their fixed components, normalised; zero if the norm is below `limit`.
 
     Also return `drag` (N, 3): motion along the normal per unit of each fixed component that keeps a node in its plane.
     """
     inside = np.where(fixed, 0.0, normal)
     length = np.linalg.norm(inside, axis=1, keepdims=True)
-    left = length > least
+    left = length > limit
     unit = np.divide(inside, length, out=np.zeros_like(inside), where=left)
     drag = np.divide(inside - normal, length, out=np.zeros_like(inside), where=left)
     return unit, drag

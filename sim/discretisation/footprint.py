@@ -161,7 +161,7 @@ class ContactSurface:
         inputs = [self._corners, self._ball, self._table, self._position, footprints.tools, footprints.contacts]
         inputs += [self._division.max_edge_ratio, self._division.min_subdivisions, self._division.max_subdivisions]
         self.device.launch(
-            _press, (len(self._ball), len(footprints.tools)), inputs, [footprints.weight, footprints.sums]
+            _integrate_footprint, (len(self._ball), len(footprints.tools)), inputs, [footprints.weight, footprints.sums]
         )
 
     def check_contact(self, points: np.ndarray, radii: np.ndarray) -> None:
@@ -202,7 +202,7 @@ class ContactSurface:
     def _find_contacts(self, imprint: FootprintArrays) -> None:
         """Find the contact point of each tool and its distance, which is inf if larger than the radius of the tool."""
         inputs = [self._corners, self._ball, imprint.tools]
-        self.device.launch(_search, imprint.levels[0].shape, inputs, [imprint.levels[0]])
+        self.device.launch(_search_chunk, imprint.levels[0].shape, inputs, [imprint.levels[0]])
         for some, fewer in pairwise(imprint.levels):
             self.device.launch(_reduce_candidates, fewer.shape, [some], [fewer])
 
@@ -215,7 +215,7 @@ def compute_footprint_weights(
     return surface.find_footprints(points, radii).to_matrix(len(nodes))
 
 
-def find_nearest_on(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
+def find_nearest_point(corners: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Return the point (3,) on triangles with `corners` (S, 3, 3) [m] that is nearest to `point` (3,)."""
     apart = np.arange(3 * len(corners)).reshape(-1, 3)
     skin = ContactSurface(corners.reshape(-1, 3), apart, find_device("cpu", "float64"))
@@ -234,13 +234,13 @@ def _find_on_edge(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
-def _select_nearer(one: wp.vec3d, other: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
-    """Return `one` or `other`, the point that is nearer to `point`."""
-    return wp.where(wp.length_sq(one - point) <= wp.length_sq(other - point), one, other)
+def _select_nearer(a: wp.vec3d, b: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+    """Return `a` or `b`, the point that is nearer to `point`."""
+    return wp.where(wp.length_sq(a - point) <= wp.length_sq(b - point), a, b)
 
 
 @wp.func
-def nearest_on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
+def find_nearest_on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) -> wp.vec3d:
     """Return the point on the triangle a, b, c that is nearest to `point`.
 
     Ericson 2005, "Real-Time Collision Detection", section 5.1.5: the projection onto the plane if it is inside the
@@ -261,68 +261,68 @@ def nearest_on_triangle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, point: wp.vec3d) 
 
 
 @wp.func
-def _place(of: wp.vec4d) -> wp.vec3d:
+def _get_centre(ball: wp.vec4d) -> wp.vec3d:
     """Return the centre of a ball or the point of a tool, the first three components; the fourth one is the radius."""
-    return wp.vec3d(of[0], of[1], of[2])
+    return wp.vec3d(ball[0], ball[1], ball[2])
 
 
 @wp.func
-def _pack_candidate(place: wp.vec3d, length: wp.float64) -> wp.vec4d:
-    return wp.vec4d(place[0], place[1], place[2], length)
+def _pack_candidate(point: wp.vec3d, distance: wp.float64) -> wp.vec4d:
+    return wp.vec4d(point[0], point[1], point[2], distance)
 
 
 @forward_kernel
-def _search(
+def _search_chunk(
     corners: wp.array2d(dtype=wp.vec3d),
-    ball: wp.array(dtype=wp.vec4d),
+    balls: wp.array(dtype=wp.vec4d),
     tools: wp.array(dtype=wp.vec4d),
     # outputs
-    found: wp.array2d(dtype=wp.vec4d),
+    candidates: wp.array2d(dtype=wp.vec4d),
 ):
     """Find the nearest point on a chunk of triangles and its distance; inf if no point is in range."""
     chunk, c = wp.tid()
-    point = _place(tools[c])
+    point = _get_centre(tools[c])
     best = tools[c][3]
-    found[chunk, c] = _pack_candidate(point, wp.float64(wp.inf))
-    for s in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, ball.shape[0])):
-        near = ball[s][3] + best
-        if wp.length_sq(_place(ball[s]) - point) <= near * near:
-            nearest = nearest_on_triangle(corners[s, 0], corners[s, 1], corners[s, 2], point)
+    candidates[chunk, c] = _pack_candidate(point, wp.float64(wp.inf))
+    for s in range(chunk * CHUNK, wp.min((chunk + 1) * CHUNK, balls.shape[0])):
+        near = balls[s][3] + best
+        if wp.length_sq(_get_centre(balls[s]) - point) <= near * near:
+            nearest = find_nearest_on_triangle(corners[s, 0], corners[s, 1], corners[s, 2], point)
             far = wp.length(nearest - point)
             if far <= best:
                 best = far
-                found[chunk, c] = _pack_candidate(nearest, far)
+                candidates[chunk, c] = _pack_candidate(nearest, far)
 
 
 @forward_kernel
 def _reduce_candidates(
-    found: wp.array2d(dtype=wp.vec4d),
+    candidates: wp.array2d(dtype=wp.vec4d),
     # outputs
     nearest: wp.array2d(dtype=wp.vec4d),
 ):
     """Reduce each group of candidate points to the nearest one."""
     group, c = wp.tid()
-    best = found[group * CHUNK, c]
+    best = candidates[group * CHUNK, c]
     for k in range(1, CHUNK):
-        other = found[wp.min(group * CHUNK + k, found.shape[0] - 1), c]
+        other = candidates[wp.min(group * CHUNK + k, candidates.shape[0] - 1), c]
         if other[3] < best[3]:
             best = other
     nearest[group, c] = best
 
 
 @forward_kernel
-def _press(
+def _integrate_footprint(
     corners: wp.array2d(dtype=wp.vec3d),
-    ball: wp.array(dtype=wp.vec4d),
-    table: wp.array2d(dtype=wp.int32),
-    position: wp.array(dtype=wp.vec3d),
+    balls: wp.array(dtype=wp.vec4d),
+    triangles: wp.array2d(dtype=wp.int32),
+    positions: wp.array(dtype=wp.vec3d),
     tools: wp.array(dtype=wp.vec4d),
-    touched: wp.array(dtype=wp.vec4d),
-    fineness: wp.float64,
-    fewest: int,
-    most: int,
+    contacts: wp.array(dtype=wp.vec4d),
+    max_edge_ratio: wp.float64,
+    min_subdivisions: int,
+    max_subdivisions: int,
     # outputs
-    weight: wp.array2d(dtype=wp.float64),
+    weights: wp.array2d(dtype=wp.float64),
     sums: wp.array(dtype=wp.vec4d),
 ):
     """Add the integral of w N_a over a triangle, up to a constant factor, from the centroids of n^2 equal parts.
@@ -330,15 +330,15 @@ def _press(
     In a row of parts with constant y, part j is inside the footprint if A j^2 + 2 B j + C < 0, an interval of j.
     """
     s, c = wp.tid()
-    point, radius = _place(touched[c]), tools[c][3]
-    near = ball[s][3] + radius
-    if wp.length_sq(_place(ball[s]) - point) > near * near:
+    point, radius = _get_centre(contacts[c]), tools[c][3]
+    near = balls[s][3] + radius
+    if wp.length_sq(_get_centre(balls[s]) - point) > near * near:
         return
     zero, one, two = wp.float64(0.0), wp.float64(1.0), wp.float64(2.0)
     start, first, second = corners[s, 0] - point, corners[s, 1] - corners[s, 0], corners[s, 2] - corners[s, 0]
     longest = wp.max(wp.max(wp.length(first), wp.length(second)), wp.length(first - second))
-    n = int(fewest)
-    while longest > fineness * radius * wp.float64(n) and n < most:
+    n = int(min_subdivisions)
+    while longest > max_edge_ratio * radius * wp.float64(n) and n < max_subdivisions:
         n *= 2
     h = one / wp.float64(n)
     step = h * second
@@ -369,14 +369,14 @@ def _press(
     scale = wp.length(wp.cross(first, second)) * h * h / radius
     x, y, z = m[0] - m[1] - m[2], m[1], m[2]
     share = vec6d(x, y, z, zero, zero, zero)
-    if table.shape[1] == 6:  # L (2 L - 1) at corners, 4 L_i L_j at midpoints
+    if triangles.shape[1] == 6:  # L (2 L - 1) at corners, 4 L_i L_j at midpoints
         xy, yz, zx = y - mm[0] - mm[1], mm[1], z - mm[1] - mm[2]
         halves = vec6d(xy + zx, xy + yz, yz + zx, -two * xy, -two * yz, -two * zx)
         share -= two * halves
     moment = wp.vec3d()
-    for a in range(table.shape[1]):
-        wp.atomic_add(weight, table[s, a], c, scale * share[a])
-        moment += share[a] * position[table[s, a]]
+    for a in range(triangles.shape[1]):
+        wp.atomic_add(weights, triangles[s, a], c, scale * share[a])
+        moment += share[a] * positions[triangles[s, a]]
     wp.atomic_add(sums, c, scale * wp.vec4d(m[0], moment[0], moment[1], moment[2]))
 
 

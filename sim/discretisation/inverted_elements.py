@@ -18,8 +18,8 @@ def build_kernel(device: Device, size: int, points: int, min_ratio: float) -> wp
     @forward_kernel(module="unique")
     def count_inverted(
         u: wp.array2d(dtype=scalar),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
         # outputs
         out: wp.array(dtype=wp.int32),
     ):
@@ -28,8 +28,8 @@ def build_kernel(device: Device, size: int, points: int, min_ratio: float) -> wp
         for q in range(points):
             F = wp.identity(n=3, dtype=scalar)
             for a in range(size):
-                i = 3 * table[e, a]
-                F += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]), gradient[e, q, a])
+                i = 3 * elements[e, a]
+                F += wp.outer(vec(u[i, c], u[i + 1, c], u[i + 2, c]), gradients[e, q, a])
             if wp.determinant(F) <= scalar(min_ratio):
                 wp.atomic_add(out, c, 1)
                 return

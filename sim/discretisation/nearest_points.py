@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from ..runtime.device import forward_kernel, load_module
-from .footprint import nearest_on_triangle
+from .footprint import find_nearest_on_triangle
 
 # Number of alternating projections between a triangle and an extended core.
 PROJECTION_ITERATIONS = 16
@@ -98,11 +98,11 @@ class NearestSearch:
 @forward_kernel
 def _find_nearest(
     corners: wp.array2d(dtype=wp.vec3d),
-    middle: wp.vec3d,
+    centre: wp.vec3d,
     axes: wp.mat33d,
-    half: wp.vec3d,
-    turns: int,
-    share: wp.array(dtype=wp.vec3d),
+    half_sizes: wp.vec3d,
+    iterations: int,
+    barycentric: wp.array(dtype=wp.vec3d),
     distance: wp.array(dtype=wp.float64),
     normal: wp.array(dtype=wp.vec3d),
 ):
@@ -115,9 +115,9 @@ def _find_nearest(
     one, pace = wp.float64(1.0), wp.float64(1.0)
     place = (a + b + c) / wp.float64(3.0)
     ahead = wp.vec3d(place)  # copies, since plain assignment would alias
-    for _turn in range(turns):
+    for _turn in range(iterations):
         last, before = wp.vec3d(place), wp.float64(pace)
-        place = nearest_on_triangle(a, b, c, _find_nearest_in_box(ahead, middle, axes, half))
+        place = find_nearest_on_triangle(a, b, c, _find_nearest_in_box(ahead, centre, axes, half_sizes))
         pace = (one + wp.sqrt(one + wp.float64(4.0) * before * before)) / wp.float64(2.0)
         ahead = place + ((before - one) / pace) * (place - last)
     first, second, offset = b - a, c - a, place - a
@@ -126,38 +126,38 @@ def _find_nearest(
     area = wp.max(aa * bb - ab * ab, wp.float64(1.0e-300))
     v = wp.clamp((bb * pa - ab * pb) / area, wp.float64(0.0), one)
     w = wp.clamp((aa * pb - ab * pa) / area, wp.float64(0.0), one - v)
-    share[face] = wp.vec3d(one - v - w, v, w)
-    away = place - _find_nearest_in_box(place, middle, axes, half)
+    barycentric[face] = wp.vec3d(one - v - w, v, w)
+    away = place - _find_nearest_in_box(place, centre, axes, half_sizes)
     distance[face] = wp.length(away)
     normal[face] = wp.normalize(away)
     down = -wp.vec3d(axes[0, 2], axes[1, 2], axes[2, 2])
-    above = _compute_face_height(place, middle, axes, half)
+    above = _compute_face_height(place, centre, axes, half_sizes)
     if above >= wp.float64(0.0):
         distance[face] = -above
         normal[face] = down
     for corner in range(3):
-        above = _compute_face_height(corners[face, corner], middle, axes, half)
+        above = _compute_face_height(corners[face, corner], centre, axes, half_sizes)
         if above >= wp.float64(0.0) and -above < distance[face]:
             distance[face] = -above
             normal[face] = down
             weight = wp.vec3d()
             weight[corner] = one
-            share[face] = weight
+            barycentric[face] = weight
 
 
 @wp.func
-def _compute_face_height(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.float64:
+def _compute_face_height(point: wp.vec3d, centre: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.float64:
     """Return the height of a point above a flat box if the point is over the upper face; else -1."""
     none = wp.float64(0.0)
-    local = wp.transpose(axes) @ (point - middle)
+    local = wp.transpose(axes) @ (point - centre)
     within = wp.abs(local[0]) <= half[0] and wp.abs(local[1]) <= half[1] and local[2] >= none
     return wp.where(within and half[2] == none and half[0] > none and half[1] > none, local[2], wp.float64(-1.0))
 
 
 @wp.func
-def _find_nearest_in_box(point: wp.vec3d, middle: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.vec3d:
+def _find_nearest_in_box(point: wp.vec3d, centre: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.vec3d:
     """Return the point of the box nearest to a point."""
-    local = wp.transpose(axes) @ (point - middle)
+    local = wp.transpose(axes) @ (point - centre)
     for i in range(3):
         local[i] = wp.clamp(local[i], -half[i], half[i])
-    return middle + axes @ local
+    return centre + axes @ local

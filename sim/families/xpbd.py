@@ -18,7 +18,7 @@ from ..effects import Elasticity
 from ..geometry.tetmesh import EDGES
 from ..runtime.device import forward_kernel
 from ..runtime.views import run_in_order, to_library, to_view
-from ..terms.laws.invariants import cofactor
+from ..terms.laws.invariants import cofactor_matrix
 from ..terms.laws.springs import compute_spring_coefficients
 from .linear_body import list_fixed_vertices
 from .models import Relaxation
@@ -95,7 +95,7 @@ def solve_constraints(
     F = wp.identity(n=3, dtype=wp.float64)
     for k in range(4):
         F += wp.outer(get_displacement(u, table[e, k], c), gradient[e, k])
-    cof = cofactor(F)
+    cof = cofactor_matrix(F)
     total = compliance[e, 6]
     for k in range(4):
         total += inverse[table[e, k]] * wp.length_sq(cof * gradient[e, k])

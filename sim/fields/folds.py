@@ -121,7 +121,7 @@ def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing
     free = np.flatnonzero(near.reshape(-1)[used])
     held = stiff.reshape(-1)[used[free], None]
 
-    def cost(variables: np.ndarray) -> tuple[float, np.ndarray]:
+    def compute_cost(variables: np.ndarray) -> tuple[float, np.ndarray]:
         change, places = variables.reshape(-1, 3), rest.copy()
         places[free] += change
         at = places[corners]
@@ -136,7 +136,7 @@ def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing
         return size, (slope[free] + 2.0 * held * change).ravel()
 
     options = {"maxiter": UNFOLDING.max_iterations}
-    found = minimize(cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options=options)
+    found = minimize(compute_cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options=options)
     change = (spacing * found.x.reshape(-1, 3).T).astype(part.dtype)
     for values, more in zip(part, change, strict=True):
         values[np.unravel_index(used[free], shape)] += more

@@ -44,50 +44,50 @@ def build_kernels(device: Device, dtype: Any, rows_per_thread: int) -> tuple[wp.
     scalar = device.scalar
 
     @forward_kernel(module="unique")
-    def lower(
-        first: wp.array(dtype=wp.int32),
+    def restrict(
+        row_start: wp.array(dtype=wp.int32),
         column: wp.array(dtype=wp.int32),
         value: wp.array(dtype=scalar),
         scale: wp.array(dtype=scalar),
-        square: wp.array(dtype=wp.float64),
+        square_norm: wp.array(dtype=wp.float64),
         r: wp.array2d(dtype=scalar),
         # outputs
         out: wp.array2d(dtype=dtype),
     ):
         """Compute out_i = scale_i (L^T r)_i / |r|."""
         block, c = wp.tid()
-        size = scalar(wp.sqrt(square[c]))
+        size = scalar(wp.sqrt(square_norm[c]))
         share = wp.where(size > scalar(0.0), scalar(1.0) / size, scalar(0.0))
         for j in range(rows_per_thread):
             i = rows_per_thread * block + j
             if i < scale.shape[0]:
                 total = scalar(0.0)
-                for k in range(first[i], first[i + 1]):
+                for k in range(row_start[i], row_start[i + 1]):
                     total += value[k] * r[column[k], c]
                 out[i, c] = dtype(share * scale[i] * total)
 
     @forward_kernel(module="unique")
-    def raise_(
-        first: wp.array(dtype=wp.int32),
+    def extend(
+        row_start: wp.array(dtype=wp.int32),
         column: wp.array(dtype=wp.int32),
         value: wp.array(dtype=scalar),
-        square: wp.array(dtype=wp.float64),
-        solved: wp.array2d(dtype=dtype),
+        square_norm: wp.array(dtype=wp.float64),
+        solution: wp.array2d(dtype=dtype),
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """Compute out_r = |r| (L x)_r."""
         block, c = wp.tid()
-        size = scalar(wp.sqrt(square[c]))
+        size = scalar(wp.sqrt(square_norm[c]))
         for j in range(rows_per_thread):
             r = rows_per_thread * block + j
             if r < out.shape[0]:
                 total = scalar(0.0)
-                for k in range(first[r], first[r + 1]):
-                    total += value[k] * scalar(solved[column[k], c])
+                for k in range(row_start[r], row_start[r + 1]):
+                    total += value[k] * scalar(solution[column[k], c])
                 out[r, c] = size * total
 
-    return lower, raise_
+    return restrict, extend
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,21 +138,21 @@ class DenseInverse:
         """Multiply r by the dense matrix, in the stream of Warp."""
         device, count = self._device, r.shape[1]
         room, some = self._get_buffers(count), ROWS_PER_THREAD if count > 1 else 1
-        lower, raise_ = build_kernels(device, room.right_side.dtype, some)
+        restrict, extend = build_kernels(device, room.right_side.dtype, some)
         room.square_norm.zero_()
         add_dots(device, r, r, room.square_norm)
         inputs = [*self._into, self._scale, room.square_norm, r]
-        device.launch(lower, (-(-self._scale.shape[0] // some), count), inputs, [room.right_side])
-        if self._is_half_read(count):
+        device.launch(restrict, (-(-self._scale.shape[0] // some), count), inputs, [room.right_side])
+        if self._reads_half(count):
             room.solution.zero_()
             add_product(self._tiles, wp.from_torch(self._inverse), room.right_side.flatten(), room.solution.flatten())
         else:
             with torch.cuda.stream(wp.stream_to_torch(device.name)):
                 torch.matmul(self._inverse, wp.to_torch(room.right_side), out=wp.to_torch(room.solution))
         inputs = [*self._back, room.square_norm, room.solution]
-        device.launch(raise_, (-(-r.shape[0] // some), count), inputs, [out])
+        device.launch(extend, (-(-r.shape[0] // some), count), inputs, [out])
 
-    def _is_half_read(self, count: int) -> bool:
+    def _reads_half(self, count: int) -> bool:
         """Return True if only half of the matrix is read: for one load case, reading determines the time."""
         return count == 1 and self._inverse.dtype == torch.float16
 
@@ -161,7 +161,7 @@ class DenseInverse:
         if count not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_workspace_width(width)}
             low, name = LOW_TYPES[self._device.precision], self._device.name
-            if self._is_half_read(count):
+            if self._reads_half(count):
                 low = wp.float32
             shape = (self._size, -(-count // TILE) * TILE if count > 1 else 1)
             right, solved = (wp.zeros(shape, dtype=low, device=name) for _ in range(2))

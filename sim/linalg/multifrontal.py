@@ -127,7 +127,7 @@ class SparseFactor:
                 panels.append(panel)
         out, size = np.empty((len(rows), len(rows)), self._precision), self._settings.strip_size
 
-        def fill(firsts: range) -> None:
+        def fill_strips(firsts: range) -> None:
             for first in firsts:
                 strip = slice(first, first + size)
                 x = unit[:, strip].toarray(order="C").astype(self._precision)
@@ -135,7 +135,7 @@ class SparseFactor:
 
         share = choose_threads(len(rows))
         with limit_to_one_thread():
-            run_concurrently([partial(fill, range(size * k, len(rows), size * share)) for k in range(share)])
+            run_concurrently([partial(fill_strips, range(size * k, len(rows), size * share)) for k in range(share)])
         return out
 
     def _solve_columns(self, x: np.ndarray) -> np.ndarray:

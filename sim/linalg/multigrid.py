@@ -54,10 +54,10 @@ def build_kernel(device: Device, size: int) -> wp.Kernel:
     mat, vec = wp.types.matrix((size, size), scalar), wp.types.vector(size, scalar)
 
     @forward_kernel(module="unique")
-    def step(
+    def apply_step(
         inverse: wp.array(dtype=mat),
-        kept: scalar,
-        added: scalar,
+        momentum: scalar,
+        scale: scalar,
         r: wp.array2d(dtype=scalar),
         # outputs
         d: wp.array2d(dtype=scalar),
@@ -70,11 +70,11 @@ def build_kernel(device: Device, size: int) -> wp.Kernel:
             part[k] = r[size * i + k, c]
         z = inverse[i] * part
         for k in range(size):
-            new = kept * d[size * i + k, c] + added * z[k]
+            new = momentum * d[size * i + k, c] + scale * z[k]
             d[size * i + k, c] = new
             x[size * i + k, c] += new
 
-    return step
+    return apply_step
 
 
 class TwoLevelCycle:
@@ -138,11 +138,11 @@ class TwoLevelCycle:
         centre, radius = (self._largest + low) / 2.0, (self._largest - low) / 2.0
         ratio = radius / centre
         d = self._device.allocate(*r.shape)
-        self._step(0.0, 1.0 / centre, r, d, x)
+        self._apply_step(0.0, 1.0 / centre, r, d, x)
         for _ in range(self._smoother.degree - 1):
             self._stiffness.add_product(r, -1.0, d)
             following = 1.0 / (2.0 * centre / radius - ratio)
-            self._step(following * ratio, 2.0 * following / radius, r, d, x)
+            self._apply_step(following * ratio, 2.0 * following / radius, r, d, x)
             ratio = following
 
     def _compute_residual(self, r: wp.array, x: wp.array) -> wp.array:
@@ -150,9 +150,9 @@ class TwoLevelCycle:
         self._stiffness.add_product(out, -1.0, x)
         return out
 
-    def _step(self, kept: float, added: float, r: wp.array, d: wp.array, x: wp.array) -> None:
+    def _apply_step(self, momentum: float, scale: float, r: wp.array, d: wp.array, x: wp.array) -> None:
         scalar, step = self._device.scalar, build_kernel(self._device, self._size)
-        inputs = [self._inverse, scalar(kept), scalar(added), r]
+        inputs = [self._inverse, scalar(momentum), scalar(scale), r]
         self._device.launch(step, (r.shape[0] // self._size, r.shape[1]), inputs, [d, x])
 
     def _estimate_eigenvalue(self) -> float:
@@ -162,7 +162,7 @@ class TwoLevelCycle:
         largest = 1.0
         for _ in range(self._smoother.power_iterations):
             new, sum_ = device.allocate(*x.shape), device.allocate(*x.shape)
-            self._step(0.0, 1.0, self._stiffness.multiply(x), new, sum_)
+            self._apply_step(0.0, 1.0, self._stiffness.multiply(x), new, sum_)
             size = float(np.sqrt(compute_dots(device, new, new)[0]))
             largest = float(compute_dots(device, x, new)[0] / compute_dots(device, x, x)[0])
             x = combine_columns(device, device.allocate(*x.shape), np.array([1.0 / size]), new, x)

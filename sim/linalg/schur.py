@@ -67,7 +67,7 @@ def condense_exterior(
 
 
 def _compute_reduction(
-    whole: sp.csr_array, far: sp.csc_array, coupling: sp.csc_array, device: Device, strip: int
+    stiffness: sp.csr_array, motions: sp.csc_array, coupling: sp.csc_array, device: Device, strip: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return -L (L^T K L)^-1 L^T B (3N, m) and the Schur reduction (m, m), for motions L and a coupling B (3N, m).
 
@@ -77,15 +77,15 @@ def _compute_reduction(
         from . import block_inverse
 
         where = wp.device_to_torch(device.name)
-        if block_inverse.can_invert(len(far.indptr) + len(coupling.indptr), where):
+        if block_inverse.can_invert(len(motions.indptr) + len(coupling.indptr), where):
             across, taken = block_inverse.eliminate_unknowns(
-                sp.csc_array(far.T @ whole @ far), sp.csc_array(far.T @ coupling), where
+                sp.csc_array(motions.T @ stiffness @ motions), sp.csc_array(motions.T @ coupling), where
             )
-            return -(far.astype(np.float32) @ across), taken
+            return -(motions.astype(np.float32) @ across), taken
     fine = Device(device.name, "float64")
-    solver = build_direct_solver(sp.csc_array(whole), far, find_moved_nodes(far), fine, "float64")
+    solver = build_direct_solver(sp.csc_array(stiffness), motions, find_moved_nodes(motions), fine, "float64")
     count = len(coupling.indptr) - 1
-    follow, taken = np.zeros((len(whole.indptr) - 1, count), device.precision), np.zeros((count, count))
+    follow, taken = np.zeros((len(stiffness.indptr) - 1, count), device.precision), np.zeros((count, count))
     for first in range(0, count, strip):
         some = coupling[:, first : first + strip].toarray()
         out = fine.allocate(*some.shape)

@@ -49,11 +49,11 @@ class Front:
 
 
 def build_fronts(
-    matrix: sp.csc_array, node: np.ndarray, parts: int = 1, settings: FrontSizes = FRONT_SIZES
+    matrix: sp.csc_array, node: np.ndarray, part_count: int = 1, settings: FrontSizes = FRONT_SIZES
 ) -> tuple[np.ndarray, list[list[Front]]]:
     """Return an order (n,) of the unknowns of a matrix with little fill-in, and the fronts in elimination order.
 
-    Unknowns of one `node` (n,) stay together. The fronts are divided into `parts` independent parts of about equal
+    Unknowns of one `node` (n,) stay together. The fronts are divided into `part_count` independent parts of about equal
     work, followed by a last part that is coupled to all others.
     """
     number, member, weight = np.unique(node, return_inverse=True, return_counts=True)
@@ -65,21 +65,21 @@ def build_fronts(
     graph += graph.T  # an entry may be zero by round-off, and not stored, on one side only
     order = order_by_dissection(graph)
     groups = _group_nodes(sp.csr_array(graph[order][:, order]), weight[order], settings)
-    divided = _split_subtrees(groups, weight[order], parts, settings.max_fronts_above)
+    divided = _split_subtrees(groups, weight[order], part_count, settings.max_fronts_above)
     inner = np.concatenate([np.zeros(0, int), *(groups[number][0] for part in divided for number in part)])
     order, place = order[inner], np.argsort(inner)
     weight = weight[order]
     start = np.cumsum(weight) - weight
     stop = 0
 
-    def front(number: int) -> Front:
+    def build_front(number: int) -> Front:
         nonlocal stop
         own, border = groups[number]
         first, stop = stop, stop + int(weight[place[own]].sum())
         later = np.sort(place[border])
-        return Front(first, stop, _spread(start[later], weight[later]))
+        return Front(first, stop, _join_ranges(start[later], weight[later]))
 
-    fronts = [[front(number) for number in part] for part in divided]
+    fronts = [[build_front(number) for number in part] for part in divided]
     return np.argsort(np.argsort(order)[member], kind="stable"), fronts
 
 
@@ -94,9 +94,9 @@ def order_by_dissection(graph: sp.csr_array) -> np.ndarray:
     return np.asarray(order)
 
 
-def _spread(start: np.ndarray, count: np.ndarray) -> np.ndarray:
+def _join_ranges(starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return the concatenated ranges start, ..., start + count - 1."""
-    return np.repeat(start - (np.cumsum(count) - count), count) + np.arange(count.sum())
+    return np.repeat(starts - (np.cumsum(counts) - counts), counts) + np.arange(counts.sum())
 
 
 def _build_elimination_tree(graph: sp.csr_array) -> list[int]:
@@ -114,13 +114,13 @@ def _build_elimination_tree(graph: sp.csr_array) -> list[int]:
     return parent
 
 
-def _group_nodes(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) -> list[tuple[np.ndarray, np.ndarray]]:
+def _group_nodes(graph: sp.csr_array, sizes: np.ndarray, settings: FrontSizes) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return groups of nodes that are eliminated together, each with the later nodes that its elimination couples.
 
-    `graph` (N, N) is in elimination order; `weight` (N,) is the number of unknowns of each node.
+    `graph` (N, N) is in elimination order; `sizes` (N,) is the number of unknowns of each node.
     """
-    parent, count = _build_elimination_tree(graph), len(weight)
-    below, top = weight.tolist(), list(range(count))
+    parent, count = _build_elimination_tree(graph), len(sizes)
+    below, top = sizes.tolist(), list(range(count))
     for node, above in enumerate(parent):
         if above != -1:
             below[above] += below[node]
@@ -132,13 +132,13 @@ def _group_nodes(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) 
         members.setdefault(top[node], []).append(node)
 
     # Sets of nodes are the bits of integers: a union is one operation.
-    alike = {int(unknowns): _encode_nodes(np.flatnonzero(weight == unknowns), count) for unknowns in np.unique(weight)}
+    alike = {int(unknowns): _encode_nodes(np.flatnonzero(sizes == unknowns), count) for unknowns in np.unique(sizes)}
 
-    def size(nodes: int) -> int:
+    def count_unknowns(nodes: int) -> int:
         return sum(unknowns * (nodes & which).bit_count() for unknowns, which in alike.items())
 
-    def entries(own: int, border: int) -> float:
-        return own * (0.5 * own + border)
+    def count_entries(pivots: int, border: int) -> float:
+        return pivots * (0.5 * pivots + border)
 
     groups: dict[int, tuple[list[int], int, int, int]] = {}
     children: dict[int, list[int]] = {last: [] for last in members}
@@ -149,10 +149,10 @@ def _group_nodes(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) 
         for child in children[last]:
             border |= groups[child][1]
         border = border >> last + 1 << last + 1
-        k, m = int(weight[own].sum()), size(border)
+        k, m = int(sizes[own].sum()), count_unknowns(border)
         for child in children[last]:
             inner, _, j, n = groups[child]
-            if entries(j + k, m) <= entries(k, m) + entries(j, n) + settings.max_zeros:
+            if count_entries(j + k, m) <= count_entries(k, m) + count_entries(j, n) + settings.max_zeros:
                 own, k = inner + own, k + j
                 del groups[child]
         groups[last] = own, border, k, m
@@ -162,17 +162,17 @@ def _group_nodes(graph: sp.csr_array, weight: np.ndarray, settings: FrontSizes) 
 
 
 def _split_subtrees(
-    groups: list[tuple[np.ndarray, np.ndarray]], weight: np.ndarray, parts: int, most_above: int
+    groups: list[tuple[np.ndarray, np.ndarray]], sizes: np.ndarray, part_count: int, max_above: int
 ) -> list[list[int]]:
-    """Return whole subtrees of groups in `parts` parts, and the groups above in a last part, in elimination order.
+    """Return whole subtrees of groups in `part_count` parts, and the groups above in a last part, in elimination order.
 
     The root of the heaviest subtree is moved to the last part as long as the total time decreases. The total is the
     time of the last part plus the longest time of the other parts.
     """
-    owner = np.zeros(len(weight), int)
+    owner = np.zeros(len(sizes), int)
     for number, (own, _) in enumerate(groups):
         owner[own] = number
-    entries = [float(weight[own].sum() * (0.5 * weight[own].sum() + weight[border].sum())) for own, border in groups]
+    entries = [float(sizes[own].sum() * (0.5 * sizes[own].sum() + sizes[border].sum())) for own, border in groups]
     below: list[list[int]] = [[] for _ in groups]
     trees, whole = [], list(entries)
     for number, (_, border) in enumerate(groups):
@@ -183,10 +183,10 @@ def _split_subtrees(
         else:
             trees.append(number)
     shortest, best, top = np.inf, [], []
-    while trees and len(top) <= most_above:
+    while trees and len(top) <= max_above:
         trees.sort(key=lambda number: whole[number], reverse=True)
-        shares: list[list[int]] = [[] for _ in range(parts)]
-        loads = [0.0] * parts
+        shares: list[list[int]] = [[] for _ in range(part_count)]
+        loads = [0.0] * part_count
         for number in trees:
             least = loads.index(min(loads))
             shares[least].append(number)
@@ -197,12 +197,13 @@ def _split_subtrees(
         top.append(trees.pop(0))
         trees += below[top[-1]]
     if not best:
-        return [[] for _ in range(parts + 1)]
+        return [[] for _ in range(part_count + 1)]
 
-    def subtree(number: int) -> list[int]:
-        return [number, *(lower for child in below[number] for lower in subtree(child))]
+    def list_subtree(number: int) -> list[int]:
+        return [number, *(lower for child in below[number] for lower in list_subtree(child))]
 
-    return [*(sorted(lower for number in share for lower in subtree(number)) for share in best[:-1]), sorted(best[-1])]
+    subtrees = [sorted(lower for number in share for lower in list_subtree(number)) for share in best[:-1]]
+    return [*subtrees, sorted(best[-1])]
 
 
 def _encode_nodes(nodes: np.ndarray, count: int) -> int:

@@ -97,27 +97,27 @@ def build_kernel(device: Device, code: str) -> wp.Kernel:
 
 # Scatter-add of the lower half of a matrix to rows and columns of another.
 SCATTER_CODE = """
-    for (int j = 0; j < place.shape[0]; ++j) {
-        double* to = whole.data + (size_t)place.data[j] * whole.shape[1];
-        const double* from = part.data + (size_t)j * part.shape[1];
-        for (int i = j; i < place.shape[0]; ++i) to[place.data[i]] += from[i];
+    for (int j = 0; j < rows.shape[0]; ++j) {
+        double* to = matrix.data + (size_t)rows.data[j] * matrix.shape[1];
+        const double* from = block.data + (size_t)j * block.shape[1];
+        for (int i = j; i < rows.shape[0]; ++i) to[rows.data[i]] += from[i];
     }
 """
 
 
 @wp.func_native(SCATTER_CODE)
-def _add(part: wp.array2d(dtype=wp.float64), place: wp.array(dtype=wp.int64), whole: wp.array2d(dtype=wp.float64)): ...
+def _add(block: wp.array2d(dtype=wp.float64), rows: wp.array(dtype=wp.int64), matrix: wp.array2d(dtype=wp.float64)): ...
 
 
 @forward_kernel(module="unique")
-def _add_part(
-    part: wp.array2d(dtype=wp.float64),
-    place: wp.array(dtype=wp.int64),
+def _add_lower(
+    block: wp.array2d(dtype=wp.float64),
+    rows: wp.array(dtype=wp.int64),
     # outputs
-    whole: wp.array2d(dtype=wp.float64),
+    matrix: wp.array2d(dtype=wp.float64),
 ):
-    """Add `part` to `whole` at the indices `place`; both are transposed, so that columns are contiguous."""
-    _add(part, place, whole)
+    """Add `block` to `matrix` at the indices `rows`; both are transposed, so that columns are contiguous."""
+    _add(block, rows, matrix)
 
 
 def add_lower_block(block: np.ndarray, index: np.ndarray, matrix: np.ndarray) -> None:
@@ -126,7 +126,7 @@ def add_lower_block(block: np.ndarray, index: np.ndarray, matrix: np.ndarray) ->
     This kernel is ten times as fast as NumPy.
     """
     views = [wp.array(array, device="cpu", copy=False) for array in (block.T, index, matrix.T)]
-    Device("cpu", "float64").launch(_add_part, (1,), views[:2], views[2:])
+    Device("cpu", "float64").launch(_add_lower, (1,), views[:2], views[2:])
 
 
 class TriangularSweeps:

@@ -95,7 +95,7 @@ class ContactDescent:
         return self.compliance.places[: 3 * len(self.barrier.touchable_nodes)]
 
     @cached_property
-    def _room(self) -> Callable[[int, int, int], Scratch]:
+    def _scratch(self) -> Callable[[int, int, int], Scratch]:
         """Function `allocate_scratch` with a cache of the last two results, since allocation is slow."""
         return lru_cache(2)(partial(allocate_scratch, self._exact))
 
@@ -112,7 +112,7 @@ class ContactDescent:
         with run_in_order(device):
             batch = self._begin_batch(start)
             if count == 1 and self.captured_steps is not None:
-                self._replay(self.captured_steps, batch, tolerance, max_iter)
+                self._run_captured(self.captured_steps, batch, tolerance, max_iter)
             ready = np.ones(count, bool)
             while True:
                 over = ready & self._find_ended(batch, tolerance[live], max_iter)
@@ -151,7 +151,7 @@ class ContactDescent:
             stalls=slow, steps=steps, failures=failed, waiting=waiting, ended=ended,
         )  # fmt: skip
 
-    def _replay(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, most: int) -> None:
+    def _run_captured(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, max_iter: int) -> None:
         """Run captured steps of a single load case until it ends.
 
         Return early if the load case needs a larger workspace or Newton's method, which captured steps do not include.
@@ -160,7 +160,7 @@ class ContactDescent:
         if batch.model is None or not steps.set_tools(judge.constant):
             return
         batch.state, batch.force, batch.response, batch.d = steps.load_state(batch.state, batch.force, batch.response)
-        while not self._find_ended(batch, tolerance, most).any():
+        while not self._find_ended(batch, tolerance, max_iter).any():
             self._rebuild_models(batch, np.ones(1, bool))
             if batch.model is not known:
                 known = batch.model
@@ -188,17 +188,17 @@ class ContactDescent:
             else:  # the load case's model has been reset
                 known = None
 
-    def _find_ended(self, batch: Batch, tolerance: np.ndarray, most: int) -> np.ndarray:
+    def _find_ended(self, batch: Batch, tolerance: np.ndarray, max_iter: int) -> np.ndarray:
         """Return a mask (b,) of load cases that have ended, in equilibrium or not."""
-        lost = (batch.stalls >= self.limits.patience) | (batch.steps >= most) | ~batch.state.is_finite
+        lost = (batch.stalls >= self.limits.patience) | (batch.steps >= max_iter) | ~batch.state.is_finite
         return lost | (batch.state.relative <= tolerance)
 
-    def _rebuild_models(self, batch: Batch, wanted: np.ndarray) -> None:
-        """Recompute the stale models of the load cases in the mask `wanted` (b,)."""
-        renewed = np.flatnonzero(wanted & batch.stale)
+    def _rebuild_models(self, batch: Batch, mask: np.ndarray) -> None:
+        """Recompute the stale models of the load cases in the mask `mask` (b,)."""
+        renewed = np.flatnonzero(mask & batch.stale)
         if batch.model is not None and self._strained is not None and len(renewed):
             fresh = self._strained.build_model(from_view(self.problem.device, batch.state.u), renewed)
-            batch.stale &= ~wanted
+            batch.stale &= ~mask
             if fresh is not None:
                 batch.model = batch.model.merge_columns(renewed, fresh)
 
@@ -207,20 +207,20 @@ class ContactDescent:
         limits = self.limits
         return np.maximum(limits.forcing * np.minimum(batch.state.relative, 1.0), limits.tolerance_factor * tolerance)
 
-    def _compute_directions(self, batch: Batch, wanted: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
-        """Compute directions of the load cases in the mask `wanted` (b,); return a mask (b,) of final failures.
+    def _compute_directions(self, batch: Batch, mask: np.ndarray, tolerance: np.ndarray) -> np.ndarray:
+        """Compute directions of the load cases in the mask `mask` (b,); return a mask (b,) of final failures.
 
         A load case whose model has no equilibrium waits for the next call, with a larger proximal term. If this fails,
         its model is reset; finally a nonconvex model is accepted. The other load cases continue without waiting.
         """
-        self._rebuild_models(batch, wanted)
-        force, found = batch.force + 0.0, np.zeros(len(wanted), bool)
+        self._rebuild_models(batch, mask)
+        force, found = batch.force + 0.0, np.zeros(len(mask), bool)
         bent = self._find_nonconvex(batch)
-        for some, limits in ((np.flatnonzero(wanted & ~bent), FORCES), (np.flatnonzero(wanted & bent), NONCONVEX)):
+        for some, limits in ((np.flatnonzero(mask & ~bent), FORCES), (np.flatnonzero(mask & bent), NONCONVEX)):
             if len(some):
-                on = select_columns(self.problem.device, some, len(wanted))
+                on = select_columns(self.problem.device, some, len(mask))
                 force[:, on], found[some] = self._solve_forces(batch, some, tolerance, limits)
-        over = self._increase_proximal_term(batch, wanted & ~found)
+        over = self._increase_proximal_term(batch, mask & ~found)
         some = np.flatnonzero(found)
         if len(some):
             self._compute_steps(batch, some, force)
@@ -237,13 +237,13 @@ class ContactDescent:
         batch.failures = np.where(waiting, batch.failures + 1, 0)
         fresh = waiting & (batch.failures % times == 0)
         batch.reset_model(np.flatnonzero(fresh))
-        batch.proximal = np.where(fresh, 0.0, np.where(waiting, self._raise_drag(batch.proximal), batch.proximal))
+        batch.proximal = np.where(fresh, 0.0, np.where(waiting, self._raise_proximal(batch.proximal), batch.proximal))
         return batch.failures >= 3 * times
 
-    def _compute_steps(self, batch: Batch, some: np.ndarray, force: Any) -> None:
-        """Compute directions, step lengths and predicted decreases of cases `some` (k,) under tool forces (3n, b)."""
+    def _compute_steps(self, batch: Batch, cases: np.ndarray, force: Any) -> None:
+        """Compute directions, step lengths and predicted decreases of cases `cases` (k,) under tool forces (3n, b)."""
         now, device = batch.state, self.problem.device
-        on = select_columns(device, some, len(batch.proximal))
+        on = select_columns(device, cases, len(batch.proximal))
         if batch.model is None:
             batch.response[:, on] += self.compliance.compute_full_motion((force - batch.force)[:, on])
             batch.force[:, on] = force[:, on]
@@ -254,36 +254,36 @@ class ContactDescent:
                 -batch.response[:, on] - self.compliance.apply(self._compute_forces(batch, force)[0])[:, on]
             )
         if batch.history.max_pairs:
-            history = batch.history.get_history(some)
+            history = batch.history.get_history(cases)
             batch.d[:, on] -= history.compute_motion(
-                history.compute_weights(self._pull(now.smooth_gradient, force)[:, on])
+                history.compute_weights(self._add_forces(now.smooth_gradient, force)[:, on])
             )
         longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.d))
-        batch.length[some] = longest[some]
-        batch.decrease[some] = -_compute_dots(now.gradient[:, on], batch.d[:, on])
+        batch.length[cases] = longest[cases]
+        batch.decrease[cases] = -_compute_dots(now.gradient[:, on], batch.d[:, on])
 
     def _solve_forces(
-        self, batch: Batch, some: np.ndarray, tolerance: np.ndarray, most: ForceLimits
+        self, batch: Batch, cases: np.ndarray, tolerance: np.ndarray, limits: ForceLimits
     ) -> tuple[Any, np.ndarray]:
-        """Return the tool forces (3n, k) on the models of load cases `some` (k,), and a mask (k,) of solved cases."""
+        """Return the tool forces (3n, k) on the models of load cases `cases` (k,), and a mask (k,) of solved cases."""
         rows, now = self._rows, batch.state
-        on = select_columns(self.problem.device, some, len(batch.proximal))
-        barrier, known = self.barrier.reduce(some), batch.force[:, on]
+        on = select_columns(self.problem.device, cases, len(batch.proximal))
+        barrier, known = self.barrier.reduce(cases), batch.force[:, on]
         if barrier is None:
-            return known, np.ones(len(some), bool)
-        exact = self._compute_force_tolerance(batch, tolerance)[some]
-        soft, free = ContactCompliance(self.compliance, self._exact, self._room), now.u[rows] - batch.response[rows]
+            return known, np.ones(len(cases), bool)
+        exact = self._compute_force_tolerance(batch, tolerance)[cases]
+        soft, free = ContactCompliance(self.compliance, self._exact, self._scratch), now.u[rows] - batch.response[rows]
         if batch.model is not None:
             free = free - self._compute_forces(batch, batch.force)[1]
             soft = replace(soft, own=batch.model.change[on])
         free, here = free[:, on], to_double(now.u[rows][:, on])
         if batch.history.max_pairs:
-            history = batch.history.get_history(some)
+            history = batch.history.get_history(cases)
             own = to_double(history.sw[:, :, rows])
             soft = replace(soft, history=own, middle=to_double(history.middle_matrix))
-            weights = history.compute_weights(self._pull(now.smooth_gradient, batch.force)[:, on])
+            weights = history.compute_weights(self._add_forces(now.smooth_gradient, batch.force)[:, on])
             free = free - (to_double(weights).mT @ own)[:, 0].T
-        return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.proximal[some], most)
+        return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.proximal[cases], limits)
 
     def _compute_forces(self, batch: Batch, force: Any) -> tuple[Any, Any]:
         """Return additional forces (3N, b) [N] on the undeformed mesh: changes of tool forces, and model corrections.
@@ -299,8 +299,8 @@ class ContactDescent:
         out[compliance.places] += own
         return out, cast_like(batch.response, compliance.compute_motion(own)[: len(self._rows)])
 
-    def _raise_drag(self, drag: np.ndarray) -> np.ndarray:
-        return np.maximum(self.limits.proximal, self.limits.growth * drag)
+    def _raise_proximal(self, proximal: np.ndarray) -> np.ndarray:
+        return np.maximum(self.limits.proximal, self.limits.growth * proximal)
 
     def _try_steps(self, batch: Batch) -> np.ndarray:
         """Evaluate the trial step of each case that does not wait; return a mask (b,) of cases that need a direction.
@@ -324,68 +324,67 @@ class ContactDescent:
             now.put_columns(taken, some, new)
         return misled | there | (batch.waiting & ~batch.ended)
 
-    def _take_steps(self, batch: Batch, t: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _take_steps(self, batch: Batch, t: np.ndarray, slopes: np.ndarray, norms: np.ndarray) -> tuple[np.ndarray, ...]:
         """Accept or shorten steps of length t (b,); return masks (b,) of accepted steps and of models to be reset.
 
-        The decision depends on the slopes `ahead` (b,) and the residuals `free` (b,) after the step.
+        The decision depends on `slopes` (b,) and residual `norms` (b,) after the step.
         """
         limits, now, going = self.limits, batch.state, ~(batch.waiting | batch.ended)
-        far = going & is_step_too_long(ahead, batch.decrease) & (t > limits.accepted_length)
-        batch.length, there = np.where(far, t * backtrack_by_slopes(ahead, batch.decrease), t), going & ~far
+        far = going & is_step_too_long(slopes, batch.decrease) & (t > limits.accepted_length)
+        batch.length, there = np.where(far, t * backtrack_by_slopes(slopes, batch.decrease), t), going & ~far
         misled = far & (batch.length < limits.reset_length)
         if misled.any():  # reading from the GPU only if needed
             misled &= batch.is_updated
-        well = (t > limits.min_good_step) & (free <= limits.residual_factor * now.norm)
+        well = (t > limits.min_good_step) & (norms <= limits.residual_factor * now.norm)
         eased = np.where(batch.proximal >= limits.proximal, batch.proximal / limits.growth, 0.0)
-        worse = (t < limits.min_good_step) | (free > now.norm)
-        drag = np.where(
-            there & well, eased, np.where(misled | (there & worse), self._raise_drag(batch.proximal), batch.proximal)
-        )
+        worse = (t < limits.min_good_step) | (norms > now.norm)
+        raised = np.where(misled | (there & worse), self._raise_proximal(batch.proximal), batch.proximal)
+        drag = np.where(there & well, eased, raised)
         batch.proximal, batch.steps = drag, batch.steps + (misled | there)
-        batch.stale |= there & (free > limits.stale_factor * now.norm)
+        batch.stale |= there & (norms > limits.stale_factor * now.norm)
         batch.stalls = np.where(there & well, 0, batch.stalls + (misled | there))
         batch.reset_model(np.flatnonzero(misled))
         return there, misled
 
-    def _update_models(self, batch: Batch, new: ContactState, taken: np.ndarray, some: Any) -> None:
-        """Update the models with the accepted steps of cases `taken`; `some` is this selection for device arrays."""
+    def _update_models(self, batch: Batch, new: ContactState, cases: np.ndarray, index: Any) -> None:
+        """Update the models with the accepted steps of cases `cases`; `index` is this selection for device arrays."""
         now = batch.state
         if batch.model is not None:
-            batch.force[:, some] = batch.target_force[:, some]
-            batch.response[:, some] = self._compute_response(new.smooth_gradient[:, some], batch.force[:, some])
+            batch.force[:, index] = batch.target_force[:, index]
+            batch.response[:, index] = self._compute_response(new.smooth_gradient[:, index], batch.force[:, index])
             return
-        moved, change = new.u[:, some] - now.u[:, some], new.smooth_gradient[:, some] - now.smooth_gradient[:, some]
-        rest = self._compute_response(new.smooth_gradient[:, some], batch.force[:, some])
-        way = rest - batch.response[:, some]
-        batch.response[:, some] = rest
-        positive = np.flatnonzero((_compute_dots(moved, change) > self.limits.min_curvature) & new.is_finite[taken])
+        moved, change = new.u[:, index] - now.u[:, index], new.smooth_gradient[:, index] - now.smooth_gradient[:, index]
+        rest = self._compute_response(new.smooth_gradient[:, index], batch.force[:, index])
+        way = rest - batch.response[:, index]
+        batch.response[:, index] = rest
+        positive = np.flatnonzero((_compute_dots(moved, change) > self.limits.min_curvature) & new.is_finite[cases])
         if len(positive):
-            on = select_columns(self.problem.device, positive, len(taken))
-            batch.history.update_history(taken[positive], moved[:, on], change[:, on], way[:, on])
+            on = select_columns(self.problem.device, positive, len(cases))
+            batch.history.update_history(cases[positive], moved[:, on], change[:, on], way[:, on])
 
-    def _compute_balancing_forces(self, now: ContactState) -> Any:
+    def _compute_balancing_forces(self, state: ContactState) -> Any:
         """Return the forces (3n, b) at the touched nodes that balance the gradient of the smooth terms."""
-        barrier, rows = self.barrier.reduce(np.arange(len(now.norm))), self._rows
-        own = to_double(now.smooth_gradient[rows])
+        barrier, rows = self.barrier.reduce(np.arange(len(state.norm))), self._rows
+        own = to_double(state.smooth_gradient[rows])
         if barrier is None:
             return 0.0 * own
-        slope = barrier.compute_gradient(to_double(now.u[rows]))
+        slope = barrier.compute_gradient(to_double(state.u[rows]))
         shape = -1, 3, slope.shape[1]
         touched = (slope != 0.0).reshape(shape).any(1)
         return (-own.reshape(shape) * touched[:, None]).reshape(slope.shape)
 
-    def _pull(self, smooth: Any, force: Any) -> Any:
+    def _add_forces(self, smooth: Any, force: Any) -> Any:
         """Return smooth gradients (3N, b) plus the forces (3n, b) on the touchable nodes."""
         out = smooth + 0.0
         out[self._rows] += force
         return out
 
-    def _evaluate_state(self, judge: ResidualEvaluator, u: Any) -> ContactState:
+    def _evaluate_state(self, evaluator: ResidualEvaluator, u: Any) -> ContactState:
         """Return the contact state at u (3N, b), with residuals as in `Problem.residual`."""
         problem, device = self.problem, self.problem.device
         place, pressed = device.allocate(*u.shape), device.allocate(*u.shape)
         to_view(place)[:] = u
-        found = judge(place)
+        found = evaluator(place)
         self.barrier.add_gradient(place, pressed)
         problem.constraint.project_nodes(pressed)
         whole = to_view(found.g)
@@ -393,7 +392,7 @@ class ContactDescent:
 
     def _compute_response(self, smooth: Any, force: Any) -> Any:
         """Return the linear response (3N, b) [m] of the undeformed mesh to the residual."""
-        return self.compliance.apply(self._pull(smooth, force))
+        return self.compliance.apply(self._add_forces(smooth, force))
 
 
 def _compute_dots(x: Any, y: Any) -> np.ndarray:

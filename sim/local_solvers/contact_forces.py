@@ -141,35 +141,35 @@ def solve_contact_forces(
 
 def _solve_forces(
     barrier: ReducedBarrier,
-    soft: ContactCompliance,
+    compliance: ContactCompliance,
     columns: np.ndarray,
-    own: tuple[Any, Any, Any],
-    asked: tuple[np.ndarray, np.ndarray],
+    vectors: tuple[Any, Any, Any],
+    options: tuple[np.ndarray, np.ndarray],
     limits: ForceLimits,
-    room: int,
+    capacity: int,
 ) -> tuple[Any, np.ndarray, Any]:
-    """Return forces (3n, k), status (k,) and node indices (n, k) of load cases (k,), for up to `room` touched nodes.
+    """Return forces (3n, k), status (k,) and node indices (n, k) of load cases, for up to `capacity` touched nodes.
 
-    `own` contains current positions, targets and known forces (3n, k); `asked` contains tolerance and proximal (k,).
+    `vectors` are current positions, targets and known forces (3n, k); `options` are tolerance and proximal (k,).
     """
-    device, count = soft.device, len(columns)
-    nodes, functions = len(own[0]) // 3, barrier.functions
-    scratch = soft.get_scratch(nodes, 1 << (count - 1).bit_length(), room)
+    device, count = compliance.device, len(columns)
+    nodes, functions = len(vectors[0]) // 3, barrier.functions
+    scratch = compliance.get_scratch(nodes, 1 << (count - 1).bit_length(), capacity)
     out, status = device.allocate(3 * nodes, count), wp.zeros(count, dtype=wp.int32, device=device.name)
-    arrays = [from_view(device, x) for x in own] + [device.upload(x) for x in asked]
+    arrays = [from_view(device, x) for x in vectors] + [device.upload(x) for x in options]
     touching = barrier.build_structs(columns)
     kernel, model, ends = (
         build_kernel(device, functions),
-        soft.build_model(columns, limits.diagonal_shift),
-        build_kernel_limits(limits, room),
+        compliance.build_model(columns, limits.diagonal_shift),
+        build_kernel_limits(limits, capacity),
     )
 
-    def part(first: int, stop: int) -> None:
+    def launch_part(first: int, stop: int) -> None:
         inputs = [*arrays, first, *touching, model, ends, scratch]
         launch(device, kernel, stop - first, inputs, [out, status])
 
     middle = count if device.on_cuda else (count + 1) // 2
-    run_concurrently([partial(part, 0, middle), partial(part, middle, count)])
+    run_concurrently([partial(launch_part, 0, middle), partial(launch_part, middle, count)])
     return to_view(out), status.numpy(), to_view(scratch.place)[:, :count]
 
 
@@ -184,19 +184,20 @@ def build_kernel_limits(limits: ForceLimits, capacity: int) -> Limits:
 def allocate_scratch(device: Device, nodes: int, columns: int, capacity: int) -> Scratch:
     """Return scratch arrays for the given numbers of nodes, load cases and touched nodes (`capacity`)."""
 
-    def numbers(*shape: int) -> wp.array:
+    def allocate_floats(*shape: int) -> wp.array:
         return wp.empty(shape, dtype=wp.float64, device=device.name)
 
-    def counts(*shape: int) -> wp.array:
+    def allocate_ints(*shape: int) -> wp.array:
         return wp.empty(shape, dtype=wp.int32, device=device.name)
 
     out, size = Scratch(), 3 * capacity
     for name in ("force", "w", "at", "slope", "change", "way", "held"):
-        setattr(out, name, numbers(columns, 3 * nodes).transpose())
-    out.place, out.acts = counts(columns, nodes).transpose(), counts(columns, nodes).transpose()
-    out.touched, out.acting, out.counts = counts(columns, nodes), counts(columns, nodes), counts(columns, 2)
-    out.middle_history = numbers(columns, 2 * PAIRS, size)
+        setattr(out, name, allocate_floats(columns, 3 * nodes).transpose())
+    out.place, out.acts = allocate_ints(columns, nodes).transpose(), allocate_ints(columns, nodes).transpose()
+    out.touched, out.acting = allocate_ints(columns, nodes), allocate_ints(columns, nodes)
+    out.counts = allocate_ints(columns, 2)
+    out.middle_history = allocate_floats(columns, 2 * PAIRS, size)
     for name in ("soft", "stiff", "both", "system"):
-        setattr(out, name, numbers(columns, size, size))
-    out.x, out.y = numbers(columns, size), numbers(columns, size)
+        setattr(out, name, allocate_floats(columns, size, size))
+    out.x, out.y = allocate_floats(columns, size), allocate_floats(columns, size)
     return out

@@ -20,14 +20,14 @@ TOUCHED, ACTING = wp.constant(0), wp.constant(1)  # Columns of `Scratch.counts`:
 def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     """Return the kernel for a barrier, launched over (load case, thread)."""
     down, across = get_block_shape(device)
-    threads, dense, Stage, Near = down * across, build_functions(device), barrier.barrier_struct, barrier.pairs_struct
+    threads, dense, Contact, Near = down * across, build_functions(device), barrier.barrier_struct, barrier.pairs_struct
     wide = wp.constant(CUDA_SUMS if device.on_cuda else CPU_SUMS)
     Strip = wp.types.vector(length=wide, dtype=wp.float64)
     overshoot, least, middle, most = (
         wp.constant(wp.float64(x)) for x in (OVERSHOOT, MIN_BACKTRACK, DEFAULT_BACKTRACK, MAX_BACKTRACK)
     )
     factor, solve = dense.factor, dense.solve
-    add_force, add_matrix, longest = barrier.add_force, barrier.add_matrix, barrier.bound_step
+    add_force, add_matrix, bound_step = barrier.add_force, barrier.add_matrix, barrier.bound_step
 
     @wp.func
     def dot(x: wp.array2d(dtype=wp.float64), y: wp.array2d(dtype=wp.float64), c: int, me: int) -> wp.float64:
@@ -44,26 +44,26 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return x[3 * i, c] != zero or x[3 * i + 1, c] != zero or x[3 * i + 2, c] != zero
 
     @wp.func
-    def has_same_nodes(x: wp.array2d(dtype=wp.float64), place: wp.array2d(dtype=wp.int32), c: int, me: int) -> bool:
-        """Return True if x is nonzero at exactly those nodes whose index in `place` is not -1."""
+    def has_same_nodes(x: wp.array2d(dtype=wp.float64), index: wp.array2d(dtype=wp.int32), c: int, me: int) -> bool:
+        """Return True if x is nonzero at exactly those nodes whose index in `index` is not -1."""
         other = wp.float64(0.0)
-        for i in range(me, place.shape[0], threads):
-            if is_nonzero(x, i, c) != (place[i, c] >= 0):
+        for i in range(me, index.shape[0], threads):
+            if is_nonzero(x, i, c) != (index[i, c] >= 0):
                 other += wp.float64(1.0)
         return get_sum(other) == wp.float64(0.0)
 
     @wp.func
     def list_nodes(
         x: wp.array2d(dtype=wp.float64),
-        place: wp.array2d(dtype=wp.int32),
+        index: wp.array2d(dtype=wp.int32),
         nodes: wp.array2d(dtype=wp.int32),
         counts: wp.array2d(dtype=wp.int32),
-        which: int,
+        column: int,
         c: int,
         me: int,
     ) -> int:
-        """List the nodes with nonzero x in ascending order, set `place` (-1 for others), and return their number."""
-        n = place.shape[0]
+        """List the nodes with nonzero x in ascending order, set `index` (-1 for others), and return their number."""
+        n = index.shape[0]
         own = (n + threads - 1) // threads
         begin, end = wp.min(me * own, n), wp.min((me + 1) * own, n)
         mine = wp.int32(0)
@@ -72,21 +72,21 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                 mine += 1
         number = get_prefix(mine)
         for i in range(begin, end):
-            place[i, c] = -1
+            index[i, c] = -1
             if is_nonzero(x, i, c):
                 nodes[c, number] = i
-                place[i, c] = number
+                index[i, c] = number
                 number += 1
         if me == threads - 1:
-            counts[c, which] = number
+            counts[c, column] = number
         wait()
-        return counts[c, which]
+        return counts[c, column]
 
     @wp.func
     def compute_gradient(
         x: wp.array2d(dtype=wp.float64),
-        here: wp.array2d(dtype=wp.float64),
-        stage: Stage,
+        positions: wp.array2d(dtype=wp.float64),
+        contact: Contact,
         near: Near,
         s: Scratch,
         c: int,
@@ -94,23 +94,23 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     ):
         """Compute the gradient of the barrier and of the proximal term at x."""
         for r in range(me, x.shape[0], threads):
-            s.slope[r, c] = s.held[r, c] * (x[r, c] - here[r, c])
-        add_force(x, stage, near, c, me, s.slope)
+            s.slope[r, c] = s.held[r, c] * (x[r, c] - positions[r, c])
+        add_force(x, contact, near, c, me, s.slope)
 
     @wp.func
-    def assemble_curvature(stage: Stage, near: Near, definite: int, m: int, s: Scratch, c: int, me: int):
+    def assemble_curvature(contact: Contact, near: Near, definite: int, m: int, s: Scratch, c: int, me: int):
         """Assemble the curvature matrix of the barrier and of the proximal term at w, for the m touched nodes."""
         for i in range(me // across, 3 * m, down):
             for j in range(me % across, 3 * m, across):
                 s.stiff[c, i, j] = wp.float64(0.0)
         wait()
-        add_matrix(s.w, stage, near, definite, s.place, c, me, s.stiff)
+        add_matrix(s.w, contact, near, definite, s.place, c, me, s.stiff)
         for i in range(me, 3 * m, threads):
             s.stiff[c, i, i] = s.stiff[c, i, i] + s.held[3 * s.touched[c, i // 3] + i % 3, c]
         wait()
 
     @wp.func
-    def get_change(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
+    def get_compliance_change(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
         """Return an entry of the change of the compliance by strained tissue."""
         own = wp.float64(0.0)
         if model.own.shape[1] > 0:
@@ -120,7 +120,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     @wp.func
     def get_compliance(model: ComplianceModel, c: int, i: int, j: int) -> wp.float64:
         """Return a compliance entry of touched nodes, symmetrised, since half precision may round the columns."""
-        return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + get_change(model, c, i, j)
+        return wp.float64(0.5) * (model.rest[i, j] + model.rest[j, i]) + get_compliance_change(model, c, i, j)
 
     @wp.func
     def list_changes(model: ComplianceModel, s: Scratch, c: int, me: int) -> int:
@@ -154,7 +154,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                     share = s.change[j, c]
                     for q in range(wide):
                         i = wp.min(first + q * threads, size - 1)
-                        soft = model.rest[j, i] + get_change(model, c, j, i)
+                        soft = model.rest[j, i] + get_compliance_change(model, c, j, i)
                         if s.place[i // 3, c] >= 0:
                             soft = get_compliance(model, c, i, j)
                         sums[q] += soft * share
@@ -268,7 +268,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         return True
 
     @wp.func
-    def are_known(model: ComplianceModel, m: int, s: Scratch, c: int) -> bool:
+    def has_all_columns(model: ComplianceModel, m: int, s: Scratch, c: int) -> bool:
         """Return True if the columns of the compliance are available for all touched nodes."""
         missing = wp.int32(0)
         for i in range(m):
@@ -277,16 +277,16 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
 
     @forward_kernel(module="unique", launch_bounds=threads)
     def solve_forces(
-        here: wp.array2d(dtype=wp.float64),
-        there: wp.array2d(dtype=wp.float64),
-        known: wp.array2d(dtype=wp.float64),
+        positions: wp.array2d(dtype=wp.float64),
+        targets: wp.array2d(dtype=wp.float64),
+        known_forces: wp.array2d(dtype=wp.float64),
         tolerance: wp.array(dtype=wp.float64),
-        drag: wp.array(dtype=wp.float64),
-        first: int,
-        stage: Stage,
+        proximal: wp.array(dtype=wp.float64),
+        first_case: int,
+        contact: Contact,
         near: Near,
         model: ComplianceModel,
-        ends: Limits,
+        limits: Limits,
         s: Scratch,
         # outputs
         out: wp.array2d(dtype=wp.float64),
@@ -294,29 +294,29 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     ):
         """Solve for contact forces, as `contact_forces.solve_contact_forces`, in load cases with the status `OPEN`."""
         c, me = wp.tid()
-        c = c + first
+        c = c + first_case
         if status[c] != OPEN:
             return
-        size = here.shape[0]
+        size = positions.shape[0]
         for r in range(me, size, threads):
             s.held[r, c] = wp.float64(0.0)
-            s.force[r, c] = known[r, c]
-            s.w[r, c] = here[r, c]
+            s.force[r, c] = known_forces[r, c]
+            s.w[r, c] = positions[r, c]
         wait()
-        compute_gradient(s.w, here, stage, near, s, c, me)
+        compute_gradient(s.w, positions, contact, near, s, c, me)
         m = list_nodes(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
-        if m > ends.capacity or not are_known(model, m, s, c):
+        if m > limits.capacity or not has_all_columns(model, m, s, c):
             wait()
             if me == 0:
-                status[c] = wp.where(m > ends.capacity, TOO_MANY_TOUCHED, UNKNOWN)
+                status[c] = wp.where(m > limits.capacity, TOO_MANY_TOUCHED, UNKNOWN)
             return
         sound = wp.bool(False)  # True if `soft` holds a valid Cholesky factor
         if m > 0:
-            stiff = drag[c] / assemble_compliance(model, m, s, c, me)
+            stiff = proximal[c] / assemble_compliance(model, m, s, c, me)
             for i in range(me, 3 * m, threads):
                 row = 3 * s.touched[c, i // 3] + i % 3
                 s.held[row, c] = stiff
-                s.x[c, i] = there[row, c] - here[row, c]
+                s.x[c, i] = targets[row, c] - positions[row, c]
             wait()
             sound = factor(s.soft, 3 * m, c, me)
             if sound:
@@ -326,15 +326,15 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                     s.force[row, c] = s.force[row, c] + s.x[c, i]
         wait()
         for r in range(me, size, threads):
-            s.change[r, c] = s.force[r, c] - known[r, c]
+            s.change[r, c] = s.force[r, c] - known_forces[r, c]
         wait()
         compute_motion(model, s.at, s, c, me)
         for r in range(me, size, threads):
-            s.w[r, c] = there[r, c] + s.at[r, c]
+            s.w[r, c] = targets[r, c] + s.at[r, c]
         wait()
-        compute_gradient(s.w, here, stage, near, s, c, me)
+        compute_gradient(s.w, positions, contact, near, s, c, me)
         convex, verdict = wp.bool(True), wp.int32(OPEN)
-        for step in range(ends.max_iterations + 1):
+        for step in range(limits.max_iterations + 1):
             fresh = not has_same_nodes(s.slope, s.place, c, me)
             if fresh:
                 m = list_nodes(s.slope, s.place, s.touched, s.counts, TOUCHED, c, me)
@@ -344,11 +344,11 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
             left = dot(s.change, s.change, c, me)
             if left <= tolerance[c] * tolerance[c] * dot(s.slope, s.slope, c, me):
                 verdict = wp.int32(SOLVED)
-            elif m > ends.capacity:
+            elif m > limits.capacity:
                 verdict = wp.int32(TOO_MANY_TOUCHED)
-            elif step == ends.max_iterations or not (convex or step <= ends.nonconvex_iterations):
+            elif step == limits.max_iterations or not (convex or step <= limits.nonconvex_iterations):
                 verdict = wp.int32(NO_EQUILIBRIUM)
-            elif fresh and not are_known(model, m, s, c):
+            elif fresh and not has_all_columns(model, m, s, c):
                 verdict = wp.int32(UNKNOWN)
             if verdict != OPEN:
                 break
@@ -361,27 +361,27 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
                     sound = factor(s.soft, 3 * m, c, me)
                 convex = sound
                 if sound:
-                    assemble_curvature(stage, near, 0, m, s, c, me)
+                    assemble_curvature(contact, near, 0, m, s, c, me)
                     convex = apply_woodbury(m, s, c, me)
                 if sound and not convex:  # retry with positive semi-definite contact curvature
-                    assemble_curvature(stage, near, 1, m, s, c, me)
+                    assemble_curvature(contact, near, 1, m, s, c, me)
                     apply_woodbury(m, s, c, me)
             compute_motion(model, s.way, s, c, me)
             own = wp.float64(0.0)
             for r in range(me, size, threads):
                 own += (s.slope[r, c] - s.force[r, c]) * s.way[r, c]
             predicted = -get_sum(own)
-            t = longest(s.w, s.way, stage, near, c, me)
-            for cut in range(ends.max_backtracks + 1):
+            t = bound_step(s.w, s.way, contact, near, c, me)
+            for cut in range(limits.max_backtracks + 1):
                 for r in range(me, size, threads):
                     s.at[r, c] = s.w[r, c] + t * s.way[r, c]
                 wait()
-                compute_gradient(s.at, here, stage, near, s, c, me)
+                compute_gradient(s.at, positions, contact, near, s, c, me)
                 own = wp.float64(0.0)
                 for r in range(me, size, threads):
                     own += (s.slope[r, c] - s.force[r, c] - t * s.change[r, c]) * s.way[r, c]
                 ahead = get_sum(own)
-                if ahead <= overshoot * wp.abs(predicted) or cut == ends.max_backtracks:
+                if ahead <= overshoot * wp.abs(predicted) or cut == limits.max_backtracks:
                     break
                 share = middle
                 if predicted > wp.float64(0.0) and wp.isfinite(ahead):

@@ -57,36 +57,36 @@ def build_kernels(device: Device) -> ContactStepKernels:
     def compute_positions(
         rows: wp.array(dtype=wp.int32),
         u: wp.array2d(dtype=scalar),
-        rest: wp.array2d(dtype=scalar),
-        more: wp.array2d(dtype=scalar),
+        response: wp.array2d(dtype=scalar),
+        correction: wp.array2d(dtype=scalar),
         # outputs
-        here: wp.array2d(dtype=wp.float64),
-        there: wp.array2d(dtype=wp.float64),
+        positions: wp.array2d(dtype=wp.float64),
+        targets: wp.array2d(dtype=wp.float64),
     ):
         """Compute the current positions of the nodes, and their positions under the known forces."""
         i = wp.tid()
-        here[i, 0] = wp.float64(u[rows[i], 0])
-        there[i, 0] = here[i, 0] - wp.float64(rest[rows[i], 0]) - wp.float64(more[i, 0])
+        positions[i, 0] = wp.float64(u[rows[i], 0])
+        targets[i, 0] = positions[i, 0] - wp.float64(response[rows[i], 0]) - wp.float64(correction[i, 0])
 
     @forward_kernel(module="unique")
     def compute_change(
-        found: wp.array2d(dtype=wp.float64),
+        new_force: wp.array2d(dtype=wp.float64),
         force: wp.array2d(dtype=wp.float64),
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """Compute the change of the tool forces."""
         i = wp.tid()
-        out[i, 0] = scalar(found[i, 0] - force[i, 0])
+        out[i, 0] = scalar(new_force[i, 0] - force[i, 0])
 
     @forward_kernel(module="unique")
     def read_length(
-        given: wp.array(dtype=wp.float64),
+        inputs: wp.array(dtype=wp.float64),
         # outputs
         length: wp.array(dtype=scalar),
     ):
         """Read the step length from the input."""
-        length[0] = scalar(given[LENGTH])
+        length[0] = scalar(inputs[LENGTH])
 
     @forward_kernel(module="unique")
     def add_forces(
@@ -104,9 +104,9 @@ def build_kernels(device: Device) -> ContactStepKernels:
         status: wp.array(dtype=wp.int32),
         length: wp.array(dtype=scalar),
         predicted: wp.array(dtype=wp.float64),
-        ahead: wp.array(dtype=wp.float64),
+        trial_slope: wp.array(dtype=wp.float64),
         sums: wp.array2d(dtype=wp.float64),
-        own: wp.array2d(dtype=wp.float64),
+        term_norms: wp.array2d(dtype=wp.float64),
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
@@ -114,10 +114,10 @@ def build_kernels(device: Device) -> ContactStepKernels:
         out[STATUS] = wp.float64(status[0])
         out[TRIED_LENGTH] = wp.float64(length[0])
         out[PREDICTED_DECREASE] = -predicted[0]
-        out[TRIAL_SLOPE] = ahead[0]
+        out[TRIAL_SLOPE] = trial_slope[0]
         loudest = wp.float64(0.0)
-        for i in range(own.shape[0]):
-            loudest = wp.where(own[i, 0] <= loudest, loudest, own[i, 0])
+        for i in range(term_norms.shape[0]):
+            loudest = wp.where(term_norms[i, 0] <= loudest, loudest, term_norms[i, 0])
         out[MAX_SQUARE_NORM] = loudest
         out[WHOLE_SUM] = sums[WHOLE, 0]
         out[FREE_SUM] = sums[FREE, 0]
@@ -159,15 +159,15 @@ class ContactSteps:
         name, exact, count = device.name, replace(device, precision="float64"), 3 * len(barrier.touchable_nodes)
         self._problem, self._preconditioner, self._barrier, self._device = problem, preconditioner, barrier, device
 
-        def numbers(rows: int) -> wp.array:
+        def allocate_column(rows: int) -> wp.array:
             return device.allocate(rows, 1)
 
-        self._u, self._smooth, self._whole, self._rest, self._x = (numbers(problem.rows) for _ in range(5))
-        self._new_u, self._new_smooth, self._new_rest = (numbers(problem.rows) for _ in range(3))
-        self._constant, self._pull, self._answer, self._pressed = (numbers(problem.rows) for _ in range(4))
+        self._u, self._smooth, self._whole, self._rest, self._x = (allocate_column(problem.rows) for _ in range(5))
+        self._new_u, self._new_smooth, self._new_rest = (allocate_column(problem.rows) for _ in range(3))
+        self._constant, self._pull, self._answer, self._pressed = (allocate_column(problem.rows) for _ in range(4))
         self._force, self._found, self._here, self._there = (exact.allocate(count, 1) for _ in range(4))
         self._balance = allocate_residual_arrays(problem, 1)
-        self._near, self._own, self._more, self._change = (numbers(len(compliance.rows)) for _ in range(4))
+        self._near, self._own, self._more, self._change = (allocate_column(len(compliance.rows)) for _ in range(4))
         self._rows = device.upload(compliance.rows, wp.int32)
         self._touched = self._rows[:count]
         self._nodes = wp.zeros((1, size // 3), dtype=wp.int32, device=name)
@@ -184,8 +184,8 @@ class ContactSteps:
         self._status = wp.zeros(1, dtype=wp.int32, device=name)
         self._length = wp.zeros(1, dtype=device.scalar, device=name)
         self._promised, self._ahead = (wp.zeros(1, dtype=wp.float64, device=name) for _ in range(2))
-        self._given, self._up = self._allocate_pair(INPUT_SIZE)
-        self._out, self._down = self._allocate_pair(OUTPUT_SIZE)
+        self._given, self._up = self._allocate_transfer(INPUT_SIZE)
+        self._out, self._down = self._allocate_transfer(OUTPUT_SIZE)
         self._live = np.ones(1, bool)
         self._graphs: dict[str, wp.Graph] = {}
 
@@ -207,16 +207,16 @@ class ContactSteps:
         """
         self._up.numpy()[[TOLERANCE, DRAG]] = tolerance, proximal
         ends = build_kernel_limits(NONCONVEX if allow_nonconvex else FORCES, FORCES.first_capacity)
-        return self._run("bent" if allow_nonconvex else "aim", lambda: self._compute_direction(ends))
+        return self._run_graph("bent" if allow_nonconvex else "aim", lambda: self._compute_direction(ends))
 
     def shorten_step(self, length: float) -> np.ndarray:
         """Evaluate a step with a shorter `length`, and return its results (`OUTPUT_SIZE`,)."""
         self._up.numpy()[LENGTH] = length
-        return self._run("again", self._retry_shorter_step)
+        return self._run_graph("again", self._retry_shorter_step)
 
     def take_step(self) -> None:
         """Accept the last trial step: its state becomes the current state."""
-        self._run("accept", self._take_step)
+        self._run_graph("accept", self._take_step)
 
     def set_tools(self, constant: wp.array) -> bool:
         """Load tool poses from the problem, and constant gradients (3N, 1) [N]; return False if there are no tools."""
@@ -236,17 +236,17 @@ class ContactSteps:
         u, smooth, whole, *others = here
         return ContactState(u, smooth, whole, state.norm.copy(), state.scale.copy()), *others
 
-    def _run(self, name: str, work: Callable[[], None]) -> np.ndarray:
+    def _run_graph(self, name: str, function: Callable[[], None]) -> np.ndarray:
         device = self._device
         if name in self._graphs:
             wp.capture_launch(self._graphs[name])
         else:
-            work()
+            function()
         if device.on_cuda:
             wp.synchronize_stream(wp.get_stream(device.name))
             if name not in self._graphs:
                 with wp.ScopedCapture(device.name, force_module_load=False) as capture:
-                    work()
+                    function()
                 self._graphs[name] = capture.graph
         return self._down.numpy()
 
@@ -256,9 +256,9 @@ class ContactSteps:
         kernel, stage = self._touch
         wp.copy(self._given, self._up)
         take_rows(device, self._rest, self._rows, self._near)
-        self._press()
+        self._apply_strained_stiffness()
         self._more.zero_()
-        self._give(self._own, self._more, len(self._touched))
+        self._add_motion(self._own, self._more, len(self._touched))
         inputs = [self._touched, self._u, self._rest, self._more]
         device.launch(k.compute_positions, (len(self._touched),), inputs, [self._here, self._there])
         self._status.zero_()
@@ -268,8 +268,8 @@ class ContactSteps:
         blocks.launch(self._exact, kernel, 1, inputs, [self._found, self._status])
         self._change.zero_()
         device.launch(k.compute_change, (len(self._touched),), [self._found, self._force], [self._change])
-        self._give(self._change, self._near, len(self._rows))
-        self._press()
+        self._add_motion(self._change, self._near, len(self._rows))
+        self._apply_strained_stiffness()
         combine_columns(device, self._own, 1.0, self._change, self._own)
         self._pull.zero_()
         put_rows(device, self._own, self._rows, self._pull)
@@ -281,14 +281,14 @@ class ContactSteps:
             term.longest_step(self._u, self._x, self._length)
         self._promised.zero_()
         add_dots(device, self._whole, self._x, self._promised)
-        self._try()
+        self._evaluate_trial()
 
     def _retry_shorter_step(self) -> None:
         wp.copy(self._given, self._up)
         self._device.launch(build_kernels(self._device).read_length, (1,), [self._given], [self._length])
-        self._try()
+        self._evaluate_trial()
 
-    def _try(self) -> None:
+    def _evaluate_trial(self) -> None:
         """Evaluate the trial step: the residual there, and the linear response to this residual."""
         device, problem, k = self._device, self._problem, build_kernels(self._device)
         inputs = [self._u, self._length, self._x]
@@ -317,7 +317,7 @@ class ContactSteps:
         ):
             wp.copy(to, new)
 
-    def _press(self) -> None:
+    def _apply_strained_stiffness(self) -> None:
         """Multiply the motions of strained nodes by the matrix of the strained tissue model."""
         self._own.zero_()
         inputs = [self._matrix, self._nodes, self._near]
@@ -326,7 +326,7 @@ class ContactSteps:
             build_gemv_kernel(self._device, wp.float64, wp.float64, ROW_THREADS), dim, inputs, [self._own]
         )
 
-    def _give(self, force: wp.array, out: wp.array, rows: int) -> None:
+    def _add_motion(self, force: wp.array, out: wp.array, rows: int) -> None:
         """Add the motion of the undeformed mesh under `force` to the first `rows` of `out`."""
         inputs = [self._compliance, self._every, force]
         self._device.launch(
@@ -339,7 +339,7 @@ class ContactSteps:
         self._preconditioner.apply(self._pull, self._live, out)
         self._problem.constraint.project_nodes(out)
 
-    def _allocate_pair(self, count: int) -> tuple[wp.array, wp.array]:
+    def _allocate_transfer(self, count: int) -> tuple[wp.array, wp.array]:
         """Return arrays of `count` values on the device, and in pinned host memory for direct transfer."""
         there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
         return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)

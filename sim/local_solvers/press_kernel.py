@@ -17,7 +17,7 @@ def build_gemv_kernel(device: Device, matrix_type: Any, sum_type: Any, threads_p
     scalar = device.scalar
 
     @forward_kernel(module="unique")
-    def press(
+    def add_product(
         matrix: wp.array3d(dtype=matrix_type),
         nodes: wp.array2d(dtype=wp.int32),
         motion: wp.array2d(dtype=scalar),
@@ -34,4 +34,4 @@ def build_gemv_kernel(device: Device, matrix_type: Any, sum_type: Any, threads_p
         if total != sum_type(0.0):
             wp.atomic_add(out, 3 * nodes[c, i // 3] + i % 3, c, scalar(total))
 
-    return press
+    return add_product

@@ -37,10 +37,10 @@ class LbfgsKernels:
     """L-BFGS kernels for one scalar type and one number of curvature pairs."""
 
     add_gradient: wp.Kernel
-    multiply: wp.Kernel
+    compute_products: wp.Kernel
     check_step: wp.Kernel
     set_direction: wp.Kernel
-    accept: wp.Kernel
+    accept_step: wp.Kernel
     limit_step: wp.Kernel
 
 
@@ -65,25 +65,25 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GZ_OLD, 2 * m + YW
 
     @forward_kernel(module="unique")
-    def absorb(
+    def add_gradient(
         # outputs
-        own: wp.array2d(dtype=scalar),
-        total: wp.array2d(dtype=scalar),
+        term_gradient: wp.array2d(dtype=scalar),
+        gradient: wp.array2d(dtype=scalar),
         square: wp.array(dtype=wp.float64),
     ):
-        """Add `own` to `total`, add the squared norm of `own` to `square`, and set `own` to zero."""
+        """Add a term's gradient to the sum, and its squared norm to `square`; then clear the gradient of the term."""
         block, c = wp.tid()
         squares = wp.float64(0.0)
-        for r in range(block * chunk, wp.min((block + 1) * chunk, own.shape[0])):
-            x = own[r, c]
-            total[r, c] += x
-            own[r, c] = scalar(0.0)
+        for r in range(block * chunk, wp.min((block + 1) * chunk, term_gradient.shape[0])):
+            x = term_gradient[r, c]
+            gradient[r, c] += x
+            term_gradient[r, c] = scalar(0.0)
             squares += wp.float64(x) * wp.float64(x)
         wp.atomic_add(square, c, squares)
 
     @forward_kernel(module="unique")
-    def multiply(
-        known: wp.array(dtype=wp.int32),
+    def compute_products(
+        pair_count: wp.array(dtype=wp.int32),
         s: wp.array3d(dtype=scalar),
         w: wp.array3d(dtype=scalar),
         g: wp.array2d(dtype=scalar),
@@ -108,7 +108,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         wp.atomic_add(products, gz_row, c, wp.float64(gz))
         wp.atomic_add(products, gold_row, c, wp.float64(gold))
         wp.atomic_add(products, yw_row, c, wp.float64(yw))
-        for i in range(known[c]):
+        for i in range(pair_count[c]):
             sg, wg = scalar(0.0), scalar(0.0)
             for k in range(some):
                 r = wp.min(some * block + k, last)
@@ -118,41 +118,41 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
             wp.atomic_add(products, m + i, c, wp.float64(wg))
 
     @forward_kernel(module="unique")
-    def judge(
-        loud: wp.array2d(dtype=wp.float64),
-        own: wp.array2d(dtype=wp.float64),
+    def check_step(
+        constant_norms: wp.array2d(dtype=wp.float64),
+        term_norms: wp.array2d(dtype=wp.float64),
         tolerance: wp.array(dtype=wp.float64),
-        force: wp.array(dtype=wp.float64),
+        force_tolerance: wp.array(dtype=wp.float64),
         sums: wp.array2d(dtype=wp.float64),
         predicted: wp.array(dtype=wp.float64),
         # outputs
         status: wp.array(dtype=wp.int32),
         accepted: wp.array(dtype=wp.int32),
         steps: wp.array(dtype=wp.int32),
-        cut: wp.array(dtype=wp.int32),
+        backtracks: wp.array(dtype=wp.int32),
         t: wp.array(dtype=wp.float64),
         step_length: wp.array(dtype=wp.float64),
         residual: wp.array(dtype=wp.float64),
         slot: wp.array(dtype=wp.int32),
-        aiming: wp.array(dtype=wp.int32),
+        needs_direction: wp.array(dtype=wp.int32),
     ):
-        """Accept the trial step, or backtrack; the first trial is the start. `aiming`: a direction is required."""
+        """Accept the trial step, or backtrack; the first trial is the start. Set `needs_direction` on acceptance."""
         c = wp.tid()
         accepted[c] = 0
         slot[c] = -1
-        aiming[c] = 0
+        needs_direction[c] = 0
         if status[c] != LIVE:
             return
         zero = wp.float64(0.0)
         slope, free, whole = sums[slope_row, c], sums[free_row, c], sums[whole_row, c]
         scale = wp.max(whole - free, zero)  # the projection is orthogonal
-        for k in range(own.shape[0]):
-            scale = wp.max(scale, own[k, c])
-        for k in range(loud.shape[0]):
-            scale = wp.max(scale, loud[k, c])
+        for k in range(term_norms.shape[0]):
+            scale = wp.max(scale, term_norms[k, c])
+        for k in range(constant_norms.shape[0]):
+            scale = wp.max(scale, constant_norms[k, c])
         finite = wp.isfinite(free) and wp.isfinite(slope) and wp.isfinite(scale)
         relative = wp.sqrt(free)
-        small = relative <= force[c]
+        small = relative <= force_tolerance[c]
         if scale > zero:
             relative = relative / wp.sqrt(scale)
         first = predicted[c] == wp.float64(wp.inf)
@@ -161,7 +161,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
             accepted[c] = 1
             step_length[c] = t[c]
             residual[c] = relative
-            cut[c] = 0
+            backtracks[c] = 0
             if not first:
                 steps[c] = steps[c] + 1
         elif first:
@@ -171,26 +171,26 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
             if finite:
                 share = wp.clamp(predicted[c] / (predicted[c] + slope), wp.float64(least_kept), wp.float64(most_kept))
             t[c] = share * t[c]
-            cut[c] = cut[c] + 1
-            if cut[c] > cuts:
+            backtracks[c] = backtracks[c] + 1
+            if backtracks[c] > cuts:
                 status[c] = STOPPED
         if done:
             status[c] = DONE
         if status[c] != LIVE:
             t[c] = zero
         elif accepted[c] != 0:
-            aiming[c] = 1
+            needs_direction[c] = 1
 
     @forward_kernel(module="unique")
-    def aim(
-        aiming: wp.array(dtype=wp.int32),
+    def set_direction(
+        needs_direction: wp.array(dtype=wp.int32),
         step_length: wp.array(dtype=wp.float64),
         sums: wp.array2d(dtype=wp.float64),
         products: wp.array2d(dtype=wp.float64),
         # outputs
         status: wp.array(dtype=wp.int32),
-        head: wp.array(dtype=wp.int32),
-        known: wp.array(dtype=wp.int32),
+        newest: wp.array(dtype=wp.int32),
+        pair_count: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
         t: wp.array(dtype=wp.float64),
         predicted: wp.array(dtype=wp.float64),
@@ -198,16 +198,16 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         wg: wp.array2d(dtype=wp.float64),
         sy: wp.array3d(dtype=wp.float64),
         yw: wp.array3d(dtype=wp.float64),
-        along_s: wp.array2d(dtype=scalar),
-        along_w: wp.array2d(dtype=scalar),
+        weights_s: wp.array2d(dtype=scalar),
+        weights_w: wp.array2d(dtype=scalar),
     ):
         """Add the pair of the accepted step; two-loop recursion for d = -M^-1 g + sum of (a_i s_i + b_i w_i).
 
-        The first `known` slots are filled; slot 0 follows slot m - 1. The first trial length is the secant step of the
-        previous line search, since every unit step would be shortened where tissue stiffens.
+        The first `pair_count` slots are filled; slot 0 follows slot m - 1. The first trial length is the secant step of
+        the previous line search, since every unit step would be shortened where tissue stiffens.
         """
         c = wp.tid()
-        if aiming[c] == 0:
+        if needs_direction[c] == 0:
             return
         zero = wp.float64(0.0)
         slope, gz = sums[slope_row, c], products[gz_row, c]
@@ -218,7 +218,7 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         n = int(-1)
         # Also false at the start, where `predicted` is infinite.
         if rise > wp.float64(least_curvature) * predicted[c] and products[yw_row, c] > zero:
-            n = (head[c] + 1) % m
+            n = (newest[c] + 1) % m
             for i in range(m):
                 change = products[m + i, c] - wg[i, c]
                 sy[i, n, c] = products[i, c] - sg[i, c]
@@ -226,10 +226,10 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
                 yw[n, i, c] = change
             sy[n, n, c] = step_length[c] * rise
             yw[n, n, c] = products[yw_row, c]
-            head[c] = n
-            known[c] = wp.min(known[c] + 1, m)
+            newest[c] = n
+            pair_count[c] = wp.min(pair_count[c] + 1, m)
             slot[c] = n
-        size = known[c]
+        size = pair_count[c]
         for i in range(m):
             sg[i, c] = wp.where(i == n, step_length[c] * slope, products[i, c])
             wg[i, c] = wp.where(i == n, gz - products[gold_row, c], products[m + i, c])
@@ -237,12 +237,12 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
         by_s, by_w, along, across = weights(), weights(), weights(), weights()
         curved, crossed = products_of_pairs(), products_of_pairs()
         for a in range(m):
-            i = (head[c] - a + m) % m
+            i = (newest[c] - a + m) % m
             along[a] = sg[i, c]
             across[a] = wg[i, c]
             for b in range(m):
                 if b <= a:
-                    j = (head[c] - b + m) % m
+                    j = (newest[c] - b + m) % m
                     curved[a, b] = sy[i, j, c]
                     crossed[a, b] = yw[i, j, c]
         for a in range(m):  # first loop, newest pair to oldest
@@ -269,12 +269,12 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
                 decrease -= by_w[a] * across[a] + by_s[a] * along[a]
         if not decrease > zero:  # no descent direction, by round-off: restart from -M^-1 g
             decrease = gz
-            known[c] = 0
-            head[c] = m - 1
+            pair_count[c] = 0
+            newest[c] = m - 1
         for a in range(m):
-            i = (head[c] - a + m) % m
-            along_s[i, c] = scalar(by_s[a])
-            along_w[i, c] = scalar(by_w[a])
+            i = (newest[c] - a + m) % m
+            weights_s[i, c] = scalar(by_s[a])
+            weights_w[i, c] = scalar(by_w[a])
         predicted[c] = decrease
         t[c] = length
         if not (decrease > zero and wp.isfinite(decrease)):
@@ -282,14 +282,14 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
             t[c] = zero
 
     @forward_kernel(module="unique")
-    def move(
+    def accept_step(
         status: wp.array(dtype=wp.int32),
         accepted: wp.array(dtype=wp.int32),
-        known: wp.array(dtype=wp.int32),
+        pair_count: wp.array(dtype=wp.int32),
         slot: wp.array(dtype=wp.int32),
         step_length: wp.array(dtype=wp.float64),
-        along_s: wp.array2d(dtype=scalar),
-        along_w: wp.array2d(dtype=scalar),
+        weights_s: wp.array2d(dtype=scalar),
+        weights_w: wp.array2d(dtype=scalar),
         new_g: wp.array2d(dtype=scalar),
         new_z: wp.array2d(dtype=scalar),
         # outputs
@@ -313,12 +313,12 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
             if n >= 0:
                 s[n, r, c] = step[k]
                 w[n, r, c] = new_z[r, c] - z[r, c]
-        size = known[c]
+        size = pair_count[c]
         for i in range(m):  # unrolled: address arithmetic dominates
             if i < size:
                 for k in range(few):
                     r = wp.min(few * block + k, last)
-                    direction[k] += along_w[i, c] * w[i, r, c] + along_s[i, c] * s[i, r, c]
+                    direction[k] += weights_w[i, c] * w[i, r, c] + weights_s[i, c] * s[i, r, c]
         live = status[c] == LIVE
         for k in range(few):
             r = few * block + k
@@ -330,14 +330,14 @@ def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
                     d[r, c] = direction[k]
 
     @forward_kernel(module="unique")
-    def clamp(
+    def limit_step(
         # outputs
-        bound: wp.array(dtype=scalar),
+        max_length: wp.array(dtype=scalar),
         t: wp.array(dtype=wp.float64),
     ):
-        """Limit the step length t to `bound`, and reset the bound to 1."""
+        """Limit the step length t to `max_length`, and reset the bound to 1."""
         c = wp.tid()
-        t[c] = wp.min(t[c], wp.float64(bound[c]))
-        bound[c] = scalar(1.0)
+        t[c] = wp.min(t[c], wp.float64(max_length[c]))
+        max_length[c] = scalar(1.0)
 
-    return LbfgsKernels(absorb, multiply, judge, aim, move, clamp)
+    return LbfgsKernels(add_gradient, compute_products, check_step, set_direction, accept_step, limit_step)

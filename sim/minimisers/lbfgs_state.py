@@ -191,7 +191,7 @@ class LbfgsWorkspace:
         problem, device = self._problem, self._problem.device
         rows, count = a["u"].shape
         spread, one = lbfgs_trial_kernels.choose_thread_spread(device, count), (count,)
-        step = lbfgs_trial_kernels.build_kernels(device, spread).step
+        step = lbfgs_trial_kernels.build_kernels(device, spread).compute_trial
         device.launch(step, (spread.count_threads(rows), count), [a["u"], a["t"], a["d"]], [a["v"]])
         found = compute_residual_arrays(problem, a["v"], a["constant"], a["d"], self._trial)
         inputs = [a["loud"], found.term_norms, a["tolerance"], a["force"], found.sums, a["predicted"]]
@@ -204,7 +204,7 @@ class LbfgsWorkspace:
         inputs = [a["status"], a["accepted"], a["known"], a["slot"], a["step_length"], a["along_s"], a["along_w"]]
         outputs = [a["u"], a["d"], a["g"], a["z"], a["s"], a["w"]]
         device.launch(
-            k.accept, (-(-rows // get_rows_per_thread(device)), count), [*inputs, found.g, a["new_z"]], outputs
+            k.accept_step, (-(-rows // get_rows_per_thread(device)), count), [*inputs, found.g, a["new_z"]], outputs
         )
         self._limit_steps()
 
@@ -225,7 +225,7 @@ class LbfgsWorkspace:
             dim = (len(a["products"]), lbfgs_trial_kernels.choose_thread_spread(device, 1).count_threads(rows))
             device.launch(build_multiply_kernel(device, PAIRS), dim, inputs, outputs)
         else:
-            device.launch(k.multiply, (-(-rows // ROWS_PER_THREAD), count), inputs, outputs)
+            device.launch(k.compute_products, (-(-rows // ROWS_PER_THREAD), count), inputs, outputs)
         inputs = [a["aiming"], a["step_length"], self._trial.sums, a["products"]]
         outputs = [a["status"], a["head"], a["known"], a["slot"], a["t"], a["predicted"]]
         outputs += [a["sg"], a["wg"], a["sy"], a["yw"], a["along_s"], a["along_w"]]

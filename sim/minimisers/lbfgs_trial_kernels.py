@@ -38,9 +38,9 @@ def choose_thread_spread(device: Device, columns: int) -> ThreadSpread:
 
 
 @wp.func
-def get_first_row(thread: int, lanes: int, each: int):
+def get_first_row(thread: int, lanes: int, rows_per_thread: int):
     """Return the first row of a thread; the next rows of the thread follow at intervals of `lanes`."""
-    return thread // lanes * lanes * each + thread % lanes
+    return thread // lanes * lanes * rows_per_thread + thread % lanes
 
 
 @wp.func
@@ -53,8 +53,8 @@ def return_value(value: wp.float64) -> wp.float64:
 class LbfgsTrialKernels:
     """Trial step kernels for one scalar type and distribution, launched over (threads of rows or nodes, load cases)."""
 
-    step: wp.Kernel
-    finish: wp.Kernel
+    compute_trial: wp.Kernel
+    project_gradient: wp.Kernel
 
 
 @cache
@@ -66,7 +66,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
     own_row, whole_row, free_row, slope_row = OWN, WHOLE, FREE, SLOPE
 
     @forward_kernel(module="unique")
-    def step(
+    def compute_trial(
         u: wp.array2d(dtype=scalar),
         t: wp.array(dtype=wp.float64),
         d: wp.array2d(dtype=scalar),
@@ -82,7 +82,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
                 v[r, c] = u[r, c] + length * d[r, c]
 
     @forward_kernel(module="unique")
-    def finish(
+    def project_gradient(
         constant: wp.array2d(dtype=scalar),
         fixed: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
@@ -114,19 +114,19 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
             wp.atomic_add(sums, free_row, c, free)
             wp.atomic_add(sums, slope_row, c, slope)
 
-    return LbfgsTrialKernels(step, finish)
+    return LbfgsTrialKernels(compute_trial, project_gradient)
 
 
 @cache
 def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
-    """Return the kernel `multiply` for a single load case, launched over (products, threads of rows)."""
+    """Return the kernel `compute_products` for a single load case, launched over (products, threads of rows)."""
     scalar, m, spread = device.scalar, pairs, choose_thread_spread(device, 1)
     lanes, each = spread.lanes, spread.rows_per_thread
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GZ_OLD, 2 * m + YW
 
     @forward_kernel(module="unique")
-    def multiply(
-        known: wp.array(dtype=wp.int32),
+    def compute_products(
+        pair_count: wp.array(dtype=wp.int32),
         s: wp.array3d(dtype=scalar),
         w: wp.array3d(dtype=scalar),
         g: wp.array2d(dtype=scalar),
@@ -139,7 +139,7 @@ def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
         """Compute inner products: of the new gradient g' with each s and w, with z' and z (z = M^-1 g); y . w."""
         product, thread = wp.tid()
         pair = product % m
-        if product < 2 * m and pair >= known[0]:
+        if product < 2 * m and pair >= pair_count[0]:
             return  # uniform over the warp, so `sum_warp` below stays valid
         total, first = wp.float64(0.0), get_first_row(thread, lanes, each)
         for k in range(each):
@@ -162,4 +162,4 @@ def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
         if thread % lanes == 0:
             wp.atomic_add(products, product, 0, total)
 
-    return multiply
+    return compute_products

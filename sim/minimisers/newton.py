@@ -143,19 +143,19 @@ def is_stress_free(problem: Problem, u: wp.array, factor: float) -> np.ndarray:
     node, whichever is larger; so the large round-off of a sliver counts only at its own nodes.
     """
 
-    def at_nodes(force: wp.array) -> np.ndarray:
+    def compute_node_norms(force: wp.array) -> np.ndarray:
         return np.linalg.norm(force.numpy().reshape(-1, 3, u.shape[1]), axis=1)
 
     change = wp.empty_like(u)
     combine_columns(
         problem.device, problem.gradient(_perturb_last_digit(problem.device, u)), -1.0, problem.gradient(u), change
     )
-    noise = at_nodes(change)
+    noise = compute_node_norms(change)
     out = np.ones(u.shape[1], bool)
     for term in problem.terms:
         own = wp.zeros_like(u)
         term.add_gradient(u, own)
-        out &= (at_nodes(own) <= factor * np.maximum(noise, np.median(noise, axis=0))).all(axis=0)
+        out &= (compute_node_norms(own) <= factor * np.maximum(noise, np.median(noise, axis=0))).all(axis=0)
     return out
 
 

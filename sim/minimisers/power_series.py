@@ -30,22 +30,22 @@ def build_mixing_kernel(device: Device) -> wp.Kernel:
     scalar = device.scalar
 
     @forward_kernel(module="unique")
-    def mix(
+    def mix_columns(
         x: wp.array2d(dtype=scalar),
-        weight: wp.array2d(dtype=scalar),
+        weights: wp.array2d(dtype=scalar),
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """Compute out_r(g n + j) = sum over t of x_r(g m + t) w_tj, from m to n columns in each group g."""
         r, g = wp.tid()
-        many, wanted = weight.shape[0], weight.shape[1]
+        many, wanted = weights.shape[0], weights.shape[1]
         for j in range(wanted):
             total = scalar(0.0)
             for t in range(many):
-                total += x[r, g * many + t] * weight[t, j]
+                total += x[r, g * many + t] * weights[t, j]
             out[r, g * wanted + j] = total
 
-    return mix
+    return mix_columns
 
 
 def mix_columns(device: Device, x: wp.array, weight: np.ndarray) -> wp.array:

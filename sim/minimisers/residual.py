@@ -64,7 +64,7 @@ def compute_residual_arrays(
     inputs = [constant, *problem.constraint.node_arrays, v if d is None else d]
     spread = lbfgs_trial_kernels.choose_thread_spread(device, count)
     device.launch(
-        lbfgs_trial_kernels.build_kernels(device, spread).finish,
+        lbfgs_trial_kernels.build_kernels(device, spread).project_gradient,
         (spread.count_threads(rows // 3), count),
         inputs,
         [workspace.g, workspace.sums],

@@ -71,17 +71,17 @@ def compute_second_order(
     tasks = 1 if device.on_cuda else choose_threads(sum(len(each.chosen) for each in work))
     tables = [to_library(device, np.zeros((len(first), len(functionals)), np.float32)) for _ in range(tasks)]
 
-    def add_all(table: Any, those: list[_Some]) -> None:
-        for some in those:
-            add(table, some)
+    def add_batches(table: Any, batches: list[_Some]) -> None:
+        for batch in batches:
+            add_batch(table, batch)
             progress(next(done), len(work))
 
-    def add(table: Any, some: _Some) -> None:
-        gradient = _build_gradient_matrix(some.elements, some.chosen)
-        weight = np.repeat(some.elements.weight[some.chosen].ravel(), 9)[:, None]
+    def add_batch(table: Any, batch: _Some) -> None:
+        gradient = _build_gradient_matrix(batch.elements, batch.chosen)
+        weight = np.repeat(batch.elements.weight[batch.chosen].ravel(), 9)[:, None]
         strain = to_library(device, (gradient @ unit_motions.T).astype(np.float32).reshape(-1, 9, len(unit_motions)))
         lever = to_library(device, (weight * (gradient @ functionals.T)).astype(np.float32))
-        tensor = to_library(device, some.tensor)
+        tensor = to_library(device, batch.tensor)
         for component in np.flatnonzero(np.diff(start)).tolist():
             rows = slice(int(start[component]), int(start[component + 1]))
             stiffening = (strain[:, :, component] @ tensor).reshape(-1, 9, 9)
@@ -89,7 +89,7 @@ def compute_second_order(
             table[rows] -= stress.reshape(len(lever), -1).T @ lever
 
     with run_in_order(device):
-        run_concurrently([partial(add_all, table, work[k::tasks]) for k, table in enumerate(tables)])
+        run_concurrently([partial(add_batches, table, work[k::tasks]) for k, table in enumerate(tables)])
         table = to_host(sum(tables[1:], tables[0]))
     twice = np.where(first == second, 1.0, 2.0).astype(np.float32)
     return np.column_stack([first, second]), table * twice[:, None]

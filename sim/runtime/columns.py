@@ -20,14 +20,14 @@ CHUNK = 64  # Rows that one thread sums before its atomic addition to the column
 class ColumnKernels:
     """Kernels for column arithmetic and row copies, for one scalar type."""
 
-    dot: wp.Kernel
-    dot_alone: wp.Kernel
+    compute_dots: wp.Kernel
+    compute_single_dot: wp.Kernel
     combine: wp.Kernel
     add_multiple: wp.Kernel
     unstack: wp.Kernel
-    take: wp.Kernel
-    put: wp.Kernel
-    add: wp.Kernel
+    gather_rows: wp.Kernel
+    scatter_rows: wp.Kernel
+    add_rows: wp.Kernel
 
 
 @cache
@@ -37,7 +37,7 @@ def build_kernels(device: Device) -> ColumnKernels:
     chunk, lanes = CHUNK, get_warp_width(device)
 
     @forward_kernel(module="unique")
-    def dot(
+    def compute_dots(
         x: wp.array2d(dtype=scalar),
         y: wp.array2d(dtype=scalar),
         # outputs
@@ -51,7 +51,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         wp.atomic_add(out, c, total)
 
     @forward_kernel(module="unique")
-    def dot_alone(
+    def compute_single_dot(
         x: wp.array2d(dtype=scalar),
         y: wp.array2d(dtype=scalar),
         # outputs
@@ -103,7 +103,7 @@ def build_kernels(device: Device) -> ColumnKernels:
             out[c, n, k] = wp.float64(x[3 * nodes[n] + k, c])
 
     @forward_kernel(module="unique")
-    def take(
+    def gather_rows(
         x: wp.array2d(dtype=scalar),
         rows: wp.array(dtype=wp.int32),
         # outputs
@@ -114,7 +114,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         out[i, c] = x[rows[i], c]
 
     @forward_kernel(module="unique")
-    def put(
+    def scatter_rows(
         x: wp.array2d(dtype=scalar),
         rows: wp.array(dtype=wp.int32),
         # outputs
@@ -125,7 +125,7 @@ def build_kernels(device: Device) -> ColumnKernels:
         out[rows[i], c] = x[i, c]
 
     @forward_kernel(module="unique")
-    def add(
+    def add_rows(
         x: wp.array2d(dtype=scalar),
         rows: wp.array(dtype=wp.int32),
         # outputs
@@ -135,7 +135,8 @@ def build_kernels(device: Device) -> ColumnKernels:
         i, c = wp.tid()
         out[rows[i], c] += x[i, c]
 
-    return ColumnKernels(dot, dot_alone, combine, add_multiple, unstack, take, put, add)
+    dots = compute_dots, compute_single_dot
+    return ColumnKernels(*dots, combine, add_multiple, unstack, gather_rows, scatter_rows, add_rows)
 
 
 @cache
@@ -143,7 +144,7 @@ def build_copy_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
     """Return two kernels, for arrays of the type `dtype`: copy selected columns, and copy to selected columns."""
 
     @forward_kernel(module="unique")
-    def gather(
+    def copy_columns(
         x: wp.array2d(dtype=dtype),
         columns: wp.array(dtype=wp.int32),
         # outputs
@@ -154,18 +155,18 @@ def build_copy_kernels(dtype: Any) -> tuple[wp.Kernel, wp.Kernel]:
         out[r, c] = x[r, columns[c]]
 
     @forward_kernel(module="unique")
-    def scatter(
+    def write_columns(
         x: wp.array2d(dtype=dtype),
-        some: wp.array(dtype=wp.int32),
+        source_columns: wp.array(dtype=wp.int32),
         columns: wp.array(dtype=wp.int32),
         # outputs
         out: wp.array2d(dtype=dtype),
     ):
         """Copy to selected columns: out_r,columns(c) = x_r,some(c)."""
         r, c = wp.tid()
-        out[r, columns[c]] = x[r, some[c]]
+        out[r, columns[c]] = x[r, source_columns[c]]
 
-    return gather, scatter
+    return copy_columns, write_columns
 
 
 def find_workspace_width(device: Device, count: int) -> int:
@@ -210,9 +211,9 @@ def add_dots(device: Device, x: wp.array, y: wp.array, out: wp.array) -> None:
     k, (rows, count) = build_kernels(device), x.shape
     if device.on_cuda and count == 1:
         lanes = get_warp_width(device)
-        device.launch(k.dot_alone, (-(-rows // lanes) * lanes,), [x, y], [out])
+        device.launch(k.compute_single_dot, (-(-rows // lanes) * lanes,), [x, y], [out])
     else:
-        device.launch(k.dot, (-(-rows // CHUNK), count), [x, y], [out])
+        device.launch(k.compute_dots, (-(-rows // CHUNK), count), [x, y], [out])
 
 
 def compute_dots(device: Device, x: wp.array, y: wp.array) -> np.ndarray:
@@ -241,11 +242,11 @@ def gather_columns(
     device: Device, x: wp.array, columns: np.ndarray | wp.array, out: wp.array | None = None
 ) -> wp.array:
     """Return a copy (..., k) of the given columns (k,) of x (..., b), in `out` if given."""
-    index = _index(device, columns)
+    index = _to_index(device, columns)
     if out is None:
         out = wp.empty((*x.shape[:-1], len(index)), dtype=x.dtype, device=device.name)
-    gather, _ = build_copy_kernels(x.dtype)
-    device.launch(gather, _flatten_rows(out).shape, [_flatten_rows(x), index], [_flatten_rows(out)])
+    copy_columns, _ = build_copy_kernels(x.dtype)
+    device.launch(copy_columns, _flatten_rows(out).shape, [_flatten_rows(x), index], [_flatten_rows(out)])
     return out
 
 
@@ -253,10 +254,10 @@ def scatter_columns(
     device: Device, x: wp.array, columns: np.ndarray, out: wp.array, source_columns: np.ndarray | None = None
 ) -> None:
     """Copy x (..., k), or its columns `source_columns` (k,), to the columns `columns` (k,) of out (..., b)."""
-    _, scatter = build_copy_kernels(x.dtype)
+    _, write_columns = build_copy_kernels(x.dtype)
     source_columns = np.arange(x.shape[-1]) if source_columns is None else source_columns
-    inputs = [_flatten_rows(x), _index(device, source_columns), _index(device, columns)]
-    device.launch(scatter, (_flatten_rows(x).shape[0], len(source_columns)), inputs, [_flatten_rows(out)])
+    inputs = [_flatten_rows(x), _to_index(device, source_columns), _to_index(device, columns)]
+    device.launch(write_columns, (_flatten_rows(x).shape[0], len(source_columns)), inputs, [_flatten_rows(out)])
 
 
 def unstack_columns(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarray:
@@ -266,7 +267,7 @@ def unstack_columns(device: Device, x: wp.array, nodes: np.ndarray) -> np.ndarra
     return out.numpy()
 
 
-def _index(device: Device, columns: np.ndarray | wp.array) -> wp.array:
+def _to_index(device: Device, columns: np.ndarray | wp.array) -> wp.array:
     return columns if isinstance(columns, wp.array) else device.upload(columns, wp.int32)
 
 
@@ -279,18 +280,18 @@ def take_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array | None 
     """Return a copy (m, b) of the given rows (m,) of x (n, b), in `out` if given."""
     if out is None:
         out = wp.empty((len(rows), x.shape[1]), dtype=x.dtype, device=device.name)
-    device.launch(build_kernels(device).take, (len(rows), x.shape[1]), [x, rows], [out])
+    device.launch(build_kernels(device).gather_rows, (len(rows), x.shape[1]), [x, rows], [out])
     return out
 
 
 def put_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
     """Copy x (m, b) to the given rows (m,) of out (n, b)."""
-    device.launch(build_kernels(device).put, x.shape, [x, rows], [out])
+    device.launch(build_kernels(device).scatter_rows, x.shape, [x, rows], [out])
 
 
 def add_rows(device: Device, x: wp.array, rows: wp.array, out: wp.array) -> None:
     """Add x (m, b) to the given rows (m,) of out (n, b); the rows must be unique."""
-    device.launch(build_kernels(device).add, x.shape, [x, rows], [out])
+    device.launch(build_kernels(device).add_rows, x.shape, [x, rows], [out])
 
 
 @wp.func_native(

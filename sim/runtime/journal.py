@@ -58,7 +58,7 @@ class Journal:
         """
         try:
             start = self._file.seek(0, os.SEEK_END)
-            self._file.write(_record(batch, payload, self._key))
+            self._file.write(_build_record(batch, payload, self._key))
             self._file.flush()
         except OSError as error:
             raise InputError(
@@ -109,7 +109,7 @@ def open_journal(path: Path, description: Mapping[str, str]) -> Iterator[Journal
     DamageWarning
         Damaged records are omitted.
     """
-    opening = _record((RUN_GROUP, 0), json.dumps(dict(description)).encode(), b"")
+    opening = _build_record((RUN_GROUP, 0), json.dumps(dict(description)).encode(), b"")
     key = hashlib.sha256(opening).digest()
     if not path.exists():
         with write_atomically(path, path.suffix) as draft:
@@ -132,13 +132,13 @@ def read_description(path: Path) -> dict[str, str]:
     return {}
 
 
-def _get_payload(held: Held) -> bytes:
+def _get_payload(data: Held) -> bytes:
     """Return the payload of the first record, which must be valid."""
-    return held[RECORD_HEADER.size : RECORD_HEADER.size + RECORD_HEADER.unpack(held[: RECORD_HEADER.size])[3]]
+    return data[RECORD_HEADER.size : RECORD_HEADER.size + RECORD_HEADER.unpack(data[: RECORD_HEADER.size])[3]]
 
 
 def _restore_records(
-    path: Path, file: BinaryIO, opening: bytes, key: bytes, stated: Mapping[str, str]
+    path: Path, file: BinaryIO, opening: bytes, key: bytes, description: Mapping[str, str]
 ) -> dict[Batch, tuple[int, int]]:
     """Return start and size of the valid records, by batch, and truncate the file after the last valid record."""
     foreign = f"{path}: is not an unfinished run, or its beginning is damaged: delete it, and run the command again."
@@ -147,7 +147,7 @@ def _restore_records(
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as held:
         whole = held[: len(opening)] == opening
         if not whole and _verify_record(held, 0, b"") == (RUN_GROUP, 0):
-            check_same_description(path, json.loads(_get_payload(held)), stated)
+            check_same_description(path, json.loads(_get_payload(held)), description)
         places, damaged = _find_records(held, len(opening), key)
     if not whole and not places:
         raise InputError(foreign)
@@ -189,45 +189,45 @@ def check_same_description(
             )
 
 
-def _find_records(held: Held, start: int, key: bytes) -> tuple[dict[Batch, tuple[int, int]], list[tuple[int, str]]]:
+def _find_records(data: Held, start: int, key: bytes) -> tuple[dict[Batch, tuple[int, int]], list[tuple[int, str]]]:
     """Return start and size of the valid records from position `start`, and start and name of the invalid records."""
     places: dict[Batch, tuple[int, int]] = {}
     damaged: list[tuple[int, str]] = []
-    while start < len(held):
-        batch = _verify_record(held, start, key)
+    while start < len(data):
+        batch = _verify_record(data, start, key)
         if batch is None:
-            damaged.append((start, _name(held, start)))
-            following = held.find(RECORD_MARK, start + 1)
-            start = len(held) if following < 0 else following
+            damaged.append((start, _describe_record(data, start)))
+            following = data.find(RECORD_MARK, start + 1)
+            start = len(data) if following < 0 else following
         else:
-            size = RECORD_HEADER.size + RECORD_HEADER.unpack(held[start : start + RECORD_HEADER.size])[3]
+            size = RECORD_HEADER.size + RECORD_HEADER.unpack(data[start : start + RECORD_HEADER.size])[3]
             places[batch] = start, size
             start += size
     return places, damaged
 
 
-def _record(batch: Batch, payload: bytes, key: bytes) -> bytes:
+def _build_record(batch: Batch, payload: bytes, key: bytes) -> bytes:
     head = RECORD_HEADER.pack(RECORD_MARK, batch[0].encode(), batch[1], len(payload), b"")[len(RECORD_MARK) : -16]
     return RECORD_MARK + head + _compute_digest(head, payload, key) + payload
 
 
-def _verify_record(held: Held, start: int, key: bytes) -> Batch | None:
+def _verify_record(data: Held, start: int, key: bytes) -> Batch | None:
     """Return the batch of the record at position `start`, or None if there is no valid record with this key."""
-    head = held[start : start + RECORD_HEADER.size]
+    head = data[start : start + RECORD_HEADER.size]
     if len(head) < RECORD_HEADER.size:
         return None
     mark, group, first, length, digest = RECORD_HEADER.unpack(head)
     end = start + RECORD_HEADER.size + length
-    if mark != RECORD_MARK or end > len(held):
+    if mark != RECORD_MARK or end > len(data):
         return None
-    if _compute_digest(head[len(RECORD_MARK) : -16], held[start + RECORD_HEADER.size : end], key) != digest:
+    if _compute_digest(head[len(RECORD_MARK) : -16], data[start + RECORD_HEADER.size : end], key) != digest:
         return None
     return group.rstrip(b"\0").decode(), first
 
 
-def _name(held: Held, start: int) -> str:
+def _describe_record(data: Held, start: int) -> str:
     """Return the name of a damaged record at position `start`, if it can be read."""
-    head = held[start : start + RECORD_HEADER.size]
+    head = data[start : start + RECORD_HEADER.size]
     if len(head) == RECORD_HEADER.size and head.startswith(RECORD_MARK):
         _, group, first, _, _ = RECORD_HEADER.unpack(head)
         if group.rstrip(b"\0").isalpha():

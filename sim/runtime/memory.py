@@ -61,10 +61,10 @@ def measure_host_bytes(budget: MemoryBudget = MemoryBudget()) -> int:
     return min(found)
 
 
-def choose_batch_size(rows: int, device: Device, free: int, budget: MemoryBudget = MemoryBudget()) -> int:
-    """Return the number of load cases of `rows` = 3N unknowns that are solved together within `free` bytes."""
+def choose_batch_size(rows: int, device: Device, free_bytes: int, budget: MemoryBudget = MemoryBudget()) -> int:
+    """Return the number of load cases of `rows` = 3N unknowns that are solved together within `free_bytes` bytes."""
     widest = budget.max_cases_on_cuda if device.on_cuda else budget.max_cases
-    fitting = int(budget.batch_fraction * free / max(estimate_column_bytes(rows, device), 1))
+    fitting = int(budget.batch_fraction * free_bytes / max(estimate_column_bytes(rows, device), 1))
     return int(np.clip(find_widest_workspace(device, fitting), 1, widest))
 
 
@@ -109,9 +109,9 @@ def estimate_column_bytes(rows: int, device: Device) -> int:
     return WORK_COLUMNS * wp.types.type_size_in_bytes(device.scalar) * rows
 
 
-def format_gigabytes(amount: float) -> str:
+def format_gigabytes(size: float) -> str:
     """Return a text with an amount of memory in GiB."""
-    return f"{amount / 2**30:.3g} GiB"
+    return f"{size / 2**30:.3g} GiB"
 
 
 def _read_lines(path: Path) -> list[str]:

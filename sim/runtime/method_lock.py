@@ -19,8 +19,8 @@ def lock_method(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenat
     """Return a method of a `Locked` object that holds the lock; other threads wait until the method returns."""
 
     @wraps(method)
-    def held(self: Locked, *args: P.args, **kwargs: P.kwargs) -> R:
+    def run_locked(self: Locked, *args: P.args, **kwargs: P.kwargs) -> R:
         with self.lock:
             return method(self, *args, **kwargs)
 
-    return held
+    return run_locked

@@ -12,8 +12,8 @@ def install_hint(extra: str) -> str:
 
 
 @contextmanager
-def require_extra(extra: str, what: str) -> Iterator[None]:
-    """Run a block that imports packages of an extra; `what` is the start of the message, as "these environments need".
+def require_extra(extra: str, message: str) -> Iterator[None]:
+    """Run a block that imports packages of an extra; `message` is its start, as "these environments need".
 
     Raises
     ------
@@ -24,4 +24,4 @@ def require_extra(extra: str, what: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        raise InputError(f"{what} the package {package}, which is not installed. {install_hint(extra)}") from error
+        raise InputError(f"{message} the package {package}, which is not installed. {install_hint(extra)}") from error

@@ -41,7 +41,7 @@ def start_process(
     The child process ends with this process, and ignores Ctrl-C, which the terminal sends to both processes. The
     `variables` are set in its environment before its first import.
     """
-    process = get_context("spawn").Process(target=_run, args=(target, args), name=name, daemon=True)
+    process = get_context("spawn").Process(target=_run_target, args=(target, args), name=name, daemon=True)
     with _set_environment(variables or {}), _ignore_interrupts():
         process.start()
     return process
@@ -75,8 +75,8 @@ def map_parallel(function: Callable[[Task], Any], tasks: Sequence[Task], count: 
     InputError, LostProcessError
         See `map_unordered`.
     """
-    with process_pool(["cpu"] * min(count, len(tasks)), _return_given, function) as children:
-        yield from map_unordered(children, _call, tasks)
+    with process_pool(["cpu"] * min(count, len(tasks)), _return_value, function) as children:
+        yield from map_unordered(children, _apply_function, tasks)
 
 
 def map_unordered(
@@ -94,7 +94,7 @@ def map_unordered(
     waiting, busy = iter(tasks), {}
     lost: Exception | None = None
 
-    def busied(child: ChildProcess) -> None:
+    def send_next(child: ChildProcess) -> None:
         for task in waiting:
             with suppress(BrokenPipeError, ConnectionResetError):  # reported when its result is read
                 child.pipe.send((work, task))
@@ -102,7 +102,7 @@ def map_unordered(
             return
 
     for child in children:
-        busied(child)
+        send_next(child)
     while busy:
         ready = wait(list(busy), 0.0 if lost else None)
         if not ready:
@@ -115,7 +115,7 @@ def map_unordered(
                 lost = lost or error
                 continue
             if lost is None:
-                busied(child)
+                send_next(child)
             yield task, answer
     if lost is not None:
         raise lost
@@ -178,22 +178,22 @@ def build_gpu_environment(device: str) -> dict[str, str]:
     return {VISIBLE_VARIABLE: cards.split(",")[int(number or 0)] if cards else number or "0"}
 
 
-def _start_child(device: str, make: Callable[..., Any], given: tuple[Any, ...], closing: ExitStack) -> ChildProcess:
+def _start_child(device: str, make: Callable[..., Any], args: tuple[Any, ...], stack: ExitStack) -> ChildProcess:
     ours, theirs = Pipe()
     variables = build_gpu_environment(device)
     own = "cuda:0" if variables else device
-    process = start_process(_serve, theirs, own, make, given, name=device, variables=variables)
+    process = start_process(_run_worker, theirs, own, make, args, name=device, variables=variables)
     theirs.close()
     child = ChildProcess(device, process, ours)
-    closing.callback(_end, child)
+    stack.callback(_kill_child, child)
     return child
 
 
 @contextmanager
-def _set_environment(more: Mapping[str, str]) -> Iterator[None]:
+def _set_environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Set environment variables during the block."""
-    before = {name: os.environ.get(name) for name in more}
-    os.environ.update(more)
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:
@@ -217,42 +217,42 @@ def _ignore_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _end(child: ChildProcess) -> None:
+def _kill_child(child: ChildProcess) -> None:
     child.process.kill()
     child.process.join()
     child.pipe.close()
 
 
-def _serve(pipe: Any, device: str, make: Callable[..., Any], given: tuple[Any, ...]) -> None:
+def _run_worker(pipe: Any, device: str, make: Callable[..., Any], args: tuple[Any, ...]) -> None:
     """Call `make`, then run tasks from the pipe until it closes; exceptions are sent as results."""
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        made = _try_call(make, device, *given)
+        made = _try_call(make, device, *args)
         pipe.send(made if isinstance(made, Exception) else None)
         while True:
             work, task = pipe.recv()
             pipe.send(_try_call(work, made, task))
 
 
-def _return_given(device: str, given: Any) -> Any:
-    return given
+def _return_value(device: str, value: Any) -> Any:
+    return value
 
 
-def _call(function: Callable[[Task], Any], task: Task) -> Any:
+def _apply_function(function: Callable[[Task], Any], task: Task) -> Any:
     return function(task)
 
 
-def _try_call(function: Callable[..., Any], *given: Any) -> Any:
+def _try_call(function: Callable[..., Any], *args: Any) -> Any:
     """Return the result of a function or, if the function raises an exception, this exception with a traceback note."""
     try:
-        return function(*given)
+        return function(*args)
     except Exception as error:
         error.add_note(traceback.format_exc())
         return error
 
 
-def _run(target: Callable[..., object], given: tuple[Any, ...]) -> None:
+def _run_target(target: Callable[..., object], args: tuple[Any, ...]) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    target(*given)
+    target(*args)
 
 
 def _end_with_parent() -> None:

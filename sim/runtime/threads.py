@@ -112,10 +112,10 @@ def run_concurrently(tasks: Sequence[Task]) -> None:
 
 
 @cache
-def _get_queue(number: int) -> SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]]:
+def _get_queue(thread_number: int) -> SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]]:
     """Return the queue of the thread with this number."""
     queue: SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]] = SimpleQueue()
-    Thread(target=_serve, args=(queue,), name=f"sulcus {number}", daemon=True).start()
+    Thread(target=_run_tasks, args=(queue,), name=f"sulcus {thread_number}", daemon=True).start()
     return queue
 
 
@@ -124,7 +124,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_get_queue.cache_clear)
 
 
-def _serve(queue: SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]]) -> None:
+def _run_tasks(queue: SimpleQueue[tuple[Task, SimpleQueue[BaseException | None]]]) -> None:
     while True:
         task, ended = queue.get()
         try:

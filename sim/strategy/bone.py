@@ -29,6 +29,6 @@ def solve_free_of_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses:
     restarted, clear = np.zeros(count, bool), np.flatnonzero(~on_bone)
     if len(clear):
         found = strategy.solve(cases.select(clear), [guess[:, clear] for guess in guesses])
-        result.put_cases(clear, found, device)
+        result.replace_cases(clear, found, device)
         restarted[clear] = found.restarted
     return replace(result, path_fraction=result.reached, restarted=restarted)

@@ -49,42 +49,42 @@ def build_kernels(device: Device) -> FrameKernels:
 
     @forward_kernel(module="unique")
     def apply_push(
-        given: wp.array(dtype=wp.float64),
+        inputs: wp.array(dtype=wp.float64),
         nodes: wp.array(dtype=wp.int32),
-        weight: wp.array2d(dtype=wp.float64),
+        weights: wp.array2d(dtype=wp.float64),
         sums: wp.array(dtype=wp.vec4d),
         # outputs
         constant: wp.array2d(dtype=scalar),
-        loud: wp.array2d(dtype=wp.float64),
+        constant_norms: wp.array2d(dtype=wp.float64),
     ):
         """Write the gradient -w_i / (sum of w) F of the push, and add its squared norm."""
         i = wp.tid()
         square = wp.float64(0.0)
         if i < nodes.shape[0]:
-            share = weight[i, 0] / sums[0][0]
+            share = weights[i, 0] / sums[0][0]
             for k in range(3):
-                f = scalar(share * given[4 + k])
+                f = scalar(share * inputs[4 + k])
                 constant[3 * nodes[i] + k, 0] = -f
                 square += wp.float64(f) * wp.float64(f)
         square = sum_warp(square)
         if i % lanes == 0:
-            wp.atomic_add(loud, 0, 0, square)
+            wp.atomic_add(constant_norms, 0, 0, square)
 
     @forward_kernel(module="unique")
     def extrapolate(
-        given: wp.array(dtype=wp.float64),
+        inputs: wp.array(dtype=wp.float64),
         # outputs
-        past: wp.array2d(dtype=scalar),
+        last_u: wp.array2d(dtype=scalar),
         u: wp.array2d(dtype=scalar),
         d: wp.array2d(dtype=scalar),
         g: wp.array2d(dtype=scalar),
         z: wp.array2d(dtype=scalar),
     ):
-        """Extrapolate u += a (u - past), store the old u in `past`, and clear direction and gradients."""
+        """Extrapolate u += a (u - past), store the old u in `last_u`, and clear direction and gradients."""
         r = wp.tid()
         last = u[r, 0]
-        u[r, 0] = last + scalar(given[7]) * (last - past[r, 0])
-        past[r, 0] = last
+        u[r, 0] = last + scalar(inputs[7]) * (last - last_u[r, 0])
+        last_u[r, 0] = last
         d[r, 0] = scalar(0.0)
         g[r, 0] = scalar(0.0)
         z[r, 0] = scalar(0.0)
@@ -95,41 +95,41 @@ def build_kernels(device: Device) -> FrameKernels:
         t: wp.array(dtype=wp.float64),
         predicted: wp.array(dtype=wp.float64),
         residual: wp.array(dtype=wp.float64),
-        loud: wp.array2d(dtype=wp.float64),
+        constant_norms: wp.array2d(dtype=wp.float64),
         sg: wp.array2d(dtype=wp.float64),
         wg: wp.array2d(dtype=wp.float64),
         steps: wp.array(dtype=wp.int32),
-        cut: wp.array(dtype=wp.int32),
+        backtracks: wp.array(dtype=wp.int32),
         status: wp.array(dtype=wp.int32),
-        tried: wp.array(dtype=wp.int32),
-        going: wp.array(dtype=wp.int32),
+        evaluations: wp.array(dtype=wp.int32),
+        is_active: wp.array(dtype=wp.int32),
         inverted: wp.array(dtype=wp.int32),
     ):
         """Reset the iteration so that the start is evaluated first; the L-BFGS history does not change."""
         t[0] = wp.float64(0.0)
         predicted[0] = wp.float64(wp.inf)
         residual[0] = wp.float64(wp.inf)
-        loud[0, 0] = wp.float64(0.0)
+        constant_norms[0, 0] = wp.float64(0.0)
         for i in range(m):
             sg[i, 0] = wp.float64(0.0)
             wg[i, 0] = wp.float64(0.0)
         steps[0] = 0
-        cut[0] = 0
+        backtracks[0] = 0
         status[0] = LIVE
-        tried[0] = 0
-        going[0] = 1
+        evaluations[0] = 0
+        is_active[0] = 1
         inverted[0] = 0
 
     @forward_kernel(module="unique")
     def check_ended(
         status: wp.array(dtype=wp.int32),
         # outputs
-        tried: wp.array(dtype=wp.int32),
-        going: wp.array(dtype=wp.int32),
+        evaluations: wp.array(dtype=wp.int32),
+        is_active: wp.array(dtype=wp.int32),
     ):
-        """Increase the number of evaluations, and clear `going` if the descent has ended."""
-        tried[0] = tried[0] + 1
-        going[0] = wp.where(status[0] == LIVE and tried[0] < most, 1, 0)
+        """Increase the number of evaluations, and clear `is_active` if the descent has ended."""
+        evaluations[0] = evaluations[0] + 1
+        is_active[0] = wp.where(status[0] == LIVE and evaluations[0] < most, 1, 0)
 
     @forward_kernel(module="unique")
     def write_results(
@@ -196,8 +196,8 @@ class CapturedFrame:
         self._past = problem.device.allocate(problem.rows, 1)
         name = problem.device.name
         self._tried, self._going, self._inverted = (wp.zeros(1, dtype=wp.int32, device=name) for _ in range(3))
-        self._given, self._up = self._allocate_pair(INPUT_SIZE)
-        self._out, self._down = self._allocate_pair(HEADER_SIZE + problem.rows)
+        self._given, self._up = self._allocate_transfer(INPUT_SIZE)
+        self._out, self._down = self._allocate_transfer(HEADER_SIZE + problem.rows)
         self._imprint = skin.allocate_footprints(wp.array(ptr=self._given.ptr, dtype=wp.vec4d, shape=(1,), device=name))
         self._graph: wp.Graph | None = None
 
@@ -240,10 +240,10 @@ class CapturedFrame:
             self._load_updated_model(update_model_at(self.part, self._device, self._workspace.columns["u"]))
             self._workspace.columns["known"].zero_()  # curvature pairs are valid for their own model only
 
-    def _load_updated_model(self, bent: UpdatedModel | None) -> None:
+    def _load_updated_model(self, model: UpdatedModel | None) -> None:
         if self._knowing is not None:
-            self.bent = bent
-            self._knowing.load_model(bent)
+            self.bent = model
+            self._knowing.load_model(model)
 
     def solve_push(self, point: np.ndarray, radius: float, force: np.ndarray, extrapolation: float) -> np.ndarray:
         """Return the result of a push at `point` (3,) [m] with a footprint `radius` [m] and a `force` (3,) [N].
@@ -293,7 +293,7 @@ class CapturedFrame:
         inputs = [self._workspace.columns["status"]]
         self._device.launch(build_kernels(self._device).check_ended, (1,), inputs, [self._tried, self._going])
 
-    def _allocate_pair(self, count: int) -> tuple[wp.array, wp.array]:
+    def _allocate_transfer(self, count: int) -> tuple[wp.array, wp.array]:
         """Return arrays of `count` values on the device, and in pinned host memory for direct transfer."""
         there = wp.zeros(count, dtype=wp.float64, device=self._device.name)
         return there, wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._device.on_cuda)

@@ -40,11 +40,11 @@ class DeviceWarmStart(Mapping[str, Any]):
     thread may read the data while the next frame begins.
     """
 
-    def __init__(self, own: Mapping[str, np.ndarray], state: LbfgsState, lock: RLock, bent: UpdatedModel | None = None):
-        self._own = dict(own)
-        self._lock = lock
+    def __init__(
+        self, data: Mapping[str, np.ndarray], state: LbfgsState, lock: RLock, model: UpdatedModel | None = None
+    ):
+        self._own, self._lock, self.bent = dict(data), lock, model
         self.state: LbfgsState | None = state
-        self.bent = bent
 
     def copy_to_host(self) -> None:
         """Copy data that is still on the device to the host."""
@@ -119,9 +119,9 @@ class FrameSequence:
             last = start.displacement.reshape(-1, 1)
         else:
             last = guess()
-            if not self._take(loads, start, last):
+            if not self._load_start(loads, start, last):
                 return None
-        self._make_way()
+        self._release_state()
         way = compute_directions(now, last, start.warm)
         share = (
             compute_factors(now, way[PUSHES_KEY][:, 1], start.warm[PUSHES_KEY][:, 1])[0]
@@ -159,7 +159,7 @@ class FrameSequence:
         self._last, self._here = ref(result), ref(warm)
         return result
 
-    def _take(self, loads: Loads, start: Deformation, last: np.ndarray) -> bool:
+    def _load_start(self, loads: Loads, start: Deformation, last: np.ndarray) -> bool:
         """Load a start to the device; return False if the start is not usable."""
         cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
@@ -180,7 +180,7 @@ class FrameSequence:
         part = self._frame.part
         return None if part is None else restore_updated_model(warm, self._problem.device, len(self._nodes), part.size)
 
-    def _make_way(self) -> None:
+    def _release_state(self) -> None:
         """Update the warm-start data before the next frame, which starts from the current state."""
         there, here = self._there(), self._here()
         if there is not None:

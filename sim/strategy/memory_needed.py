@@ -118,19 +118,18 @@ def compute_memory(
     inverted_rows: int,
     batch: int | None,
     loads: int,
-    free: int,
+    free_bytes: int,
     budget: MemoryBudget = BUDGET,
 ) -> MemoryEstimate:
-    """Return the memory if the preconditioner inverts `inverted_rows` unknowns; `free` is the free memory [bytes]."""
+    """Return the memory if the preconditioner inverts `inverted_rows` unknowns, and `free_bytes` of memory are free."""
     rows, width = 3 * space.count, wp.types.type_size_in_bytes(device.scalar)
     tables = FIXED_BYTES + BYTES_PER_NODE[space.element] * space.count * width // 4
     taken, left = _estimate_inverse_bytes(inverted_rows, device)
     column = estimate_column_bytes(rows, device)
     if batch is None:
-        batch = choose_batch_size(rows, device, free - tables - left, budget)
-    return MemoryEstimate(
-        len(space.mesh.nodes), space.element, device, tables + taken, tables + left, column, min(batch, loads), free
-    )
+        batch = choose_batch_size(rows, device, free_bytes - tables - left, budget)
+    nodes, setup, constant = len(space.mesh.nodes), tables + taken, tables + left
+    return MemoryEstimate(nodes, space.element, device, setup, constant, column, min(batch, loads), free_bytes)
 
 
 def _list_unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:

@@ -87,14 +87,14 @@ class LoadProgress:
         long_enough = self.step >= stepping.min_step * np.minimum(1.0, 4.0 * max_steps)
         return shorter, (self.reached < 1.0) & long_enough
 
-    def propose_shares(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
+    def propose_fractions(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the next fractions (k,) of the cases `rows` (k,), and the longest path of their tools [gaps]."""
         aim = np.minimum(self.reached[rows] + self.step[rows], 1.0)
         return aim, float(((aim - self.reached[rows]) * self.gaps[rows]).max())
 
-    def take_steps(self, rows: np.ndarray, target: np.ndarray, good: np.ndarray) -> None:
-        """Accept the steps of those cases `rows` (k,) that are `good`, and set their fraction to `target` (k,)."""
-        self.reached[rows[good]] = target[good]
+    def take_steps(self, rows: np.ndarray, fractions: np.ndarray, good: np.ndarray) -> None:
+        """Accept the steps of those cases `rows` (k,) that are `good`, and set their fraction to `fractions` (k,)."""
+        self.reached[rows[good]] = fractions[good]
 
     def resize_steps(self, rows: np.ndarray, good: np.ndarray, growth: np.ndarray, shrink: float, widen: float) -> None:
         """Increase the steps of `good` cases in `rows` (k,); multiply other steps by `shrink`, and gaps by `widen`."""

@@ -58,12 +58,12 @@ class SolverResult:
         """Mask (B,) of load cases with a good outcome."""
         return np.array([outcome.good for outcome in self.outcome], bool)
 
-    def put_cases(self, index: np.ndarray, other: SolverResult, device: Device) -> None:
-        """Overwrite the results of the cases `index` (k,) with those of `other`; outer steps are added."""
-        scatter_columns(device, other.u, index, self.u)
-        self.iterations[index] += other.iterations
+    def replace_cases(self, index: np.ndarray, source: SolverResult, device: Device) -> None:
+        """Overwrite the results of the cases `index` (k,) with those of `source`; outer steps are added."""
+        scatter_columns(device, source.u, index, self.u)
+        self.iterations[index] += source.iterations
         for name in ("outcome", "residual", "reached", "inverted"):
-            getattr(self, name)[index] = getattr(other, name)
+            getattr(self, name)[index] = getattr(source, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,7 @@ class Strategy:
         return None if step is None else self.build_batch_solver() if step is SolverStep.NEAR else self.single_solver
 
     @cached_property
-    def _touched(self) -> Preconditioner:
+    def _contact_preconditioner(self) -> Preconditioner:
         """Preconditioner that includes contact; not on CUDA, where half precision does not resolve contact."""
         if self.problem.device.on_cuda:
             return self.preconditioner
@@ -156,13 +156,13 @@ class Strategy:
                 astray[again] = True
                 some = replace(cases.select(again), restarted=np.ones(len(again), bool))
                 problem.begin(some)
-                result.put_cases(again, self._solve_whole_load(some), device)
+                result.replace_cases(again, self._solve_whole_load(some), device)
         result.outcome[astray & result.good] = Outcome.CONVERGED_ANEW
         lost = np.flatnonzero(self._find_unsolved(result))
         if len(lost):
             found = self._raise_load(cases.select(lost), result, lost)
             astray[lost] |= found.reached > result.reached[lost]
-            result.put_cases(lost, found, device)
+            result.replace_cases(lost, found, device)
         return replace(result, path_fraction=result.reached, restarted=astray) if problem.barriers else result
 
     def _find_loaded_cases(self, count: int) -> np.ndarray:
@@ -231,7 +231,7 @@ class Strategy:
             left -= int(found.steps.max(initial=0))
             outcome = np.full(len(index), Outcome.BUDGET, object)
             outcome[found.status == DONE], outcome[found.status == NOT_FINITE] = Outcome.CONVERGED, Outcome.NOT_FINITE
-            result.put_cases(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
+            result.replace_cases(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
             gained = found.warm_start
             index = index[found.unfinished]
             if len(index) == 0:
@@ -239,7 +239,7 @@ class Strategy:
             problem.begin(cases.select(index))
             start = gather_columns(device, found.u, found.unfinished)
         else:
-            result.put_cases(index, self._run_newton(start, self.accuracy.outer), device)
+            result.replace_cases(index, self._run_newton(start, self.accuracy.outer), device)
         return replace(result, warm_start=gained)
 
     def _solve_contact(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
@@ -257,17 +257,17 @@ class Strategy:
         outcome[found.status == DONE] = Outcome.CONVERGED
         result = self._build_result(found.u, outcome, found.steps, found.residual, 0)
 
-        def batched(rows: np.ndarray) -> Sequence[np.ndarray]:
+        def split_rows(rows: np.ndarray) -> Sequence[np.ndarray]:
             return [rows][: len(rows)] if device.on_cuda else list(rows[:, None])
 
         near = np.flatnonzero(~result.good & (found.residual <= self.gaps.newton_residual))
-        for some in batched(near):
+        for some in split_rows(near):
             problem.begin(cases.select(some))
-            result.put_cases(some, self._run_newton(gather_columns(device, found.u, some), few), device)
+            result.replace_cases(some, self._run_newton(gather_columns(device, found.u, some), few), device)
         left = np.flatnonzero(~result.good)
-        for some in batched(left):
+        for some in split_rows(left):
             begun = gather_columns(device, start, some)
-            result.put_cases(some, self._close_gaps(cases.select(some), begun, outer, gaps), device)
+            result.replace_cases(some, self._close_gaps(cases.select(some), begun, outer, gaps), device)
         return result
 
     def _close_gaps(self, cases: Cases, start: wp.array, outer: int, gaps: float) -> SolverResult:
@@ -291,7 +291,7 @@ class Strategy:
     def _run_newton(self, start: wp.array, outer: int, tolerance: float | None = None) -> SolverResult:
         """Return the result for the current batch by Newton's method, in at most `outer` iterations."""
         accuracy = replace(self.accuracy, outer=outer, tolerance=tolerance or self.accuracy.tolerance)
-        found = find_equilibrium(self.problem, NewtonCG(self._touched, accuracy.inner), start, accuracy)
+        found = find_equilibrium(self.problem, NewtonCG(self._contact_preconditioner, accuracy.inner), start, accuracy)
         return self._build_result(found.u, found.outcome, found.iterations, found.residual, found.linear_iterations)
 
     def _build_result(
@@ -308,11 +308,11 @@ class Strategy:
         problem, device = self.problem, self.problem.device
         cases = replace(cases, restarted=np.ones(len(index), bool))
 
-        def raised(part: Cases, share: np.ndarray) -> Cases:
-            return replace(part, loads=part.loads.scale(share), share=share)
+        def scale_loads(cases: Cases, fraction: np.ndarray) -> Cases:
+            return replace(cases, loads=cases.loads.scale(fraction), share=fraction)
 
         start = device.allocate(problem.rows, len(index))
-        found = self._solve_in_steps(cases, start, raised, self.stepping.first_step, self.accuracy.steps)
+        found = self._solve_in_steps(cases, start, scale_loads, self.stepping.first_step, self.accuracy.steps)
         outcome = failed.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
         none = np.flatnonzero(found.reached <= failed.reached[index])
@@ -326,34 +326,34 @@ class Strategy:
         If no force acts on the undeformed mesh at the end of the path, the undeformed mesh is the solution.
         """
 
-        def moved(part: Cases, share: np.ndarray) -> Cases:
-            return replace(part, share=share)
+        def move(cases: Cases, fraction: np.ndarray) -> Cases:
+            return replace(cases, share=fraction)
 
         device, count, most = self.problem.device, len(cases.loads), self.accuracy.steps
         acting = np.flatnonzero(self._find_loaded_cases(count))
         if len(acting) == count:
-            return self._solve_in_steps(cases, start, moved, 1.0, most)
+            return self._solve_in_steps(cases, start, move, 1.0, most)
         none, every = np.zeros(count, int), np.full(count, Outcome.CONVERGED, object)
         result = SolverResult(
             device.allocate(*start.shape), every, none, np.zeros(count), np.ones(count), none.copy(), 0
         )
         if len(acting):
             part = gather_columns(device, start, acting)
-            result.put_cases(acting, self._solve_in_steps(cases.select(acting), part, moved, 1.0, most), device)
+            result.replace_cases(acting, self._solve_in_steps(cases.select(acting), part, move, 1.0, most), device)
         return result
 
     def _solve_in_steps(
-        self, cases: Cases, start: wp.array, aimed: Callable[[Cases, np.ndarray], Cases], first: float, most: int
+        self, cases: Cases, start: wp.array, build: Callable[[Cases, np.ndarray], Cases], first_step: float, most: int
     ) -> SolverResult:
         """Solve for cases at growing fractions from `start` (3N, b); return the equilibrium at the largest fraction.
 
-        The function `aimed` builds cases at fractions (b,). The first step has the length `first`; steps are limited by
+        `build` returns the cases at fractions (b,). The first step has the length `first_step`. Steps are limited by
         the motion that tools may make at once, and at most `most` steps may be shorter than this limit. A good outcome
         requires the fraction 1; at smaller fractions, a residual at round-off is also accepted.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         gaps = np.maximum.reduce([np.zeros(count), *(term.compute_path_in_gaps(cases) for term in problem.barriers)])
-        shares = LoadProgress.start(first, gaps)
+        shares = LoadProgress.start(first_step, gaps)
         u, left, done = wp.clone(start), most, 1
         none, outcome = np.zeros(count, int), np.full(count, Outcome.BUDGET, object)
         result = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
@@ -361,15 +361,15 @@ class Strategy:
         wanted = outer if problem.barriers else self.stepping.target_iterations
         outer = outer if problem.barriers else min(self.stepping.max_iterations, outer)
         while left >= 0:
-            strides = [term.compute_stride(aimed(cases, shares.reached), u) for term in problem.barriers]
+            strides = [term.compute_stride(build(cases, shares.reached), u) for term in problem.barriers]
             shorter, going = shares.limit_steps(np.minimum.reduce([np.ones(count), *strides]), self.stepping)
             rows = np.flatnonzero(going & (result.iterations < self.accuracy.most))
             patience = self.stepping.patience * self.accuracy.inner * done
             if len(rows) == 0 or result.linear_iterations > patience:
                 break
-            aim, travel = shares.propose_shares(rows)
+            aim, travel = shares.propose_fractions(rows)
             left -= int(shorter[rows].any())
-            part = aimed(cases.select(rows), aim)
+            part = build(cases.select(rows), aim)
             found = self._solve_contact(part, gather_columns(device, u, rows), outer, travel)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
@@ -380,15 +380,17 @@ class Strategy:
             result.iterations[rows] += found.iterations
             result.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
             result = replace(result, linear_iterations=result.linear_iterations + found.linear_iterations)
-        return self._finish(cases, aimed, result)
+        return self._mark_bad(cases, build, result)
 
-    def _finish(self, cases: Cases, aimed: Callable[[Cases, np.ndarray], Cases], result: SolverResult) -> SolverResult:
+    def _mark_bad(
+        self, cases: Cases, build: Callable[[Cases, np.ndarray], Cases], result: SolverResult
+    ) -> SolverResult:
         """Return the result after the last step, with marks for cases pierced by a tool or below the whole load."""
         problem, u, outcome, reached = self.problem, result.u, result.outcome, result.reached
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
         if problem.barriers and len(short) < len(reached):
-            problem.begin(aimed(cases, np.ones(len(reached))))
+            problem.begin(build(cases, np.ones(len(reached))))
             buried = np.logical_or.reduce([term.find_penetrating(u) for term in problem.barriers])
             pierced = (problem.find_overlaps(u)[0] | buried) & (reached == 1.0)
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0

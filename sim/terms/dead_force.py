@@ -18,8 +18,8 @@ from ..runtime.device import Device, forward_kernel
 class DeadForceKernels:
     """Kernels over loaded nodes, for one scalar type."""
 
-    spread: wp.Kernel
-    subtract: wp.Kernel
+    distribute: wp.Kernel
+    subtract_forces: wp.Kernel
     subtract_work: wp.Kernel
 
 
@@ -30,20 +30,20 @@ def build_kernels(device: Device) -> DeadForceKernels:
     chunk = CHUNK
 
     @forward_kernel(module="unique")
-    def spread(
-        weight: wp.array2d(dtype=wp.float64),
+    def distribute(
+        weights: wp.array2d(dtype=wp.float64),
         sums: wp.array(dtype=wp.vec4d),
-        whole: wp.array2d(dtype=wp.float64),
+        tool_forces: wp.array2d(dtype=wp.float64),
         # outputs
         force: wp.array2d(dtype=scalar),
     ):
         """Distribute tool forces F by footprint weights w: f_(3i+k)c += w_ic / (sum of w)_c F_ck."""
         i, c = wp.tid()
         for k in range(3):
-            force[3 * i + k, c] += scalar(weight[i, c] / sums[c][0] * whole[c, k])
+            force[3 * i + k, c] += scalar(weights[i, c] / sums[c][0] * tool_forces[c, k])
 
     @forward_kernel(module="unique")
-    def subtract(
+    def subtract_forces(
         nodes: wp.array(dtype=wp.int32),
         force: wp.array2d(dtype=scalar),
         # outputs
@@ -70,7 +70,7 @@ def build_kernels(device: Device) -> DeadForceKernels:
                 total += wp.float64(force[3 * i + k, c]) * wp.float64(u[3 * nodes[i] + k, c])
         wp.atomic_sub(out, c, total)
 
-    return DeadForceKernels(spread, subtract, subtract_work)
+    return DeadForceKernels(distribute, subtract_forces, subtract_work)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def build_pushed_forces(surface: ContactSurface, device: Device, loads: Loads) -
     for cause in causes:
         footprints = surface.find_footprints(cause.point, cause.footprint)
         inputs = [footprints.weight, footprints.sums, device.upload(cause.force, wp.float64)]
-        device.launch(build_kernels(device).spread, footprints.weight.shape, inputs, [force])
+        device.launch(build_kernels(device).distribute, footprints.weight.shape, inputs, [force])
     return NodalForces(surface.numbers, force)
 
 
@@ -163,7 +163,7 @@ class DeadForce:
         if self._forces is not None:
             dim = (len(self._forces.nodes), u.shape[1])
             inputs = [self._forces.nodes, self._forces.force]
-            self._device.launch(build_kernels(self._device).subtract, dim, inputs, [out])
+            self._device.launch(build_kernels(self._device).subtract_forces, dim, inputs, [out])
 
     def linearise(self, u: wp.array, definite: wp.array) -> None:
         """Do nothing: a dead load has no tangent stiffness."""

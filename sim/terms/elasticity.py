@@ -15,7 +15,7 @@ from ..discretisation.term import Cases
 from ..runtime.columns import Workspaces
 from ..runtime.device import Device
 from ..runtime.threads import choose_threads, run_concurrently
-from .element_kernels import build_kernels, build_spreading_kernel
+from .element_kernels import build_broadcast_kernel, build_kernels
 from .laws.law import Law
 from .state_source import StateSource
 
@@ -130,7 +130,7 @@ class ElasticTerm:
             self._cases, numbers = cases, self._numbers.get_array(len(cases.loads))
             points, own = numbers.shape[:2], self._tissue[1].shape[1]
             dim = (*points, own, len(cases.loads))
-            self._device.launch(build_spreading_kernel(self._device), dim, [self._constants], [numbers])
+            self._device.launch(build_broadcast_kernel(self._device), dim, [self._constants], [numbers])
             for source in self._sources:
                 source.fill(cases, own, numbers)
                 own += source.count
@@ -171,15 +171,15 @@ class ElasticTerm:
         count, size = len(elements.table), 3 * elements.table.shape[1]
         dof = (3 * elements.table[:, :, None] + np.arange(3)).reshape(count, size)
         u = self._device.upload(np.repeat(self._at.numpy()[dof.ravel()], size, axis=1))
-        self._apart.linearise(u, self._device.upload(np.zeros(size), wp.int32))
+        self._disconnected.linearise(u, self._device.upload(np.zeros(size), wp.int32))
         out = self._device.allocate(count * size, size)
-        self._apart.add_curvature(self._device.upload(np.tile(np.eye(size), (count, 1))), out)
+        self._disconnected.add_curvature(self._device.upload(np.tile(np.eye(size), (count, 1))), out)
         place = np.repeat(dof, size, axis=1).ravel(), np.tile(dof, size).ravel()
         entries = out.numpy().ravel().astype(np.float64)
         return sp.csc_array(sp.coo_array((entries, place), shape=(3 * elements.node_count,) * 2))
 
     @cached_property
-    def _apart(self) -> "ElasticTerm":
+    def _disconnected(self) -> "ElasticTerm":
         """Copy of the term with separate nodes for each element."""
         elements, law, coefficients = self._rest[0], *self._tissue
         table = np.arange(elements.table.size, dtype=np.int32).reshape(elements.table.shape)
@@ -226,7 +226,7 @@ class ElasticTerm:
     def update_max_strain(self, elements: wp.array, u: wp.array, columns: wp.array, out: wp.array) -> None:
         """Raise `out` to the strain of the elements, as `StrainTerm.update_max_strain`."""
         inputs = [u, columns, *self._shape]
-        self._launch_on_some(self._strain_kernels.strain, elements, inputs, out, np.maximum)
+        self._launch_on(self._strain_kernels.update_max_strain, elements, inputs, out, np.maximum)
 
     def add_stiffening(
         self, elements: wp.array, u: wp.array, columns: wp.array, min_strain: wp.array, index: wp.array, out: wp.array
@@ -234,14 +234,14 @@ class ElasticTerm:
         """Add the stiffness increments of the elements to `out`, as `StrainTerm.add_stiffening`."""
         coefficients = self._numbers.get_array(u.shape[1]) if self._sources else self._constants
         inputs = [u, columns, min_strain, index, *self._shape, self._weight, coefficients]
-        self._launch_on_some(self._strain_kernels.stiffen, elements, inputs, out, np.add)
+        self._launch_on(self._strain_kernels.add_stiffening, elements, inputs, out, np.add)
 
-    def _launch_on_some(self, kernel: wp.Kernel, some: wp.array, inputs: list, out: wp.array, joined: np.ufunc) -> None:
-        """Launch a kernel on elements `some` (k,) in parallel blocks with separate outputs, and combine the outputs."""
-        if not len(some):
+    def _launch_on(self, kernel: wp.Kernel, elements: wp.array, inputs: list, out: wp.array, ufunc: np.ufunc) -> None:
+        """Launch a kernel on `elements` (k,) in parallel blocks with separate outputs, and join the outputs."""
+        if not len(elements):
             return
-        ends = np.linspace(0, len(some), len(self._parts) + 1).astype(int).tolist()
-        parts = [some[first:stop] for first, stop in pairwise(ends) if first < stop]
+        ends = np.linspace(0, len(elements), len(self._parts) + 1).astype(int).tolist()
+        parts = [elements[first:stop] for first, stop in pairwise(ends) if first < stop]
         outputs = [out, *(wp.zeros_like(out) for _ in parts[1:])]
         columns = len(inputs[1])
         run_concurrently(
@@ -251,7 +251,7 @@ class ElasticTerm:
             ]
         )
         for other in outputs[1:]:
-            joined(out.numpy(), other.numpy(), out=out.numpy())
+            ufunc(out.numpy(), other.numpy(), out=out.numpy())
 
     def longest_step(self, u: wp.array, du: wp.array, out: wp.array) -> None:
         """Reduce `out` to the fraction of the step up to which J > 0, if the law requires this."""
@@ -268,7 +268,7 @@ class ElasticTerm:
             return None
         strains = self._strains.get_array(u.shape[1])
         outputs = [strains[part.first : part.first + part.count] for part in self._parts]
-        self._launch_on_blocks(self._kernels.measure, lambda part: [u, *part.shape], outputs, u.shape[1])
+        self._launch_on_blocks(self._kernels.compute_gradients, lambda part: [u, *part.shape], outputs, u.shape[1])
         kept = [source.end(self._cases, strains) for source in reversed(self._sources)]
         return next((memory for memory in kept if memory is not None), None)
 
@@ -277,11 +277,11 @@ class ElasticTerm:
         sums = [out, *(wp.zeros_like(out) for _ in self._parts[1:])]
         numbers = self._numbers.get_array(columns) if self._sources else None
 
-        def all_inputs(part: _Part) -> list:
+        def collect_inputs(part: _Part) -> list:
             own = part.coefficients if numbers is None else numbers[part.first : part.first + part.count]
             return [*inputs, *part.shape, part.weight, own]
 
-        self._launch_on_blocks(kernel, all_inputs, sums, columns)
+        self._launch_on_blocks(kernel, collect_inputs, sums, columns)
         for total in sums[1:]:
             np.add(out.numpy(), total.numpy(), out=out.numpy())
 

@@ -7,7 +7,7 @@ import warp as wp
 
 from ..runtime.device import Device, forward_kernel
 from .element_functions import build_functions
-from .laws.invariants import cofactor
+from .laws.invariants import cofactor_matrix
 from .laws.law import Law
 
 # Minimum J after a step, as a fraction of J before: bounds the logarithm and its second derivative.
@@ -23,16 +23,16 @@ class ElementKernels:
     add_curvature: wp.Kernel
     add_diagonal: wp.Kernel
     bound_step: wp.Kernel | None
-    measure: wp.Kernel
+    compute_gradients: wp.Kernel
 
 
 @cache
-def build_spreading_kernel(device: Device) -> wp.Kernel:
+def build_broadcast_kernel(device: Device) -> wp.Kernel:
     """Return the kernel that copies the coefficients of each element to all its points and load cases."""
     scalar = device.scalar
 
     @forward_kernel(module="unique")
-    def spread(
+    def copy_coefficients(
         coefficients: wp.array2d(dtype=scalar),
         # outputs
         out: wp.array4d(dtype=scalar),
@@ -41,7 +41,7 @@ def build_spreading_kernel(device: Device) -> wp.Kernel:
         e, q, i, c = wp.tid()
         out[e, q, i, c] = coefficients[e, i]
 
-    return spread
+    return copy_coefficients
 
 
 @cache
@@ -56,15 +56,15 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
     stress, stress_change, density = law.stress, law.stress_change, law.energy
     kept = MIN_VOLUME_RATIO
     functions = build_functions(law, device, size, count)
-    gradient_of, numbers = functions.gradient, functions.array_type
-    at, at_rest = functions.get_coefficients, functions.get_rest_coefficients
+    compute_gradient, numbers = functions.compute_gradient, functions.array_type
+    get_coefficients, get_rest_coefficients = functions.get_coefficients, functions.get_rest_coefficients
 
     @wp.func
-    def spread(
+    def add_forces(
         P: mat,
         sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
         e: int,
         q: int,
         c: int,
@@ -73,12 +73,12 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         """Add the element forces f_a += P grad N_a; the sum of these forces is zero."""
         total = vec()
         for a in range(1, size if size else sizes[e]):
-            i = 3 * table[e, a]
-            f = P * gradient[e, q, a]
+            i = 3 * elements[e, a]
+            f = P * gradients[e, q, a]
             total += f
             for k in range(3):
                 wp.atomic_add(out, i + k, c, f[k])
-        i = 3 * table[e, 0]
+        i = 3 * elements[e, 0]
         for k in range(3):
             wp.atomic_sub(out, i + k, c, total[k])
 
@@ -86,79 +86,79 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
     def add_energy(
         u: wp.array2d(dtype=scalar),
         sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        weight: wp.array2d(dtype=scalar),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
+        weights: wp.array2d(dtype=scalar),
         coefficients: numbers,
         # outputs
         out: wp.array(dtype=wp.float64),
     ):
         """Add the energy: E += sum over points of w psi(H)."""
         e, c = wp.tid()
-        for q in range(gradient.shape[1]):
-            H = gradient_of(u, sizes, table, gradient, e, q, c)
-            wp.atomic_add(out, c, wp.float64(weight[e, q] * density(H, at(coefficients, e, q, c))))
+        for q in range(gradients.shape[1]):
+            H = compute_gradient(u, sizes, elements, gradients, e, q, c)
+            wp.atomic_add(out, c, wp.float64(weights[e, q] * density(H, get_coefficients(coefficients, e, q, c))))
 
     @forward_kernel(module="unique")
     def add_gradient(
         u: wp.array2d(dtype=scalar),
         sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        weight: wp.array2d(dtype=scalar),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
+        weights: wp.array2d(dtype=scalar),
         coefficients: numbers,
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """Add the internal forces: f_a += sum over points of w P(H) grad N_a."""
         e, c = wp.tid()
-        for q in range(gradient.shape[1]):
-            H = gradient_of(u, sizes, table, gradient, e, q, c)
-            P = weight[e, q] * stress(H, at(coefficients, e, q, c))
-            spread(P, sizes, table, gradient, e, q, c, out)
+        for q in range(gradients.shape[1]):
+            H = compute_gradient(u, sizes, elements, gradients, e, q, c)
+            P = weights[e, q] * stress(H, get_coefficients(coefficients, e, q, c))
+            add_forces(P, sizes, elements, gradients, e, q, c, out)
 
     @forward_kernel(module="unique")
     def add_curvature(
         p: wp.array2d(dtype=scalar),
-        where: wp.array2d(dtype=scalar),
+        u: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
         sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        weight: wp.array2d(dtype=scalar),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
+        weights: wp.array2d(dtype=scalar),
         coefficients: numbers,
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
         """Add f_a += sum over points of w dP(H; D) grad N_a; `definite` load cases use the undeformed tangent."""
         e, c = wp.tid()
-        for q in range(gradient.shape[1]):
-            k = at(coefficients, e, q, c)
+        for q in range(gradients.shape[1]):
+            k = get_coefficients(coefficients, e, q, c)
             H = mat()
             if definite[c] == 0:
-                H = gradient_of(where, sizes, table, gradient, e, q, c)
+                H = compute_gradient(u, sizes, elements, gradients, e, q, c)
             else:
-                k = at_rest(k)
-            D = gradient_of(p, sizes, table, gradient, e, q, c)
-            P = weight[e, q] * stress_change(H, D, k)
-            spread(P, sizes, table, gradient, e, q, c, out)
+                k = get_rest_coefficients(k)
+            D = compute_gradient(p, sizes, elements, gradients, e, q, c)
+            P = weights[e, q] * stress_change(H, D, k)
+            add_forces(P, sizes, elements, gradients, e, q, c, out)
 
     @wp.func
-    def along(H: mat, of: constants, k: int, m: int):
+    def compute_stress_change(H: mat, coefficients: constants, k: int, l: int):
         """Return dP for dF = e_k (x) e_m."""
         D = mat()
-        D[k, m] = scalar(1.0)
-        return stress_change(H, D, of)
+        D[k, l] = scalar(1.0)
+        return stress_change(H, D, coefficients)
 
     # Unrolled, its many stress changes take ten seconds to compile.
     @forward_kernel(module="unique", module_options={"max_unroll": 0})
     def add_diagonal(
-        where: wp.array2d(dtype=scalar),
+        u: wp.array2d(dtype=scalar),
         definite: wp.array(dtype=wp.int32),
         sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
-        weight: wp.array2d(dtype=scalar),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
+        weights: wp.array2d(dtype=scalar),
         coefficients: numbers,
         # outputs
         out: wp.array2d(dtype=mat),
@@ -168,43 +168,43 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
         Nine stress changes are computed per point and used for all nodes.
         """
         e, c = wp.tid()
-        for q in range(gradient.shape[1]):
-            k = at(coefficients, e, q, c)
+        for q in range(gradients.shape[1]):
+            k = get_coefficients(coefficients, e, q, c)
             H = mat()
             if definite[c] == 0:
-                H = gradient_of(where, sizes, table, gradient, e, q, c)
+                H = compute_gradient(u, sizes, elements, gradients, e, q, c)
             else:
-                k = at_rest(k)
+                k = get_rest_coefficients(k)
             for j in range(3):
-                X = along(H, k, j, 0)
-                Y = along(H, k, j, 1)
-                Z = along(H, k, j, 2)
+                X = compute_stress_change(H, k, j, 0)
+                Y = compute_stress_change(H, k, j, 1)
+                Z = compute_stress_change(H, k, j, 2)
                 for a in range(size if size else sizes[e]):
-                    g = gradient[e, q, a]
-                    f = weight[e, q] * ((g[0] * X + g[1] * Y + g[2] * Z) * g)
+                    g = gradients[e, q, a]
+                    f = weights[e, q] * ((g[0] * X + g[1] * Y + g[2] * Z) * g)
                     block = mat()
                     for i in range(3):
                         block[i, j] = f[i]
-                    wp.atomic_add(out, table[e, a], c, block)
+                    wp.atomic_add(out, elements[e, a], c, block)
 
     @forward_kernel(module="unique")
     def bound_step(
         u: wp.array2d(dtype=scalar),
         du: wp.array2d(dtype=scalar),
         sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
         # outputs
         out: wp.array(dtype=scalar),
     ):
         """Halve t until J = det(F + s D) >= kept det F for all s in [0, t]; J is a cubic polynomial of s."""
         e, c = wp.tid()
         one = scalar(1.0)
-        for q in range(gradient.shape[1]):
-            H = gradient_of(u, sizes, table, gradient, e, q, c)
-            D = gradient_of(du, sizes, table, gradient, e, q, c)
+        for q in range(gradients.shape[1]):
+            H = compute_gradient(u, sizes, elements, gradients, e, q, c)
+            D = compute_gradient(du, sizes, elements, gradients, e, q, c)
             F = wp.identity(n=3, dtype=scalar) + H
-            normal, normal_change = cofactor(F), cofactor(D)
+            normal, normal_change = cofactor_matrix(F), cofactor_matrix(D)
             a0 = wp.dot(F[0], normal[0])
             a1 = wp.ddot(normal, D)
             a2 = wp.ddot(F, normal_change)
@@ -235,18 +235,18 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> ElementKer
             wp.atomic_min(out, c, t)
 
     @forward_kernel(module="unique")
-    def measure(
+    def compute_gradients(
         u: wp.array2d(dtype=scalar),
         sizes: wp.array(dtype=wp.int32),
-        table: wp.array2d(dtype=wp.int32),
-        gradient: wp.array3d(dtype=vec),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
         # outputs
         out: wp.array3d(dtype=mat),
     ):
         """Compute the displacement gradient H at every point."""
         e, c = wp.tid()
-        for q in range(gradient.shape[1]):
-            out[e, q, c] = gradient_of(u, sizes, table, gradient, e, q, c)
+        for q in range(gradients.shape[1]):
+            out[e, q, c] = compute_gradient(u, sizes, elements, gradients, e, q, c)
 
     bounded = bound_step if law.needs_positive_volume else None
-    return ElementKernels(add_energy, add_gradient, add_curvature, add_diagonal, bounded, measure)
+    return ElementKernels(add_energy, add_gradient, add_curvature, add_diagonal, bounded, compute_gradients)

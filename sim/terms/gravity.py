@@ -40,7 +40,7 @@ def build_weight_change(
     volume = sum_by_node(table, whole, count)
 
     @lru_cache(cache_size)
-    def weights(*posture: float) -> np.ndarray:
+    def compute_weights(*posture: float) -> np.ndarray:
         """Return the weight (N, 3) [N] of each node in a posture, given by the direction and the level [m]."""
         direction, level = np.array(posture[:3]), posture[3]
         height = (-space.nodes @ direction - level)[table[:, :4]]
@@ -52,16 +52,17 @@ def build_weight_change(
         mass = effect.density * volume - effect.csf_density * under
         return STANDARD_GRAVITY * mass[:, None] * direction
 
-    def forces(loads: Loads) -> NodalForces | None:
+    def compute_forces(loads: Loads) -> NodalForces | None:
         cause = loads.get(Posture)
         if cause is None:
             return None
-        scan = weights(*normalise_gravity(np.array([effect.direction]))[0], effect.csf_level)
-        now = [weights(*row) for row in np.column_stack([normalise_gravity(cause.direction), cause.csf_level]).tolist()]
+        scan = compute_weights(*normalise_gravity(np.array([effect.direction]))[0], effect.csf_level)
+        postures = np.column_stack([normalise_gravity(cause.direction), cause.csf_level]).tolist()
+        now = [compute_weights(*row) for row in postures]
         change = cause.share[:, None, None] * (np.reshape(now, (-1, count, 3)) - scan)
         return NodalForces(device.upload(np.arange(count), wp.int32), device.upload(change.reshape(-1, 3 * count).T))
 
-    return forces
+    return compute_forces
 
 
 def normalise_gravity(direction: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ def build_kernels(device: Device) -> InertiaKernels:
     def add_energy(
         mass: wp.array(dtype=scalar),
         weight: wp.array(dtype=scalar),
-        aim: wp.array2d(dtype=scalar),
+        target: wp.array2d(dtype=scalar),
         u: wp.array2d(dtype=scalar),
         # outputs
         out: wp.array(dtype=wp.float64),
@@ -48,7 +48,7 @@ def build_kernels(device: Device) -> InertiaKernels:
         total = wp.float64(0.0)
         for i in range(block * chunk, wp.min((block + 1) * chunk, mass.shape[0])):
             for k in range(3):
-                away = wp.float64(u[3 * i + k, c]) - wp.float64(aim[3 * i + k, c])
+                away = wp.float64(u[3 * i + k, c]) - wp.float64(target[3 * i + k, c])
                 total += wp.float64(mass[i]) * away * away
         wp.atomic_add(out, c, wp.float64(0.5) * wp.float64(weight[c]) * total)
 
@@ -57,15 +57,15 @@ def build_kernels(device: Device) -> InertiaKernels:
         mass: wp.array(dtype=scalar),
         weight: wp.array(dtype=scalar),
         x: wp.array2d(dtype=scalar),
-        aim: wp.array2d(dtype=scalar),
-        aimed: scalar,
+        target: wp.array2d(dtype=scalar),
+        factor: scalar,
         # outputs
         out: wp.array2d(dtype=scalar),
     ):
-        """Add inertial forces f_i += m_i w_c (x_i - aimed a_i); `aimed` is 0 or 1."""
+        """Add inertial forces f_i += m_i w_c (x_i - aimed a_i); `factor` is 0 or 1."""
         i, c = wp.tid()
         for k in range(3):
-            out[3 * i + k, c] += mass[i] * weight[c] * (x[3 * i + k, c] - aimed * aim[3 * i + k, c])
+            out[3 * i + k, c] += mass[i] * weight[c] * (x[3 * i + k, c] - factor * target[3 * i + k, c])
 
     @forward_kernel(module="unique")
     def add_blocks(
@@ -138,7 +138,7 @@ class InertiaTerm:
         steps, count = cases.steps, len(cases.loads)
         self._cases = cases
         drift = steps / (1.0 + self._damping * steps)
-        aim = self._start(cases) + drift[:, None, None] * self._get_velocities(cases)
+        aim = self._get_start(cases) + drift[:, None, None] * self._get_velocities(cases)
         passes = np.where(steps > 0.0, steps, np.inf)
         self._weight.get_array(count).assign(1.0 / passes**2 + self._damping / passes)
         self._aim.get_array(count).assign(np.ascontiguousarray(aim.reshape(count, 3 * len(self._masses)).T))
@@ -187,9 +187,9 @@ class InertiaTerm:
         now = u.numpy().astype(np.float64).T.reshape(u.shape[1], len(self._masses), 3)
         steps = self._cases.steps[:, None, None]
         passes = np.where(steps > 0.0, steps, np.inf)
-        return np.where(steps > 0.0, (now - self._start(self._cases)) / passes, self._get_velocities(self._cases))
+        return np.where(steps > 0.0, (now - self._get_start(self._cases)) / passes, self._get_velocities(self._cases))
 
-    def _start(self, cases: Cases) -> np.ndarray:
+    def _get_start(self, cases: Cases) -> np.ndarray:
         """Return the displacement (B, N, 3) [m] at the start of the time step."""
         still = np.zeros((len(cases.loads), len(self._masses), 3))
         return still if cases.displacement is None else cases.displacement
@@ -198,6 +198,6 @@ class InertiaTerm:
         """Return the velocities (B, N, 3) [m/s] at the start of the time step."""
         return cases.get_past(self.name, (len(self._masses), 3))
 
-    def _add_force(self, x: wp.array, aim: wp.array, aimed: float, out: wp.array) -> None:
-        inputs = [self._mass, self._weight.get_array(x.shape[1]), x, aim, aimed]
+    def _add_force(self, x: wp.array, target: wp.array, factor: float, out: wp.array) -> None:
+        inputs = [self._mass, self._weight.get_array(x.shape[1]), x, target, factor]
         self._device.launch(self._kernels.add_force, (len(self._mass), x.shape[1]), inputs, [out])

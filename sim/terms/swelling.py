@@ -24,7 +24,7 @@ def build_swollen_law(law: Law, device: Device, count: int) -> Law:
     own_energy, own_stress, own_change = law.energy, law.stress, law.stress_change
 
     @wp.func
-    def of_law(c: whole):
+    def get_law_coefficients(c: whole):
         """Return the coefficients of the wrapped law."""
         k = inner()
         for i in range(count):
@@ -32,7 +32,7 @@ def build_swollen_law(law: Law, device: Device, count: int) -> Law:
         return k
 
     @wp.func
-    def elastic(H: mat, c: whole):
+    def compute_elastic_part(H: mat, c: whole):
         """Return the elastic displacement gradient F_e - I = (H - r I) / (1 + r)."""
         return (H - c[count] * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + c[count])
 
@@ -40,43 +40,43 @@ def build_swollen_law(law: Law, device: Device, count: int) -> Law:
     def energy(H: mat, c: whole):
         """Return the energy density (1 + r)^3 psi(F_e) [Pa]."""
         s = scalar(1.0) + c[count]
-        return s * s * s * own_energy(elastic(H, c), of_law(c))
+        return s * s * s * own_energy(compute_elastic_part(H, c), get_law_coefficients(c))
 
     @wp.func
     def stress(H: mat, c: whole):
         """Return the stress P = (1 + r)^2 P(F_e) [Pa]."""
         s = scalar(1.0) + c[count]
-        return s * s * own_stress(elastic(H, c), of_law(c))
+        return s * s * own_stress(compute_elastic_part(H, c), get_law_coefficients(c))
 
     @wp.func
     def stress_change(H: mat, D: mat, c: whole):
         """Return dP [Pa] for dF = D: (1 + r) dP(F_e; D)."""
-        return (scalar(1.0) + c[count]) * own_change(elastic(H, c), D, of_law(c))
+        return (scalar(1.0) + c[count]) * own_change(compute_elastic_part(H, c), D, get_law_coefficients(c))
 
     @wp.func
-    def same(k: inner):
+    def return_coefficients(k: inner):
         """Return the coefficients unchanged."""
         return k
 
-    own_rest = law.at_rest or same
+    own_rest = law.at_rest or return_coefficients
 
     @wp.func
-    def at_rest(c: whole):
+    def get_rest_values(c: whole):
         """Return the coefficients in the undeformed state: those of the wrapped law, and r = 0."""
-        k, own = whole(), own_rest(of_law(c))
+        k, own = whole(), own_rest(get_law_coefficients(c))
         for i in range(count):
             k[i] = own[i]
         return k
 
-    return Law(f"swelling {law.name}", energy, stress, stress_change, law.needs_positive_volume, at_rest)
+    return Law(f"swelling {law.name}", energy, stress, stress_change, law.needs_positive_volume, get_rest_values)
 
 
 @dataclass(frozen=True)
 class SwellingKernels:
     """Kernels for the swelling ratio, launched over (element, point, load case)."""
 
-    fill: wp.Kernel
-    shrink: wp.Kernel
+    write_ratio: wp.Kernel
+    remove_swelling: wp.Kernel
 
 
 @cache
@@ -85,30 +85,30 @@ def build_kernels(device: Device) -> SwellingKernels:
     scalar, mat = device.scalar, device.matrix
 
     @forward_kernel(module="unique")
-    def fill(
-        swells: wp.array(dtype=scalar),
-        wider: wp.array(dtype=scalar),
-        place: int,
+    def write_ratio(
+        mask: wp.array(dtype=scalar),
+        ratio: wp.array(dtype=scalar),
+        index: int,
         # outputs
         out: wp.array4d(dtype=scalar),
     ):
         """Write the swelling ratio r_eqc = s_e r_c."""
         e, q, c = wp.tid()
-        out[e, q, place, c] = swells[e] * wider[c]
+        out[e, q, index, c] = mask[e] * ratio[c]
 
     @forward_kernel(module="unique")
-    def shrink(
-        swells: wp.array(dtype=scalar),
-        wider: wp.array(dtype=scalar),
+    def remove_swelling(
+        mask: wp.array(dtype=scalar),
+        ratio: wp.array(dtype=scalar),
         # outputs
         strain: wp.array3d(dtype=mat),
     ):
         """Replace H by the elastic part F_e - I = (H - r I) / (1 + r)."""
         e, q, c = wp.tid()
-        r = swells[e] * wider[c]
+        r = mask[e] * ratio[c]
         strain[e, q, c] = (strain[e, q, c] - r * wp.identity(n=3, dtype=scalar)) / (scalar(1.0) + r)
 
-    return SwellingKernels(fill, shrink)
+    return SwellingKernels(write_ratio, remove_swelling)
 
 
 class Swelling:
@@ -126,9 +126,9 @@ class Swelling:
 
     count, width = 1, 0
 
-    def __init__(self, theta: Callable[[np.ndarray], np.ndarray], swells: np.ndarray, device: Device):
+    def __init__(self, theta: Callable[[np.ndarray], np.ndarray], mask: np.ndarray, device: Device):
         self._theta, self._device = theta, device
-        self._swells = device.upload(swells.astype(np.float64))
+        self._swells = device.upload(mask.astype(np.float64))
 
     def build_law(self, inner: Law, count: int) -> Law:
         """Return the law that applies `inner` to the elastic part of the deformation."""
@@ -137,12 +137,12 @@ class Swelling:
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
         """Write the ratio r at every point."""
         inputs = [self._swells, self._compute_linear_strain(cases), first]
-        self._device.launch(build_kernels(self._device).fill, (*out.shape[:2], out.shape[3]), inputs, [out])
+        self._device.launch(build_kernels(self._device).write_ratio, (*out.shape[:2], out.shape[3]), inputs, [out])
 
     def end(self, cases: Cases, strains: wp.array) -> None:
         """Replace strains by their elastic part for inner sources; return None, since there is no history."""
         inputs = [self._swells, self._compute_linear_strain(cases)]
-        self._device.launch(build_kernels(self._device).shrink, strains.shape, inputs, [strains])
+        self._device.launch(build_kernels(self._device).remove_swelling, strains.shape, inputs, [strains])
 
     def _compute_linear_strain(self, cases: Cases) -> wp.array:
         """Return the ratio r (b,), also accurate for small theta."""

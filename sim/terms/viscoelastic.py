@@ -44,7 +44,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
     own_energy, own_stress, own_change = parts.energy, parts.stress, parts.stress_change
 
     @wp.func
-    def of_law(c: whole):
+    def get_law_coefficients(c: whole):
         """Return the coefficients of the wrapped law."""
         k = inner()
         for i in range(count):
@@ -52,7 +52,7 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
         return k
 
     @wp.func
-    def pull(c: whole):
+    def get_tensor(c: whole):
         """Return the symmetric tensor A [Pa]."""
         xx, yy, zz, yz, zx, xy = (c[count + 1], c[count + 2], c[count + 3], c[count + 4], c[count + 5], c[count + 6])
         return mat(xx, xy, zx, xy, yy, yz, zx, yz, zz)
@@ -60,35 +60,35 @@ def build_relaxing_law(law: Law, device: Device, count: int) -> Law:
     @wp.func
     def energy(H: mat, c: whole):
         """Return the energy density of the step, psi + (f - 1) psi_shape + A : E [Pa]."""
-        return own_energy(H, of_law(c), c[count], pull(c))
+        return own_energy(H, get_law_coefficients(c), c[count], get_tensor(c))
 
     @wp.func
     def stress(H: mat, c: whole):
         """Return the stress [Pa]: P + (f - 1) P_shape + the derivative of A : E."""
-        return own_stress(H, of_law(c), c[count], pull(c))
+        return own_stress(H, get_law_coefficients(c), c[count], get_tensor(c))
 
     @wp.func
     def stress_change(H: mat, D: mat, c: whole):
         """Return dP [Pa] for dF = D, the derivative of `stress`."""
-        return own_change(H, D, of_law(c), c[count], pull(c))
+        return own_change(H, D, get_law_coefficients(c), c[count], get_tensor(c))
 
     @wp.func
-    def at_rest(c: whole):
+    def get_rest_values(c: whole):
         """Return the coefficients without relaxation and overstress."""
         k = c
         for i in range(count, count + 1 + TENSOR_COMPONENTS):
             k[i] = scalar(0.0)
         return k
 
-    return Law(f"viscoelastic {law.name}", energy, stress, stress_change, parts.needs_positive_volume, at_rest)
+    return Law(f"viscoelastic {law.name}", energy, stress, stress_change, parts.needs_positive_volume, get_rest_values)
 
 
 @dataclass(frozen=True)
 class ViscoelasticKernels:
     """Kernels for one time step of the Prony series at every point."""
 
-    fade: wp.Kernel
-    advance: wp.Kernel
+    write_relaxation: wp.Kernel
+    update_history: wp.Kernel
 
 
 @cache
@@ -100,35 +100,35 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
     six = TENSOR_COMPONENTS
 
     @forward_kernel(module="unique")
-    def fade(
-        share: wp.array2d(dtype=scalar),
+    def write_relaxation(
+        ratio: wp.array2d(dtype=scalar),
         tau: wp.array2d(dtype=scalar),
-        step: wp.array(dtype=scalar),
-        past: wp.array3d(dtype=scalar),
-        first: int,
+        time_step: wp.array(dtype=scalar),
+        history: wp.array3d(dtype=scalar),
+        index: int,
         # outputs
         out: wp.array4d(dtype=scalar),
     ):
-        """Compute f - 1 and A; `past` (b, points, 6 (n + 1)) contains S, then each H_i."""
+        """Compute f - 1 and A; `history` (b, points, 6 (n + 1)) contains S, then each H_i."""
         e, q, c = wp.tid()
         p = e * out.shape[1] + q
         less = scalar(0.0)
-        for i in range(share.shape[1]):
-            less += share[e, i] * exp_less_one(-step[c] / (scalar(2.0) * tau[e, i]))
-        out[e, q, first, c] = less
+        for i in range(ratio.shape[1]):
+            less += ratio[e, i] * exp_less_one(-time_step[c] / (scalar(2.0) * tau[e, i]))
+        out[e, q, index, c] = less
         for k in range(six):
             pull = scalar(0.0)
-            for i in range(share.shape[1]):
-                half = wp.exp(-step[c] / (scalar(2.0) * tau[e, i]))
-                pull += half * (half * past[c, p, six * (i + 1) + k] - share[e, i] * past[c, p, k])
-            out[e, q, first + 1 + k, c] = pull
+            for i in range(ratio.shape[1]):
+                half = wp.exp(-time_step[c] / (scalar(2.0) * tau[e, i]))
+                pull += half * (half * history[c, p, six * (i + 1) + k] - ratio[e, i] * history[c, p, k])
+            out[e, q, index + 1 + k, c] = pull
 
     @forward_kernel(module="unique")
-    def advance(
-        share: wp.array2d(dtype=scalar),
+    def update_history(
+        ratio: wp.array2d(dtype=scalar),
         tau: wp.array2d(dtype=scalar),
-        step: wp.array(dtype=scalar),
-        past: wp.array3d(dtype=scalar),
+        time_step: wp.array(dtype=scalar),
+        history: wp.array3d(dtype=scalar),
         coefficients: wp.array(dtype=constants),
         strain: wp.array3d(dtype=mat),
         # outputs
@@ -142,11 +142,11 @@ def build_kernels(law: Law, device: Device, count: int) -> ViscoelasticKernels:
         for k in range(six):
             now = wp.where(k < 3, low[k % 3], high[k % 3])
             out[c, p, k] = now
-            for i in range(share.shape[1]):
-                half, row = wp.exp(-step[c] / (scalar(2.0) * tau[e, i])), six * (i + 1) + k
-                out[c, p, row] = half * (half * past[c, p, row] + share[e, i] * (now - past[c, p, k]))
+            for i in range(ratio.shape[1]):
+                half, row = wp.exp(-time_step[c] / (scalar(2.0) * tau[e, i])), six * (i + 1) + k
+                out[c, p, row] = half * (half * history[c, p, row] + ratio[e, i] * (now - history[c, p, k]))
 
-    return ViscoelasticKernels(fade, advance)
+    return ViscoelasticKernels(write_relaxation, update_history)
 
 
 class Prony:
@@ -188,15 +188,14 @@ class Prony:
 
     def fill(self, cases: Cases, first: int, out: wp.array) -> None:
         """Write f - 1 and A at every point."""
-        self._device.launch(
-            self._kernels.fade, (*out.shape[:2], out.shape[3]), [*self._series, *self._get_history(cases), first], [out]
-        )
+        inputs = [*self._series, *self._get_history(cases), first]
+        self._device.launch(self._kernels.write_relaxation, (*out.shape[:2], out.shape[3]), inputs, [out])
 
     def end(self, cases: Cases, strains: wp.array) -> np.ndarray:
         """Return the updated S and H_i."""
         out = self._device.allocate(len(cases.loads), *self._shape)
         inputs = [*self._series, *self._get_history(cases), self._coefficients, strains]
-        self._device.launch(self._kernels.advance, strains.shape, inputs, [out])
+        self._device.launch(self._kernels.update_history, strains.shape, inputs, [out])
         return out.numpy()
 
     def _get_history(self, cases: Cases) -> list[wp.array]:

@@ -77,7 +77,7 @@ class Wall:
 
 
 @wp.func
-def to_bone(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
+def to_bone_frame(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
     """Return (h + R, r + R) of node s at displacement x; the bone recedes by the added width of a widened barrier."""
     gap = wall.gap + (wall.widening - wp.float64(1.0)) * wall.activation[s]
     h = gap - wp.dot(wall.normal[s], x) - wp.float64(0.5) * wp.dot(x, wall.curvature[s] * x)
@@ -85,7 +85,7 @@ def to_bone(wall: Wall, s: int, x: wp.vec3d) -> wp.vec2d:
 
 
 @wp.func
-def distance_gradient(p: wp.vec2d) -> wp.vec2d:
+def get_distance_gradient(p: wp.vec2d) -> wp.vec2d:
     """Return the gradient of d with respect to (h, r): a unit vector away from the bone."""
     if wp.max(p[0], p[1]) > wp.float64(0.0):
         return wp.normalize(wp.vec2d(wp.max(p[0], wp.float64(0.0)), wp.max(p[1], wp.float64(0.0))))
@@ -95,52 +95,52 @@ def distance_gradient(p: wp.vec2d) -> wp.vec2d:
 
 
 @wp.func
-def distance(wall: Wall, p: wp.vec2d) -> wp.float64:
+def get_distance(wall: Wall, p: wp.vec2d) -> wp.float64:
     """Return the distance d to the bone [m]."""
-    return wp.dot(distance_gradient(p), p) - wall.edge
+    return wp.dot(get_distance_gradient(p), p) - wall.edge
 
 
 @wp.func
-def to_displacement(wall: Wall, s: int, x: wp.vec3d, along: wp.float64, across: wp.float64) -> wp.vec3d:
-    """Return the displacement vector that reduces h by `along` and increases r by `across`."""
-    return along * (wall.normal[s] + wall.curvature[s] * x) + across * wall.inward[s]
+def to_displacement(wall: Wall, s: int, x: wp.vec3d, h_decrease: wp.float64, r_increase: wp.float64) -> wp.vec3d:
+    """Return the displacement vector that reduces h by `h_decrease` and increases r by `r_increase`."""
+    return h_decrease * (wall.normal[s] + wall.curvature[s] * x) + r_increase * wall.inward[s]
 
 
 @wp.func
 def get_approach(wall: Wall, s: int, x: wp.vec3d, p: wp.vec2d) -> wp.vec3d:
     """Return m = -grad d: d decreases by m . du."""
-    at = distance_gradient(p)
+    at = get_distance_gradient(p)
     return to_displacement(wall, s, x, at[0], -at[1])
 
 
 @wp.func
-def stiffness(wall: Wall, s: int) -> wp.float64:
+def get_stiffness(wall: Wall, s: int) -> wp.float64:
     """Return the stiffness w k = w mu / (activation distance) [N/m^2]."""
     return wall.area[s] * wall.shear / (wall.widening * wall.activation[s])
 
 
 @wp.func
-def stiffness_block(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
+def compute_stiffness_block(wall: Wall, s: int, x: wp.vec3d, definite: int) -> wp.mat33d:
     """Return the block w k (b'' m (x) m + b' d''); if `definite`, without the edge curvature, which may be negative."""
-    p = to_bone(wall, s, x)
-    d, m, at = distance(wall, p), get_approach(wall, s, x, p), distance_gradient(p)
+    p = to_bone_frame(wall, s, x)
+    d, m, at = get_distance(wall, p), get_approach(wall, s, x, p), get_distance_gradient(p)
     width = wall.widening * wall.activation[s]
     pressure = barrier_slope(d, width)
     K = barrier_curvature(d, width) * wp.outer(m, m) - pressure * at[0] * wall.curvature[s]
     if definite == 0 and wp.min(at[0], at[1]) > wp.float64(0.0):
         round = to_displacement(wall, s, x, at[1], at[0])
         K += pressure / wp.dot(at, p) * wp.outer(round, round)
-    return stiffness(wall, s) * K
+    return get_stiffness(wall, s) * K
 
 
 @wp.func
-def step_fraction(distance: wp.float64, falls: wp.float64, bends: wp.float64) -> wp.float64:
-    """Return the largest t <= 1 with distance - t falls - t^2 bends / 2 >= (1 - MAX_STEP_FRACTION) distance.
+def bound_fraction(distance: wp.float64, slope: wp.float64, curvature: wp.float64) -> wp.float64:
+    """Return the largest t <= 1 with distance - t slope - t^2 curvature / 2 >= (1 - MAX_STEP_FRACTION) distance.
 
-    The curvature `bends` must be >= 0.
+    The curvature `curvature` must be >= 0.
     """
     lost = wp.float64(MAX_STEP_FRACTION) * distance
-    root = falls + wp.sqrt(falls * falls + wp.float64(2.0) * lost * bends)
+    root = slope + wp.sqrt(slope * slope + wp.float64(2.0) * lost * curvature)
     if root > wp.float64(2.0) * lost:
         return wp.float64(2.0) * lost / root
     return wp.float64(1.0)
@@ -152,7 +152,7 @@ def build_kernels(device: Device) -> SkullKernels:
     scalar, mat = device.scalar, device.matrix
 
     @wp.func
-    def motion(u: wp.array2d(dtype=scalar), i: int, c: int) -> wp.vec3d:
+    def get_vector(u: wp.array2d(dtype=scalar), i: int, c: int) -> wp.vec3d:
         """Return the displacement u_i of a node in double precision."""
         return wp.vec3d(wp.float64(u[3 * i, c]), wp.float64(u[3 * i + 1, c]), wp.float64(u[3 * i + 2, c]))
 
@@ -165,9 +165,10 @@ def build_kernels(device: Device) -> SkullKernels:
     ):
         """Add the energy: E += sum over nodes of w k b(d)."""
         s, c = wp.tid()
-        d, width = (distance(wall, to_bone(wall, s, motion(u, wall.nodes[s], c))), wall.widening * wall.activation[s])
+        d = get_distance(wall, to_bone_frame(wall, s, get_vector(u, wall.nodes[s], c)))
+        width = wall.widening * wall.activation[s]
         if d < width:
-            wp.atomic_add(out, c, stiffness(wall, s) * barrier(d, width))
+            wp.atomic_add(out, c, get_stiffness(wall, s) * barrier(d, width))
 
     @forward_kernel(module="unique")
     def add_gradient(
@@ -178,9 +179,9 @@ def build_kernels(device: Device) -> SkullKernels:
     ):
         """Add the gradient: g -= w k b'(d) m."""
         s, c = wp.tid()
-        x = motion(u, wall.nodes[s], c)
-        p = to_bone(wall, s, x)
-        f = -stiffness(wall, s) * barrier_slope(distance(wall, p), wall.widening * wall.activation[s])
+        x = get_vector(u, wall.nodes[s], c)
+        p = to_bone_frame(wall, s, x)
+        f = -get_stiffness(wall, s) * barrier_slope(get_distance(wall, p), wall.widening * wall.activation[s])
         m = get_approach(wall, s, x, p)
         for k in range(3):
             out[3 * wall.nodes[s] + k, c] += scalar(f * m[k])
@@ -196,7 +197,8 @@ def build_kernels(device: Device) -> SkullKernels:
     ):
         """Add the tangent stiffness times p: f += K_ii p_i."""
         s, c = wp.tid()
-        f = stiffness_block(wall, s, motion(u, wall.nodes[s], c), definite[c]) * motion(p, wall.nodes[s], c)
+        K = compute_stiffness_block(wall, s, get_vector(u, wall.nodes[s], c), definite[c])
+        f = K * get_vector(p, wall.nodes[s], c)
         for k in range(3):
             out[3 * wall.nodes[s] + k, c] += scalar(f[k])
 
@@ -210,7 +212,7 @@ def build_kernels(device: Device) -> SkullKernels:
     ):
         """Add the diagonal blocks K_ii."""
         s, c = wp.tid()
-        K = stiffness_block(wall, s, motion(u, wall.nodes[s], c), definite[c])
+        K = compute_stiffness_block(wall, s, get_vector(u, wall.nodes[s], c), definite[c])
         block = mat()
         for row in range(3):
             for column in range(3):
@@ -227,12 +229,12 @@ def build_kernels(device: Device) -> SkullKernels:
     ):
         """Limit t so that d(u + t du) >= (1 - kept) d and no node crosses the bone; d is convex in h and r."""
         s, c = wp.tid()
-        x, along = motion(u, wall.nodes[s], c), motion(du, wall.nodes[s], c)
-        p = to_bone(wall, s, x)
-        d = distance(wall, p)
+        x, along = get_vector(u, wall.nodes[s], c), get_vector(du, wall.nodes[s], c)
+        p = to_bone_frame(wall, s, x)
+        d = get_distance(wall, p)
         if d > wp.float64(PARABOLA_FRACTION) * wall.widening * wall.activation[s]:
-            bends = distance_gradient(p)[0] * wp.dot(along, wall.curvature[s] * along)
-            wp.atomic_min(out, c, scalar(step_fraction(d, wp.dot(get_approach(wall, s, x, p), along), bends)))
+            bends = get_distance_gradient(p)[0] * wp.dot(along, wall.curvature[s] * along)
+            wp.atomic_min(out, c, scalar(bound_fraction(d, wp.dot(get_approach(wall, s, x, p), along), bends)))
 
     return SkullKernels(add_energy, add_gradient, add_curvature, add_diagonal, bound_step)
 

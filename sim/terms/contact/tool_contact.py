@@ -22,7 +22,7 @@ from .reduced import ReducedToolBarrier
 from .tool_blocks import ContactStruct, NearPairs
 from .tool_functions import BarrierScale, Surface, Tools
 from .tool_kernels import build_kernels
-from .tool_path import CONTACT_SAMPLING, ContactSampling, ToolPath, approach
+from .tool_path import CONTACT_SAMPLING, ContactSampling, ToolPath, find_approach
 
 # Distance from a point in a subdivided triangle to the nearest sample point, at most [edges of the subdivision].
 MAX_SAMPLE_DISTANCE = 2.0 / 3.0
@@ -61,33 +61,33 @@ class ToolContactTerm:
         self,
         name: str,
         tools: tuple[Tool, ...],
-        way: Callable[[Cases], ToolPath | None],
+        compute_path: Callable[[Cases], ToolPath | None],
         nodes: np.ndarray,
         triangles: np.ndarray,
-        whole: np.ndarray,
+        closed: np.ndarray,
         bone: np.ndarray,
         gap: float,
         shear: float,
         device: Device,
-        touch: ContactSampling = CONTACT_SAMPLING,
+        sampling: ContactSampling = CONTACT_SAMPLING,
     ):
         self.name = name
         cores = [core for tool in tools for core in list_cores(tool)]
         self._owner = np.repeat(np.arange(len(tools)), [len(list_cores(tool)) for tool in tools])
-        self._first, self._sag = np.unique(self._owner, return_index=True)[1], touch.max_sag * gap
+        self._first, self._sag = np.unique(self._owner, return_index=True)[1], sampling.max_sag * gap
         self._nodes, self._corners = nodes, [core.corners for core in cores]
-        self._triangles, self._closed = triangles, device.upload(whole, wp.int32)
-        self._shapes, self._way, self._device, self._touch = tools, way, device, touch
+        self._triangles, self._closed = triangles, device.upload(closed, wp.int32)
+        self._shapes, self._way, self._device, self._touch = tools, compute_path, device, sampling
         self._kernels = build_kernels(device, triangles.shape[1])
-        fine = np.sqrt(2.0 * min(core.radius for core in cores) * touch.max_sag * gap) / MAX_SAMPLE_DISTANCE
-        self._surface, self._rows = _build_surface(nodes, triangles, fine / touch.max_stretch, device)
+        fine = np.sqrt(2.0 * min(core.radius for core in cores) * sampling.max_sag * gap) / MAX_SAMPLE_DISTANCE
+        self._surface, self._rows = _build_surface(nodes, triangles, fine / sampling.max_stretch, device)
         self._bone, _ = _build_surface(nodes, bone, fine, device)
         self._cores = [
             device.upload(np.array([core.centre for core in cores]), wp.vec3d),
             device.upload(np.array([core.half for core in cores]), wp.vec3d),
             device.upload(np.array([core.radius + self._sag for core in cores]), wp.float64),
         ]
-        self._asked, self._gap, self._shear = gap, (1.0 - touch.max_sag) * gap, shear
+        self._asked, self._gap, self._shear = gap, (1.0 - sampling.max_sag) * gap, shear
         self.widen_gap(1.0)
         self._pose: np.ndarray | None = None
         # a step needs the same poses several times
@@ -101,14 +101,14 @@ class ToolContactTerm:
             return np.ones(len(cases.loads))
         clear = wp.full((len(self._owner), u.shape[1]), np.inf, dtype=wp.float64, device=self._device.name)
         inputs = [u, self._surface, self._get_tools(way.interpolate(cases.path_fraction))]
-        self._device.launch(self._kernels.clearance, (len(self._triangles), u.shape[1]), inputs, [clear])
+        self._device.launch(self._kernels.bound_clearance, (len(self._triangles), u.shape[1]), inputs, [clear])
         of_tools = np.minimum.reduceat(clear.numpy(), self._first, axis=0).T + self._sag
         return way.compute_stride(self._shapes, of_tools.clip(0.0), self._touch)
 
     def compute_path_in_gaps(self, cases: Cases) -> np.ndarray:
         """Return the largest motion (B,) of all tools, in units of the gap."""
         way = self._way(cases)
-        return np.zeros(len(cases.loads)) if way is None else way.travel(self._shapes).max(axis=1) / self._gap
+        return np.zeros(len(cases.loads)) if way is None else way.measure_motion(self._shapes).max(axis=1) / self._gap
 
     def find_penetrating(self, u: wp.array) -> np.ndarray:
         """Return a mask (b,) of load cases with a tool centre, or a corner of a tool core, inside the tissue."""
@@ -128,7 +128,7 @@ class ToolContactTerm:
         for moved, surface in ((u, self._surface), (wp.zeros_like(u), self._bone)):
             out = wp.zeros(dim, dtype=wp.float64, device=self._device.name)
             inputs = [moved, surface, self._tools]
-            self._device.launch(self._kernels.nearest, (len(surface.table), u.shape[1]), inputs, [out])
+            self._device.launch(self._kernels.measure_depth, (len(surface.table), u.shape[1]), inputs, [out])
             found.append((out.numpy() < -self._asked - self._sag).any(axis=0))
         return np.stack(found)
 
@@ -192,13 +192,13 @@ class ToolContactTerm:
         return np.concatenate([own, np.sort(others)])
 
     @cached_property
-    def _alone(self) -> "tuple[ToolContactTerm, ReducedToolBarrier]":
+    def _local(self) -> "tuple[ToolContactTerm, ReducedToolBarrier]":
         """Copy of the term on only the touchable nodes, also as a `ReducedBarrier`."""
         nodes, own = self._nodes[self.touchable_nodes], np.searchsorted(self.touchable_nodes, self._triangles)
         corners, exact = own[:, :3], replace(self._device, precision="float64")
         term = ToolContactTerm(
-            self.name, self._shapes, self._way, nodes=nodes, triangles=own, whole=corners, bone=own[:0],
-            gap=self._asked, shear=self._shear, device=exact, touch=self._touch,
+            self.name, self._shapes, self._way, nodes=nodes, triangles=own, closed=corners, bone=own[:0],
+            gap=self._asked, shear=self._shear, device=exact, sampling=self._touch,
         )  # fmt: skip
         return term, ReducedToolBarrier(term, len(nodes), own.shape[1], exact)
 
@@ -206,7 +206,7 @@ class ToolContactTerm:
         """Return the barrier on the touchable nodes, or None; see `LocalBarrier.reduce`."""
         if self._pose is None:
             return None
-        term, reduced = self._alone
+        term, reduced = self._local
         term._set_pose(self._pose[columns])
         term._scale = self._scale
         return reduced
@@ -296,15 +296,16 @@ def build_tool_contact(
     points, normals = space.nodes[touchable], compute_vertex_normals(space.nodes, triangles[:, :3])[touchable]
 
     @lru_cache(sampling.cached_poses)
-    def came_from(number: int, pose: bytes) -> np.ndarray:
-        return approach(tools[number], np.frombuffer(pose).reshape(4, 4), points, normals, reach, sampling.max_steps)
+    def find_start(number: int, pose: bytes) -> np.ndarray:
+        goal = np.frombuffer(pose).reshape(4, 4)
+        return find_approach(tools[number], goal, points, normals, reach, sampling.max_steps)
 
-    def clear(pose: np.ndarray) -> np.ndarray:
+    def find_clear_poses(pose: np.ndarray) -> np.ndarray:
         """Return the contact-free poses (B, tools, 4, 4) from which tools approach the poses `pose`."""
-        begin = [came_from(number, one.tobytes()) for case in pose for number, one in enumerate(case)]
-        return np.reshape(begin, pose.shape)
+        starts = [find_start(number, one.tobytes()) for case in pose for number, one in enumerate(case)]
+        return np.reshape(starts, pose.shape)
 
-    def way(cases: Cases) -> ToolPath | None:
+    def compute_path(cases: Cases) -> ToolPath | None:
         last = cases.get_past(name, (len(tools), 4, 4)) if name in cases.memory else None
         if contact:
             cause = cases.loads.get(Touching)
@@ -314,7 +315,7 @@ def build_tool_contact(
                 raise InputError(
                     f"Touching has poses of {cause.pose.shape[1]} tools, but ToolContact has {len(tools)}."
                 )
-            return ToolPath(_find_path_starts(last, cases.restarted, clear, cause.pose), cause.pose)
+            return ToolPath(_find_path_starts(last, cases.restarted, find_clear_poses, cause.pose), cause.pose)
         cause = cases.loads.get(Retracted)
         if cause is None:
             return None
@@ -327,15 +328,15 @@ def build_tool_contact(
     solid = np.logical_or(anatomy.fixed.all(axis=1), anatomy.slide_normal.any(axis=1))
     bone = space.surface[solid[whole].all(axis=1)]
     return ToolContactTerm(
-        name, tools, way, nodes=space.nodes, triangles=triangles, whole=whole, bone=bone,
-        gap=effect.gap, shear=shear, device=device, touch=sampling,
+        name, tools, compute_path, nodes=space.nodes, triangles=triangles, closed=whole, bone=bone,
+        gap=effect.gap, shear=shear, device=device, sampling=sampling,
     )  # fmt: skip
 
 
-def _build_surface(nodes: np.ndarray, triangles: np.ndarray, fine: float, device: Device) -> tuple[Surface, int]:
-    """Return the surface with sample points at most `fine` [m] apart, and the maximum number of rows per triangle."""
+def _build_surface(nodes: np.ndarray, triangles: np.ndarray, spacing: float, device: Device) -> tuple[Surface, int]:
+    """Return the surface with sample points at most `spacing` [m] apart, and the maximum rows per triangle."""
     corners = nodes[triangles[:, :3]]
-    pieces = np.ceil(compute_edge_lengths(corners).max(axis=1) / fine).astype(np.int32)
+    pieces = np.ceil(compute_edge_lengths(corners).max(axis=1) / spacing).astype(np.int32)
     out = Surface()
     out.rest = device.upload(nodes, wp.vec3d)
     out.table = device.upload(triangles, wp.int32)
@@ -345,12 +346,12 @@ def _build_surface(nodes: np.ndarray, triangles: np.ndarray, fine: float, device
 
 
 def _find_path_starts(
-    last: np.ndarray | None, restarted: np.ndarray | None, clear: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
+    past: np.ndarray | None, restarted: np.ndarray | None, retract: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
 ) -> np.ndarray:
     """Return path starts (B, tools, 4, 4): the last poses; without history or if `restarted`, poses without contact."""
-    begin = pose.copy() if last is None else last.copy()
-    new = np.ones(len(pose), bool) if last is None else np.zeros(len(pose), bool) if restarted is None else restarted
-    begin[new] = clear(pose[new])
+    begin = pose.copy() if past is None else past.copy()
+    new = np.ones(len(pose), bool) if past is None else np.zeros(len(pose), bool) if restarted is None else restarted
+    begin[new] = retract(pose[new])
     return begin
 
 

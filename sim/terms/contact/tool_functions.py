@@ -57,7 +57,7 @@ class ToolDistance:
 
 
 @wp.func
-def distance_to_core(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
+def compute_core_distance(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
     """Return the distance d = |v| - r to a core, v from the nearest point of the core to p, and two derivatives.
 
     These are n = v / |v| and dn = (M - n (x) n) / |v|; M selects the components in which p is outside the core.
@@ -78,7 +78,7 @@ def distance_to_core(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDis
 
 
 @wp.func
-def skip(clearance: wp.float64, spacing: wp.float64, max_offset: int) -> int:
+def compute_offset(clearance: wp.float64, spacing: wp.float64, max_offset: int) -> int:
     """Return the offset, 1 to `max_offset`, of the next point to test; each point lowers `clearance` by `spacing`."""
     out = wp.int32(1)
     if clearance > spacing:
@@ -87,11 +87,11 @@ def skip(clearance: wp.float64, spacing: wp.float64, max_offset: int) -> int:
 
 
 @wp.func
-def curvature_at(touch: ToolDistance, gap: wp.float64, definite: int) -> wp.mat33d:
+def compute_curvature(contact: ToolDistance, gap: wp.float64, definite: int) -> wp.mat33d:
     """Return b'' n (x) n + b' dn; if `definite`, only the first term, which is positive semi-definite."""
-    out = barrier_curvature(touch.distance, gap) * wp.outer(touch.normal, touch.normal)
+    out = barrier_curvature(contact.distance, gap) * wp.outer(contact.normal, contact.normal)
     if definite == 0:
-        out += barrier_slope(touch.distance, gap) * touch.curvature
+        out += barrier_slope(contact.distance, gap) * contact.curvature
     return out
 
 
@@ -100,25 +100,25 @@ class ToolFunctions:
     """Warp functions for triangles with `size` nodes; `forces` is the type of nodal vectors (size, 3).
 
     A triangle is sampled at the centroids of n^2 congruent parts in n rows, where n is the number of pieces per edge.
-    Functions `_in_row` sum over one row. These functions use the axes of a core (see `seen`), and skip points that are
+    Functions of a row sum over its points. They use the axes of a core (see `to_core_axes`), and skip points that are
     certainly outside the range of the core.
     """
 
     forces: Any
-    motion_of: wp.Function
-    nodes_of: wp.Function
-    seen: wp.Function
-    spread: wp.Function
-    weight_of: wp.Function
-    reach_of: wp.Function
-    pace_of: wp.Function
-    least_distance: wp.Function
+    get_motion: wp.Function
+    get_positions: wp.Function
+    to_core_axes: wp.Function
+    add_forces: wp.Function
+    get_stiffness: wp.Function
+    bound_norm: wp.Function
+    bound_spacing: wp.Function
+    bound_distance: wp.Function
     is_near: wp.Function
-    shape_of: wp.Function
-    energy_in_row: wp.Function
-    force_in_row: wp.Function
-    add_matrix_in_row: wp.Function
-    share_in_row: wp.Function
+    compute_shapes: wp.Function
+    sum_row_energy: wp.Function
+    sum_row_forces: wp.Function
+    add_row_matrix: wp.Function
+    bound_row_step: wp.Function
 
 
 @cache
@@ -135,7 +135,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
     steep = wp.constant(wp.float64(SLOPE_SUMS[size]))
 
     @wp.func
-    def shape_of(i: int, j: int, n: int) -> shares:
+    def compute_shapes(i: int, j: int, n: int) -> shares:
         """Return the shape functions at the centroid of part j in row i of n rows; odd parts are inverted triangles."""
         third, turned = wp.float64(1.0) / wp.float64(3 * n), j % 2
         y = wp.float64(3 * i + 1 + turned) * third
@@ -151,7 +151,7 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         return out
 
     @wp.func
-    def motion_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
+    def get_motion(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
         """Return the displacements of a triangle's nodes (size, 3)."""
         out = forces()
         for a in range(size):
@@ -160,131 +160,131 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         return out
 
     @wp.func
-    def nodes_of(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
+    def get_positions(surface: Surface, u: wp.array2d(dtype=scalar), s: int, c: int) -> forces:
         """Return the deformed positions of a triangle's nodes (size, 3)."""
-        out = motion_of(surface, u, s, c)
+        out = get_motion(surface, u, s, c)
         for a in range(size):
             for k in range(3):
                 out[a, k] += surface.rest[surface.table[s, a]][k]
         return out
 
     @wp.func
-    def seen(at: forces, tools: Tools, k: int, c: int) -> forces:
+    def to_core_axes(x: forces, tools: Tools, k: int, c: int) -> forces:
         """Return positions relative to the centre of a core, along the axes of the core."""
         R = tools.rotation[k, c]
         start = tools.origin[k, c] + R * tools.centre[k]
         out = forces()
         for a in range(size):
-            out[a] = wp.transpose(R) * (at[a] - start)
+            out[a] = wp.transpose(R) * (x[a] - start)
         return out
 
     @wp.func
-    def spread(surface: Surface, total: forces, s: int, c: int, out: wp.array2d(dtype=scalar)):
+    def add_forces(surface: Surface, total: forces, s: int, c: int, out: wp.array2d(dtype=scalar)):
         """Add the nodal forces of a triangle: f_a += total_a."""
         for a in range(size):
             for k in range(3):
                 wp.atomic_add(out, 3 * surface.table[s, a] + k, c, scalar(total[a, k]))
 
     @wp.func
-    def weight_of(surface: Surface, scale: BarrierScale, s: int) -> wp.float64:
+    def get_stiffness(surface: Surface, scale: BarrierScale, s: int) -> wp.float64:
         """Return the barrier stiffness times the area per sample point of a triangle [N/m]."""
         return scale.stiffness * surface.area[s] / wp.float64(surface.pieces[s] * surface.pieces[s])
 
     @wp.func
-    def reach_of(along: forces) -> wp.float64:
+    def bound_norm(vectors: forces) -> wp.float64:
         """Return an upper bound of the norm over a triangle of an interpolated vector, from nodal vectors (size, 3)."""
         out = wp.float64(0.0)
         for a in range(size):
-            out = wp.max(out, wp.length(along[a]))
+            out = wp.max(out, wp.length(vectors[a]))
         return bulge * out
 
     @wp.func
-    def around(at: forces) -> forces:
+    def subtract_centroid(x: forces) -> forces:
         """Return the node positions (size, 3) relative to the centroid of the corners."""
-        middle, out = wp.vec3d(), at
+        middle, out = wp.vec3d(), x
         for a in range(3):
-            middle += at[a] / wp.float64(3.0)
+            middle += x[a] / wp.float64(3.0)
         for a in range(size):
-            out[a] = at[a] - middle
+            out[a] = x[a] - middle
         return out
 
     @wp.func
-    def pace_of(at: forces, n: int) -> wp.float64:
+    def bound_spacing(x: forces, n: int) -> wp.float64:
         """Return an upper bound of the distance between adjacent sample points of a row.
 
         Between these points, barycentric coordinates change by 1/3, 1/3 and 2/3 of a piece.
         """
-        return steep * reach_of(around(at)) / (bulge * wp.float64(n))
+        return steep * bound_norm(subtract_centroid(x)) / (bulge * wp.float64(n))
 
     @wp.func
-    def least_distance(at: forces, times: wp.float64, half: wp.vec3d, radius: wp.float64) -> wp.float64:
-        """Return a lower bound of the distance of a core from a triangle scaled by `times` about its centroid."""
-        arms = around(at)
-        return distance_to_core(at[0] - arms[0], half, radius).distance - times * reach_of(arms)
+    def bound_distance(x: forces, scale: wp.float64, half: wp.vec3d, radius: wp.float64) -> wp.float64:
+        """Return a lower bound of the distance of a core from a triangle scaled by `scale` about its centroid."""
+        arms = subtract_centroid(x)
+        return compute_core_distance(x[0] - arms[0], half, radius).distance - scale * bound_norm(arms)
 
     @wp.func
-    def is_near(at: forces, reach: wp.float64, half: wp.vec3d, radius: wp.float64) -> bool:
-        """Return True if a point of the triangle may be within `reach` of a core."""
-        return least_distance(at, wp.float64(1.0), half, radius) < reach
+    def is_near(x: forces, max_distance: wp.float64, half: wp.vec3d, radius: wp.float64) -> bool:
+        """Return True if a point of the triangle may be within `max_distance` of a core."""
+        return bound_distance(x, wp.float64(1.0), half, radius) < max_distance
 
     @wp.func
-    def energy_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> wp.float64:
+    def sum_row_energy(x: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> wp.float64:
         """Return the sum of b(d) over the points of a row."""
-        total, pace, most, j = wp.float64(0.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
+        total, pace, most, j = wp.float64(0.0), bound_spacing(x, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
-            d = distance_to_core(shape_of(i, j, n) * at, half, radius).distance
+            d = compute_core_distance(compute_shapes(i, j, n) * x, half, radius).distance
             total += barrier(d, gap)
-            j += skip(d - gap, pace, most)
+            j += compute_offset(d - gap, pace, most)
         return total
 
     @wp.func
-    def force_in_row(at: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> forces:
+    def sum_row_forces(x: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> forces:
         """Return the sum of N_a b'(d) n over the points of a row, for each node a."""
-        total, pace, most, j = forces(), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
+        total, pace, most, j = forces(), bound_spacing(x, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
-            N = shape_of(i, j, n)
-            touch = distance_to_core(N * at, half, radius)
-            if touch.distance < gap:
-                total += wp.outer(N, barrier_slope(touch.distance, gap) * touch.normal)
-            j += skip(touch.distance - gap, pace, most)
+            N = compute_shapes(i, j, n)
+            contact = compute_core_distance(N * x, half, radius)
+            if contact.distance < gap:
+                total += wp.outer(N, barrier_slope(contact.distance, gap) * contact.normal)
+            j += compute_offset(contact.distance - gap, pace, most)
         return total
 
     @wp.func
-    def add_matrix_in_row(
-        at: forces,
+    def add_row_matrix(
+        x: forces,
         surface: Surface,
         tools: Tools,
         scale: BarrierScale,
         definite: int,
-        place: wp.array2d(dtype=wp.int32),
+        index: wp.array2d(dtype=wp.int32),
         s: int,
         i: int,
         k: int,
         c: int,
         out: wp.array3d(dtype=wp.float64),
     ):
-        """Add K_ab += sum over points of a row of w k H N_a N_b, between the nodes with `place` >= 0."""
+        """Add K_ab += sum over points of a row of w k H N_a N_b, between the nodes with `index` >= 0."""
         n, half, radius = surface.pieces[s], tools.half[k], tools.radius[k]
-        total, touched, pace, most, j = blocks(), wp.bool(False), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
+        total, touched, pace, most, j = blocks(), wp.bool(False), bound_spacing(x, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
-            N = shape_of(i, j, n)
-            touch = distance_to_core(N * at, half, radius)
-            if touch.distance < scale.gap:
+            N = compute_shapes(i, j, n)
+            contact = compute_core_distance(N * x, half, radius)
+            if contact.distance < scale.gap:
                 touched = True
-                H = curvature_at(touch, scale.gap, definite)
+                H = compute_curvature(contact, scale.gap, definite)
                 for a in range(size):
                     for b in range(size):
                         if b <= a:
                             for row in range(3):
                                 q = 3 * (a * (a + 1) // 2 + b) + row
                                 total[q] = total[q] + N[a] * N[b] * H[row]
-            j += skip(touch.distance - scale.gap, pace, most)
+            j += compute_offset(contact.distance - scale.gap, pace, most)
         if touched:
-            R, weight = tools.rotation[k, c], weight_of(surface, scale, s)
+            R, weight = tools.rotation[k, c], get_stiffness(surface, scale, s)
             for a in range(size):
-                first = 3 * place[surface.table[s, a], c]
+                first = 3 * index[surface.table[s, a], c]
                 for b in range(size):
-                    second, q = 3 * place[surface.table[s, b], c], 3 * (a * (a + 1) // 2 + b)
+                    second, q = 3 * index[surface.table[s, b], c], 3 * (a * (a + 1) // 2 + b)
                     if b <= a and first >= 0 and second >= 0:
                         H = weight * (R * wp.matrix_from_rows(total[q], total[q + 1], total[q + 2]) * wp.transpose(R))
                         for row in range(3):
@@ -294,33 +294,22 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
                                     wp.atomic_add(out, c, second + column, first + row, H[row, column])
 
     @wp.func
-    def share_in_row(at: forces, along: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64) -> wp.float64:
+    def bound_row_step(x: forces, motion: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64) -> wp.float64:
         """Return the fraction of a motion, at most 1, with which no point of a row reaches the centre of a core."""
-        out, pace, most, j = wp.float64(1.0), pace_of(at, n), 2 * (n - i) - 1, wp.int32(0)
-        farthest = reach_of(along)
+        out, pace, most, j = wp.float64(1.0), bound_spacing(x, n), 2 * (n - i) - 1, wp.int32(0)
+        farthest = bound_norm(motion)
         while j < most:
-            N = shape_of(i, j, n)
-            room = distance_to_core(N * at, half, radius).distance + radius
-            far = wp.length(N * along)
+            N = compute_shapes(i, j, n)
+            room = compute_core_distance(N * x, half, radius).distance + radius
+            far = wp.length(N * motion)
             if far > kept * room:
                 out = wp.min(out, kept * room / far)
-            j += skip(room - farthest / kept, pace, most)
+            j += compute_offset(room - farthest / kept, pace, most)
         return out
 
     return ToolFunctions(
-        forces=forces,
-        motion_of=motion_of,
-        nodes_of=nodes_of,
-        seen=seen,
-        spread=spread,
-        weight_of=weight_of,
-        reach_of=reach_of,
-        pace_of=pace_of,
-        least_distance=least_distance,
-        is_near=is_near,
-        shape_of=shape_of,
-        energy_in_row=energy_in_row,
-        force_in_row=force_in_row,
-        add_matrix_in_row=add_matrix_in_row,
-        share_in_row=share_in_row,
-    )
+        forces=forces, get_motion=get_motion, get_positions=get_positions, to_core_axes=to_core_axes,
+        add_forces=add_forces, get_stiffness=get_stiffness, bound_norm=bound_norm, bound_spacing=bound_spacing,
+        bound_distance=bound_distance, is_near=is_near, compute_shapes=compute_shapes, sum_row_energy=sum_row_energy,
+        sum_row_forces=sum_row_forces, add_row_matrix=add_row_matrix, bound_row_step=bound_row_step,
+    )  # fmt: skip

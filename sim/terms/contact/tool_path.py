@@ -61,7 +61,7 @@ class ToolPath:
         out[on_the_way, :3, 3] = moved[on_the_way]
         return out.reshape(count, tools, 4, 4)
 
-    def travel(self, tools: tuple[Tool, ...]) -> np.ndarray:
+    def measure_motion(self, tools: tuple[Tool, ...]) -> np.ndarray:
         """Return the maximum motion (B, tools) [m] of any point of each tool."""
         before, after = self.start_pose[:, :, :3], self.end_pose[:, :, :3]
         turn = (before[..., :3].swapaxes(2, 3) @ after[..., :3]).reshape(-1, 3, 3)
@@ -75,10 +75,10 @@ class ToolPath:
         """Return the path fraction (B,), at most 1, that tools with a `clearance` (B, tools) [m] may move at once."""
         radii = np.array([min(core.radius for core in list_cores(tool)) for tool in tools])
         most = clearance + sampling.max_stride * radii
-        return (most / np.maximum(self.travel(tools), most)).min(axis=1)
+        return (most / np.maximum(self.measure_motion(tools), most)).min(axis=1)
 
 
-def approach(
+def find_approach(
     tool: Tool,
     pose: np.ndarray,
     points: np.ndarray,

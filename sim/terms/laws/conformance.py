@@ -51,9 +51,9 @@ class Evaluator:
     kernel: wp.Kernel
     tissue: Tissue
 
-    def __call__(self, H: np.ndarray, D: np.ndarray | None = None, of: Tissue | None = None) -> Evaluated:
+    def __call__(self, H: np.ndarray, D: np.ndarray | None = None, tissue: Tissue | None = None) -> Evaluated:
         """Return the results at displacement gradients H (n, 3, 3) with increments D (n, 3, 3)."""
-        return self.evaluate(H, D, (of or self.tissue).coefficients)
+        return self.evaluate(H, D, (tissue or self.tissue).coefficients)
 
     def evaluate(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
         """Return the results at H (n, 3, 3) with increments D (n, 3, 3) and other coefficients."""
@@ -67,12 +67,12 @@ class Evaluator:
 
 
 @cache
-def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
+def build_evaluator(tissue: Tissue, precision: Precision) -> Evaluator:
     """Return the evaluator of the law of a tissue, on the CPU."""
     device = find_device("cpu", precision)
     scalar, mat = device.scalar, device.matrix
-    constants = wp.types.vector(len(of.coefficients), scalar)
-    density, stress_of, change_of = of.functions.energy, of.functions.stress, of.functions.stress_change
+    constants = wp.types.vector(len(tissue.coefficients), scalar)
+    density, stress_of, change_of = tissue.functions.energy, tissue.functions.stress, tissue.functions.stress_change
 
     @forward_kernel(module="unique")
     def evaluate(
@@ -90,7 +90,7 @@ def build_evaluator(of: Tissue, precision: Precision) -> Evaluator:
         stress[i] = stress_of(H[i], c)
         change[i] = change_of(H[i], D[i], c)
 
-    return Evaluator(device, evaluate, of)
+    return Evaluator(device, evaluate, tissue)
 
 
 @dataclass(frozen=True)
@@ -209,6 +209,6 @@ def _find_largest(values: np.ndarray) -> float:
     return float(np.abs(values).max())
 
 
-def _compute_error(found: np.ndarray, wanted: np.ndarray) -> float:
-    """Return the largest difference between `found` and `wanted`, relative to the largest value of `wanted`."""
-    return _find_largest(found - wanted) / max(_find_largest(wanted), np.finfo(float).tiny)
+def _compute_error(values: np.ndarray, expected: np.ndarray) -> float:
+    """Return the largest difference between `values` and `expected`, relative to the largest value of `expected`."""
+    return _find_largest(values - expected) / max(_find_largest(expected), np.finfo(float).tiny)

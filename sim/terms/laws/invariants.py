@@ -10,22 +10,22 @@ import warp as wp
 
 
 @wp.func
-def cofactor(A: Any):
+def cofactor_matrix(A: Any):
     """Return the cofactor matrix cof A, the derivative of det A; its rows are cross products of A's rows."""
     return wp.matrix_from_rows(wp.cross(A[1], A[2]), wp.cross(A[2], A[0]), wp.cross(A[0], A[1]))
 
 
 @wp.func
-def second_order_volume(H: Any):
+def nonlinear_volume_change(H: Any):
     """Return J - 1 - tr H = tr cof H + det H, the volume change beyond first order."""
-    C = cofactor(H)
+    C = cofactor_matrix(H)
     return wp.trace(C) + wp.dot(H[0], C[0])
 
 
 @wp.func
 def volume_change(H: Any):
     """Return the volume change j = J - 1 = det(I + H) - 1."""
-    return wp.trace(H) + second_order_volume(H)
+    return wp.trace(H) + nonlinear_volume_change(H)
 
 
 @wp.func
@@ -42,7 +42,7 @@ def log_one_plus(j: Any):
 def cofactor_excess(H: Any):
     """Return cof(I + H) - I = tr H I - H^T + cof H."""
     t = wp.trace(H)
-    return t * wp.identity(n=3, dtype=type(t)) - wp.transpose(H) + cofactor(H)
+    return t * wp.identity(n=3, dtype=type(t)) - wp.transpose(H) + cofactor_matrix(H)
 
 
 @wp.func

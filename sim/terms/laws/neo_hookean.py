@@ -9,7 +9,14 @@ from typing import Any
 
 import warp as wp
 
-from .invariants import cofactor, cofactor_change, cofactor_excess, log_one_plus, second_order_volume, volume_change
+from .invariants import (
+    cofactor_change,
+    cofactor_excess,
+    cofactor_matrix,
+    log_one_plus,
+    nonlinear_volume_change,
+    volume_change,
+)
 from .law import Law
 
 
@@ -34,7 +41,7 @@ def energy(H: Any, c: Any):
     if j <= -type(mu)(1.0):
         return type(mu)(wp.inf)
     log_J = log_one_plus(j)
-    return mu * (half * wp.ddot(H, H) - second_order_volume(H) + log_volume_excess(j)) + half * lam * log_J * log_J
+    return mu * (half * wp.ddot(H, H) - nonlinear_volume_change(H) + log_volume_excess(j)) + half * lam * log_J * log_J
 
 
 @wp.func
@@ -46,7 +53,8 @@ def stress(H: Any, c: Any):
     shrunk = mu / (type(mu)(1.0) + j)
     pressure = lam * log_one_plus(j) / (type(mu)(1.0) + j)
     normal = pressure - shrunk
-    return mu * H + normal * (cofactor(H) - wp.transpose(H)) + (normal * wp.trace(H) + shrunk * j + pressure) * identity
+    level = normal * wp.trace(H) + shrunk * j + pressure
+    return mu * H + normal * (cofactor_matrix(H) - wp.transpose(H)) + level * identity
 
 
 @wp.func

@@ -13,11 +13,11 @@ import warp as wp
 
 from .invariants import exp_less_one, green_strain, log_one_plus, volume_change
 from .law import Law
-from .spectral import principal_axes
+from .spectral import compute_principal_axes
 
 
 @wp.func
-def log_stretches(H: Any, e: Any, N: Any):
+def compute_log_stretches(H: Any, e: Any, N: Any):
     """Return ln lambda_k = log1p(2 e_k) / 2, or ln |F n_k| under strong compression, where 1 + 2 e_k loses digits."""
     one, two = type(e[0])(1.0), type(e[0])(2.0)
     x = type(e)()
@@ -32,14 +32,14 @@ def log_stretches(H: Any, e: Any, N: Any):
 
 
 @wp.func
-def squares(x: Any):
+def compute_squared_stretches(x: Any):
     """Return the squared stretches lambda_k^2 = exp(2 x_k)."""
     two = type(x[0])(2.0)
     return wp.vector(wp.exp(two * x[0]), wp.exp(two * x[1]), wp.exp(two * x[2]))
 
 
 @wp.func
-def isochoric(x: Any):
+def compute_isochoric_log_stretches(x: Any):
     """Return the isochoric part y_k = ln l_k = x_k - mean x."""
     mean = (x[0] + x[1] + x[2]) / type(x[0])(3.0)
     return x - wp.vector(mean, mean, mean)
@@ -66,7 +66,7 @@ def sinh_ratio(z: Any):
 
 
 @wp.func
-def kirchhoff(H: Any, y: Any, c: Any):
+def compute_kirchhoff_stresses(H: Any, y: Any, c: Any):
     """Return principal Kirchhoff stresses t_k [Pa] = a_k - mean a + K ln J, with a_k = sum_i c_i / m_i l_k^m_i."""
     a = type(y)()
     for i in range(len(c) // 2):
@@ -83,9 +83,9 @@ def energy(H: Any, c: Any):
     if j <= -type(j)(1.0):
         return type(j)(wp.inf)
     log_J = log_one_plus(j)
-    e, N = principal_axes(green_strain(H))
-    x = log_stretches(H, e, N)
-    y = isochoric(x)
+    e, N = compute_principal_axes(green_strain(H))
+    x = compute_log_stretches(H, e, N)
+    y = compute_isochoric_log_stretches(x)
     psi = c[0] / type(j)(2.0) * log_J * log_J
     for i in range(len(c) // 2):
         m = c[2 * i + 2]
@@ -97,19 +97,19 @@ def energy(H: Any, c: Any):
 @wp.func
 def stress(H: Any, c: Any):
     """Return the stress P [Pa] = F S, with S = sum_k t_k / lambda_k^2 n_k (x) n_k."""
-    e, N = principal_axes(green_strain(H))
-    x = log_stretches(H, e, N)
-    t = kirchhoff(H, isochoric(x), c)
-    S = wp.transpose(N) * wp.diag(wp.cw_div(t, squares(x))) * N
+    e, N = compute_principal_axes(green_strain(H))
+    x = compute_log_stretches(H, e, N)
+    t = compute_kirchhoff_stresses(H, compute_isochoric_log_stretches(x), c)
+    S = wp.transpose(N) * wp.diag(wp.cw_div(t, compute_squared_stretches(x))) * N
     return S + H * S
 
 
 @wp.func
-def stiffness_between(k: int, l: int, e: Any, y: Any, c: Any):
+def compute_divided_difference(k: int, l: int, e: Any, y: Any, c: Any):
     """Return b_kl [Pa] = sum_i c_i exp(m_i (y_k + y_l) / 2) sinh(m_i d / 2) / (m_i d / 2) x d / tanh d.
 
-    b_kl is the divided difference of a in `kirchhoff` over the eigenvalues e, times the mean squared stretch. By use of
-    tanh d = (e_k - e_l) / (1 + e_k + e_l) for d = ln(lambda_k / lambda_l), b_kl is also accurate for equal stretches.
+    b_kl is the divided difference of a in `compute_kirchhoff_stresses` over the eigenvalues e, times the mean squared
+    stretch. With tanh d = (e_k - e_l) / (1 + e_k + e_l), d = ln(lambda_k / lambda_l), equal stretches are accurate too.
     """
     one, two = type(c[0])(1.0), type(c[0])(2.0)
     tanh = wp.abs(e[k] - e[l]) / (one + e[k] + e[l])
@@ -133,19 +133,19 @@ def stress_change(H: Any, D: Any, c: Any):
     (K + tr b / 9 - (b_kk + b_ll) / 3) G_ll / lambda_l^2.
     """
     one, two, three = type(c[0])(1.0), type(c[0])(2.0), type(c[0])(3.0)
-    e, N = principal_axes(green_strain(H))
-    x = log_stretches(H, e, N)
-    y = isochoric(x)
-    t = kirchhoff(H, y, c)
-    q = wp.cw_div(wp.vector(one, one, one), squares(x))
+    e, N = compute_principal_axes(green_strain(H))
+    x = compute_log_stretches(H, e, N)
+    y = compute_isochoric_log_stretches(x)
+    t = compute_kirchhoff_stresses(H, y, c)
+    q = wp.cw_div(wp.vector(one, one, one), compute_squared_stretches(x))
     G = D + wp.transpose(H) * D
     G = N * (G + wp.transpose(G)) * wp.transpose(N) / two
     dS = type(H)()
     b = type(e)()
     for k in range(3):
-        b[k] = stiffness_between(k, k, e, y, c)
+        b[k] = compute_divided_difference(k, k, e, y, c)
         for l in range(k):
-            dS[k, l] = q[k] * q[l] * (stiffness_between(k, l, e, y, c) - t[k] - t[l]) * G[k, l]
+            dS[k, l] = q[k] * q[l] * (compute_divided_difference(k, l, e, y, c) - t[k] - t[l]) * G[k, l]
             dS[l, k] = dS[k, l]
     g = wp.cw_mul(q, wp.get_diag(G))
     swelling = g[0] + g[1] + g[2]

@@ -10,7 +10,7 @@ import warp as wp
 
 
 @wp.func
-def principal_axes(A: Any):
+def compute_principal_axes(A: Any):
     """Return eigenvalues e (3,), unsorted, and N (3, 3) whose rows are the eigenvectors: A = N^T diag(e) N."""
     zero, one, two = type(A[0, 0])(0.0), type(A[0, 0])(1.0), type(A[0, 0])(2.0)
     e = wp.get_diag(A)

@@ -20,13 +20,13 @@ from .law import Law
 
 
 @wp.func
-def edge(c: Any, number: int):
+def get_edge(c: Any, number: int):
     """Return the undeformed edge vector [m] with a number from 0 to 5: edges 01, 02, 03, 12, 13, 23."""
     return wp.vector(c[2 + 3 * number], c[3 + 3 * number], c[4 + 3 * number])
 
 
 @wp.func
-def elongation(H: Any, L: Any):
+def compute_elongation(H: Any, L: Any):
     """Return l - L [m] of an undeformed edge L: (2 L.HL + |HL|^2) / (l + L), without cancellation."""
     h = H * L
     two = type(L[0])(2.0)
@@ -39,7 +39,7 @@ def energy(H: Any, c: Any):
     j = volume_change(H)
     psi = c[1] * j * j
     for number in range(6):
-        longer = elongation(H, edge(c, number))
+        longer = compute_elongation(H, get_edge(c, number))
         psi += c[0] * longer * longer
     return psi / type(j)(2.0)
 
@@ -50,9 +50,9 @@ def stress(H: Any, c: Any):
     identity = wp.identity(n=3, dtype=type(c[0]))
     P = c[1] * volume_change(H) * (identity + cofactor_excess(H))
     for number in range(6):
-        L = edge(c, number)
+        L = get_edge(c, number)
         moved = L + H * L
-        P += c[0] * elongation(H, L) / wp.length(moved) * wp.outer(moved, L)
+        P += c[0] * compute_elongation(H, L) / wp.length(moved) * wp.outer(moved, L)
     return P
 
 
@@ -63,11 +63,11 @@ def stress_change(H: Any, D: Any, c: Any):
     cof = identity + cofactor_excess(H)
     dP = c[1] * (wp.ddot(cof, D) * cof + volume_change(H) * cofactor_change(identity + H, D))
     for number in range(6):
-        L = edge(c, number)
+        L = get_edge(c, number)
         moved, way = L + H * L, D * L
         l = wp.length(moved)
         along = wp.length(L) * wp.dot(moved, way) / (l * l * l)
-        dP += c[0] * wp.outer(elongation(H, L) / l * way + along * moved, L)
+        dP += c[0] * wp.outer(compute_elongation(H, L) / l * way + along * moved, L)
     return dP
 
 

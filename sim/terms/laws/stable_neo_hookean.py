@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from .invariants import cofactor, cofactor_change, cofactor_excess, second_order_volume, volume_change
+from .invariants import cofactor_change, cofactor_excess, cofactor_matrix, nonlinear_volume_change, volume_change
 from .law import Law
 
 
@@ -20,7 +20,7 @@ def energy(H: Any, c: Any):
     mu, lam = c[0], c[1]
     j = volume_change(H)
     half = type(mu)(0.5)
-    return mu * (half * wp.ddot(H, H) - second_order_volume(H)) + half * (lam + mu) * j * j
+    return mu * (half * wp.ddot(H, H) - nonlinear_volume_change(H)) + half * (lam + mu) * j * j
 
 
 @wp.func
@@ -30,7 +30,7 @@ def stress(H: Any, c: Any):
     pressure = (lam + mu) * volume_change(H)
     normal = pressure - mu
     identity = wp.identity(n=3, dtype=type(mu))
-    return mu * H + normal * (cofactor(H) - wp.transpose(H)) + (normal * wp.trace(H) + pressure) * identity
+    return mu * H + normal * (cofactor_matrix(H) - wp.transpose(H)) + (normal * wp.trace(H) + pressure) * identity
 
 
 @wp.func
