@@ -93,7 +93,7 @@ def test_small_strain_stress_agrees_with_hookes_law(name: str, double: Evaluator
     """Uniaxial stress of 1e-6 E stretches by 1e-6 and contracts by nu 1e-6; a shear strain gives E / (2 (1 + nu))."""
     stretch = 1e-6 * np.diag([1.0, -poisson, -poisson])
     shear = 1e-6 * (np.eye(3)[[1]].T @ np.eye(3)[[0]] + np.eye(3)[[0]].T @ np.eye(3)[[1]])
-    stress = double(np.stack([stretch, shear]), of=tissue(name, young, poisson)).stress
+    stress = double(np.stack([stretch, shear]), tissue=tissue(name, young, poisson)).stress
     np.testing.assert_allclose(stress[0], 1e-6 * young * np.diag([1.0, 0.0, 0.0]), atol=1e-10 * young)
     np.testing.assert_allclose(stress[1], shear * young / (1.0 + poisson), atol=1e-10 * young)
 

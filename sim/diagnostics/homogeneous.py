@@ -35,7 +35,7 @@ def compute_shear_stress(tissue: Tissue, shear: np.ndarray) -> np.ndarray:
     """Compute the nominal stress P_12 (n,) [Pa] in simple shear F = I + shear e_1 e_2^T, for shears (n,)."""
     H = np.zeros((len(shear), 3, 3))
     H[:, 0, 1] = shear
-    return build_evaluator(tissue, "float64")(H, of=tissue).stress[:, 0, 1]
+    return build_evaluator(tissue, "float64")(H, tissue=tissue).stress[:, 0, 1]
 
 
 def compute_stress(law: Evaluator, coefficients: tuple[float, ...], stretch: np.ndarray, mu: float) -> np.ndarray:
