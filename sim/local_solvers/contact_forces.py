@@ -144,19 +144,19 @@ def _solve_forces(
     compliance: ContactCompliance,
     columns: np.ndarray,
     vectors: tuple[Any, Any, Any],
-    options: tuple[np.ndarray, np.ndarray],
+    constants: tuple[np.ndarray, np.ndarray],
     limits: ForceLimits,
     capacity: int,
 ) -> tuple[Any, np.ndarray, Any]:
     """Return forces (3n, k), status (k,) and node indices (n, k) of load cases, for up to `capacity` touched nodes.
 
-    `vectors` are current positions, targets and known forces (3n, k); `options` are tolerance and proximal (k,).
+    `vectors` are current positions, targets and known forces (3n, k); `constants` are tolerance and proximal (k,).
     """
     device, count = compliance.device, len(columns)
     nodes, functions = len(vectors[0]) // 3, barrier.functions
     scratch = compliance.get_scratch(nodes, 1 << (count - 1).bit_length(), capacity)
     out, status = device.allocate(3 * nodes, count), wp.zeros(count, dtype=wp.int32, device=device.name)
-    arrays = [from_view(device, x) for x in vectors] + [device.upload(x) for x in options]
+    arrays = [from_view(device, x) for x in vectors] + [device.upload(x) for x in constants]
     touching = barrier.build_structs(columns)
     kernel, model, ends = (
         build_kernel(device, functions),
