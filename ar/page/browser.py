@@ -354,7 +354,9 @@ class Browser:
         self.controls.bind_button(self.recorder.add_button(name), toggle_recording)
         self.controls.bind_key(RECORD_KEY, toggle_recording)
 
-    status, plays, show_beside = show_status, show_playback, show_side_panels  # Former names, for one release.
+    # Former names, for one release.
+    status, plays, show_beside, send = show_status, show_playback, show_side_panels, send_updates
+    send_sight, put_sight, note = send_image, send_image_element, store_update
 
 
 def build_element(name: str, html: str) -> str:
