@@ -107,7 +107,7 @@ def draw_section(
         Error bound [m] of the surface, drawn as a dashed line at this distance outside; None: no line.
     """
     wide, tall = size
-    low, scale = _compute_frame(plane, layer, profile[0], tip, size)
+    low, scale = _compute_inset_origin(plane, layer, profile[0], tip, size)
     columns, rows = np.meshgrid(np.arange(wide), np.arange(tall))
     places = low + np.stack([columns, rows], axis=2) / scale
     distance = compute_signed_distance(
@@ -147,7 +147,7 @@ def add_caption(inset: np.ndarray, lines: list[str]) -> np.ndarray:
     return out
 
 
-def _compute_frame(
+def _compute_inset_origin(
     plane: CutPlane, layer: Layer, surface: np.ndarray, tip: np.ndarray | None, size: tuple[int, int]
 ) -> tuple[np.ndarray, float]:
     """Compute the plane coordinates (2,) [m] of the inset's upper left corner, and its scale [pixel/m]."""

@@ -280,12 +280,12 @@ class Browser:
         if (control := self.controls.handles.get(label)) is not None:
             self.store_update(f"words {label}", lambda: setattr(control, "label", words))
 
-    def write(self, label: str, words: str) -> None:
+    def write(self, label: str, html: str) -> None:
         """Replace the text (HTML) of a note; an empty note is hidden."""
         folder, text = self.controls.notes[label]
 
         def send_text() -> None:
-            text.content, folder.visible = format_note(words), bool(words)
+            text.content, folder.visible = format_note(html), bool(html)
 
         self.store_update(f"note {label}", send_text)
 

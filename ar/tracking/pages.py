@@ -300,10 +300,10 @@ def _read_pixels(page: Image.Image) -> np.ndarray:
     return np.asarray(page.convert("L"))
 
 
-def _encode_pages(pages: Sequence[PrintedPage], form: str, **how: object) -> bytes:
+def _encode_pages(pages: Sequence[PrintedPage], file_format: str, **settings: object) -> bytes:
     """Encode one page as an image file, or several pages in one file, with Pillow."""
     first, *others = [Image.fromarray(page.pixels).convert("1", dither=Image.Dither.NONE) for page in pages]
     more = {"save_all": True, "append_images": others} if others else {}
     file = io.BytesIO()
-    first.save(file, form, **more, **how)
+    first.save(file, file_format, **more, **settings)
     return file.getvalue()

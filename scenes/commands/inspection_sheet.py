@@ -106,7 +106,7 @@ def draw_sheet(inspection: Inspection, masks: HeadMasks, subject: Subject, open_
         middle = 0.5 * (low + high) * across + centre * (1.0 - across)
         view = InspectionView(f"{plane.name}, through the tumour", right, down, middle, reach)
         colour, names = _slice(view, masks, subject, open_mask)
-        panels.append(_draw_frame(colour, view))
+        panels.append(_annotate_view(colour, view))
         drawn |= names
     panels.append(_draw_cortex(masks, subject, open_mask))
     picture = Image.new("RGB", (2 * SIDE + COLUMN_WIDTH, 2 * SIDE), GROUND_COLOUR)
@@ -189,7 +189,7 @@ def _draw_cortex(masks: HeadMasks, subject: Subject, opened: np.ndarray) -> np.n
     colour[there] = base * (0.3 + 0.7 * light)[:, None]
     shadow = _rasterise_points(view, subject.interface, inward, cell) >= 0
     colour[shadow] = _blend_colour(colour[shadow], COLOURS["tumour"], SHADOW_OPACITY)
-    return _draw_frame(np.rint(colour).astype(np.uint8), view)
+    return _annotate_view(np.rint(colour).astype(np.uint8), view)
 
 
 def _rasterise_points(view: InspectionView, points: np.ndarray, inward: np.ndarray, cell: float) -> np.ndarray:
@@ -207,7 +207,7 @@ def _rasterise_points(view: InspectionView, points: np.ndarray, inward: np.ndarr
     return seen
 
 
-def _draw_frame(colour: np.ndarray, view: InspectionView) -> np.ndarray:
+def _annotate_view(colour: np.ndarray, view: InspectionView) -> np.ndarray:
     """Return the image of a view with its name, orientation letters and a scale bar."""
     picture = Image.fromarray(colour)
     ink = ImageDraw.Draw(picture)

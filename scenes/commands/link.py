@@ -70,13 +70,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--registration",
         metavar="R.json",
-        help="registration from `sulcus register --anatomy`, instead of a received transform, which "
-        "cannot be checked: results are then marked unreliable",
+        help="registration from `sulcus register --anatomy`; without it, a received transform is used, "
+        "and results are marked unreliable",
     )
     parser.add_argument(
         "--tool", metavar="TOOL.json",
-        help="tool geometry and its pose in the received transform (default: tool of the model at StylusTip of "
-        "PLUS; origin at the tip, z away from the shaft)",
+        help="tool geometry and its pose in the received transform (default: tool of the model, with its origin at "
+        "the stylus tip of PLUS)",
     )  # fmt: skip
     parser.add_argument(
         "--tracking-noise", type=float, default=0.5, metavar="MM",

@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--locator", metavar="FILE.npz", type=Path,
-        help="ensemble of the anatomy; computed in minutes if missing (default: next to the anatomy)",
+        help="ensemble of motions of the anatomy; computed in minutes if missing (default: next to the anatomy)",
     )  # fmt: skip
     add_region_argument(parser, REGIONS)
     add_device(parser, "building a missing locator")

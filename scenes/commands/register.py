@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--anatomy", type=Path, metavar="P.vtu", help="anatomy: also estimate the error at its tumour")
     parser.add_argument(
         "--surface", type=Path, metavar="CLOUD.csv",
-        help="columns px,py,pz [mm]: places traced on the brain's surface of --anatomy, in the reference's frame",
+        help="points traced on the open cortex, in the frame of the reference; columns px,py,pz [mm]; needs --anatomy",
     )  # fmt: skip
     add_json(parser)
     add_force(parser)

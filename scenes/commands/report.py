@@ -67,8 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed-protocol",
         action="store_true",
-        help="measure the experiment of Tonutti, Gras, Yang 2017 instead: their loads and learners, one position "
-        "left out at a time, and all other models on the same loads",
+        help="repeat the experiment of Tonutti, Gras, Yang 2017 instead: their loads and learners, one position "
+        "left out at a time; other models on the same loads",
     )
     parser.add_argument(
         "--seed-mesh",

@@ -60,7 +60,7 @@ def write_rates(folder: Path) -> Iterator[Callable[[str, TaskOutcome], None]]:
 
 
 def read_rates(folder: Path) -> list[TaskRate]:
-    """Read the recorded rates of a folder; incomplete lines, which a killed process may leave, are skipped."""
+    """Read the task durations of a run folder; incomplete lines, which a killed process may leave, are skipped."""
     found = []
     for path in sorted((folder / RATES).glob("*.csv")):
         for line in path.read_text(errors="replace").splitlines(keepends=True):

@@ -37,11 +37,11 @@ def add_camera_options(parser: argparse.ArgumentParser, default: str | None = No
     )  # fmt: skip
     group.add_argument(
         "--distance", type=float, metavar="MM",
-        help="distance of the camera (default: 300; tracked: all targets in sight)",
+        help="distance of the camera (default: 300; with --path tracked: all targets are visible)",
     )  # fmt: skip
     group.add_argument("--path", choices=PATHS, default=default, help=f"camera motion (default: {default or 'none'})")
     group.add_argument("--path-seed", type=int, default=0, help="seed of --path hand-held")
-    group.add_argument("--eye", choices=("left", "right"), help="draw one eye of a stereo pair, 24 mm apart")
+    group.add_argument("--eye", choices=("left", "right"), help="camera of a stereo pair that draws; baseline 24 mm")
 
 
 def parse_size(text: str) -> tuple[int, int]:

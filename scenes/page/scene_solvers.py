@@ -76,7 +76,7 @@ class SceneSolvers:
                 assert fem_player is not None
                 deformer = fem_player.deformer
             else:
-                deformer = self._build_trained(name, stage.scene)
+                deformer = self._build_trained_model(name, stage.scene)
             self.players[name, disabled_effects] = self.patient.build_player_of(stage, deformer, name)
         return self.players[name, disabled_effects]
 
@@ -100,7 +100,7 @@ class SceneSolvers:
             self.camera_stages = {key: replace(player.stage, scene=scene)}
         return replace(player, stage=self.camera_stages[key])
 
-    def _build_trained(self, name: str, scene: Scene) -> Deformer:
+    def _build_trained_model(self, name: str, scene: Scene) -> Deformer:
         """Return the trained model `name`. An FEM fallback is built under `build_lock`, on the CPU like the stages."""
         with self.build_lock if name == GUARDED else nullcontext():
             return replace(self.patient, device="cpu").build_deformer(name, scene)

@@ -77,7 +77,7 @@ class CortexSurface:
     colour: np.ndarray | tuple[float, float, float] = CORTEX_COLOUR
 
     def build_layer(self, positions: np.ndarray) -> Layer:
-        """Return the rendered layer for mesh vertices at `positions` (V, 3) [m]."""
+        """Build the layer to render for mesh vertices at `positions` (V, 3) [m]."""
         rest = None if self.texture is None else self.rest_points
         return Layer(
             "cortex", CORTEX, positions[self.vertices], self.triangles, self.colour, 0.5, solid=self.texture, rest=rest

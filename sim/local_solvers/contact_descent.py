@@ -157,7 +157,7 @@ class ContactDescent:
         Return early if the load case needs a larger workspace or Newton's method, which captured steps do not include.
         """
         known, judge, limits = None, batch.evaluator, self.limits
-        if batch.model is None or not steps.set_tools(judge.constant):
+        if batch.model is None or not steps.load_tools(judge.constant):
             return
         batch.state, batch.force, batch.response, batch.d = steps.load_state(batch.state, batch.force, batch.response)
         while not self._find_ended(batch, tolerance, max_iter).any():

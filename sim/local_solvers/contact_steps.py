@@ -218,14 +218,14 @@ class ContactSteps:
         """Accept the last trial step: its state becomes the current state."""
         self._run_graph("accept", self._take_step)
 
-    def set_tools(self, constant: wp.array) -> bool:
+    def load_tools(self, constant_gradient: wp.array) -> bool:
         """Load tool poses from the problem, and constant gradients (3N, 1) [N]; return False if there are no tools."""
         reduction = self._barrier.reduce(np.zeros(1, int))
         if reduction is None:
             return False
         if self._touch is None:
             self._touch = build_kernel(self._exact, reduction.functions), reduction.build_structs(np.zeros(1, int))
-        wp.copy(self._constant, constant)
+        wp.copy(self._constant, constant_gradient)
         return True
 
     def load_state(self, state: ContactState, force: Any, response: Any) -> tuple[ContactState, Any, Any, Any]:

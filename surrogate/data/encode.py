@@ -29,10 +29,10 @@ def compute_unit_nodal_forces(patch: Patch, pushes: Pushed) -> np.ndarray:
 
 def compute_root_scaled_forces(patch: Patch, pushes: Pushed) -> np.ndarray:
     """Scale `compute_unit_nodal_forces` by the root of the force, so that products of two scale with force."""
-    return scale_by_root_force(compute_unit_nodal_forces(patch, pushes), pushes)
+    return scale_by_sqrt_force(compute_unit_nodal_forces(patch, pushes), pushes)
 
 
-def scale_by_root_force(nodal_forces: np.ndarray, pushes: Pushed) -> np.ndarray:
+def scale_by_sqrt_force(nodal_forces: np.ndarray, pushes: Pushed) -> np.ndarray:
     """Multiply nodal forces (B, 3 m) for a total of one newton by the square root of each load's force."""
     return np.sqrt(split_forces(pushes)[0])[:, None] * nodal_forces
 

@@ -91,7 +91,7 @@ def to_indentation(loads: Loads, tool: BuiltIn, patch: Patch) -> Pushed:
     """
     pose, core = get_poses(loads, tool), get_core(tool)
     foot = pose[:, :3, 3] + pose[:, :3, :3] @ (core.centre - [0.0, 0.0, core.half[2]])
-    at = np.einsum("bij,kj->bki", pose[:, :3, :3], _sample_core(core)) + pose[:, None, :3, 3]
+    at = np.einsum("bij,kj->bki", pose[:, :3, :3], _sample_tool_core(core)) + pose[:, None, :3, 3]
     near, off = _compute_signed_distances(patch, np.concatenate([foot, at.reshape(-1, 3)]))
     point, distance = near[: len(pose)], off[: len(pose)]
     inward = patch.find_normals(point)
@@ -117,7 +117,7 @@ def _compute_signed_distances(patch: Patch, points: np.ndarray) -> tuple[np.ndar
     return near, np.copysign(np.linalg.norm(away, axis=1), np.einsum("bi,bi->b", away, patch.find_normals(near)))
 
 
-def _sample_core(core: Core) -> np.ndarray:
+def _sample_tool_core(core: Core) -> np.ndarray:
     """Sample points (k, 3) [m] of a core and its border, in the tool's frame; of a rod, only near its lower end."""
     steps = np.ceil(2.0 * core.half / (SAMPLE_SPACING * core.radius)).astype(int)
     low, high = core.centre - core.half, core.centre + core.half

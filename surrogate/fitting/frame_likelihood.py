@@ -65,7 +65,7 @@ def compute_pressing_likelihood(pressing: Responses, columns: np.ndarray, eviden
 
 
 def predict_observation(responses: Responses, skull: str, evidence: Evidence) -> np.ndarray:
-    """Compute the displacements (poissons, ratios, loads, m) [m] of responses along the axes of the evidence."""
+    """Predict the m observed displacement components (Poisson's ratios, stiffness ratios, loads, m) [m]."""
     column = np.searchsorted(responses.nodes, evidence.location.vertices)
     motion = responses.motion[skull][..., column, :]
     return np.einsum("prlmki,mk,mi->prlm", motion, evidence.location.weights, evidence.axis, optimize=True)

@@ -129,7 +129,7 @@ def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation,
 
 
 def compute_tool_pressure(model: Learned, loads: Loads, result: Deformation) -> np.ndarray:
-    """Compute the tool's mean pressure (B, k) [Pa] at the k vertices of the bare surface: nodal force / nodal area.
+    """Compute the tool's mean pressure (B, k) [Pa] at the k vertices of the open cortex: nodal force / nodal area.
 
     Contact forces are computed on linear tissue and scaled so that their sum is the model's tool force. A nodal area is
     a third of the area of the adjacent deformed triangles, as in `sim.contact_pressure.compute_pressure`.

@@ -92,7 +92,7 @@ class TrainingRange:
         return measures._replace(magnitude=np.clip(measures.magnitude, *self.force))
 
     def compute_excess(self, pushes: Pushed, measures: LoadMeasures) -> Excess:
-        """Compute the excess of loads over the training range, from their measures."""
+        """Compute by how much loads exceed the training range: distance, overhang, angle, force and footprint."""
         magnitude, angle, overhang = measures
         away = np.sqrt(compute_squared_distances(pushes.point, self.points).min(axis=1))
         beyond = np.stack(

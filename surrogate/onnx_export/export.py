@@ -17,7 +17,7 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.versions import get_version
 
 from ..data.cortex_patch import open_patch
-from ..data.encode import compute_tool_features, distribute_forces, scale_by_root_force
+from ..data.encode import compute_tool_features, distribute_forces, scale_by_sqrt_force
 from ..model.conformal import LEVELS
 from ..model.learned import Learned
 from ..model.training_range import measure_loads
@@ -98,7 +98,7 @@ def build_graph(name: str, model: Learned, cortex: bool = False) -> GraphBuilder
     encoders = {
         "tool": compute_tool_features,
         "nodal": lambda _, pushed: distribute_forces(add_weight_input(), pushed),
-        "rooted": lambda _, pushed: scale_by_root_force(distribute_forces(add_weight_input(), pushed), pushed),
+        "rooted": lambda _, pushed: scale_by_sqrt_force(distribute_forces(add_weight_input(), pushed), pushed),
     }
     displacement: Any = model.predict_motion(pushed, nodes, encoders)
     known = measure_loads(patch, pushed)

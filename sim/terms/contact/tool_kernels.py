@@ -209,7 +209,7 @@ def build_kernels(device: Device, size: int) -> ToolKernels:
         # outputs
         out: wp.array(dtype=scalar),
     ):
-        """Limit t to kept (d + r) / |dx|, so that no point moves to the centre of a tool or through the tool."""
+        """Limit the step to a fraction of (distance + radius) / |dx|: no point reaches a tool's centre or passes it."""
         s, c = wp.tid()
         at, n, along = get_positions(surface, u, s, c), surface.pieces[s], get_motion(surface, du, s, c)
         for k in range(tools.radius.shape[0]):

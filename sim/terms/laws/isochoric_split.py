@@ -36,7 +36,7 @@ def compute_inverse_transpose(H: Any):
 class LawSplit:
     """Warp functions of a split law with coefficients k, for a displacement gradient H with an increment D.
 
-    energy(H, k, less, A) -> psi + less psi_shape + A : E [Pa]; E is the strain conjugate to a stress A [Pa]. stress and
+    energy(H, k, beta, A) -> psi + beta psi_shape + A : E [Pa]; E is the strain conjugate to a stress A [Pa]. stress and
     stress_change(H, D, ...) are its derivatives. overstress(H, k) -> S [Pa] is the deviatoric stress conjugate to E.
     """
 
@@ -60,7 +60,7 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
     @wp.func
     def energy(H: mat, k: Any, beta: scalar, A: mat):
-        """Return psi(F) + less (psi(F) - psi(J^(1/3) I)) + (Cb - I) : A / 2; +inf where J <= 0."""
+        """Return psi(F) + beta (psi(F) - psi(J^(1/3) I)) + (Cb - I) : A / 2; +inf where J <= 0."""
         if volume_change(H) <= scalar(-1.0):
             return scalar(wp.inf)
         own = own_energy(H, k)
@@ -69,7 +69,7 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
     @wp.func
     def stress(H: mat, k: Any, beta: scalar, A: mat):
-        """Return (1+less) P(F) - less p J^(1/3) F^-T + J^(-1/3) (Q - (Q:F) F^-T / 3), p I = P(J^(1/3) I), Q = Fb A."""
+        """Return (1+beta) P(F) - beta p J^(1/3) F^-T + J^(-1/3) (Q - (Q:F) F^-T / 3), p I = P(J^(1/3) I), Q = Fb A."""
         F, Q = wp.identity(n=3, dtype=scalar) + H, A + compute_isochoric(H) * A
         G, V = compute_inverse_transpose(H), compute_volumetric(H)
         wide = scalar(1.0) + V[0, 0]
@@ -119,17 +119,17 @@ def build_own_split(law: Law, of_shape: wp.Function, device: Device) -> LawSplit
 
     @wp.func
     def energy(H: mat, k: Any, beta: scalar, A: mat):
-        """Return psi + less psi_shape + (C - I) : A / 2."""
+        """Return psi + beta psi_shape + (C - I) : A / 2."""
         return own_energy(H, k) + beta * own_energy(H, of_shape(k)) + wp.ddot(green_strain(H), A)
 
     @wp.func
     def stress(H: mat, k: Any, beta: scalar, A: mat):
-        """Return the stress P + less P_shape + F A."""
+        """Return the stress P + beta P_shape + F A."""
         return own_stress(H, k) + beta * own_stress(H, of_shape(k)) + A + H * A
 
     @wp.func
     def stress_change(H: mat, D: mat, k: Any, beta: scalar, A: mat):
-        """Return the stress increment dP + less dP_shape + D A."""
+        """Return the stress increment dP + beta dP_shape + D A."""
         return own_change(H, D, k) + beta * own_change(H, D, of_shape(k)) + D * A
 
     @wp.func
