@@ -52,7 +52,7 @@ def test_background_study_shows_input_error_as_warning():
 
 def test_effect_costs_change_labels_of_existing_switches():
     button, none = SimpleNamespace(label=""), cast("Any", None)
-    page = Mock(controls=SimpleNamespace(handles={"Gravity": button}), note=lambda key, send: send())
+    page = Mock(controls=SimpleNamespace(handles={"Gravity": button}), store_update=lambda key, send: send())
     page.rename = partial(Browser.rename, page)
     costs, _ = build_studies(none, none, none, threading.Lock(), lambda: page)
     costs.show({EFFECT_COSTS: "note", "Gravity": "gravity: +1 ms", "ToolForce": "of another scene"})

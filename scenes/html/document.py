@@ -101,7 +101,7 @@ def choose_model(patient: PatientSetup, learner: str | None = None) -> ExportedM
             reasons.append(str(error))
     if not found:
         raise InputError(" ".join(reasons) or "there is no model next to this anatomy: make one by `sulcus train`.")
-    return min(found, key=lambda one: _count_bytes(one.sheet))
+    return min(found, key=lambda one: _count_bytes(one.graph))
 
 
 def build_exported_model(name: str, model: Learned, with_cortex: bool) -> ExportedModel:
