@@ -59,7 +59,7 @@ def test_report_table_has_values_under_their_headings(tmp_path):
     one = compute_distance_figures(np.full((4, 2), 1e-3), np.full((4, 2, 3), 1e-2), np.arange(4.0))
     row = ReportRow("svr", "learnt", reference=one, median=1.5, p99=2.5, set_up=3.5, memory=0.25)
     row = replace(row, loads=600, units=60, series=9000, inside=12, solving=180.0, learning=120.0, timed=1000)
-    row = replace(row, bare=0.0125, reference=replace(one, worst=replace(one.worst, mean=7.5)))
+    row = replace(row, reference=replace(one, worst=replace(one.worst, mean=7.5)))
     row = replace(row, outcomes={"CONVERGED": 3, "INVERTED": 1}, adapt=70.0)
     write_report(tmp_path, "a machine", [Section("data", (), (row, ReportRow("odd", "f", state="no <memory>")))])
     text = (tmp_path / "index.html").read_text()

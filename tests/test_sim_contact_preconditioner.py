@@ -46,7 +46,7 @@ def test_contact_preconditioner_includes_skull() -> None:
     effects = [Elasticity(Material("neo-hookean", 3000.0, 0.45)), Held(), SkullContact(), ToolContact((Ball(RADIUS),))]
     fem = Fem(hold(mesh, mesh.nodes[:, 2] < 1e-9, wall), effects, Accuracy(1e-7), "cpu", element="p1")
     knowing, plain = fem.strategy, replace(fem.strategy)
-    vars(plain)["_touched"] = fem.strategy.preconditioner
+    vars(plain)["_contact_preconditioner"] = fem.strategy.preconditioner
     found, expected = (one.solve(Cases(touching(down), np.zeros(1)), []) for one in (knowing, plain))
     assert knowing.contact is None and found.good.all() and expected.good.all()
     np.testing.assert_allclose(found.u.numpy(), expected.u.numpy(), atol=1e-8)
