@@ -161,7 +161,8 @@ def build_tool_controls(
     tilts = (
         Slider(
             f"direction {name} [deg]", -MAX_TILT, MAX_TILT, 1.0, 0.0,
-            lambda value, name=name: move(**{name: np.radians(value)}), f"tilt {name} (to {side}) [deg]", tilt_hint,
+            lambda value, name=name: move(**{f"tilt_{name}": np.radians(value)}),
+            f"tilt {name} (to {side}) [deg]", tilt_hint,
         )
         for name, _, side in directions
     )  # fmt: skip
