@@ -103,7 +103,7 @@ def list_one_factor_variants(study: ReportStudy) -> tuple[FemVariant, ...]:
         *(FemVariant(f"FEM {name}", mesh=mesh) for name, mesh in meshes.items()),
         *(
             FemVariant(f"FEM {_format_power(size)}", tolerance=size)
-            for size in TOLERANCES[:: 1 if study.thorough else 4]
+            for size in (TOLERANCES if study.thorough else (TOLERANCES[0], TOLERANCES[-1]))
             if size != STANDARD_TOLERANCE
         ),
         *((FemVariant("FEM float64", precision="float64"),) if study.thorough else ()),

@@ -4,7 +4,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..material import Tissue
-from ..terms.laws.conformance import Evaluator, build_evaluator
+from ..terms.laws.conformance import build_evaluator
 
 MAX_STEPS = 60  # Maximum number of Newton steps for the lateral stretch.
 TOLERANCE = 1e-9  # Largest lateral stress, relative to the shear modulus.
@@ -28,25 +28,21 @@ def compute_uniaxial_stress(tissue: Tissue, stretch: np.ndarray) -> np.ndarray:
     stretch = np.asarray(stretch, np.float64)
     if not (np.isfinite(stretch) & (stretch > 0.0)).all():
         raise InputError("a stretch is not a positive number: give 1.1 for 10 % tension, 0.9 for compression.")
-    return compute_stress(build_evaluator(tissue, "float64"), tissue.coefficients, stretch, tissue.lame[0])
+    evaluate = build_evaluator(tissue, "float64")
+    lateral = stretch**-0.5
+    sides = np.broadcast_to(np.diag([0.0, 1.0, 1.0]), (len(stretch), 3, 3))
+    for _ in range(MAX_STEPS):
+        H = np.stack([stretch, lateral, lateral], axis=1)[:, :, None] * np.eye(3) - np.eye(3)
+        result = evaluate(H, sides)
+        if (np.abs(result.stress[:, 1, 1]) <= TOLERANCE * tissue.lame[0]).all():
+            return result.stress[:, 0, 0]
+        lateral = np.maximum(lateral - result.stress[:, 1, 1] / result.change[:, 1, 1], 0.5 * lateral)
+    low, high = stretch.min(), stretch.max()
+    raise InputError(f"no lateral stretch makes the sides of a sample stress-free at stretches {low:g} to {high:g}.")
 
 
 def compute_shear_stress(tissue: Tissue, shear: np.ndarray) -> np.ndarray:
     """Compute the nominal stress P_12 (n,) [Pa] in simple shear F = I + shear e_1 e_2^T, for shears (n,)."""
     H = np.zeros((len(shear), 3, 3))
     H[:, 0, 1] = shear
-    return build_evaluator(tissue, "float64")(H, tissue=tissue).stress[:, 0, 1]
-
-
-def compute_stress(law: Evaluator, coefficients: tuple[float, ...], stretch: np.ndarray, mu: float) -> np.ndarray:
-    """Compute uniaxial stresses as `compute_uniaxial_stress`, for a `law` with other coefficients; mu [Pa]."""
-    lateral = stretch**-0.5
-    sides = np.broadcast_to(np.diag([0.0, 1.0, 1.0]), (len(stretch), 3, 3))
-    for _ in range(MAX_STEPS):
-        H = np.stack([stretch, lateral, lateral], axis=1)[:, :, None] * np.eye(3) - np.eye(3)
-        result = law.evaluate(H, sides, coefficients)
-        if (np.abs(result.stress[:, 1, 1]) <= TOLERANCE * mu).all():
-            return result.stress[:, 0, 0]
-        lateral = np.maximum(lateral - result.stress[:, 1, 1] / result.change[:, 1, 1], 0.5 * lateral)
-    low, high = stretch.min(), stretch.max()
-    raise InputError(f"no lateral stretch makes the sides of a sample stress-free at stretches {low:g} to {high:g}.")
+    return build_evaluator(tissue, "float64")(H).stress[:, 0, 1]

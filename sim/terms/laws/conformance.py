@@ -10,6 +10,7 @@ import warp as wp
 from ...errors import InputError
 from ...material import Tissue, get_lame
 from ...runtime.device import Device, Precision, find_device, forward_kernel
+from .law import Law
 
 
 @dataclass(frozen=True)
@@ -66,13 +67,18 @@ class Evaluator:
         return Evaluated(*(array.numpy().astype(np.float64) for array in (energy, stress, change)))
 
 
-@cache
 def build_evaluator(tissue: Tissue, precision: Precision) -> Evaluator:
     """Return the evaluator of the law of a tissue, on the CPU."""
     device = find_device("cpu", precision)
+    return Evaluator(device, _build_kernel(tissue.functions, len(tissue.coefficients), device), tissue)
+
+
+@cache
+def _build_kernel(law: Law, count: int, device: Device) -> wp.Kernel:
+    """Return the kernel that evaluates a law with `count` coefficients; tissues of the same law share the kernel."""
     scalar, mat = device.scalar, device.matrix
-    constants = wp.types.vector(len(tissue.coefficients), scalar)
-    density, stress_of, change_of = tissue.functions.energy, tissue.functions.stress, tissue.functions.stress_change
+    constants = wp.types.vector(count, scalar)
+    density, stress_of, change_of = law.energy, law.stress, law.stress_change
 
     @forward_kernel(module="unique")
     def evaluate(
@@ -90,7 +96,7 @@ def build_evaluator(tissue: Tissue, precision: Precision) -> Evaluator:
         stress[i] = stress_of(H[i], c)
         change[i] = change_of(H[i], D[i], c)
 
-    return Evaluator(device, evaluate, tissue)
+    return evaluate
 
 
 @dataclass(frozen=True)
