@@ -47,7 +47,8 @@ from .loads import (
     push,
     stack,
 )
-from .material import BRAIN, MATERIALS, Material, Ogden, Tissue
+from .material import BRAIN, Material, Ogden, Tissue
+from .named_tissues import MATERIALS
 from .resected_fem import build_fem
 from .skulls import Bonded, SkullContact, Slide
 from .terms.laws.conformance import check_tissue

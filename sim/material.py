@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from inspect import getattr_static
 from typing import TYPE_CHECKING, Protocol
 
@@ -22,6 +22,7 @@ LAWS = ("linear", "corotational", "neo-hookean", "stable-neo-hookean")
 
 HYPERELASTIC = ("neo-hookean", "stable-neo-hookean", "ogden")
 """Names of the laws that support a Prony series: their energy separates shape and volume change at finite strain."""
+NO_LIMIT = 1e3  # Limit of an Ogden law without one; no logarithmic strain reaches it.
 Pairs = tuple[tuple[float, float], ...]
 """Prony series of pairs (g, tau [s]): deviatoric stress relaxes by a fraction sum g (1 - exp(-t / tau)) in time t."""
 
@@ -83,6 +84,12 @@ class Material:
         mu = self.young / (2.0 * (1.0 + self.poisson))
         return mu, self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
+    def replace_constants(self, young: float | None = None, poisson: float | None = None) -> Material:
+        """Return the tissue with another Young's modulus [Pa] or Poisson's ratio; None keeps the present one."""
+        return replace(
+            self, young=self.young if young is None else young, poisson=self.poisson if poisson is None else poisson
+        )
+
     @property
     def coefficients(self) -> tuple[float, ...]:
         """Coefficients of the law's kernels: Lamé's (mu, lambda) [Pa]."""
@@ -113,6 +120,9 @@ class Ogden:
         Bulk modulus K [Pa].
     prony
         Prony series of the deviatoric stress, or () without relaxation. With it, `terms` are instantaneous values.
+    limit
+        |ln l| above which growing exponentials continue as Taylor polynomials of second degree; None: nowhere. A large
+        exponent that was fitted to small strains is far too stiff beyond them.
 
     Raises
     ------
@@ -125,6 +135,7 @@ class Ogden:
     terms: tuple[tuple[float, float], ...]
     bulk: float
     prony: Pairs = ()
+    limit: float | None = None
 
     def __post_init__(self) -> None:
         if not self.terms:
@@ -137,12 +148,15 @@ class Ogden:
             raise InputError(f"Ogden's c sum to {total} Pa, twice the shear modulus: must be positive.")
         if not (np.isfinite(self.bulk) and self.bulk > 0.0):
             raise InputError(f"the bulk modulus is {self.bulk} Pa: give a positive number.")
+        if self.limit is not None and not 0.0 < self.limit < 1.0:
+            raise InputError(f"the limit of Ogden's law is {self.limit}: give a logarithmic strain between 0 and 1.")
         check_prony(self.prony, self.law)
 
     def __str__(self) -> str:
         """Return the description for results."""
         terms = "; ".join(f"{c:g},{m:g}" for c, m in self.terms)
-        return f"{self.law} {terms} Pa, K {1e-3 * self.bulk:g} kPa{', relaxing' if self.prony else ''}"
+        limit = "" if self.limit is None else f", polynomial from strain {self.limit:g}"
+        return f"{self.law} {terms} Pa, K {1e-3 * self.bulk:g} kPa{limit}{', relaxing' if self.prony else ''}"
 
     @property
     def lame(self) -> tuple[float, float]:
@@ -151,14 +165,38 @@ class Ogden:
         return mu, self.bulk - 2.0 * mu / 3.0
 
     @property
+    def young(self) -> float:
+        """Young's modulus at small strain [Pa]."""
+        mu, lam = self.lame
+        return round(mu * (3.0 * lam + 2.0 * mu) / (lam + mu), 9)
+
+    @property
+    def poisson(self) -> float:
+        """Poisson's ratio at small strain."""
+        mu, lam = self.lame
+        return round(lam / (2.0 * (lam + mu)), 12)
+
+    def replace_constants(self, young: float | None = None, poisson: float | None = None) -> Ogden:
+        """Return the tissue with another Young's modulus [Pa] or Poisson's ratio at small strain, and its exponents."""
+        if young is None and poisson is None:
+            return self
+        times = 1.0 if young is None else young / self.young
+        mu, lam = (times * one for one in self.lame)
+        if poisson is not None:
+            mu, lam = Material("linear", times * self.young, poisson).lame
+        bulk, _, *terms = self.coefficients_at(mu, lam)
+        return replace(self, terms=tuple(zip(terms[::2], terms[1::2], strict=True)), bulk=bulk)
+
+    @property
     def coefficients(self) -> tuple[float, ...]:
-        """Coefficients of the law's kernels: (K, c_1, m_1, c_2, m_2, ...)."""
+        """Coefficients of the law's kernels: (K, limit, c_1, m_1, c_2, m_2, ...)."""
         return self.coefficients_at(*self.lame)
 
     def coefficients_at(self, mu: float, lam: float) -> tuple[float, ...]:
         """Return the coefficients for other Lamé parameters (mu, lambda) [Pa] at small strain."""
         share = mu / self.lame[0]
-        return (lam + 2.0 * mu / 3.0, *(number for c, m in self.terms for number in (share * c, m)))
+        limit = NO_LIMIT if self.limit is None else self.limit
+        return (lam + 2.0 * mu / 3.0, limit, *(number for c, m in self.terms for number in (share * c, m)))
 
     @property
     def functions(self) -> Law:
@@ -266,8 +304,9 @@ def check_prony(prony: Pairs, law: str) -> None:
 def to_tissue_json(tissue: Tissue) -> str:
     """Return the tissue as one line of JSON, which `read_tissue_json` reads."""
     constants = asdict(tissue)  # pyright: ignore[reportArgumentType]
-    if not tissue.prony:
-        constants.pop("prony", None)  # omitted for backward compatibility
+    for name, usual in (("prony", ()), ("limit", None)):  # omitted for backward compatibility
+        if constants.get(name) == usual:
+            constants.pop(name, None)
     return json.dumps({"law": tissue.law, **constants})
 
 
@@ -284,7 +323,8 @@ def read_tissue_json(text: str) -> Tissue:
         prony = tuple((float(g), float(tau)) for g, tau in constants.pop("prony", ()))
         if constants["law"] == Ogden.law:
             terms = tuple((float(c), float(m)) for c, m in constants["terms"])
-            return Ogden(terms, float(constants["bulk"]), prony)
+            limit = constants.get("limit")
+            return Ogden(terms, float(constants["bulk"]), prony, None if limit is None else float(limit))
         return Material(**constants, prony=prony)
     except InputError as error:
         raise InputError(f"{text[:200]!r} is no tissue: {error}") from error
@@ -326,57 +366,20 @@ def collect_coefficients(tissues: Sequence[Tissue], portion: str = "whole") -> n
     return np.array([row + (0.0, 1.0) * ((longest - len(row)) // 2) for row in rows])
 
 
+IsotropicTissue = Material | Ogden
+"""Tissue with Young's modulus and Poisson's ratio at small strain."""
 BRAIN = Material("neo-hookean", 3000.0, 0.49)
 """Recommended tissue, used by default in every scene and command. See `elements.RECOMMENDED` for the element."""
+MEASURED_BRAIN = Ogden(((2200.0, -20.0),), 2200.0 * 1.49 / 0.06, limit=0.11)
+"""Human brain ex vivo, the mean of grey and white matter: see `named_tissues.MATERIALS`."""
 
 
-@dataclass(frozen=True)
-class MaterialSet:
-    """Tissue with the time scale for which it is valid and the source of its constants."""
+def build_law(law: str, young: float, poisson: float) -> IsotropicTissue:
+    """Return tissue of a law, with constants at small strain; Ogden's has the exponent of `MEASURED_BRAIN`.
 
-    tissue: Material | Ogden
-    time_scale: str
-    source: str
-
-
-MATERIALS = {
-    "default": MaterialSet(BRAIN, "seconds", "the same as `seconds`"),
-    "seed": MaterialSet(
-        Material("neo-hookean", 3330.0, 0.4945),
-        "seconds",
-        "small-strain equivalent of the two-term Ogden law of Tonutti, Gras, Yang 2017, Artif. Intell. Med. 80:39-47",
-    ),
-    "seconds": MaterialSet(
-        BRAIN,
-        "seconds",
-        "customary in simulating neurosurgery: Wittek, Hawkins, Miller 2009, Biomech. Model. Mechanobiol. 8:77-84",
-    ),
-    "undrained": MaterialSet(
-        Material("neo-hookean", 3000.0, 0.499),
-        "the limit in which no fluid leaves the tissue",
-        "`seconds`, nearer to incompressible",
-    ),
-    "drained": MaterialSet(
-        Material("neo-hookean", 2100.0, 0.45),
-        "minutes to hours: the limit in which fluid has left the tissue; how fast it leaves is not modelled",
-        "E 2.1 kPa, nu 0.45 in brain that consolidates: Miga, Paulsen et al. 1999, IEEE Trans. Med. Imaging 18:866-874",
-    ),
-    # mu is the shear modulus, with 2 mu / alpha^2 before the bracket, as in the measurements with which the paper
-    # compares; if it were FEBio's c_1, the tissue would be half as stiff.
-    "minutes": MaterialSet(
-        Ogden(((1340.0, -19.0),), 148e3),
-        "minutes",
-        "mu 670 Pa, alpha -19, K 148 kPa from brain shift between prone and supine in vivo, PMC9748497",
-    ),
-    # Incompressible in the paper; the bulk modulus is that of an instantaneous Poisson's ratio of 0.49.
-    "viscoelastic": MaterialSet(
-        Ogden(((2.0 * 842.0, -4.7),), 842.0 * 2.98 / 0.06, ((0.45, 0.5), (0.365, 50.0))),
-        "half a second to minutes, as loads say how much time goes by; else at once",
-        "mu 842 Pa, alpha -4.7, g 0.45 and 0.365, tau 0.5 and 50 s: Miller, Chinzei 2002, J. Biomech. 35:483-490",
-    ),
-}
-"""Tissues by the names used in commands, each with its valid time scale and the source of its constants.
-
-The stiffness of brain depends on the duration of the load. `default` is the tissue of scenes and of the shipped
-models. `viscoelastic` depends on the time of the loads. `seed` is the tissue of the published protocol.
-"""
+    Raises
+    ------
+    InputError
+        See `Material`.
+    """
+    return MEASURED_BRAIN.replace_constants(young, poisson) if law == Ogden.law else Material(law, young, poisson)

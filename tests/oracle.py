@@ -32,9 +32,14 @@ def energy_density(law: str, F: np.ndarray, *coefficients: float) -> np.ndarray:
     """psi (T,) [Pa] of deformation gradients F (T, 3, 3)."""
     if law == "ogden":
         stretch, J = np.linalg.svd(F, compute_uv=False), np.linalg.det(F)
-        bulk, terms = coefficients[0], zip(coefficients[1::2], coefficients[2::2], strict=True)
-        isochoric = J[:, None] ** (-1.0 / 3.0) * stretch
-        return sum(c / m**2 * ((isochoric**m).sum(axis=1) - 3.0) for c, m in terms) + bulk / 2.0 * np.log(J) ** 2
+        bulk, limit, *numbers = coefficients
+        y = np.log(J[:, None] ** (-1.0 / 3.0) * stretch)
+        psi = bulk / 2.0 * np.log(J) ** 2
+        for c, m in zip(numbers[::2], numbers[1::2], strict=True):
+            t = np.minimum(m * y, abs(m) * limit)
+            d = m * y - t
+            psi = psi + c / m**2 * (np.exp(t) * (1.0 + d + d**2 / 2.0 + d**3 / 6.0) - 1.0 - m * y).sum(axis=1)
+        return psi
     mu, lam = coefficients
     trace = np.trace(F, axis1=1, axis2=2)
     first = np.einsum("tij,tij->t", F, F)
@@ -56,8 +61,12 @@ def piola(law: str, F: np.ndarray, *coefficients: float) -> np.ndarray:
     if law == "ogden":
         U, stretch, V = np.linalg.svd(F)
         J = np.linalg.det(F)[:, None]
-        bulk, terms = coefficients[0], zip(coefficients[1::2], coefficients[2::2], strict=True)
-        shape = np.sum([c / m * (J ** (-1.0 / 3.0) * stretch) ** m for c, m in terms], axis=0)
+        bulk, limit, *numbers = coefficients
+        y = np.log(J ** (-1.0 / 3.0) * stretch)
+        shape = 0.0
+        for c, m in zip(numbers[::2], numbers[1::2], strict=True):
+            t = np.minimum(m * y, abs(m) * limit)
+            shape = shape + c / m * np.exp(t) * (1.0 + (m * y - t) + (m * y - t) ** 2 / 2.0)
         kirchhoff = shape - shape.mean(axis=1, keepdims=True) + bulk * np.log(J)
         return U @ ((kirchhoff / stretch)[:, :, None] * V)
     mu, lam = coefficients
@@ -170,7 +179,7 @@ def coefficients_carried(material: Tissue, carries: str) -> tuple[float, ...]:
     if isinstance(material, Ogden):
         if carries == "shape":
             return (soft + 2.0 * mu / 3.0, *material.coefficients[1:])
-        return lam - soft, 0.0, 1.0
+        return lam - soft, 1e3, 0.0, 1.0
     return (mu, soft) if carries == "shape" else (0.0, lam - soft)
 
 

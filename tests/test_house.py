@@ -19,7 +19,7 @@ ROOMS = WHEEL | {"benchmarks": set(WHEEL)}
 ORDER = (
     {"sim.errors", "sim.elements"},
     {"sim.arguments", "sim.skulls", "sim.tools", "sim.material", "sim.geometry"},
-    {"sim.accuracy", "sim.loads", "sim.anatomy"},
+    {"sim.accuracy", "sim.loads", "sim.anatomy", "sim.named_tissues"},
     {"sim.fields"},
     {"sim.runtime", "sim.effects", "sim.deformation"},
     {"sim.discretisation", "sim.terms.laws"},

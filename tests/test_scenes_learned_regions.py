@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_sim_anatomy import hollowed, necrotic_labels
+from test_sim_conformance import YEOH
 from theatres import short, small
 
 from scenes.analysis.uncertainty import apply_sample, get_tissue
@@ -24,7 +25,8 @@ from sim.bodies.meshfile import write_anatomy
 from sim.effects import Elasticity, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.material import BRAIN, MATERIALS, Material
+from sim.material import BRAIN, Material, Ogden
+from sim.named_tissues import MATERIALS
 from surrogate.data.dataset import read_dataset
 from surrogate.data.solution_rows import describe_tissue_source, read_tissue_text
 from surrogate.training.expansion import Expansion
@@ -73,7 +75,8 @@ class TestScenes:
             assert found.default == Material(BRAIN.law, 2100.0, 0.45)
             assert found.get_law(NECROSIS_LABEL) == Material(BRAIN.law, 350.0, 0.45)
         minutes = asked(theatre, short(), "--material", "minutes").elasticity
-        assert minutes.get_law(NECROSIS_LABEL) == minutes.default  # Ogden's constants are no Young's modulus
+        necrosis = minutes.get_law(NECROSIS_LABEL)
+        assert isinstance(necrosis, Ogden) and necrosis.young == pytest.approx(MATERIALS["minutes"].tissue.young / 6.0)
 
     def test_scenes_with_relaxing_brain_relax_in_all_regions(self, theatre):
         found = asked(theatre, find_scene("retract")).elasticity
@@ -104,8 +107,8 @@ class TestScenes:
         ).elasticity  # three times as stiff, as such
         assert stated.get_law(TUMOUR_LABEL) == replace(BRAIN, young=18.0 * BRAIN.young, poisson=0.45)
         assert stated.get_law(NECROSIS_LABEL) == found.get_law(NECROSIS_LABEL) and stated.default == found.default
-        with pytest.raises(InputError, match=r"the scene .* has another tissue: ogden"):
-            get_tissue(small().replace_regions({TUMOUR_LABEL: MATERIALS["minutes"].tissue}))
+        with pytest.raises(InputError, match=r"the scene .* has another tissue: Yeoh"):
+            get_tissue(small().replace_regions({TUMOUR_LABEL: YEOH.Yeoh(500.0, 0.0, 1e4)}))
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from scenes.gym.model_responses import Hertz
 from scenes.gym.setting import open_setting
 from scenes.gym.tasks import DEBULK, PALPATE, RETRACT
 from scenes.gym.tissue_requests import TissueRequest
-from sim.material import MATERIALS
+from sim.named_tissues import MATERIALS
 
 
 def test_model_force_and_motion_match_fem():

@@ -17,7 +17,8 @@ from scenes.play.deformers import to_model_path
 from sim.anatomy import TUMOUR_LABEL
 from sim.effects import Elasticity
 from sim.errors import InputError
-from sim.material import BRAIN, MATERIALS
+from sim.material import BRAIN
+from sim.named_tissues import MATERIALS
 from surrogate.data.solution_rows import describe_tissue_source
 
 STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})

@@ -15,7 +15,8 @@ from programs import main
 from scenes.options.tissue_options import add_tissue_arguments, check_stiffness, parse_region_tissues, parse_tissue
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
-from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
+from sim.material import BRAIN, LAWS, MEASURED_BRAIN, Material, Ogden, Tissue
+from sim.named_tissues import MATERIALS
 
 MESH = box((2, 2, 3), 0.1, distortion=0.15)
 UPPER = (MESH.nodes[MESH.tets].mean(axis=1)[:, 2] > 0.05).astype(int)
@@ -39,6 +40,7 @@ def asked(*words: str) -> Tissue:
         (("--material", "corotational", "--poisson", "0.3"), Material("corotational", 3000.0, 0.3)),
         (("--material", "seconds"), Material("neo-hookean", 3000.0, 0.49)),
         (("--material", "seconds", "--young", "9000"), Material("neo-hookean", 9000.0, 0.49)),
+        (("--material", "brain", "--young", "9000"), MEASURED_BRAIN.replace_constants(9000.0)),
         (("--material", "minutes"), MATERIALS["minutes"].tissue),
         (TWO_TERMS, Ogden(((1340.0, -19.0), (700.0, 2.5)), 2e4)),
         (("--material", "ogden", "--ogden=-300,2; 1e3 , 4", "--bulk", "2e4"), Ogden(((-300.0, 2.0), (1e3, 4.0)), 2e4)),
@@ -54,7 +56,6 @@ def test_tissue_options_give_the_expected_tissue(words: tuple[str, ...], expecte
         (("--ogden", "1340,-19"), "--ogden says nothing to --material default"),
         (("--material", "neo-hookean", "--bulk", "1e4"), "--bulk says nothing to --material neo-hookean"),
         (("--material", "minutes", "--bulk", "1e4"), "--bulk says nothing to --material minutes"),
-        (("--material", "minutes", "--young", "3000"), "--young says nothing to --material minutes"),
         ((*TWO_TERMS, "--young", "3000"), "--young says nothing to --material ogden"),
         ((*TWO_TERMS, "--poisson", "0.4"), "--poisson says nothing to --material ogden"),
         (("--material", "ogden", "--bulk", "1e4"), "lacks --ogden"),
@@ -80,6 +81,9 @@ def test_region_tissues_have_the_law_of_the_brain() -> None:
     assert found == {2: Material("neo-hookean", 9000.0, 0.3), -1: Material("neo-hookean", 500.0, 0.49)}
     found = parse_region_tissues(["7:500,2;300,-4;1e4"], MATERIALS["minutes"].tissue)
     assert found == {7: Ogden(((500.0, 2.0), (300.0, -4.0)), 1e4)}
+    one = parse_region_tissues(["2:9000,0.3"], MATERIALS["brain"].tissue)[2]
+    assert isinstance(one, Ogden)
+    assert (one.young, one.poisson, one.terms[0][1], one.limit) == (9000.0, 0.3, -20.0, 0.11)
 
 
 @pytest.mark.parametrize(("name", "text"), [("seconds", "2:9000,0.3"), ("minutes", "2:500,2;1e4")])
@@ -91,9 +95,9 @@ def test_region_tissues_have_the_relaxation_of_the_brain(name: str, text: str) -
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("2:9000,0.3", "write REGION:C1,M1;C2,M2;K"),
-        ("2:1e4", "--region 2:1e4: Ogden's law has no terms"),
-        ("2:500,2", "write REGION:C1,M1;C2,M2;K"),
+        ("2:500,2,1", "write REGION:YOUNG, as in oedema:2000, or 2:1340,-19;148000"),
+        ("2:500;1e4", "write REGION:YOUNG, as in oedema:2000, or 2:1340,-19;148000"),
+        ("2:500,2", "Poisson's ratio is 2.0"),
         ("2:500,2;0", "bulk modulus is 0.0 Pa"),
         ("grey:500,2;1e4", "write REGION"),
     ],

@@ -377,7 +377,7 @@ def test_check_and_episode_use_error_of_uncertainty_command(theatre, tmp_path, c
 
 
 def test_uncertainty_rejects_tissue_without_young_modulus(theatre, tmp_path, monkeypatch, capsys):
-    from sim.material import MATERIALS
+    from sim.named_tissues import MATERIALS
 
     scene = short().replace_tissue(MATERIALS["minutes"].tissue, None)
     with pytest.raises(InputError, match="Young's modulus"):

@@ -15,7 +15,8 @@ from sim.effects import Elasticity, Held, NodalForce
 from sim.fem import Fem
 from sim.geometry.tetmesh import TetMesh
 from sim.loads import Cause, Loads, Nodal, Prescribed
-from sim.material import MATERIALS, Material, Ogden, Tissue
+from sim.material import Material, Ogden, Tissue
+from sim.named_tissues import MATERIALS
 from sim.runtime.device import find_device
 
 TIGHT = Accuracy(tolerance=1e-11)

@@ -5,10 +5,14 @@ import pytest
 from oracle import piola, tissue
 from test_sim_law import MU, gradients, relative, rotations
 
-from sim.material import MATERIALS, Ogden, Tissue
+from sim.material import MEASURED_BRAIN, Ogden, Tissue
+from sim.named_tissues import MATERIALS
 from sim.terms.laws.conformance import build_evaluator
 
 MINUTES = MATERIALS["minutes"].tissue
+EVEN = Ogden(((2200.0, -20.0), (300.0, 4.0), (200.0, -2.0)), 54e3)
+ODD = Ogden(tuple((c, m + 1e-9) for c, m in EVEN.terms), EVEN.bulk)
+LIMITED = Ogden(((2200.0, -20.0), (200.0, 5.0)), 54e3, limit=0.11)
 
 
 TURN = rotations(1)[0]
@@ -22,11 +26,17 @@ PRINCIPAL = {
     "closer than single precision": [0.9, 1.1, 1.1 + 1e-7],
     "nearly three": [1.1, 1.1 + 1e-6, 1.1 - 1e-5],
     "apart": [0.5, 1.0, 1.9],
+    "one beyond the limit": [0.87, 1.02, 1.04],
+    "two nearly equal beyond the limit": [0.85, 0.85 + 1e-9, 1.05],
     "crushed": [0.15, 2.5, 2.5],
 }
 
 
-@pytest.mark.parametrize("of", [tissue("ogden"), MINUTES], ids=["two terms", "minutes"])
+@pytest.mark.parametrize(
+    "of",
+    [tissue("ogden"), MINUTES, EVEN, MEASURED_BRAIN, LIMITED],
+    ids=["two terms", "minutes", "even", "brain", "limited"],
+)
 @pytest.mark.parametrize("turn", [np.eye(3), TURN], ids=["on the axes", "turned"])
 @pytest.mark.parametrize("stretches", PRINCIPAL.values(), ids=PRINCIPAL)
 def test_ogden_stress_at_equal_stretches_is_exact(of: Tissue, turn: np.ndarray, stretches: list[float]) -> None:
@@ -79,3 +89,15 @@ def test_ogden_term_without_stiffness_changes_no_stress() -> None:
     filled = build_evaluator(Ogden((*of.terms, (0.0, 1.0)), of.bulk), "float64")(H, D)
     np.testing.assert_array_equal(filled.stress, short.stress)
     np.testing.assert_array_equal(filled.change, short.change)
+
+
+@pytest.mark.parametrize("spread", [1e-6, 1e-3, 0.1, 0.3])
+def test_integer_powers_agree_with_principal_axes(spread: float) -> None:
+    """Exponents that are not exactly even take the other path."""
+    H = gradients("ogden", 200, spread)
+    D = np.random.default_rng(11).normal(size=H.shape)
+    powers, axes = (build_evaluator(of, "float64")(H, D) for of in (EVEN, ODD))
+    assert relative(powers.stress - axes.stress, axes.stress).max() < 1e-7
+    assert relative(powers.change - axes.change, axes.change).max() < 1e-7
+    single = build_evaluator(EVEN, "float32")(H.astype(np.float32).astype(np.float64), D)
+    assert relative(single.change - powers.change, powers.change).max() < 2e-5

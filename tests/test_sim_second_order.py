@@ -8,8 +8,9 @@ from sim.accuracy import REFERENCE
 from sim.effects import NodalForce, build_push_effects
 from sim.fem import Fem
 from sim.loads import Loads, Nodal
-from sim.material import MATERIALS, Material
+from sim.material import Material
 from sim.minimisers.second_order import compute_second_order
+from sim.named_tissues import MATERIALS
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from locators import in_a_skull
+from test_sim_conformance import YEOH
 
 from sim.anatomy import PART_LABELS
 from sim.effects import Elasticity
@@ -110,7 +111,7 @@ def test_known_regions_are_listed_and_checked(body):
         "region 3 (oedema) 0.5 times as stiff as the brain, Poisson's ratio 0.45"
     )
     with pytest.raises(InputError, match="--region"):
-        list_known_regions(Elasticity(BRAIN, {2: Ogden(((1340.0, -19.0),), 148000.0)}))
+        list_known_regions(Elasticity(BRAIN, {2: YEOH.Yeoh(500.0, 0.0, 1e4)}))
     with pytest.raises(InputError, match=r"no region 4 \(ventricles\)"):
         check_regions((Region(PART_LABELS["ventricles"], 0.5),), body)
     for bad in ((2, -1.0), (2, float("nan")), (2, 1.0, 0.6), ([2], 1.0), (2.5, 1.0)):

@@ -16,7 +16,8 @@ from sim.errors import InputError
 from sim.fem import Fem
 from sim.geometry.locate import locate
 from sim.loads import Loads, Posture, Pushed
-from sim.material import MATERIALS, Ogden
+from sim.material import Ogden
+from sim.named_tissues import MATERIALS
 from surrogate.data.tool_loads import draw as drawn_loads
 from surrogate.model.kept_arrays import get_cache_path, load_cached_arrays
 

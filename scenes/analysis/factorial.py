@@ -1,7 +1,7 @@
 """Full factorial study of the tumour's motion: skull, Poisson's ratio, craniotomy, depth and tumour stiffness."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
@@ -65,7 +65,7 @@ def solve_levels(levels: Levels = LEVELS, nodes: int = 5300, device: str = "auto
 
 
 def _build_body_variant(chosen: Mapping[str, str | float]) -> BodyVariant:
-    tissue = replace(BRAIN, poisson=float(chosen["nu"]))
+    tissue = BRAIN.replace_constants(poisson=float(chosen["nu"]))
     return BodyVariant(tissue, float(chosen["tumour's stiffness"]), str(chosen["skull"]))
 
 

@@ -13,9 +13,12 @@ from sim.effects import SKULLS, Elasticity, ToolDisplacement, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
 from sim.loads import MAGNITUDE, Displaced, Loads, Pushed, stack
-from sim.material import BRAIN, Material
+from sim.material import BRAIN, IsotropicTissue, Ogden, build_law
 from surrogate.data.cortex_patch import Patch, open_patch
 from surrogate.data.tool_loads import find_perpendiculars
+
+LAW_VARIANTS = "neo-hookean", Ogden.law
+"""Laws with the same E and nu at small strain; Ogden's exponent is that of measured brain."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class BodyVariant:
     tetrahedra near nu = 0.5 would look like an influence of nu.
     """
 
-    tissue: Material = BRAIN
+    tissue: IsotropicTissue = BRAIN
     tumour: float = 1.0
     skull: str = "bonded"
     element: str = "smoothed"
@@ -64,12 +67,19 @@ def list_variants(anatomy: Anatomy, body: BodyVariant, elements: Sequence[str] =
         Variant("its direction", "as drawn", "+-2 deg", body, LoadPerturbation(turn=np.radians(2.0))),
         Variant("its position", "as drawn", "+-1 mm", body, LoadPerturbation(shift=1e-3)),
         *(
-            Variant("E", text, f"{step:+.0%}", replace(body, tissue=replace(tissue, young=(1.0 + step) * tissue.young)))
+            Variant(
+                "E", text, f"{step:+.0%}", replace(body, tissue=tissue.replace_constants((1.0 + step) * tissue.young))
+            )
             for step in (-0.2, 0.2)
         ),
         *(
-            Variant("nu", poisson, f"{nu:g}", replace(body, tissue=replace(tissue, poisson=nu)))
+            Variant("nu", poisson, f"{nu:g}", replace(body, tissue=tissue.replace_constants(poisson=nu)))
             for nu in (0.45, 0.49, 0.495)
+        ),
+        *(
+            Variant("law", tissue.law, law, replace(body, tissue=build_law(law, tissue.young, tissue.poisson)))
+            for law in LAW_VARIANTS
+            if law != tissue.law
         ),
         *(
             Variant("tumour's stiffness", tumour, f"{ratio:g} x", replace(body, tumour=ratio))
@@ -156,7 +166,7 @@ class SensitivityStudy:
         """Build the FEM solver of a variant, for prescribed tool forces and motions."""
         tissue = body.tissue
         _, *others = build_push_effects(self.anatomy, tissue, body.skull)
-        elasticity = Elasticity(tissue, {TUMOUR_LABEL: replace(tissue, young=body.tumour * tissue.young)})
+        elasticity = Elasticity(tissue, {TUMOUR_LABEL: tissue.replace_constants(body.tumour * tissue.young)})
         effects = (elasticity, *others, ToolDisplacement())
         return Fem(self.anatomy, effects, self.accuracy, self.device, element=body.element)
 

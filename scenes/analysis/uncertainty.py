@@ -11,7 +11,7 @@ from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import Deformation
 from sim.effects import SKULLS, Effect, Elasticity, Gravity
 from sim.errors import InputError
-from sim.material import LAWS, Material
+from sim.material import LAWS, IsotropicTissue, Ogden
 from sim.skulls import Bonded, SkullContact, Slide
 
 from ..play.deformers import PatientSetup
@@ -98,10 +98,10 @@ def apply_sample(scene: Scene, sample: PatientSample) -> Scene:
     """
     tissue = get_tissue(scene)
 
-    def scale(material: Material, factor: float = 1.0) -> Material:
-        return replace(material, young=factor * sample.stiffness * material.young, poisson=sample.poisson)
+    def scale(one: IsotropicTissue, factor: float = 1.0) -> IsotropicTissue:
+        return one.replace_constants(factor * sample.stiffness * one.young, sample.poisson)
 
-    regions = {label: scale(one) for label, one in scene.elasticity.regions.items() if isinstance(one, Material)}
+    regions = {label: scale(one) for label, one in scene.elasticity.regions.items() if isinstance(one, IsotropicTissue)}
     elasticity = Elasticity(scale(tissue), {**regions, TUMOUR_LABEL: scale(get_tumour_tissue(scene), sample.ratio)})
     skull = SKULLS[choose_name(sample.skull, list_skulls(scene))]
 
@@ -143,7 +143,7 @@ def estimate_mesh_deviations(scene: Scene, samples: Sequence[PatientSample]) -> 
     return np.array([find_mesh_prior(scene, choose_name(draw.skull, skulls)).range[1] for draw in samples])
 
 
-def get_tissue(scene: Scene) -> Material:
+def get_tissue(scene: Scene) -> IsotropicTissue:
     """Return the brain's default tissue in a scene; regions may have other tissues.
 
     Raises
@@ -152,17 +152,17 @@ def get_tissue(scene: Scene) -> Material:
         The tissue of the scene or of a region has no Young's modulus and Poisson's ratio.
     """
     elasticity = scene.elasticity
-    strange = [one for one in elasticity.regions.values() if not isinstance(one, Material)]
-    if not isinstance(elasticity.default, Material) or strange:
+    strange = [one for one in elasticity.regions.values() if not isinstance(one, IsotropicTissue)]
+    if not isinstance(elasticity.default, IsotropicTissue) or strange:
         has = strange[0] if strange else elasticity.default or "none that all regions share"
         raise InputError(
             f"priors draw Young's modulus and Poisson's ratio, and the scene {scene.name} has another tissue: {has}. "
-            f"Give it one of the laws {', '.join(LAWS)}, by --material or in its file."
+            f"Give it one of the laws {', '.join((*LAWS, Ogden.law))}, by --material or in its file."
         )
     return elasticity.default
 
 
-def get_tumour_tissue(scene: Scene) -> Material:
+def get_tumour_tissue(scene: Scene) -> IsotropicTissue:
     """Return the tumour's tissue in a scene, or the brain's tissue if the tumour has no tissue of its own.
 
     Raises
@@ -171,7 +171,7 @@ def get_tumour_tissue(scene: Scene) -> Material:
         See `get_tissue`.
     """
     brain, tumour = get_tissue(scene), scene.elasticity.regions.get(TUMOUR_LABEL)
-    return tumour if isinstance(tumour, Material) else brain
+    return tumour if isinstance(tumour, IsotropicTissue) else brain
 
 
 def _shift_path(path: Path, tip: Sequence[float]) -> Path:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sim.effects import Elasticity, Gravity, Held, SkullContact
-from sim.material import MATERIALS
+from sim.named_tissues import MATERIALS
 
 from ..script.head_pose import build_drained_turn
 from ..script.scene import Scene

@@ -1,7 +1,7 @@
 """The fluid has partly drained; the tumour is debulked through a corridor, and what is left of it settles."""
 
 from sim.effects import Elasticity, Gravity, Held, SkullContact
-from sim.material import MATERIALS
+from sim.named_tissues import MATERIALS
 
 from ..script.debulking import Debulking
 from ..script.head_pose import build_drainage

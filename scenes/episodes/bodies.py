@@ -17,7 +17,7 @@ from sim.discretisation.space import recommend_element
 from sim.effects import SKULLS, Effect, Elasticity, Held, NodalForce, build_push_effects
 from sim.errors import InputError
 from sim.fem import Fem
-from sim.material import Material
+from sim.material import build_law
 from surrogate.data.dataset import read_dataset
 from surrogate.data.simulate import CREATION_KEYS, simulate
 from surrogate.data.solution_rows import describe_tissue_source
@@ -86,9 +86,9 @@ def get_tissue(values: Mapping[str, Any]) -> Elasticity:
     ratio = {name: values.get(_to_ratio_name(name), 1.0) for name in ("tumour", *PART_LABELS)}
     times = {**ratio, "necrosis": ratio["necrosis"] * ratio["tumour"]}
     regions = {
-        REGION_NAMES[name]: Material(law, times[name] * young, poisson) for name, one in ratio.items() if one != 1.0
+        REGION_NAMES[name]: build_law(law, times[name] * young, poisson) for name, one in ratio.items() if one != 1.0
     }
-    return Elasticity(Material(law, young, poisson), regions)
+    return Elasticity(build_law(law, young, poisson), regions)
 
 
 def _to_ratio_name(region: str) -> str:

@@ -15,7 +15,7 @@ from sim.bodies.intensity import to_intensity_path
 from sim.bodies.template import SITES
 from sim.effects import SKULLS
 from sim.errors import InputError
-from sim.material import LAWS
+from sim.material import BRAIN, LAWS, Ogden
 from sim.runtime.outside_files import wrap_errors
 from surrogate.training.train import LEARNERS, check_learner_names
 
@@ -84,7 +84,7 @@ class TumourPlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class TissuePlan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Distributions of tissue and skull model of a body; ratios are stiffnesses relative to the brain."""
 
-    law: Annotated[Word, LAWS] = "neo-hookean"
+    law: Annotated[Word, (*LAWS, Ogden.law)] = BRAIN.law
     young_pa: Annotated[Number, ValueLimits(100, 50_000, "Pa")] = 3000.0
     poisson: Annotated[Number, ValueLimits(0.3, 0.495)] = 0.49
     tumour_ratio: Annotated[Number, ValueLimits(0.1, 10)] = 1.0

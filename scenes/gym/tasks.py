@@ -6,7 +6,7 @@ import numpy as np
 
 from sim.effects import Bonded, Elasticity, Gravity, Held, SkullContact, ToolContact
 from sim.errors import InputError
-from sim.material import MATERIALS
+from sim.named_tissues import MATERIALS
 
 from ..script.debulking import Debulking
 from ..script.scene import Scene

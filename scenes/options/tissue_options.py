@@ -14,7 +14,8 @@ from sim.effects import SKULLS, Elasticity
 from sim.elements import ELEMENTS, RECOMMENDED
 from sim.errors import InputError
 from sim.geometry.tetmesh import TetMesh
-from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden, Tissue
+from sim.material import BRAIN, LAWS, IsotropicTissue, Ogden, Tissue, build_law
+from sim.named_tissues import MATERIALS
 
 if TYPE_CHECKING:
     from ..play.deformers import PatientSetup
@@ -80,7 +81,7 @@ def add_region_argument(parser: argparse.ArgumentParser, default: str = AS_BRAIN
     parser.add_argument(
         "--region", action="append", default=[], metavar="REGION:YOUNG[,POISSON]",
         help=f"Young's modulus [Pa] and, optionally, Poisson's ratio of a region, by number or name "
-        f"({', '.join(NON_BRAIN_REGIONS)}), such as oedema:2000 or 3:2000,0.45; for Ogden's law "
+        f"({', '.join(NON_BRAIN_REGIONS)}), such as oedema:2000 or 3:2000,0.45, or for Ogden's law its constants, "
         f"REGION:C1,M1;C2,M2;K; repeatable (default: {default}; necrosis as the tumour)",
     )  # fmt: skip
 
@@ -127,13 +128,12 @@ def parse_tissue(args: argparse.Namespace) -> Tissue:
     return replace(tissue, prony=tuple(series))
 
 
-def _parse_tissue(args: argparse.Namespace) -> Material | Ogden:
+def _parse_tissue(args: argparse.Namespace) -> IsotropicTissue:
     """Return the requested tissue without --prony; a named tissue keeps its own Prony series."""
-    preset = MATERIALS[args.material].tissue if args.material in MATERIALS else None
     ours = {"--ogden": args.ogden, "--bulk": args.bulk}
-    if args.material == Ogden.law or isinstance(preset, Ogden):
-        reject_option({"--young": args.young, "--poisson": args.poisson}, args.material, f"the laws {', '.join(LAWS)}")
     if args.material == Ogden.law:
+        given = {"--young": args.young, "--poisson": args.poisson}
+        reject_option(given, args.material, f"named tissues and the laws {', '.join(LAWS)}")
         missing = [name for name, value in ours.items() if value is None]
         if missing:
             raise InputError(f'--material ogden lacks {missing[0]}: give --ogden "C1,M1;C2,M2" and --bulk K [Pa].')
@@ -145,14 +145,9 @@ def _parse_tissue(args: argparse.Namespace) -> Material | Ogden:
             ) from error
         return Ogden(terms, args.bulk)
     reject_option(ours, args.material, "--material ogden")
-    if isinstance(preset, Ogden):
-        return preset
-    base = preset or BRAIN
-    return Material(
-        args.material if preset is None else base.law,
-        base.young if args.young is None else args.young,
-        base.poisson if args.poisson is None else args.poisson,
-    )
+    if args.material in MATERIALS:
+        return MATERIALS[args.material].tissue.replace_constants(args.young, args.poisson)
+    return build_law(args.material, BRAIN.young, BRAIN.poisson).replace_constants(args.young, args.poisson)
 
 
 def parse_elasticity(args: argparse.Namespace, mesh: TetMesh) -> Elasticity:
@@ -263,6 +258,8 @@ def parse_region_label(text: str) -> int:
 def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
     """Parse "REGION:YOUNG[,POISSON]", or "REGION:C1,M1;C2,M2;K" for Ogden's law; return label and tissue.
 
+    With Young's modulus, the region has the law and exponents of `tissue`.
+
     Raises
     ------
     InputError
@@ -271,18 +268,18 @@ def parse_region(text: str, tissue: Tissue) -> tuple[int, Tissue]:
     ogden = isinstance(tissue, Ogden)
     try:
         label, constants = text.split(":")
-        if ogden:
+        if ogden and ";" in constants:
             *terms, bulk = constants.split(";")
             return parse_region_label(label), Ogden(parse_terms(terms), float(bulk), tissue.prony)
-        if not isinstance(tissue, Material):
+        if not isinstance(tissue, IsotropicTissue):
             raise InputError(f"tissue of the law {tissue.law} has no Young's modulus.")
         young, *poisson = map(float, constants.split(","))
-        (ratio,) = poisson or (tissue.poisson,)
-        return parse_region_label(label), replace(tissue, young=young, poisson=ratio)
+        (ratio,) = poisson or (None,)
+        return parse_region_label(label), tissue.replace_constants(young, ratio)
     except InputError as error:
         raise InputError(f"--region {text}: {error}") from error
     except ValueError as error:
-        form = "REGION:C1,M1;C2,M2;K, as in 2:1340,-19;148000" if ogden else "REGION:YOUNG, as in oedema:2000"
+        form = "REGION:YOUNG, as in oedema:2000" + (", or 2:1340,-19;148000" if ogden else "")
         raise InputError(
             f"--region {text}: write {form}. REGION is a number, or one of {', '.join(NON_BRAIN_REGIONS)}."
         ) from error

@@ -10,7 +10,7 @@ from ar.page.elements import OPEN_DETAILS
 from sim.anatomy import name_region
 from sim.bodies.lobes import describe_location
 from sim.deformation import Deformation, Outcome
-from sim.material import Material, Tissue
+from sim.material import IsotropicTissue, Tissue
 
 from ..play.deformers import GUARDED, PatientSetup
 from ..play.observer import ELLIPSOID_COLOUR, TumourEstimate
@@ -119,7 +119,7 @@ def describe_tissue(tissue: Tissue | None) -> str:
     if tissue is None:
         return "a tissue for each region"
     relaxation = ", viscoelastic" if tissue.prony else ""
-    if not isinstance(tissue, Material):
+    if not isinstance(tissue, IsotropicTissue):
         return f"{tissue.law} tissue{relaxation}"
     return (
         f"{tissue.law} tissue of Young's modulus {1e-3 * tissue.young:g} kPa and Poisson's ratio {tissue.poisson:g}"

@@ -4,7 +4,7 @@ from collections.abc import Collection
 from dataclasses import replace
 
 from sim.effects import Elasticity
-from sim.material import Material, Ogden, Tissue
+from sim.material import IsotropicTissue, Tissue
 
 
 def find_trained_regions(
@@ -24,14 +24,18 @@ def find_trained_regions(
 
 def _scale_tissue(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
     """Scale a trained region's tissue to the scene's `brain`; return `brain` if the material laws cannot be scaled."""
-    if isinstance(region, Material | Ogden) and _remove_relaxation(brain) == _remove_relaxation(learned):
+    if isinstance(region, IsotropicTissue) and _remove_relaxation(brain) == _remove_relaxation(learned):
         return replace(region, prony=brain.prony)
-    if not isinstance(brain, Material) or not isinstance(region, Material) or not isinstance(learned, Material):
+    if not (
+        isinstance(brain, IsotropicTissue)
+        and isinstance(region, IsotropicTissue)
+        and isinstance(learned, IsotropicTissue)
+    ):
         return brain
     poisson = brain.poisson if region.poisson == learned.poisson else region.poisson
-    return replace(brain, young=brain.young * region.young / learned.young, poisson=poisson)
+    return brain.replace_constants(brain.young * region.young / learned.young, poisson)
 
 
 def _remove_relaxation(tissue: Tissue) -> Tissue:
     """Return a tissue without its relaxation (Prony terms)."""
-    return replace(tissue, prony=()) if isinstance(tissue, Material | Ogden) else tissue
+    return replace(tissue, prony=()) if isinstance(tissue, IsotropicTissue) else tissue

@@ -20,7 +20,7 @@ from sim.families.registry import build_family
 from sim.fem import Fem
 from sim.geometry.locate import locate
 from sim.loads import Loads, Pushed
-from sim.material import Material, Tissue
+from sim.material import IsotropicTissue, Material, Tissue
 
 from ..analysis.measurement import time_work
 from .adaptation import debulk_tumour
@@ -217,10 +217,10 @@ def change_law(tissue: Elasticity, law: str | None) -> Elasticity:
         return tissue
 
     def obeying(one: Tissue | None) -> Tissue:
-        if not isinstance(one, Material):
+        if not isinstance(one, IsotropicTissue):
             has = "a law for each region" if one is None else f"{one.law}, whose constants no other law has"
             raise InputError(f"the data's tissue obeys {has}: nothing to compare.")
-        return replace(one, law=law)
+        return one if one.law == law else Material(law, one.young, one.poisson, one.prony)
 
     return Elasticity(obeying(tissue.default), {label: obeying(one) for label, one in tissue.regions.items()})
 

@@ -14,7 +14,8 @@ from scipy.optimize import minimize_scalar
 from ar.screen import write_png
 from sim.diagnostics.homogeneous import compute_shear_stress, compute_uniaxial_stress
 from sim.errors import InputError
-from sim.material import BRAIN, LAWS, MATERIALS, Material, Ogden
+from sim.material import BRAIN, LAWS, Material, Ogden
+from sim.named_tissues import MATERIALS
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import wrap_errors
 

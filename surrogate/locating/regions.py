@@ -8,7 +8,7 @@ from numbers import Integral
 from sim.anatomy import TUMOUR_LABEL, Anatomy, describe_missing_region, describe_region
 from sim.effects import Elasticity
 from sim.errors import InputError
-from sim.material import Material, Tissue
+from sim.material import IsotropicTissue, Material, Tissue
 
 RATIO_TOLERANCE = 1e-6  # Relative tolerance for equal stiffness ratios.
 
@@ -65,13 +65,13 @@ def list_known_regions(elasticity: Elasticity) -> tuple[Region, ...]:
     brain = elasticity.default
     if not elasticity.regions:
         return ()
-    if not all(isinstance(tissue, Material) for tissue in (brain, *elasticity.regions.values())):
+    if not all(isinstance(tissue, IsotropicTissue) for tissue in (brain, *elasticity.regions.values())):
         raise InputError("a locator knows regions by their Young's modulus over the brain's: give them by --region.")
-    assert isinstance(brain, Material)
+    assert isinstance(brain, IsotropicTissue)
     return tuple(
         Region(label, tissue.young / brain.young, None if tissue.poisson == brain.poisson else tissue.poisson)
         for label, tissue in sorted(elasticity.regions.items())
-        if isinstance(tissue, Material)
+        if isinstance(tissue, IsotropicTissue)
     )
 
 
@@ -88,7 +88,7 @@ def find_differing_regions(elasticity: Elasticity, known_regions: tuple[Region, 
     Regions without an entry count as brain. The tumour is excluded, as its stiffness may be unknown. If a tissue has no
     Young's modulus, the result is empty.
     """
-    if not all(isinstance(tissue, Material) for tissue in (elasticity.default, *elasticity.regions.values())):
+    if not all(isinstance(tissue, IsotropicTissue) for tissue in (elasticity.default, *elasticity.regions.values())):
         return ()
     has, knows = ({one.label: one for one in some} for some in (list_known_regions(elasticity), known_regions))
     labels = {*has, *knows} - {TUMOUR_LABEL}

@@ -4,7 +4,8 @@
 
 Ogden 1972, Proc. R. Soc. Lond. A 326:565-584, in the uncoupled form of FEBio's theory manual. The functions use the
 eigenvalues e_k of Green's strain, lambda_k^2 = 1 + 2 e_k, and the logarithms y_k = ln l_k, whose sum is zero. There is
-no cancellation at small strain and no special case for equal stretches. Coefficients: (K, c_1, m_1, c_2, m_2, ...).
+no cancellation at small strain and no special case for equal stretches. Coefficients: (K, L, c_1, m_1, c_2, m_2, ...).
+Where a term m_i y_k exceeds |m_i| L, for a limit L, its exponential continues as a Taylor polynomial of second degree.
 """
 
 from typing import Any
@@ -13,6 +14,7 @@ import warp as wp
 
 from .invariants import exp_less_one, green_strain, log_one_plus, volume_change
 from .law import Law
+from .ogden_powers import compute_stress, compute_stress_change, has_even_exponents, is_within_limit
 from .spectral import compute_principal_axes
 
 
@@ -68,35 +70,48 @@ def sinh_ratio(z: Any):
 @wp.func
 def compute_kirchhoff_stresses(H: Any, y: Any, c: Any):
     """Return principal Kirchhoff stresses t_k [Pa] = a_k - mean a + K ln J, with a_k = sum_i c_i / m_i l_k^m_i."""
+    one, two = type(c[0])(1.0), type(c[0])(2.0)
     a = type(y)()
-    for i in range(len(c) // 2):
+    for i in range(len(c) // 2 - 1):
+        m = c[2 * i + 3]
         for k in range(3):
-            a[k] += c[2 * i + 1] / c[2 * i + 2] * exp_less_one(c[2 * i + 2] * y[k])
+            t = wp.min(m * y[k], wp.abs(m) * c[1])
+            over, growth = m * y[k] - t, exp_less_one(t)
+            a[k] += c[2 * i + 2] / m * (growth + (growth + one) * (over + over * over / two))
     level = c[0] * log_one_plus(volume_change(H)) - (a[0] + a[1] + a[2]) / type(c[0])(3.0)
     return a + wp.vector(level, level, level)
 
 
 @wp.func
 def energy(H: Any, c: Any):
-    """Return psi [Pa] = sum_i c_i / m_i^2 sum_k (exp(m_i y_k) - 1 - m_i y_k) + K/2 (ln J)^2; +inf where J <= 0."""
+    """Return psi [Pa] = sum_i c_i / m_i^2 sum_k (exp(m_i y_k) - 1 - m_i y_k) + K/2 (ln J)^2; +inf where J <= 0.
+
+    Beyond the limit the polynomial of `compute_kirchhoff_stresses` is integrated.
+    """
     j = volume_change(H)
-    if j <= -type(j)(1.0):
+    one, two = type(j)(1.0), type(j)(2.0)
+    if j <= -one:
         return type(j)(wp.inf)
     log_J = log_one_plus(j)
     e, N = compute_principal_axes(green_strain(H))
     x = compute_log_stretches(H, e, N)
     y = compute_isochoric_log_stretches(x)
-    psi = c[0] / type(j)(2.0) * log_J * log_J
-    for i in range(len(c) // 2):
-        m = c[2 * i + 2]
+    psi = c[0] / two * log_J * log_J
+    for i in range(len(c) // 2 - 1):
+        m = c[2 * i + 3]
         for k in range(3):
-            psi += c[2 * i + 1] / (m * m) * exp_excess(m * y[k])
+            t = wp.min(m * y[k], wp.abs(m) * c[1])
+            over, growth = m * y[k] - t, exp_less_one(t)
+            higher = (growth + one) * over * over * (one / two + over / (two + two + two))
+            psi += c[2 * i + 2] / (m * m) * (exp_excess(t) + growth * over + higher)
     return psi
 
 
 @wp.func
 def stress(H: Any, c: Any):
     """Return the stress P [Pa] = F S, with S = sum_k t_k / lambda_k^2 n_k (x) n_k."""
+    if has_even_exponents(c) and is_within_limit(H, c):
+        return compute_stress(H, c)
     e, N = compute_principal_axes(green_strain(H))
     x = compute_log_stretches(H, e, N)
     t = compute_kirchhoff_stresses(H, compute_isochoric_log_stretches(x), c)
@@ -110,6 +125,7 @@ def compute_divided_difference(k: int, l: int, e: Any, y: Any, c: Any):
 
     b_kl is the divided difference of a in `compute_kirchhoff_stresses` over the eigenvalues e, times the mean squared
     stretch. With tanh d = (e_k - e_l) / (1 + e_k + e_l), d = ln(lambda_k / lambda_l), equal stretches are accurate too.
+    Of the interval between y_k and y_l, the part within the limit has this mean slope, the other that of its middle.
     """
     one, two = type(c[0])(1.0), type(c[0])(2.0)
     tanh = wp.abs(e[k] - e[l]) / (one + e[k] + e[l])
@@ -117,9 +133,16 @@ def compute_divided_difference(k: int, l: int, e: Any, y: Any, c: Any):
     if tanh < one / two:
         d = log_one_plus(two * tanh / (one - tanh)) / two
     total = type(one)(0.0)
-    for i in range(len(c) // 2):
-        m = c[2 * i + 2]
-        total += c[2 * i + 1] * wp.exp(m * (y[k] + y[l]) / two) * sinh_ratio(m * d / two)
+    for i in range(len(c) // 2 - 1):
+        m = c[2 * i + 3]
+        p, q = wp.min(m * y[k], wp.abs(m) * c[1]), wp.min(m * y[l], wp.abs(m) * c[1])
+        start, end = m * y[k] - p, m * y[l] - q
+        slope = wp.exp(p) * (one + (start + end) / two)
+        if p != q:
+            slope = (p - q) * wp.exp((p + q) / two) * sinh_ratio((p - q) / two)
+            slope += start * wp.exp(p) * (one + start / two) - end * wp.exp(q) * (one + end / two)
+            slope = slope / (m * y[k] - m * y[l])
+        total += c[2 * i + 2] * slope
     if tanh > type(one)(0.0):
         total = total * d / tanh
     return total
@@ -132,6 +155,8 @@ def stress_change(H: Any, D: Any, c: Any):
     lambda_k^2 lambda_l^2 dS_kl = (b_kl - t_k - t_l) G_kl, and each lambda_k^2 dS_kk has in addition the sum over l of
     (K + tr b / 9 - (b_kk + b_ll) / 3) G_ll / lambda_l^2.
     """
+    if has_even_exponents(c) and is_within_limit(H, c):
+        return compute_stress_change(H, D, c)
     one, two, three = type(c[0])(1.0), type(c[0])(2.0), type(c[0])(3.0)
     e, N = compute_principal_axes(green_strain(H))
     x = compute_log_stretches(H, e, N)
