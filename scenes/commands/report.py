@@ -82,14 +82,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="compare tissue laws with measured stresses instead: CSV files of one tissue each (docs/notes/tissue.md)",
     )
+    parser.add_argument(
+        "--credibility",
+        type=Path,
+        metavar="DIR",
+        help="list claims, figures and tests in the order of ASME V&V 40 instead; DIR: benchmarks of a checkout",
+    )
     add_force(parser)
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure all rows and write the report; return 1 if a row could not be measured, else 0."""
-    if args.tissue:
-        return _compare_tissues(args)
+    if args.tissue or args.credibility:
+        return _compare_tissues(args) if args.tissue else _assess_credibility(args)
     try:
         sections = _measure_seed_sections(args) if args.seed_protocol else _measure_sections(args)
     except KeyboardInterrupt:
@@ -185,6 +191,23 @@ def _compare_tissues(args: argparse.Namespace) -> int:
         constants = f"mu {1e-3 * fit.mu:.3g} kPa" + ("" if fit.alpha is None else f", alpha {fit.alpha:.1f}")
         print(f"{fit.measured}: {fit.model + ':':<27} R2 of {agreement}; {constants}")
     print(f"written: {args.out / 'index.html'}")
+    return 0
+
+
+def _assess_credibility(args: argparse.Namespace) -> int:
+    """Write the credibility page, and print the number of claims and of those without support."""
+    from ..report.credibility import MISSING, read_credibility, write_credibility
+
+    rows = read_credibility(args.credibility)
+    check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / "credibility.json").is_file())
+    write_credibility(args.out, rows)
+    missing = sum(row.result == MISSING for row in rows)
+    page = str(args.out / "index.html")
+    print(
+        json.dumps({"page": page, "claims": len(rows), "missing": missing})
+        if args.json
+        else f"{len(rows)} claims, {missing} {MISSING}\nwritten: {page}"
+    )
     return 0
 
 

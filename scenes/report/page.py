@@ -24,6 +24,8 @@ table { border-collapse: collapse; font-size: 13px; margin: 1em 0; }
 th, td { padding: 3px 8px; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top; white-space: nowrap; }
 th { background: #f4f4f4; } th:first-child, td:first-child { text-align: left; }
 tr.front td:first-child { font-weight: bold; }
+tr.text td { width: 25%; text-align: left; white-space: normal; } table:has(tr.text) th { text-align: left; }
+tr.missing td { background: #fff0d8; }
 .wide { overflow-x: auto; }
 figure.chart { width: 880px; max-width: 100%; margin: 0 0 12px; } figure.chart svg { width: 100%; height: auto; }
 """

@@ -1,0 +1,63 @@
+"""Credibility page: claims with figures from records."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from scenes.cli import main
+from scenes.report.credibility import MISSING, STEPS, read_credibility
+from sim.errors import InputError
+
+HOUSE = Path(__file__).parent.parent
+OWN = HOUSE / "benchmarks"
+
+
+def write_claims(folder: Path, result: str = "# % of #", figures: str = '["one > a > x", "one > a > y"]') -> Path:
+    (folder / "records").mkdir()
+    record = {"command": "run", "machine": "here", "date": "2026-01-01", "figures": {"a": {"x": 3.5, "y": "4"}}}
+    (folder / "records" / "one.json").write_text(json.dumps(record))
+    claims = [f'[[claim]]\nstep = "{step}"\nclaim = "it <holds>"\n' for step in STEPS]
+    claims[3] += f'result = "{result}"\nfigures = {figures}\ntests = ["tests/test_it.py"]\n'
+    (folder / "credibility.toml").write_text("\n".join(claims))
+    return folder
+
+
+def test_figures_of_records_fill_the_result_of_a_claim(tmp_path, capsys):
+    rows = read_credibility(write_claims(tmp_path))
+    assert [row.step for row in rows] == list(STEPS)
+    assert rows[3].result == "3.5 % of 4" and rows[3].sources == "tests/test_it.py; run (here, 2026-01-01)"
+    assert rows[0].result == MISSING
+    assert main(["report", "--credibility", str(tmp_path), "--out", str(tmp_path / "out"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["missing"] == len(STEPS) - 1
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert page.count("<h2>") == len(STEPS) + 1 and "it &lt;holds&gt;" in page
+
+
+def test_claims_of_the_project_name_existing_tests_and_figures():
+    rows = read_credibility(OWN)
+    named = {part for row in rows for part in row.sources.split("; ") if part.startswith("tests/")}
+    assert named and all((HOUSE / name).is_file() for name in named)
+    assert any(row.result == MISSING for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("result", "figures", "words"),
+    [
+        ("#", "[]", "another number of #"),
+        ("#", '["two > a > x"]', "'two > a > x' is not a figure"),
+        ("#", '["one > b > x"]', "'one > b > x' is not a figure"),
+        ("#", '["one"]', "'one' is not a figure"),
+    ],
+)
+def test_claim_without_its_figure_is_rejected(tmp_path, result, figures, words):
+    with pytest.raises(InputError, match=words):
+        read_credibility(write_claims(tmp_path, result, figures))
+
+
+def test_step_without_claim_is_rejected(tmp_path):
+    folder = write_claims(tmp_path)
+    text = (folder / "credibility.toml").read_text()
+    (folder / "credibility.toml").write_text(text.replace("validation", "verification"))
+    with pytest.raises(InputError, match="no claim for validation"):
+        read_credibility(folder)
