@@ -71,7 +71,7 @@ OF_LAW = {
     "corotational": cost("laws.corotational"),
     "neo-hookean": cost("laws.neo_hookean"),
     "stable-neo-hookean": cost("laws.stable_neo_hookean"),
-    "ogden": cost("laws.ogden laws.spectral"),
+    "ogden": cost("laws.ogden laws.ogden_powers laws.spectral"),
     "prony": cost(
         "laws.isochoric_split laws.neo_hookean viscoelastic",
         "element_kernels:compute_gradients element_kernels:copy_coefficients viscoelastic:update_history "

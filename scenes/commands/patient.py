@@ -18,7 +18,7 @@ from sim.bodies.sample_head import build_sample_head
 from sim.bodies.subject import MeshPlan, choose_diameter, find_exposed_cortex
 from sim.elements import RECOMMENDED
 from sim.errors import InputError
-from sim.material import BRAIN, LAWS, Ogden, Tissue, build_law
+from sim.material import BRAIN, LAWS, Tissue, build_law
 from sim.runtime.atomic_files import write_atomically
 from sim.runtime.journal import open_journal
 from sim.runtime.partial_files import to_unfinished_path
@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--tool-preset", choices=PRESETS, default="palpation",
         help="tool preset; mixed: all tools; seed: the published protocol; brutal: far beyond surgical loads"
     )  # fmt: skip
-    parser.add_argument("--material", choices=(*LAWS, Ogden.law), default=BRAIN.law, help="tissue law")
+    parser.add_argument("--material", choices=LAWS, default=BRAIN.law, help="tissue law")
     add_region_argument(parser)
     add_element_argument(parser)
     parser.add_argument(
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
     steps = [
         ["anatomy", *to_label_args(args), *t1, *to_craniotomy_args(args), "--out", str(args.out)],
         ["simulate", str(args.out), "--out", str(data), "--count", str(args.count), "--tool-preset", args.tool_preset,
-         "--device", args.device, *([] if args.material == BRAIN.law else ["--material", args.material]),
+         "--device", args.device, "--material", args.material,
          *([] if args.element is None else ["--element", args.element]),
          *(f"--region={text}" for text in args.region)],
         ["train", str(data), "--out", str(model), "--learners", args.learners, "--device", args.device],
