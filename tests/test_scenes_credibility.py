@@ -55,6 +55,14 @@ def test_claim_without_its_figure_is_rejected(tmp_path, result, figures, words):
         read_credibility(write_claims(tmp_path, result, figures))
 
 
+def test_options_of_loads_are_rejected(tmp_path, capsys):
+    folder = str(write_claims(tmp_path))
+    for words in (["--quick"], ["--tissue", folder]):
+        assert main(["report", "--credibility", folder, "--out", str(tmp_path / "out"), *words]) == 2
+        assert "solves no loads" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_step_without_claim_is_rejected(tmp_path):
     folder = write_claims(tmp_path)
     text = (folder / "credibility.toml").read_text()

@@ -94,8 +94,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure all rows and write the report; return 1 if a row could not be measured, else 0."""
-    if args.tissue or args.credibility:
-        return _compare_tissues(args) if args.tissue else _assess_credibility(args)
+    if args.tissue:
+        return _compare_tissues(args)
+    if args.credibility:
+        return _assess_credibility(args)
     try:
         sections = _measure_seed_sections(args) if args.seed_protocol else _measure_sections(args)
     except KeyboardInterrupt:
@@ -178,10 +180,8 @@ def _compare_tissues(args: argparse.Namespace) -> int:
     """Write the comparison with measured tissue, and print R2 of each law in each test."""
     from ..report.tissue import read_measured_tissues, write_tissue_report
 
-    if args.data or args.anatomy or args.seed_protocol or args.scheduler or args.quick or args.full or args.loads:
-        raise InputError("--tissue solves no loads: give only --out, --force and --json with it.")
+    _check_options_without_loads(args, "--tissue", "tissue.json")
     measured = read_measured_tissues(args.tissue)
-    check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / "tissue.json").is_file())
     fits = write_tissue_report(args.out, measured)
     if args.json:
         print(json.dumps({"page": str(args.out / "index.html"), "fits": [asdict(fit) for fit in fits]}))
@@ -198,17 +198,23 @@ def _assess_credibility(args: argparse.Namespace) -> int:
     """Write the credibility page, and print the number of claims and of those without support."""
     from ..report.credibility import MISSING, read_credibility, write_credibility
 
+    _check_options_without_loads(args, "--credibility", "credibility.json")
     rows = read_credibility(args.credibility)
-    check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / "credibility.json").is_file())
     write_credibility(args.out, rows)
-    missing = sum(row.result == MISSING for row in rows)
-    page = str(args.out / "index.html")
-    print(
-        json.dumps({"page": page, "claims": len(rows), "missing": missing})
-        if args.json
-        else f"{len(rows)} claims, {missing} {MISSING}\nwritten: {page}"
-    )
+    missing, page = sum(row.result == MISSING for row in rows), str(args.out / "index.html")
+    if args.json:
+        print(json.dumps({"page": page, "claims": len(rows), "missing": missing}))
+    else:
+        print(f"{len(rows)} claims, {missing} {MISSING}\nwritten: {page}")
     return 0
+
+
+def _check_options_without_loads(args: argparse.Namespace, option: str, result: str) -> None:
+    """Reject options that have no use with `option`, and an output folder without its file `result`."""
+    others = args.data, args.anatomy, args.seed_protocol, args.scheduler, args.quick, args.full, args.loads
+    if any(others) or (args.tissue and args.credibility):
+        raise InputError(f"{option} solves no loads: give only --out, --force and --json with it.")
+    check_output_path(args.out / "index.html", ".html", args.force, resumed=(args.out / result).is_file())
 
 
 def _check_options(args: argparse.Namespace) -> str:

@@ -62,6 +62,12 @@ def green_strain(H: Any):
 
 
 @wp.func
+def scale_excess(X: Any, k: Any):
+    """Return (1 + k) (I + X) - I, without cancellation for small X and k."""
+    return X + k * (wp.identity(n=3, dtype=type(k)) + X)
+
+
+@wp.func
 def exp_less_one(t: Any):
     """Return exp(t) - 1 = 2 sinh(t/2) exp(t/2), but directly for t < -1, where sinh would overflow."""
     if t < type(t)(-1.0):

@@ -7,7 +7,15 @@ from typing import Any
 import warp as wp
 
 from ...runtime.device import Device
-from .invariants import cofactor_change, cofactor_excess, exp_less_one, green_strain, log_one_plus, volume_change
+from .invariants import (
+    cofactor_change,
+    cofactor_excess,
+    exp_less_one,
+    green_strain,
+    log_one_plus,
+    scale_excess,
+    volume_change,
+)
 from .law import Law
 
 
@@ -15,7 +23,7 @@ from .law import Law
 def compute_isochoric(H: Any):
     """Return the isochoric part Fb - I = J^(-1/3) (I + H) - I, accurate at small strain."""
     k = exp_less_one(-log_one_plus(volume_change(H)) / type(H[0, 0])(3.0))
-    return H + k * (wp.identity(n=3, dtype=type(k)) + H)
+    return scale_excess(H, k)
 
 
 @wp.func

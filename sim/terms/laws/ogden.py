@@ -14,7 +14,7 @@ import warp as wp
 
 from .invariants import exp_less_one, green_strain, log_one_plus, volume_change
 from .law import Law
-from .ogden_powers import compute_stress, compute_stress_change, has_even_exponents, is_within_limit
+from .ogden_powers import change_power_stress, compute_power_stress, is_power_sum
 from .spectral import compute_principal_axes
 
 
@@ -110,8 +110,8 @@ def energy(H: Any, c: Any):
 @wp.func
 def stress(H: Any, c: Any):
     """Return the stress P [Pa] = F S, with S = sum_k t_k / lambda_k^2 n_k (x) n_k."""
-    if has_even_exponents(c) and is_within_limit(H, c):
-        return compute_stress(H, c)
+    if is_power_sum(H, c):
+        return compute_power_stress(H, c)
     e, N = compute_principal_axes(green_strain(H))
     x = compute_log_stretches(H, e, N)
     t = compute_kirchhoff_stresses(H, compute_isochoric_log_stretches(x), c)
@@ -155,8 +155,8 @@ def stress_change(H: Any, D: Any, c: Any):
     lambda_k^2 lambda_l^2 dS_kl = (b_kl - t_k - t_l) G_kl, and each lambda_k^2 dS_kk has in addition the sum over l of
     (K + tr b / 9 - (b_kk + b_ll) / 3) G_ll / lambda_l^2.
     """
-    if has_even_exponents(c) and is_within_limit(H, c):
-        return compute_stress_change(H, D, c)
+    if is_power_sum(H, c):
+        return change_power_stress(H, D, c)
     one, two, three = type(c[0])(1.0), type(c[0])(2.0), type(c[0])(3.0)
     e, N = compute_principal_axes(green_strain(H))
     x = compute_log_stretches(H, e, N)
