@@ -41,7 +41,8 @@ from .strategy.bone import solve_free_of_bone
 from .strategy.extrapolation import as_pushes, compute_directions, extrapolate_start
 from .strategy.frame_sequence import FrameSequence, build_frame_sequence
 from .strategy.plan import SolverPlan, SolverStep, build_local_solvers, choose_plan
-from .strategy.strategy import SolverResult, Strategy
+from .strategy.solver_result import SolverResult
+from .strategy.strategy import Strategy
 from .strategy.time_steps import MAX_PRECONDITIONERS, NoMotionStep, group_time_steps
 
 # Key in the memory: displacements (B, E, 3) [m] of mid-edge nodes relative to the centres of their edges.

@@ -62,8 +62,9 @@ def test_clamped_elimination_skips_small_strain() -> None:
 
 
 @pytest.mark.parametrize("law", EVERY_LAW)
-def test_assembled_curvature_agrees_with_curvature_product(law: str) -> None:
-    fem = Fem(BODY, (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(1e-8), "cpu", element="p2")
+@pytest.mark.parametrize("element", ["p2", "smoothed"])
+def test_assembled_curvature_agrees_with_curvature_product(law: str, element: str) -> None:
+    fem = Fem(BODY, (Elasticity(tissue(law)), Held(), ToolForce()), Accuracy(1e-8), "cpu", element=element)
     problem, random = fem.problem, np.random.default_rng(0)
     u, p = (problem.device.upload(scale * random.normal(size=(problem.rows, 1))) for scale in (3e-4, 1.0))
     problem.linearise(u, np.zeros(1, bool))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +15,9 @@ from ..geometry.tetmesh import QUADRATIC_EDGES, TetMesh
 # for small strain, elements under a tool fold at their corners, where there is no point.
 EIGHT_POINTS = np.vstack([np.eye(4), (np.ones((4, 4)) - np.eye(4)) / 3.0])
 EIGHT_WEIGHTS = np.repeat([1.0 / 40.0, 9.0 / 40.0], 4)  # fractions of the volume
+
+Factors = Callable[[np.ndarray, np.ndarray, np.ndarray], Iterator[tuple[np.ndarray, ...]]]
+"""Function that returns pairs of factors, for `_assemble_products`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,14 +114,42 @@ def compute_quadratic_gradients(barycentric: np.ndarray) -> np.ndarray:
     return slope[:, :, 1:] - slope[:, :, :1]
 
 
-def assemble_hooke_stiffness(
-    elements: Elements, mu: np.ndarray, lam: np.ndarray, block_size: int = 8_000_000
-) -> sp.csc_array:
+def assemble_hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray) -> sp.csc_array:
     """Assemble the undeformed stiffness (3N, 3N) [N/m] of isotropic elements with Lamé parameters mu, lam (T,) [Pa].
 
     K = integral of 2 mu E^T E + lambda D^T D, with the operators E of strain and D of volume change: Hughes 2000, "The
-    Finite Element Method", section 2.8. K is computed by sparse matrix products, since elements may have any number
-    of nodes; blocks of at most `block_size` numbers limit the memory.
+    Finite Element Method", section 2.8.
+    """
+
+    def build_factors(part: np.ndarray, point: np.ndarray, slope: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
+        for modulus, of in ((2.0 * mu[part], _build_strain), (lam[part], _build_divergence)):
+            if modulus.any():
+                blocks, weight = of(slope), (modulus[:, None] * elements.weight[part]).ravel()
+                yield blocks, weight[point][:, None, None] * blocks
+
+    return _assemble_products(elements, build_factors)
+
+
+def assemble_tangent_stiffness(elements: Elements, tangent: np.ndarray) -> sp.csc_array:
+    """Assemble the stiffness (3N, 3N) [N/m] from dP/dH (T, q, 9, 9) [Pa]; row and column 3 i + j belong to H_ij.
+
+    K = integral of G^T (dP/dH) G, with the operator G of the displacement gradient H: Bonet, Wood 2008, "Nonlinear
+    Continuum Mechanics for Finite Element Analysis", section 9.4.
+    """
+
+    def build_factors(part: np.ndarray, point: np.ndarray, slope: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
+        own = (elements.weight[part][..., None, None] * tangent[part]).reshape(-1, 9, 3, 3)
+        blocks = np.einsum("ik,mj->mijk", np.eye(3), slope).reshape(-1, 9, 3)
+        yield blocks, np.einsum("mkij,mj->mki", own[point], slope)
+
+    return _assemble_products(elements, build_factors)
+
+
+def _assemble_products(elements: Elements, build_factors: Factors, block_size: int = 8_000_000) -> sp.csc_array:
+    """Return the symmetric sum (3N, 3N) of A^T B over points, for blocks (M, r, 3) of A and B from `build_factors`.
+
+    Its arguments are elements (T,), and for each of M shape functions the index of its point and its gradient (M, 3).
+    Sparse products serve, since elements may have any number of nodes; `block_size` numbers at once limit the memory.
     """
     total = sp.csr_array((3 * elements.node_count,) * 2)
     count, points, most = elements.gradient.shape[:3]
@@ -127,13 +159,10 @@ def assemble_hooke_stiffness(
         used = np.arange(most) < size[:, None]
         column, start = table[used], np.append(0, np.cumsum(size))
         slope = elements.gradient[part].reshape(-1, most, 3)[used]
-        for modulus, of in ((2.0 * mu[part], _build_strain), (lam[part], _build_divergence)):
-            if modulus.any():
-                blocks, weight = of(slope), (modulus[:, None] * elements.weight[part]).ravel()
-                shape = blocks.shape[1] * len(table), 3 * elements.node_count
-                scaled = np.repeat(weight, size)[:, None, None] * blocks
-                left, right = (sp.bsr_array((each, column, start), shape) for each in (blocks, scaled))
-                total += (left.T @ right).tocsr()
+        for factors in build_factors(part, np.repeat(np.arange(len(table)), size), slope):
+            shape = factors[0].shape[1] * len(table), 3 * elements.node_count
+            left, right = (sp.bsr_array((each, column, start), shape) for each in factors)
+            total += (left.T @ right).tocsr()
     return sp.csc_array(total.T)  # symmetric
 
 

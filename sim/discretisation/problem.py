@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
 
@@ -15,7 +15,7 @@ from ..runtime.columns import combine_columns, compute_norms
 from ..runtime.device import Device
 from ..runtime.views import get_library, run_in_order, to_host, to_view
 from .constraint import Constraint
-from .term import Barrier, Cases, StepTerm, StrainTerm, Term
+from .term import AssembledTerm, Barrier, Cases, StepTerm, StrainTerm, Term
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +166,18 @@ class Problem:
         if time_step < math.inf:
             offered += [term.compute_step_stiffness(time_step) for term in self.terms if isinstance(term, StepTerm)]
         return reduce(lambda a, b: a + b, offered, sp.csc_array((self.rows, self.rows)))
+
+    def assemble_stiffness(self, u: wp.array) -> sp.csc_array:
+        """Return the tangent stiffness (3N, 3N) [N/m] at u (3N, 1) [m], without barriers.
+
+        Terms without an assembled tangent are included with their undeformed stiffness.
+        """
+        terms = [term for term in self.terms if isinstance(term, AssembledTerm)]
+        others = replace(self, terms=tuple(term for term in self.terms if not isinstance(term, AssembledTerm)))
+        definite = wp.zeros(1, dtype=wp.int32, device=self.device.name)
+        for term in terms:
+            term.linearise(u, definite)
+        return reduce(lambda a, b: a + b, [term.assemble_stiffness() for term in terms], others.rest_curvature())
 
     def longest_step(self, u: wp.array, du: wp.array) -> np.ndarray:
         """Return the largest fraction (b,), at most 1, of du (3N, b) that stays inside the domain of all terms."""

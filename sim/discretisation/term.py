@@ -328,6 +328,7 @@ class LocalBarrier(Barrier, Protocol):
         ...
 
 
+@runtime_checkable
 class AssembledTerm(Term, Protocol):
     """Interface of terms that provide their tangent stiffness as a matrix."""
 

@@ -11,11 +11,19 @@ import warp as wp
 from ..runtime.blocks import get_block_shape, wait
 from ..runtime.device import Device
 
+# C++ code of y_ij += factor x_kj for columns j from `first` to `stop`: unlike Warp's indices, pointers allow SIMD.
+ROW_CODE = """
+    double* to = wp::address(y, c, i, 0);
+    const double* from = wp::address(x, c, k, 0);
+    for (int j = first; j < stop; j += STEP) to[j] += factor * from[j];
+"""
+
 
 @dataclass(frozen=True)
 class BlockFactorFunctions:
     """Warp functions for matrices (b, n, n) and vectors (b, n); only the first `size` rows and columns are used."""
 
+    add_row: wp.Function
     factor: wp.Function
     solve: wp.Function
 
@@ -25,6 +33,20 @@ def build_functions(device: Device) -> BlockFactorFunctions:
     """Return the functions for thread blocks of a device."""
     down, across = get_block_shape(device)
     threads = down * across
+
+    @wp.func_native(ROW_CODE.replace("STEP", str(across)))
+    def add_row(
+        factor: wp.float64,
+        x: wp.array3d(dtype=wp.float64),
+        k: int,
+        first: int,
+        stop: int,
+        c: int,
+        y: wp.array3d(dtype=wp.float64),
+        i: int,
+    ):
+        """Add `factor` times row k of x to row i of y, in this thread's columns from `first` to `stop`."""
+        ...
 
     @wp.func
     def factor(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int) -> bool:
@@ -40,8 +62,7 @@ def build_functions(device: Device) -> BlockFactorFunctions:
             inverse = wp.float64(1.0) / pivot
             for i in range(k + 1 + i0, size, down):
                 share = a[c, k, i] * inverse
-                for j in range(i + j0, size, across):
-                    a[c, i, j] = a[c, i, j] - share * a[c, k, j]
+                add_row(-share, a, k, i + j0, size, c, a, i)
             wait()
         for i in range(i0, size, down):
             root = wp.sqrt(a[c, i, i])
@@ -75,4 +96,4 @@ def build_functions(device: Device) -> BlockFactorFunctions:
                 x[c, k] = y
         wait()
 
-    return BlockFactorFunctions(factor, solve)
+    return BlockFactorFunctions(add_row, factor, solve)

@@ -35,7 +35,7 @@ from .contact_forces import FORCES, NONCONVEX, ContactCompliance, ForceLimits, a
 from .contact_limits import CONTACT_LIMITS, ContactLimits
 from .contact_steps import PREDICTED_DECREASE, STATUS, ContactSteps, read_step_result
 from .contact_structs import SOLVED, TOO_MANY_TOUCHED, Scratch
-from .strained_part import STRAIN_LIMITS, StrainedPart, StrainLimits
+from .strained_part import StrainedPart, StrainLimits
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class ContactDescent:
     limits
         Limits of the iterations.
     strains
-        Limits of the models of strained tissue.
+        Limits of the models of strained tissue; None: no models, but L-BFGS pairs.
     uses_graphs
         True if steps of single load cases are captured as CUDA graphs.
     """
@@ -60,14 +60,14 @@ class ContactDescent:
     preconditioner: Preconditioner
     barrier: LocalBarrier
     limits: ContactLimits = CONTACT_LIMITS
-    strains: StrainLimits = STRAIN_LIMITS
+    strains: StrainLimits | None = None
     uses_graphs: bool = False
 
     @cached_property
     def compliance(self) -> Compliance:
         """Compliance at the touchable nodes, followed by other nodes that a model of strained tissue may include."""
-        exact, own = is_exact(self.preconditioner), self.barrier.touchable_nodes
-        nodes = self.barrier.select_nodes(self.strains.max_candidates) if exact else own
+        exact, own, strains = is_exact(self.preconditioner), self.barrier.touchable_nodes, self.strains
+        nodes = self.barrier.select_nodes(strains.max_candidates) if exact and strains is not None else own
         compliance = Compliance(self.problem, self.preconditioner, nodes)
         if exact and self.problem.device.on_cuda:  # all columns take as long as one
             compliance.ensure_columns(np.arange(len(nodes)) < len(own))
@@ -76,7 +76,7 @@ class ContactDescent:
     @cached_property
     def _strained(self) -> StrainedPart | None:
         """Builder of models of strained tissue; None with multigrid, where the compliance takes too long."""
-        if not is_exact(self.preconditioner):
+        if not is_exact(self.preconditioner) or self.strains is None:
             return None
         return StrainedPart(self.problem, self.compliance, len(self.barrier.touchable_nodes), self.strains)
 
@@ -140,7 +140,7 @@ class ContactDescent:
         force, none = self._compute_balancing_forces(now), np.zeros(count)
         rest = self._compute_response(now.smooth_gradient, force)
         model = None
-        if self._strained is not None and count <= self.strains.max_cases:
+        if self._strained is not None and self.strains is not None and count <= self.strains.max_cases:
             model = self._strained.build_model(start, np.arange(count))
         pairs = BatchHistory(self.problem.device, self.problem.rows, count if model is None else 0)
         slow, steps, failed = np.zeros((3, count), int)

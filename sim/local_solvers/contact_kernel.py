@@ -26,7 +26,7 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
     overshoot, least, middle, most = (
         wp.constant(wp.float64(x)) for x in (OVERSHOOT, MIN_BACKTRACK, DEFAULT_BACKTRACK, MAX_BACKTRACK)
     )
-    factor, solve = dense.factor, dense.solve
+    factor, solve, add_row = dense.factor, dense.solve, dense.add_row
     add_force, add_matrix, bound_step = barrier.add_force, barrier.add_matrix, barrier.bound_step
 
     @wp.func
@@ -219,30 +219,28 @@ def build_kernel(device: Device, barrier: BlockFunctions) -> wp.Kernel:
         """
         size = 3 * m
         for i in range(me // across, size, down):
-            for first in range(me % across, size, wide * across):
-                sums = Strip()
-                for p in range(first, size):
-                    share = s.stiff[c, i, p]
-                    if share != wp.float64(0.0):  # most nodes share no triangle
-                        for q in range(wide):
-                            j = first + q * across
-                            if j <= p:
-                                sums[q] += share * s.soft[c, p, j]
-                for q in range(wide):
-                    if first + q * across < size:
-                        s.both[c, i, first + q * across] = sums[q]
+            for j in range(me % across, size, across):
+                s.both[c, i, j] = wp.float64(0.0)
+                s.system[c, i, j] = wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
+            for p in range(size):
+                share = s.stiff[c, i, p]
+                if share != wp.float64(0.0):  # most nodes share no triangle
+                    add_row(share, s.soft, p, me % across, p + 1, c, s.both, i)
         wait()
         for i in range(me // across, size, down):
-            for first in range(i + me % across, size, wide * across):
-                sums = Strip()
+            if threads == 1:
                 for p in range(i, size):
-                    share = s.soft[c, p, i]
+                    add_row(s.soft[c, p, i], s.both, p, i, size, c, s.system, i)
+            else:  # registers are faster than memory on a GPU
+                for first in range(i + me % across, size, wide * across):
+                    sums = Strip()
+                    for p in range(i, size):
+                        share = s.soft[c, p, i]
+                        for q in range(wide):
+                            sums[q] += share * s.both[c, p, wp.min(first + q * across, size - 1)]
                     for q in range(wide):
-                        sums[q] += share * s.both[c, p, wp.min(first + q * across, size - 1)]
-                for q in range(wide):
-                    j = first + q * across
-                    if j < size:
-                        s.system[c, i, j] = sums[q] + wp.where(i == j, wp.float64(1.0), wp.float64(0.0))
+                        if first + q * across < size:
+                            s.system[c, i, first + q * across] += sums[q]
         for i in range(me, size, threads):
             own = wp.float64(0.0)
             for p in range(size):  # L' D a = (D L)' a

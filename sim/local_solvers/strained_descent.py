@@ -26,7 +26,7 @@ from ..runtime.threads import limit_to_one_thread
 from .batch_elimination import list_open_vertices
 from .strained_part import StrainedPart, StrainLimits
 
-SINGLE_LIMITS = StrainLimits(max_nodes=320, max_omitted=np.inf)
+SINGLE_LIMITS = StrainLimits(min_strain=0.15, max_nodes=320, max_omitted=np.inf, max_candidates=800)
 """Limits for a single model, which may use all memory and be incomplete: L-BFGS corrects the remainder."""
 
 

@@ -54,17 +54,15 @@ class StrainLimits:
         Maximum memory of the matrices inverted together [bytes].
     """
 
-    min_strain: float = 0.15
-    max_nodes: int = 160
-    max_omitted: float = 0.3
-    max_candidates: int = 800
+    min_strain: float = 0.1
+    max_nodes: int = 480
+    max_omitted: float = 0.5
+    max_candidates: int = 1600
     max_cases: int = 8
     max_bytes: int = 2**31
 
 
 STRAIN_LIMITS = StrainLimits()  # Default.
-CUDA_STRAIN_LIMITS = StrainLimits(min_strain=0.1, max_nodes=480, max_omitted=0.5, max_candidates=1600)
-"""Limits on a GPU, where a larger model saves more time than its inversion takes."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,8 @@ import numpy as np
 
 from ..deformation import Outcome
 from ..discretisation.term import Cases
-from .strategy import SolverResult, Strategy
+from .solver_result import SolverResult
+from .strategy import Strategy
 from .time_steps import NoMotionStep
 
 

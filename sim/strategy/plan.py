@@ -175,7 +175,8 @@ def choose_plan(
         max_evaluations=most,
         max_outer=accuracy.outer,
         max_load_steps=accuracy.steps,
-        batch=1 if single is SolverStep.CLAMPED else batch,  # each load has its own local subproblem
+        # Each load has its own local subproblem, or its own factor of the tangent stiffness.
+        batch=1 if single is SolverStep.CLAMPED or (contact is SolverStep.CONTACT and exact and not cuda) else batch,
     )
 
 

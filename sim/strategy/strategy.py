@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 
@@ -15,55 +15,25 @@ from ..deformation import Outcome
 from ..discretisation.inverted_elements import InversionCounter
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases, LocalBarrier
+from ..linalg.multifrontal import SparseFactor
 from ..linalg.pcg import Preconditioner
 from ..local_solvers.batch_elimination import BatchElimination
 from ..local_solvers.contact_descent import ContactDescent
 from ..local_solvers.contact_preconditioner import build_contact_preconditioner
-from ..local_solvers.strained_part import CUDA_STRAIN_LIMITS
+from ..local_solvers.strained_part import STRAIN_LIMITS
+from ..local_solvers.tangent_contact import TangentContact
 from ..minimisers.lbfgs import Lbfgs, restore_history
 from ..minimisers.lbfgs_kernels import DONE, NOT_FINITE
 from ..minimisers.newton import find_equilibrium
 from ..minimisers.newton_cg import NewtonCG
 from ..minimisers.residual import measure_residual
 from ..runtime.columns import gather_columns, scatter_columns
-from ..runtime.device import Device
 from ..runtime.views import run_in_order, to_host, to_view
 from .plan import Alone, SolverPlan, SolverStep
+from .solver_result import SolverResult
 from .stepping import GAP_CONTINUATION, LOAD_STEPPING, GapContinuation, LoadProgress, LoadStepping
 
 EMPTY_HISTORY: Mapping[str, np.ndarray] = MappingProxyType({})  # Empty L-BFGS history.
-
-
-@dataclass(frozen=True, eq=False)
-class SolverResult:
-    """Solution u (3N, B) [m] on the device; (B,) outcomes, outer steps, residuals, load fractions, inverted elements.
-
-    `warm_start` is data for the next load. With moving tools, `path_fraction` (B,) is the path fraction
-    reached, and `restarted` (B,) marks cases that started from the undeformed state.
-    """
-
-    u: wp.array
-    outcome: np.ndarray
-    iterations: np.ndarray
-    residual: np.ndarray
-    reached: np.ndarray
-    inverted: np.ndarray
-    linear_iterations: int
-    warm_start: Mapping[str, np.ndarray] = field(default_factory=dict)
-    path_fraction: np.ndarray | None = None
-    restarted: np.ndarray | None = None
-
-    @property
-    def good(self) -> np.ndarray:
-        """Mask (B,) of load cases with a good outcome."""
-        return np.array([outcome.good for outcome in self.outcome], bool)
-
-    def replace_cases(self, index: np.ndarray, source: SolverResult, device: Device) -> None:
-        """Overwrite the results of the cases `index` (k,) with those of `source`; outer steps are added."""
-        scatter_columns(device, source.u, index, self.u)
-        self.iterations[index] += source.iterations
-        for name in ("outcome", "residual", "reached", "inverted"):
-            getattr(self, name)[index] = getattr(source, name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +81,13 @@ class Strategy:
         (barrier,) = self.problem.barriers
         assert isinstance(barrier, LocalBarrier)
         found = ContactDescent(self.problem, self.preconditioner, barrier)
-        return replace(found, strains=CUDA_STRAIN_LIMITS, uses_graphs=True) if self.problem.device.on_cuda else found
+        return replace(found, strains=STRAIN_LIMITS, uses_graphs=True) if self.problem.device.on_cuda else found
+
+    @cached_property
+    def tangent_contact(self) -> TangentContact | None:
+        """Contact solver for single load cases on the CPU; None on a GPU, or without a factor of the stiffness."""
+        known = self.contact is not None and isinstance(self.preconditioner, SparseFactor)
+        return TangentContact(self.contact) if known else None
 
     def get_local_solver(self, count: int) -> BatchElimination | Alone | None:
         """Return the local solver for `count` loads, or None."""
@@ -252,10 +228,15 @@ class Strategy:
         if touch is None or problem.constraint.has_motion or problem.compute_gap(start)[1].any():
             return self._close_gaps(cases, start, outer, gaps)
         start, count, few = self._mask_idle(start), len(cases.loads), min(self.gaps.max_contact_iterations, outer)
-        found = touch.descend(start, np.full(count, self.accuracy.tolerance), few)
+        tolerance = np.full(count, self.accuracy.tolerance)
+        if count == 1 and self.tangent_contact is not None:
+            found = self.tangent_contact.descend(start, tolerance, few, cases.warm)
+        else:
+            found = touch.descend(start, tolerance, few)
         outcome = np.full(count, Outcome.BUDGET, object)
         outcome[found.status == DONE] = Outcome.CONVERGED
         result = self._build_result(found.u, outcome, found.steps, found.residual, 0)
+        result = replace(result, warm_start=found.warm_start)
 
         def split_rows(rows: np.ndarray) -> Sequence[np.ndarray]:
             return [rows][: len(rows)] if device.on_cuda else list(rows[:, None])
@@ -380,6 +361,9 @@ class Strategy:
             result.iterations[rows] += found.iterations
             result.residual[rows[good]], outcome[rows] = found.residual[good], found.outcome
             result = replace(result, linear_iterations=result.linear_iterations + found.linear_iterations)
+            if count == 1:
+                cases = replace(cases, warm={**cases.warm, **found.warm_start})
+                result = replace(result, warm_start=found.warm_start)
         return self._mark_bad(cases, build, result)
 
     def _mark_bad(

@@ -9,7 +9,7 @@ from ..deformation import Outcome
 from ..discretisation.inverted_elements import InversionCounter
 from ..discretisation.problem import Problem
 from ..discretisation.term import Cases
-from .strategy import SolverResult
+from .solver_result import SolverResult
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Elastic energy: integral of psi(H) over the undeformed volume, for any law and element type."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 
-from ..discretisation.element import Elements, assemble_hooke_stiffness
+from ..discretisation.element import Elements, assemble_hooke_stiffness, assemble_tangent_stiffness
 from ..discretisation.term import Cases
 from ..runtime.columns import Workspaces
 from ..runtime.device import Device
@@ -165,26 +165,17 @@ class ElasticTerm:
         return assemble_hooke_stiffness(*self._rest)
 
     def assemble_stiffness(self) -> sp.csc_array:
-        """Return K(u) (3N, 3N) [N/m] of one load case, assembled from element stiffnesses."""
+        """Return the tangent stiffness K(u) (3N, 3N) [N/m] of one load case at the last linearisation."""
         assert self._at is not None
-        elements = self._rest[0]
-        count, size = len(elements.table), 3 * elements.table.shape[1]
-        dof = (3 * elements.table[:, :, None] + np.arange(3)).reshape(count, size)
-        u = self._device.upload(np.repeat(self._at.numpy()[dof.ravel()], size, axis=1))
-        self._disconnected.linearise(u, self._device.upload(np.zeros(size), wp.int32))
-        out = self._device.allocate(count * size, size)
-        self._disconnected.add_curvature(self._device.upload(np.tile(np.eye(size), (count, 1))), out)
-        place = np.repeat(dof, size, axis=1).ravel(), np.tile(dof, size).ravel()
-        entries = out.numpy().ravel().astype(np.float64)
-        return sp.csc_array(sp.coo_array((entries, place), shape=(3 * elements.node_count,) * 2))
-
-    @cached_property
-    def _disconnected(self) -> "ElasticTerm":
-        """Copy of the term with separate nodes for each element."""
-        elements, law, coefficients = self._rest[0], *self._tissue
-        table = np.arange(elements.table.size, dtype=np.int32).reshape(elements.table.shape)
-        apart = replace(elements, table=table, node_count=table.size)
-        return ElasticTerm(self.name, law, apart, coefficients, np.column_stack(self._rest[1:]), self._device)
+        tangent = wp.zeros((*self._rest[0].weight.shape, 9), dtype=self._device.matrix, device=self._device.name)
+        outputs = [tangent[part.first : part.first + part.count] for part in self._parts]
+        numbers = self._numbers.get_array(1) if self._sources else None
+        self._launch_on_blocks(
+            self._strain_kernels.compute_tangents,
+            lambda part: [self._at, *part.shape, _get_coefficients(part, numbers)], outputs, 1,
+        )  # fmt: skip
+        found = tangent.numpy().astype(np.float64).reshape(*tangent.shape, 9)
+        return assemble_tangent_stiffness(self._rest[0], 0.5 * (found + found.swapaxes(2, 3)))
 
     def compute_second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
         """Return the data of `StrainTerm.compute_second_order`, by fourth-order central differences of the stress."""
@@ -278,8 +269,7 @@ class ElasticTerm:
         numbers = self._numbers.get_array(columns) if self._sources else None
 
         def collect_inputs(part: _Part) -> list:
-            own = part.coefficients if numbers is None else numbers[part.first : part.first + part.count]
-            return [*inputs, *part.shape, part.weight, own]
+            return [*inputs, *part.shape, part.weight, _get_coefficients(part, numbers)]
 
         self._launch_on_blocks(kernel, collect_inputs, sums, columns)
         for total in sums[1:]:
@@ -306,6 +296,11 @@ def _build_unit_element(elements: Elements) -> Elements:
     size = None if elements.sizes is None else np.full(1, 4, np.int32)
     weight, mark = np.full((1, points), 1.0 / points), np.zeros((1, 1), int)
     return Elements(table, slope, weight, 4, np.zeros(1, int), mark, size)
+
+
+def _get_coefficients(part: _Part, numbers: wp.array | None) -> wp.array:
+    """Return the coefficients of a block: its own, or its rows of `numbers` (T, q, k, b) if these vary."""
+    return part.coefficients if numbers is None else numbers[part.first : part.first + part.count]
 
 
 def _slice_rows(array: wp.array, first: int, stop: int) -> wp.array:

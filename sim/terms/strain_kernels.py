@@ -1,4 +1,4 @@
-"""Warp kernels over strained elements: norm of the displacement gradient, and stiffness increment."""
+"""Warp kernels for the stiffness of strained elements: norm of the displacement gradient, tangents, and increments."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -12,21 +12,41 @@ from .laws.law import Law
 
 @dataclass(frozen=True)
 class StrainKernels:
-    """Kernels over a subset of the elements with one law."""
+    """Kernels over the elements with one law, or a subset of these."""
 
+    compute_tangents: wp.Kernel
     update_max_strain: wp.Kernel
     add_stiffening: wp.Kernel
 
 
 @cache
 def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKernels:
-    """Return kernels, arguments as `element_kernels.build_kernels`, launched over (index in `subset`, in `columns`)."""
+    """Return the kernels, with arguments as `element_kernels.build_kernels`, launched over (element, load case)."""
     scalar, mat, vec = device.scalar, device.matrix, device.vector
     constants = wp.types.vector(length=count, dtype=scalar)
     stress_change = law.stress_change
     functions = build_functions(law, device, size, count)
     compute_gradient, numbers = functions.compute_gradient, functions.array_type
     get_coefficients, get_rest_coefficients = functions.get_coefficients, functions.get_rest_coefficients
+
+    @forward_kernel(module="unique")
+    def compute_tangents(
+        u: wp.array2d(dtype=scalar),
+        sizes: wp.array(dtype=wp.int32),
+        elements: wp.array2d(dtype=wp.int32),
+        gradients: wp.array3d(dtype=vec),
+        coefficients: numbers,
+        # outputs
+        out: wp.array3d(dtype=mat),
+    ):
+        """Compute dP(H; e_i (x) e_j) of a load case at every point, with index 3 i + j."""
+        e, c = wp.tid()
+        for q in range(gradients.shape[1]):
+            H = compute_gradient(u, sizes, elements, gradients, e, q, c)
+            for n in range(9):
+                D = mat()
+                D[n / 3, n % 3] = scalar(1.0)
+                out[e, q, n] = stress_change(H, D, get_coefficients(coefficients, e, q, c))
 
     @forward_kernel(module="unique")
     def update_max_strain(
@@ -97,4 +117,4 @@ def build_kernels(law: Law, device: Device, size: int, count: int) -> StrainKern
                             for m in range(3):
                                 wp.atomic_add(out, c, row + m, column, wp.float64(f[m]))
 
-    return StrainKernels(update_max_strain, add_stiffening)
+    return StrainKernels(compute_tangents, update_max_strain, add_stiffening)
