@@ -34,7 +34,7 @@ from sim.strategy.plan import SolverStep
 
 LAW, HARD = "neo-hookean", np.array([[1.0, 0.5, -5.0]])
 RENEWAL = Renewal()
-EVERY = StrainLimits(min_strain=0.0, max_nodes=10**4, max_omitted=np.inf, max_candidates=10**4)
+EVERY = StrainLimits(min_strain=0.0, max_nodes=10**4, max_candidates=10**4)
 
 
 def factor_of(problem: Problem) -> SparseFactor:

@@ -149,7 +149,7 @@ def test_updated_inverse_agrees_with_strained_stiffness() -> None:
 
 def test_update_selects_the_most_strained_nodes() -> None:
     """The number is limited, and no node with small strain is selected."""
-    fem, descent, u, model = find_model(StrainLimits(min_strain=0.08, max_nodes=20, max_omitted=1.0))
+    fem, descent, u, model = find_model(StrainLimits(min_strain=0.08, max_nodes=20))
     strain = fem.problem.device.allocate(fem.space.count, 2)
     every, columns = np.ones(fem.space.count, bool), fem.problem.device.upload(BOTH, wp.int32)
     for term in fem.problem.terms:
@@ -167,7 +167,7 @@ def test_update_selects_the_most_strained_nodes() -> None:
 
 
 def test_updates_of_different_width_are_merged() -> None:
-    _, _, _, narrow = find_model(StrainLimits(min_strain=0.08, max_nodes=20, max_omitted=1.0))
+    _, _, _, narrow = find_model(StrainLimits(min_strain=0.08, max_nodes=20))
     _, _, _, wide = find_model(EVERY)
     both = narrow.merge_columns(np.array([1]), wide.select(np.array([0])))
     size = narrow.matrix.shape[1]
@@ -177,14 +177,6 @@ def test_updates_of_different_width_are_merged() -> None:
     np.testing.assert_array_equal(both.change[1], wide.change[0])
     both.reset_columns(np.array([1]))
     assert both.is_strained.tolist() == [True, False] and not both.change[1].any()
-
-
-def test_update_is_discarded_if_it_omits_strained_tissue() -> None:
-    """Its nodes leave out tissue with far more strain than the threshold."""
-    fem, descent = solver()
-    u, few = bent(fem.problem, 4e-4), StrainLimits(min_strain=0.08, max_nodes=5, max_omitted=0.1)
-    part = StrainedPart(fem.problem, descent.compliance, len(descent.barrier.touchable_nodes), few)
-    assert part.build_model(u, BOTH) is None and part.build_model(u, BOTH[1:]) is not None
 
 
 def test_deep_poses_take_fewer_steps_to_same_result() -> None:

@@ -50,20 +50,18 @@ def descend(fem: Fem, depths: tuple[float, ...], tangent: bool) -> list[DescentR
     return results
 
 
-@pytest.mark.parametrize(("law", "most"), [("neo-hookean", 1.0), ("brain", 0.7)])
+@pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("element", ["p1", "smoothed"])
-def test_tangent_contact_takes_fewer_steps_to_same_result(law: str, most: float, element: str) -> None:
+def test_tangent_contact_agrees_with_the_undeformed_stiffness(law: str, element: str) -> None:
     fem = build_fem(LAWS[law], element)
     results = {tangent: descend(fem, (2e-3, 4e-3), tangent) for tangent in (False, True)}
     for found, expected in zip(results[True], results[False], strict=True):
         assert found.status[0] == expected.status[0] == DONE
         other = expected.u.numpy()
         np.testing.assert_allclose(found.u.numpy(), other, atol=2e-5 * np.abs(other).max())
-    few, many = (sum(int(found.steps[0]) for found in results[tangent]) for tangent in (True, False))
-    assert few < most * many
 
 
-def test_tangent_contact_converges_where_the_undeformed_stiffness_does_not() -> None:
+def test_tangent_contact_converges_where_other_solver_stalls() -> None:
     few, many = (descend(build_fem(MEASURED_BRAIN), (2e-3, 4e-3, 7e-3), tangent)[-1] for tangent in (True, False))
     assert few.status[0] == DONE and many.status[0] != DONE
 
@@ -103,7 +101,7 @@ def test_unsuitable_warm_start_is_ignored(warm: Mapping[str, np.ndarray]) -> Non
     np.testing.assert_array_equal(found.u.numpy(), expected.u.numpy())
 
 
-def test_indefinite_tangent_falls_back_to_the_undeformed_stiffness(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_indefinite_tangent_is_replaced_by_undeformed_stiffness(monkeypatch: pytest.MonkeyPatch) -> None:
     fem = build_fem(LAWS["neo-hookean"])
     monkeypatch.setattr(Problem, "assemble_stiffness", lambda self, _: -self.rest_curvature())
     result = fem.deform(press(3e-3).loads)

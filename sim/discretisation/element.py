@@ -139,8 +139,9 @@ def assemble_tangent_stiffness(elements: Elements, tangent: np.ndarray) -> sp.cs
 
     def build_factors(part: np.ndarray, point: np.ndarray, slope: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
         own = (elements.weight[part][..., None, None] * tangent[part]).reshape(-1, 9, 3, 3)
-        blocks = np.einsum("ik,mj->mijk", np.eye(3), slope).reshape(-1, 9, 3)
-        yield blocks, np.einsum("mkij,mj->mki", own[point], slope)
+        blocks = (slope[:, None, :, None] * np.eye(3)[:, None]).reshape(-1, 9, 3)
+        x, y, z = (own[..., j][point] * slope[:, j, None, None] for j in range(3))
+        yield blocks, x + y + z
 
     return _assemble_products(elements, build_factors)
 

@@ -199,8 +199,7 @@ class ContactDescent:
         if batch.model is not None and self._strained is not None and len(renewed):
             fresh = self._strained.build_model(from_view(self.problem.device, batch.state.u), renewed)
             batch.stale &= ~mask
-            if fresh is not None:
-                batch.model = batch.model.merge_columns(renewed, fresh)
+            batch.model = batch.model.merge_columns(renewed, fresh)
 
     def _compute_force_tolerance(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
         """Return the relative tolerance (b,) of the tool forces."""

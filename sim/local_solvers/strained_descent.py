@@ -26,7 +26,7 @@ from ..runtime.threads import limit_to_one_thread
 from .batch_elimination import list_open_vertices
 from .strained_part import StrainedPart, StrainLimits
 
-SINGLE_LIMITS = StrainLimits(min_strain=0.15, max_nodes=320, max_omitted=np.inf, max_candidates=800)
+SINGLE_LIMITS = StrainLimits(min_strain=0.15, max_nodes=320, max_candidates=800)
 """Limits for a single model, which may use all memory and be incomplete: L-BFGS corrects the remainder."""
 
 
@@ -142,7 +142,7 @@ class StrainedDescent:
     def _build_stiffness_update(self, u: wp.array) -> StiffnessUpdate | None:
         """Return the stiffness update at u (3N, 1) [m], or None if no tissue is strained."""
         found = self._part.find_stiffening(u, np.arange(1))
-        if found is None or not found[0].shape[1]:
+        if not found[0].shape[1]:
             return None
         compliance = self._part.compliance
         place = (3 * found[0][0][:, None] + np.arange(3)).ravel()

@@ -40,16 +40,13 @@ class UpdatedModel:
         return {NODES_KEY: self.nodes.numpy(), MATRIX_KEY: self.matrix.numpy()}
 
 
-def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel | None:
+def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel:
     """Return the model of a prepared part at u (3N, 1) [m], for the load case with which the problem has begun.
 
-    Return None if the strained tissue exceeds the size of the model. The host does not wait for the GPU.
+    The host does not wait for the GPU.
     """
     with run_in_order(device):
-        found = part.find_stiffening(u, np.arange(1), fixed_size=True)
-        if found is None:
-            return None
-        lib, (places, added) = get_library(device), found
+        lib, (places, added) = get_library(device), part.find_stiffening(u, np.arange(1), fixed_size=True)
         rows = (3 * places[:, :, None] + cast_like(places, to_library(device, np.arange(3)))).reshape(1, -1)
         own, of = (
             wp.zeros(shape, dtype=dtype, device=device.name)

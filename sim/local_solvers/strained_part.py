@@ -42,8 +42,6 @@ class StrainLimits:
         Norm |H| of the displacement gradient below which the undeformed stiffness is used.
     max_nodes
         Maximum number of nodes of a model; nodes with the largest |H| have priority.
-    max_omitted
-        If nodes beyond the maximum number have a larger |H| than this, no model is used, since it would be incomplete.
     max_candidates
         Maximum number of candidate nodes: the touchable nodes and the nearest nodes to these. The compliance has three
         rows per candidate node.
@@ -55,10 +53,9 @@ class StrainLimits:
     """
 
     min_strain: float = 0.1
-    max_nodes: int = 480
-    max_omitted: float = 0.5
+    max_nodes: int = 1600
     max_candidates: int = 1600
-    max_cases: int = 8
+    max_cases: int = 4
     max_bytes: int = 2**31
 
 
@@ -157,20 +154,19 @@ class StrainedPart:
         found = [(term, term.find_elements_on(near)) for term in problem.terms if isinstance(term, StrainTerm)]
         self._elements = [(term, device.upload(some, wp.int32)) for term, some in found]
 
-    def build_model(self, u: wp.array, columns: np.ndarray) -> StrainedModel | None:
-        """Return models of the load cases `columns` (k,) at u (3N, b) [m], or None if strained tissue does not fit."""
-        found = self.find_stiffening(u, columns)
-        return None if found is None else self._build_models(*found)
+    def build_model(self, u: wp.array, columns: np.ndarray) -> StrainedModel:
+        """Return models of the load cases `columns` (k,) at u (3N, b) [m]."""
+        return self._build_models(*self.find_stiffening(u, columns))
 
     def prepare(self) -> None:
         """Compute the compliance at all nodes, unless already computed."""
         self.compliance.ensure_columns(np.ones(len(self.compliance.nodes), bool))
 
-    def find_stiffening(self, u: wp.array, columns: np.ndarray, fixed_size: bool = False) -> tuple[Any, Any] | None:
+    def find_stiffening(self, u: wp.array, columns: np.ndarray, fixed_size: bool = False) -> tuple[Any, Any]:
         """Return the most strained nodes as indices (k, n) into the compliance, and their matrices D (k, 3n, 3n) [N/m].
 
         D has zeros if a load case has fewer nodes. If `fixed_size`, n is the maximum, and the host does not wait for
-        the GPU. Return None if tissue that does not fit is strained more than `max_omitted`.
+        the GPU.
         """
         device, count, strains = self._problem.device, len(columns), self._strains
         picked = device.upload(columns, wp.int32)
@@ -180,8 +176,6 @@ class StrainedPart:
         nodes, limit, numbers = choose_strained_rows(
             device, to_view(strain)[to_view(self._near)], strains.min_strain, strains.max_nodes
         )
-        if strains.max_omitted < np.inf and float(limit.max()) > max(strains.max_omitted, strains.min_strain):
-            return None
         wide = len(nodes) if fixed_size else int(numbers.max())
         place = wp.full((len(strain), count), -1, dtype=wp.int32, device=device.name)
         near, axes = len(self._near), to_library(device, np.arange(max(wide, count), dtype=np.int32))

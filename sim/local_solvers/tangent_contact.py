@@ -17,7 +17,7 @@ from ..linalg.preconditioner import build_direct_solver
 from ..minimisers.lbfgs import DescentResult
 from .contact_descent import ContactDescent
 
-MAX_STEPS = 10  # Maximum number of steps with one factor.
+MAX_STEPS = 15  # Maximum number of steps with one factor.
 STATE_KEY = "stiffness state"  # Warm-start key: displacements (1, 3N) [m] whose tangent stiffness is factorised.
 
 
@@ -45,9 +45,8 @@ class TangentContact:
             some = min(left, MAX_STEPS)
             found = self._get_descent(state).descend(u, tolerance, some)
             left, steps = left - some, steps + int(found.steps[0])
-            if not len(found.unfinished) or left <= 0:
-                kept = {STATE_KEY: state[None]} if state.any() else {}
-                return replace(found, steps=np.array([steps]), warm_start=kept)
+            if not len(found.unfinished) or left <= 0 or not found.steps[0]:
+                return replace(found, steps=np.array([steps]), warm_start={STATE_KEY: state[None]})
             u = found.u
             state = u.numpy()[:, 0].copy()
 

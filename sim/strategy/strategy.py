@@ -86,8 +86,9 @@ class Strategy:
     @cached_property
     def tangent_contact(self) -> TangentContact | None:
         """Contact solver for single load cases on the CPU; None on a GPU, or without a factor of the stiffness."""
-        known = self.contact is not None and isinstance(self.preconditioner, SparseFactor)
-        return TangentContact(self.contact) if known else None
+        if self.contact is None or not isinstance(self.preconditioner, SparseFactor):
+            return None
+        return TangentContact(self.contact)
 
     def get_local_solver(self, count: int) -> BatchElimination | Alone | None:
         """Return the local solver for `count` loads, or None."""
