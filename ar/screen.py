@@ -76,10 +76,10 @@ def write_movie(path: Path, images: Iterable[np.ndarray], frames_per_second: flo
         part.unlink(missing_ok=True)
 
 
-def write_video(path: Path, pictures: Iterable[np.ndarray], frames_per_second: float) -> None:
+def write_video(path: Path, images: Iterable[np.ndarray], frames_per_second: float) -> None:
     """Write an MPEG-4 part 2 video image by image, so that only one image is in memory."""
     writer, size = None, None
-    for colour in pictures:
+    for colour in images:
         if writer is None:
             size = colour.shape
             code = cv2.VideoWriter.fourcc(*"mp4v")

@@ -327,41 +327,41 @@ class Fem:
     def _build_deformation(
         self,
         cases: Cases,
-        found: SolverResult,
-        more: Mapping[str, np.ndarray],
+        result: SolverResult,
+        warm_start: Mapping[str, np.ndarray],
         at: np.ndarray | None,
         seconds: Mapping[str, float],
     ) -> Deformation:
-        """Return the deformation of a solver result, with reactions, warm-start data `more`, and `seconds` by stage."""
+        """Return the deformation of a solver result, with reactions, `warm_start` data, and `seconds` by stage."""
         solved = time.perf_counter()
-        self.problem.begin(replace(cases, share=found.path_fraction, restarted=found.restarted))
-        memory = dict(self.problem.end(found.u))
+        self.problem.begin(replace(cases, share=result.path_fraction, restarted=result.restarted))
+        memory = dict(self.problem.end(result.u))
         displaced = cases.loads.get(Displaced) is not None
-        held = self.problem.gradient(found.u) if displaced or self._diagnostics.needs_forces else None
+        held = self.problem.gradient(result.u) if displaced or self._diagnostics.needs_forces else None
         on_footprint = self.problem.constraint.compute_footprint_force(held) if displaced else None
-        touching = [term.compute_reaction(found.u) for term in self.problem.barriers]
+        touching = [term.compute_reaction(result.u) for term in self.problem.barriers]
         reaction = np.concatenate([compute_push_reactions(self._skin, cases.loads, on_footprint), *touching], axis=1)
         nodes = np.arange(len(self._anatomy.mesh.nodes)) if at is None else at
         if at is None and len(self.space.edges):
-            whole = unstack_columns(self.problem.device, found.u, np.arange(self.space.count))
+            whole = unstack_columns(self.problem.device, result.u, np.arange(self.space.count))
             displacement = np.ascontiguousarray(whole[:, : len(nodes)])
             memory[MID_EDGE_KEY] = whole[:, len(nodes) :] - self.space.interpolate_field(displacement)[:, len(nodes) :]
         else:
-            displacement = unstack_columns(self.problem.device, found.u, nodes)
-        fields = self._diagnostics.compute_fields(found.u, held)
+            displacement = unstack_columns(self.problem.device, result.u, nodes)
+        fields = self._diagnostics.compute_fields(result.u, held)
         return Deformation(
             displacement=displacement,
             nodes=nodes,
-            outcome=tuple(self._diagnostics.mark_outcomes(found.outcome, found.inverted, fields["strained"])),
-            iterations=found.iterations,
-            residual=found.residual,
+            outcome=tuple(self._diagnostics.mark_outcomes(result.outcome, result.inverted, fields["strained"])),
+            iterations=result.iterations,
+            residual=result.residual,
             time=cases.loads.times,
             reaction=reaction,
             memory=memory,
-            warm={**found.warm_start, **more},
+            warm={**result.warm_start, **warm_start},
             cost=Cost({**seconds, "reactions": time.perf_counter() - solved}),
-            reached=found.reached,
-            inverted=found.inverted,
+            reached=result.reached,
+            inverted=result.inverted,
             **fields,
             source=self.description,
         )

@@ -155,7 +155,7 @@ class ReportStudy:
         pushed = self.converged.select(np.flatnonzero(self.disc_split.test_mask)).get(Pushed)
         training = self.converged.select(np.flatnonzero(self.disc_split.training_mask)).get(Pushed)
         assert pushed is not None and training is not None
-        return draw_loads_beyond(self.patch, training, pushed, self.beyond)
+        return draw_extrapolated_loads(self.patch, training, pushed, self.beyond)
 
     @cached_property
     def digest(self) -> str:
@@ -174,7 +174,7 @@ EDGE_DISTANCES = (0.5, 0.9)  # Range of distances of a centre from the edge, rel
 KINDS = ("stronger", "more oblique", "nearer to the rim")  # Kinds of loads beyond the training range.
 
 
-def draw_loads_beyond(patch: Patch, training: Pushed, pattern: Pushed, count: int) -> Loads:
+def draw_extrapolated_loads(patch: Patch, training: Pushed, pattern: Pushed, count: int) -> Loads:
     """Draw `count` loads, a third of each kind in `KINDS`, otherwise distributed as `pattern`; deterministic."""
     random = np.random.default_rng(0)
     rows = random.integers(len(pattern.point), size=count)

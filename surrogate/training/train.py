@@ -251,12 +251,14 @@ def _fit_on_all(name: str, model: Learned, solutions: TrainingSolutions, fit: Mo
         return add_distance_correction(fitted, solutions.patch, solutions.distances.select(fit.rows))
 
 
-def _add_bounds(model: Learned, near: ModelErrors, growth: Mapping[str, float], far: ModelErrors) -> Learned:
+def _add_bounds(
+    model: Learned, interpolation: ModelErrors, growth: Mapping[str, float], extrapolation: ModelErrors
+) -> Learned:
     """Return the model with bounds calibrated on errors near training loads; each grows by its `growth` [1/m]."""
-    seen = far.list_available()
+    seen = extrapolation.list_available()
     bounds = {
         way: calibrate_bound(here, BOUND_FITS[way], growth[way], seen[way])
-        for way, here in near.list_available().items()
+        for way, here in interpolation.list_available().items()
     }
     tip, force = model.tip or TipModel(), model.force
     return replace(

@@ -36,7 +36,7 @@ class TestStrains:
 
 
 @dataclass(frozen=True)
-class Evaluated:
+class LawEvaluation:
     """Results of a law: energies (n,), stresses (n, 3, 3) and stress changes (n, 3, 3), all in Pa."""
 
     energy: np.ndarray
@@ -52,11 +52,11 @@ class Evaluator:
     kernel: wp.Kernel
     tissue: Tissue
 
-    def __call__(self, H: np.ndarray, D: np.ndarray | None = None, tissue: Tissue | None = None) -> Evaluated:
+    def __call__(self, H: np.ndarray, D: np.ndarray | None = None, tissue: Tissue | None = None) -> LawEvaluation:
         """Return the results at displacement gradients H (n, 3, 3) with increments D (n, 3, 3)."""
         return self.evaluate(H, D, (tissue or self.tissue).coefficients)
 
-    def evaluate(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> Evaluated:
+    def evaluate(self, H: np.ndarray, D: np.ndarray | None, coefficients: tuple[float, ...]) -> LawEvaluation:
         """Return the results at H (n, 3, 3) with increments D (n, 3, 3) and other coefficients."""
         count, device = len(H), self.device
         energy = device.allocate(count)
@@ -64,7 +64,7 @@ class Evaluator:
         given = device.upload(H, device.matrix), device.upload(H if D is None else D, device.matrix)
         constants = wp.types.vector(len(coefficients), device.scalar)(*coefficients)
         device.launch(self.kernel, (count,), [*given, constants], [energy, stress, change])
-        return Evaluated(*(array.numpy().astype(np.float64) for array in (energy, stress, change)))
+        return LawEvaluation(*(array.numpy().astype(np.float64) for array in (energy, stress, change)))
 
 
 def build_evaluator(tissue: Tissue, precision: Precision) -> Evaluator:
