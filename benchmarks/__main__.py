@@ -23,6 +23,7 @@ BENCHMARKS = {
     "gym": "steps per second of the Gymnasium environments, with states and with images",
     "fit": "errors of tissue and skull fitted to several frames of synthetic patients",
     "track": "error of a tool's tip that a camera tracks by its printed cube",
+    "phantom": "motion of the lesion of a silicone brain phantom, measured by CT and predicted by FEM",
     "link": "latency from a pose to its result at an OpenIGTLink client",
     "shortcuts": "speed-up by each acceleration of the solver on typical loads",
     "solver": "time of the first load on a mesh and of a further one, compared with other packages",
