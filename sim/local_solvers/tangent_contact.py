@@ -40,7 +40,7 @@ class TangentContact:
         """Return the result as `ContactDescent.descend`, for one load case; its warm-start data help the next frame."""
         u, left, steps = start, max_iter, 0
         state = self._get_warm_state(warm_start)
-        state = start.numpy()[:, 0] if state is None else state
+        state = start.numpy()[:, 0].copy() if state is None else state
         while True:
             some = min(left, MAX_STEPS)
             found = self._get_descent(state).descend(u, tolerance, some)
