@@ -85,6 +85,7 @@ ANY = {f"element_kernels:{name}" for name in ("add_energy", "add_curvature", "ad
     "inertia:add_energy",
     "inertia:add_blocks",
     "contact.tool_kernels:add_matrix",
+    "strain_kernels:compute_tangents",
     "strain_kernels:update_max_strain",
     "strain_kernels:add_stiffening",
     *(
