@@ -5,11 +5,9 @@ The module of a term is imported when an effect needs the term. User-defined eff
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial, reduce
-from operator import add
+from functools import partial
 
 import numpy as np
-import scipy.sparse as sp
 import warp as wp
 
 from .anatomy import Anatomy, describe_region
@@ -242,17 +240,13 @@ def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.nda
 
 def compile_clamped_part(
     effects: Iterable[Effect], space: Discretisation, problem: Problem, selected: np.ndarray, nodes: np.ndarray
-) -> tuple[LocalProblem, Callable[[], sp.csc_array]]:
-    """Return the problem of `compile_part`, in which the nodes shared with tetrahedra that are not selected are fixed.
-
-    Also return a function that assembles its tangent stiffness (3n, 3n) [N/m] at the last linearisation of one case.
-    """
+) -> LocalProblem:
+    """Return the problem of `compile_part`, with fixed nodes where it borders on tetrahedra that are not selected."""
     effect, device = next(effect for effect in effects if isinstance(effect, Elasticity)), problem.device
     terms = _build_elasticity(effect, space, device, selected, nodes)
     rim = np.isin(nodes, space.table[~selected])[:, None]
     fixed, normal = problem.constraint.fixed[nodes] | rim, np.where(rim, 0.0, problem.constraint.normal[nodes])
-    part = _build_local_problem(Problem(tuple(terms), Constraint(fixed, normal, device), device))
-    return part, lambda: reduce(add, [term.assemble_stiffness() for term in terms])
+    return _build_local_problem(Problem(tuple(terms), Constraint(fixed, normal, device), device))
 
 
 def _build_local_problem(problem: Problem) -> LocalProblem:

@@ -1,8 +1,8 @@
 """Boundary value problem: energy as a sum of terms, under constraints."""
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
@@ -162,22 +162,30 @@ class Problem:
 
     def rest_curvature(self, time_step: float = math.inf) -> sp.csc_array:
         """Return the sum of the undeformed stiffnesses (3N, 3N) [N/m] that terms provide, for a time step [s]."""
-        offered = [matrix for matrix in (term.rest_curvature() for term in self.terms) if matrix is not None]
+        offered = [term.rest_curvature() for term in self.terms]
         if time_step < math.inf:
             offered += [term.compute_step_stiffness(time_step) for term in self.terms if isinstance(term, StepTerm)]
-        return reduce(lambda a, b: a + b, offered, sp.csc_array((self.rows, self.rows)))
+        return self._add_matrices(offered)
 
     def assemble_stiffness(self, u: wp.array) -> sp.csc_array:
         """Return the tangent stiffness (3N, 3N) [N/m] at u (3N, 1) [m], without barriers.
 
         Terms without an assembled tangent are included with their undeformed stiffness.
         """
-        terms = [term for term in self.terms if isinstance(term, AssembledTerm)]
-        others = replace(self, terms=tuple(term for term in self.terms if not isinstance(term, AssembledTerm)))
         definite = wp.zeros(1, dtype=wp.int32, device=self.device.name)
-        for term in terms:
+
+        def assemble(term: Term) -> sp.csc_array | None:
+            if not isinstance(term, AssembledTerm):
+                return term.rest_curvature()
             term.linearise(u, definite)
-        return reduce(lambda a, b: a + b, [term.assemble_stiffness() for term in terms], others.rest_curvature())
+            return term.assemble_stiffness()
+
+        return self._add_matrices(map(assemble, self.terms))
+
+    def _add_matrices(self, matrices: Iterable[sp.csc_array | None]) -> sp.csc_array:
+        """Return the sum (3N, 3N) of the matrices that are not None."""
+        given = (matrix for matrix in matrices if matrix is not None)
+        return reduce(lambda a, b: a + b, given, sp.csc_array((self.rows, self.rows)))
 
     def longest_step(self, u: wp.array, du: wp.array) -> np.ndarray:
         """Return the largest fraction (b,), at most 1, of du (3N, b) that stays inside the domain of all terms."""

@@ -69,7 +69,7 @@ class ClampedPart:
         self._limits = limits
         device, self.nodes = problem.device, np.unique(space.table[chosen])
         self._rows = (3 * self.nodes[:, None] + np.arange(3)).ravel()
-        part, self._curvature = compile_clamped_part(effects, space, problem, chosen, self.nodes)
+        part = compile_clamped_part(effects, space, problem, chosen, self.nodes)
         self._part = part.problem
         part.set_force(device.upload(-constant.numpy()[self._rows]))
         values = u.numpy()[self._rows]
@@ -100,9 +100,8 @@ class ClampedPart:
 
     def _begin_at(self, u: wp.array) -> bool:
         """Set the initial Hessian of L-BFGS to the tangent stiffness at u (3n, 1); return False if it is indefinite."""
-        self._part.linearise(u, np.zeros(1, bool))
         try:
-            self._begin_with(self._curvature())
+            self._begin_with(self._part.assemble_stiffness(u))
         except RuntimeError:
             return False
         return True
