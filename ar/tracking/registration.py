@@ -110,7 +110,7 @@ def register_points(
         pairs are swapped, one pair fits far worse than the others, or the pairs fit no rigid motion.
     """
     _check_shape(scan_points, patient_points, settings)
-    T, off = _fit_rigid(scan_points, patient_points)
+    T, off = fit_rigid(scan_points, patient_points)
     _check_fit(scan_points, patient_points, off, settings)
     centre = scan_points.mean(axis=0)
     freedom = 3 * len(scan_points) - 6
@@ -190,12 +190,12 @@ def _check_shape(scan: np.ndarray, patient: np.ndarray, settings: RegistrationSe
 def _check_fit(scan: np.ndarray, patient: np.ndarray, residuals: np.ndarray, settings: RegistrationSettings) -> None:
     """Raise ValueError for a mirrored set, a single wrong pair, two swapped pairs, or pairs that do not fit."""
     rms = _compute_rms(residuals)
-    mirrored = _compute_rms(_fit_rigid(scan * [-1.0, 1.0, 1.0], patient)[1])
+    mirrored = _compute_rms(fit_rigid(scan * [-1.0, 1.0, 1.0], patient)[1])
     if settings.min_residual_ratio * max(mirrored, settings.min_rms) < rms:
         raise ValueError("the scan's points fit their mirror image only: one frame is left-handed. Give RAS.")
     if len(scan) > MIN_PAIRS + 1:
         remaining = [[np.delete(points, row, axis=0) for points in (scan, patient)] for row in range(len(scan))]
-        others = [_compute_rms(_fit_rigid(*pairs)[1]) for pairs in remaining]
+        others = [_compute_rms(fit_rigid(*pairs)[1]) for pairs in remaining]
         row, swaps = int(np.argmin(others)), _compute_swapped_rms(scan, patient)
         one, other = min(swaps, key=lambda pair: swaps[pair])
         if (
@@ -225,12 +225,12 @@ def _compute_swapped_rms(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[in
     for pair in combinations(range(len(scan)), 2):
         other = patient.copy()
         other[list(pair)] = patient[list(pair[::-1])]
-        out[pair] = _compute_rms(_fit_rigid(scan, other)[1])
+        out[pair] = _compute_rms(fit_rigid(scan, other)[1])
     return out
 
 
-def _fit_rigid(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit T_patient_scan (4, 4); return the transform and the residuals (n, 3) [m]."""
+def fit_rigid(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit T_patient_scan (4, 4) to n point pairs (Kabsch 1976); return the transform and the residuals (n, 3) [m]."""
     middle, there = scan.mean(axis=0), patient.mean(axis=0)
     T = np.eye(4)
     u, _, v = np.linalg.svd((patient - there).T @ (scan - middle))

@@ -21,7 +21,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import nnls
+from trimesh import transform_points
 
+from ar.tracking.registration import fit_rigid
 from sim.anatomy import BRAIN_LABEL, TUMOUR_LABEL, Anatomy
 from sim.bodies.markups import SIGNS
 from sim.bodies.meshfile import read_mesh
@@ -62,7 +64,7 @@ MAX_OFFSET = 0.01  # largest distance between the lesion's surface and its marke
 
 @dataclass(frozen=True, eq=False)
 class PhantomScan:
-    """Registered scan [m]: surface markers (4, 3), lesion surface (V, 3) and (S, 3), and the rigid map `R x + t`.
+    """Registered scan [m]: surface markers (4, 3), lesion surface (V, 3) and (S, 3), and the transform T (4, 4).
 
     `residual` is the RMS distance of the registered reference markers from their design [m].
     """
@@ -70,8 +72,7 @@ class PhantomScan:
     floats: np.ndarray
     points: np.ndarray
     triangles: np.ndarray
-    rotation: np.ndarray
-    translation: np.ndarray
+    T: np.ndarray
     residual: float
 
     @property
@@ -108,14 +109,6 @@ def list_files(name: str) -> tuple[Path, Path]:
     return markers, MESHES / f"expt4{name}/segmented_deformed_lesion.msh"
 
 
-def fit_rigid(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotation (3, 3) and translation (3,) that best map points (n, 3) to others (Kabsch 1976)."""
-    left, _, right = np.linalg.svd((source - source.mean(axis=0)).T @ (target - target.mean(axis=0)))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = (right.T * signs) @ left.T
-    return rotation, target.mean(axis=0) - rotation @ source.mean(axis=0)
-
-
 def read_scan(folder: Path, name: str) -> PhantomScan:
     """Read the markers and the lesion of a scan, and register both by the four reference markers.
 
@@ -139,10 +132,9 @@ def read_scan(folder: Path, name: str) -> PhantomScan:
         used, triangles = np.unique(surface.cells_dict["triangle"], return_inverse=True)
         points, triangles = 1e-3 * np.asarray(surface.points[used], float), triangles.reshape(-1, 3)
     design = REFERENCE["initial" if name == "initial" else "deformed"]
-    rotation, translation = fit_rigid(marked[:4], design)
-    marked, points = marked @ rotation.T + translation, points @ rotation.T + translation
-    residual = np.sqrt(((marked[:4] - design) ** 2).sum(axis=1).mean())
-    scan = PhantomScan(marked[4:8], points, triangles, rotation, translation, float(residual))
+    T, residuals = fit_rigid(marked[:4], design)
+    marked, points = (transform_points(each, T) for each in (marked, points))
+    scan = PhantomScan(marked[4:8], points, triangles, T, float(np.sqrt((residuals**2).sum(axis=1).mean())))
     offset = np.linalg.norm(scan.centroid - marked[8])
     if not offset <= MAX_OFFSET:
         raise InputError(f"{lesion}: its centroid is {1e3 * offset:.0f} mm from its marker: must be 10 mm or less.")
@@ -158,7 +150,7 @@ def read_body(folder: Path, initial: PhantomScan) -> Anatomy:
         The mesh is not readable, has no tetrahedron in the lesion, or does not reach the fixture.
     """
     mesh = read_mesh(folder / BODY, "mm").mesh
-    nodes = mesh.nodes @ initial.rotation.T + initial.translation
+    nodes = transform_points(mesh.nodes, initial.T)
     centres, corners = nodes[mesh.tets].mean(axis=1), initial.points[initial.triangles]
     near = ((centres >= initial.points.min(axis=0)) & (centres <= initial.points.max(axis=0))).all(axis=1)
     region = np.full(len(mesh.tets), BRAIN_LABEL)
@@ -203,7 +195,7 @@ def compare_motions(scans: dict[str, PhantomScan], body: Anatomy | None, device:
         fields = solve_levels(body, [*between[0], *between[1][1:]], device)
     for first, last in ((0, 1), (1, 2), (0, 2)):
         start, end = scans[STATES[first]], scans[STATES[last]]
-        name, still = f"{STATES[first]} to {STATES[last]}", (np.eye(3), np.zeros(3))
+        name, still = f"{STATES[first]} to {STATES[last]}", np.eye(4)
         measured = end.floats - start.floats
         yield PhantomRow(name, "measured", 1e3 * float(np.linalg.norm(end.centroid - start.centroid)))
         yield _compare(name, "no motion", still, np.zeros_like(measured), start, end)
@@ -216,17 +208,15 @@ def compare_motions(scans: dict[str, PhantomScan], body: Anatomy | None, device:
         placed = body.mesh.nodes[lesion] + before[lesion]
         for source, weights in (("fluid level", np.eye(len(steps))[-1]), ("four markers", share)):
             moved = placed + np.tensordot(weights, steps[:, lesion], 1)
-            yield _compare(name, source, fit_rigid(placed, moved), np.tensordot(weights, seen, 1), start, end)
+            yield _compare(name, source, fit_rigid(placed, moved)[0], np.tensordot(weights, seen, 1), start, end)
 
 
 def _compare(
-    motion: str, source: str, rigid: tuple[np.ndarray, np.ndarray], floats: np.ndarray,
-    start: PhantomScan, end: PhantomScan,
-) -> PhantomRow:  # fmt: skip
-    """Return the errors of a rigid motion of the measured lesion, and of displacements (4, 3) of its markers."""
-    rotation, translation = rigid
-    centroid = rotation @ start.centroid + translation
-    some = start.points[:: 1 + len(start.points) // MAX_VERTICES] @ rotation.T + translation
+    motion: str, source: str, T: np.ndarray, floats: np.ndarray, start: PhantomScan, end: PhantomScan
+) -> PhantomRow:
+    """Return the errors of a rigid motion T (4, 4) of the lesion, and of displacements (4, 3) of its markers."""
+    centroid = transform_points(start.centroid[None], T)[0]
+    some = transform_points(start.points[:: 1 + len(start.points) // MAX_VERTICES], T)
     apart = np.linalg.norm(find_closest_points(some, end.points[end.triangles]).point - some, axis=1).mean()
     markers = np.sqrt(((floats - (end.floats - start.floats)) ** 2).sum(axis=1).mean())
     values = np.linalg.norm(centroid - start.centroid), np.linalg.norm(centroid - end.centroid), apart, markers
