@@ -167,10 +167,10 @@ def _check_compatible(effects: Iterable[Effect]) -> tuple[Effect, ...]:
     return effects
 
 
-def _check_names(terms: Iterable[Term], own: Iterable[Term]) -> None:
+def _check_names(terms: Iterable[Term], user_terms: Iterable[Term]) -> None:
     """Reject user-defined terms that are not terms or whose names are in use."""
     taken = {term.name for term in terms}
-    for term in own:
+    for term in user_terms:
         if not isinstance(term, Term):
             raise InputError(f"a user-defined effect returned a {type(term).__name__}: must be a sim.Term.")
         if term.name in taken:
@@ -223,12 +223,12 @@ class LocalProblem:
 
 
 def compile_part(
-    effects: Iterable[Effect], space: Discretisation, problem: Problem, selected: np.ndarray, nodes: np.ndarray
+    effects: Iterable[Effect], space: Discretisation, problem: Problem, tet_mask: np.ndarray, nodes: np.ndarray
 ) -> Problem:
-    """Return the problem with the elasticity of only the `selected` tetrahedra (T,) bool, on their sorted `nodes`."""
+    """Return the problem with the elasticity of only the tetrahedra in `tet_mask` (T,), on their sorted `nodes`."""
     effect = next(effect for effect in effects if isinstance(effect, Elasticity))
     constraint = Constraint(problem.constraint.fixed[nodes], problem.constraint.normal[nodes], problem.device)
-    return Problem(tuple(_build_elasticity(effect, space, problem.device, selected, nodes)), constraint, problem.device)
+    return Problem(tuple(_build_elasticity(effect, space, problem.device, tet_mask, nodes)), constraint, problem.device)
 
 
 def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.ndarray) -> LocalProblem:
@@ -239,12 +239,12 @@ def add_surrounding_stiffness(part: Problem, rows: np.ndarray, stiffness: np.nda
 
 
 def compile_clamped_part(
-    effects: Iterable[Effect], space: Discretisation, problem: Problem, selected: np.ndarray, nodes: np.ndarray
+    effects: Iterable[Effect], space: Discretisation, problem: Problem, tet_mask: np.ndarray, nodes: np.ndarray
 ) -> LocalProblem:
     """Return the problem of `compile_part`, with fixed nodes where it borders on tetrahedra that are not selected."""
     effect, device = next(effect for effect in effects if isinstance(effect, Elasticity)), problem.device
-    terms = _build_elasticity(effect, space, device, selected, nodes)
-    rim = np.isin(nodes, space.table[~selected])[:, None]
+    terms = _build_elasticity(effect, space, device, tet_mask, nodes)
+    rim = np.isin(nodes, space.table[~tet_mask])[:, None]
     fixed, normal = problem.constraint.fixed[nodes] | rim, np.where(rim, 0.0, problem.constraint.normal[nodes])
     return _build_local_problem(Problem(tuple(terms), Constraint(fixed, normal, device), device))
 
@@ -262,13 +262,13 @@ def _build_elasticity(
     effect: Elasticity,
     space: Discretisation,
     device: Device,
-    within: np.ndarray | None = None,
+    tet_mask: np.ndarray | None = None,
     nodes: np.ndarray | None = None,
     pulsation: Pulsation | None = None,
 ) -> list[AssembledTerm]:
     """Return the elastic terms: one per law and element part, over the elements of all regions with that law.
 
-    `within` (T,) bool restricts the terms to these tetrahedra, whose `nodes` (n,) are then the unknowns.
+    `tet_mask` (T,) bool restricts the terms to these tetrahedra, whose `nodes` (n,) are then the unknowns.
     """
     mesh = space.mesh
     labels = [int(label) for label in np.unique(mesh.region)]
@@ -288,8 +288,8 @@ def _build_elasticity(
             if (material.law, bool(material.prony)) == (name, relaxes)
         }
         chosen = np.isin(mesh.region, list(obeying))
-        if within is not None:
-            chosen &= within
+        if tet_mask is not None:
+            chosen &= tet_mask
         if not chosen.any():
             continue
         for part in space.build_elements(chosen):
@@ -319,37 +319,37 @@ def collect_laws(effect: Elasticity, labels: Iterable[int]) -> dict[int, Tissue]
 
 def _build_law_term(
     tissues: Sequence[Tissue],
-    which: np.ndarray,
+    tissue_numbers: np.ndarray,
     elements: Elements,
-    carries: str,
+    portion: str,
     device: Device,
     swelling: tuple[Pulsation, np.ndarray] | None,
 ) -> AssembledTerm:
-    """Return the term of elements with tissue number `which` (T,). All tissues have the same law; all or none relax.
+    """Return the term of elements with `tissue_numbers` (T,). All tissues have the same law; all or none relax.
 
     `swelling` is the effect and a mask (T,) of the elements that swell, or None.
     """
     from .terms.elasticity import ElasticTerm
 
     law = build_functions(tissues)
-    if carries == "springs":
+    if portion == "springs":
         from .terms.laws.springs import LAW, compute_spring_coefficients
 
         if tissues[0].prony or swelling is not None:
             raise InputError("springs compute neither relaxation nor pulsation: use finite elements.")
-        lame = np.array([tissue.lame for tissue in tissues])[which]
+        lame = np.array([tissue.lame for tissue in tissues])[tissue_numbers]
         return ElasticTerm(
             f"springs for {law.name}", LAW, elements, compute_spring_coefficients(lame, elements.gradient), lame, device
         )
-    lame = np.array([get_lame(tissue, carries) for tissue in tissues])[which]
-    coefficients = collect_coefficients(tissues, carries)[which]
-    name = f"elasticity {law.name}" if carries == "whole" else f"elasticity {law.name} of {carries}"
+    lame = np.array([get_lame(tissue, portion) for tissue in tissues])[tissue_numbers]
+    coefficients = collect_coefficients(tissues, portion)[tissue_numbers]
+    name = f"elasticity {law.name}" if portion == "whole" else f"elasticity {law.name} of {portion}"
     sources = []
-    if tissues[0].prony and carries != "volume":  # the volumetric part does not relax
+    if tissues[0].prony and portion != "volume":  # the volumetric part does not relax
         from .terms.viscoelastic import Prony
 
         name, points = f"visco{name}", elements.weight.shape[1]
-        pairs = [tissues[tissue].prony for tissue in which]
+        pairs = [tissues[tissue].prony for tissue in tissue_numbers]
         sources.append(Prony(name, law, coefficients, pairs, points, device))
     if swelling is not None and swelling[1].any():
         from .terms.swelling import Swelling

@@ -146,22 +146,22 @@ def solve_with_debonding(
     )
 
 
-def _compute_reactions(fem: Fem, loads: Loads, answer: Deformation) -> wp.array:
+def _compute_reactions(fem: Fem, loads: Loads, deformation: Deformation) -> wp.array:
     """Return the gradient of the energy (3N, 1) [N] at the solution: the reaction forces of the constraints."""
     problem = fem.problem
-    problem.begin(Cases(loads, answer.time, answer.memory))
-    return problem.gradient(problem.device.upload(fem.guess(loads, answer)))
+    problem.begin(Cases(loads, deformation.time, deformation.memory))
+    return problem.gradient(problem.device.upload(fem.guess(loads, deformation)))
 
 
 def _compute_traction_ratios(
-    skull: Bonded, anatomy: Anatomy, fem: Fem, bonded: np.ndarray, force: wp.array, around: float
+    skull: Bonded, anatomy: Anatomy, fem: Fem, bonded: np.ndarray, force: wp.array, radius: float
 ) -> np.ndarray:
     """Return the traction ratio (V,) of each bonded vertex: mean traction around it / strength.
 
     The averages include only bonds that are intact.
     """
     body = replace(anatomy, slide_normal=np.where(bonded[:, None], anatomy.slide_normal, 0.0))
-    bond = BondTraction(skull, body, fem.space, fem.problem.device, around)
+    bond = BondTraction(skull, body, fem.space, fem.problem.device, radius)
     own, out = bond.nodes < len(bonded), np.zeros(len(bonded))
     out[bond.nodes[own]] = bond.compute_ratios(force)[own, 0]
     return out

@@ -37,7 +37,7 @@ from .runtime.device import find_device
 from .runtime.memory import check_fits, choose_batch_size, measure_free_bytes
 from .runtime.method_lock import lock_method
 from .runtime.threads import limit_to_one_thread
-from .strategy.bone import solve_free_of_bone
+from .strategy.bone import solve_without_bone
 from .strategy.extrapolation import as_pushes, compute_directions, extrapolate_start
 from .strategy.frame_sequence import FrameSequence, build_frame_sequence
 from .strategy.plan import SolverPlan, SolverStep, build_local_solvers, choose_plan
@@ -174,8 +174,8 @@ class Fem:
         """
         check_causes(self.effects, loads)
         at = None if at is None else self._check_vertices(at)
-        if start is not None and self.following is not None:
-            answer = self.following.solve_frame(loads, start, lambda: self.guess(loads, start))
+        if start is not None and self.frame_sequence is not None:
+            answer = self.frame_sequence.solve_frame(loads, start, lambda: self.guess(loads, start))
             if answer is not None:
                 return answer if at is None else answer.restrict(at)
         check_fits(self.problem.rows, self.batch, len(loads), self.problem.device, self.strategy.kept_bytes)
@@ -193,14 +193,14 @@ class Fem:
         answer = parts[0] if len(parts) == 1 else join_deformations([replace(part, warm={}) for part in parts])
         return answer.select(np.argsort(np.concatenate([rows for _, rows in some]))) if some else answer
 
-    def _get_strategy(self, step: float) -> Strategy | NoMotionStep:
+    def _get_strategy(self, time_step: float) -> Strategy | NoMotionStep:
         """Return the strategy with a preconditioner for the time step [s]; an infinite step is a static problem."""
-        if step == 0.0 or step == math.inf:
-            return self.strategy if step else NoMotionStep(self.problem, self.strategy.inversion)
-        return self._paced(step)
+        if time_step == 0.0 or time_step == math.inf:
+            return self.strategy if time_step else NoMotionStep(self.problem, self.strategy.inversion)
+        return self._paced(time_step)
 
-    def _build_strategy(self, step: float) -> Strategy:
-        preconditioner = choose_preconditioner(self.problem, self.space, self._build_linear_stiffness, step)
+    def _build_strategy(self, time_step: float) -> Strategy:
+        preconditioner = choose_preconditioner(self.problem, self.space, self._build_linear_stiffness, time_step)
         return Strategy(self.problem, preconditioner, self.strategy.inversion, self.accuracy, self.plan)
 
     def _iterate_batches(self, count: int) -> Iterator[slice]:
@@ -208,7 +208,7 @@ class Fem:
         return (slice(first, first + self.batch) for first in range(0, max(count, 1), self.batch))
 
     @cached_property
-    def following(self) -> FrameSequence | None:
+    def frame_sequence(self) -> FrameSequence | None:
         """Solver for frame sequences on CUDA; None if the plan does not include such a solver, as on the CPU."""
         if not self.plan.captures_frames:
             return None
@@ -216,18 +216,18 @@ class Fem:
             self.strategy, self.space, self._skin, self._diagnostics, self.lock, self.description
         )
 
-    def _check_vertices(self, at: np.ndarray) -> np.ndarray:
-        return check_vertex_numbers("at", at, len(self._anatomy.mesh.nodes))
+    def _check_vertices(self, vertices: np.ndarray) -> np.ndarray:
+        return check_vertex_numbers("at", vertices, len(self._anatomy.mesh.nodes))
 
     def _check_static(self, loads: Loads) -> None:
         check_causes(self.effects, loads)
         if self.problem.depends_on_step:
             raise InputError("solutions under Inertia are time steps without static equilibrium: remove Inertia.")
 
-    def _build_linear_stiffness(self, step: float) -> sp.csc_array:
+    def _build_linear_stiffness(self, time_step: float) -> sp.csc_array:
         """Return the undeformed stiffness (3V, 3V) [N/m] of linear tetrahedra on this mesh, for a time step [s]."""
         linear = discretise(self._anatomy.mesh, "p1")
-        return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature(step)
+        return compile_problem(self.effects, self._anatomy, self._skin.device, linear).rest_curvature(time_step)
 
     @lock_method
     def residual(self, loads: Loads, answer: Deformation) -> np.ndarray:
@@ -315,21 +315,21 @@ class Fem:
         return full.reshape(len(loads), self.problem.rows).T
 
     def _solve(
-        self, strategy: Strategy | NoMotionStep, cases: Cases, last: np.ndarray | None, at: np.ndarray | None
+        self, strategy: Strategy | NoMotionStep, cases: Cases, last_u: np.ndarray | None, vertices: np.ndarray | None
     ) -> Deformation:
         clock = time.perf_counter()
-        guesses = () if last is None else (extrapolate_start(cases.loads, last, cases.warm), last)
-        found = solve_free_of_bone(strategy, cases, guesses)
+        guesses = () if last_u is None else (extrapolate_start(cases.loads, last_u, cases.warm), last_u)
+        found = solve_without_bone(strategy, cases, guesses)
         seconds = {"equilibrium": time.perf_counter() - clock}
-        way = compute_directions(as_pushes(cases.loads), last, cases.warm) if len(cases.loads) <= MAX_CARRIED else {}
-        return self._build_deformation(cases, found, way, at, seconds)
+        way = compute_directions(as_pushes(cases.loads), last_u, cases.warm) if len(cases.loads) <= MAX_CARRIED else {}
+        return self._build_deformation(cases, found, way, vertices, seconds)
 
     def _build_deformation(
         self,
         cases: Cases,
         result: SolverResult,
         warm_start: Mapping[str, np.ndarray],
-        at: np.ndarray | None,
+        vertices: np.ndarray | None,
         seconds: Mapping[str, float],
     ) -> Deformation:
         """Return the deformation of a solver result, with reactions, `warm_start` data, and `seconds` by stage."""
@@ -341,8 +341,8 @@ class Fem:
         on_footprint = self.problem.constraint.compute_footprint_force(held) if displaced else None
         touching = [term.compute_reaction(result.u) for term in self.problem.barriers]
         reaction = np.concatenate([compute_push_reactions(self._skin, cases.loads, on_footprint), *touching], axis=1)
-        nodes = np.arange(len(self._anatomy.mesh.nodes)) if at is None else at
-        if at is None and len(self.space.edges):
+        nodes = np.arange(len(self._anatomy.mesh.nodes)) if vertices is None else vertices
+        if vertices is None and len(self.space.edges):
             whole = unstack_columns(self.problem.device, result.u, np.arange(self.space.count))
             displacement = np.ascontiguousarray(whole[:, : len(nodes)])
             memory[MID_EDGE_KEY] = whole[:, len(nodes) :] - self.space.interpolate_field(displacement)[:, len(nodes) :]

@@ -34,23 +34,23 @@ class ResectedFem:
     ----------
     bodies
         Remaining bodies after 0, 1, ... all resection steps.
-    make
+    build
         Function that builds the solver of an anatomy.
-    ahead
+    eager
         True: build all solvers immediately and keep all of them. False: build each solver on first use.
-    kept
+    limit
         Maximum number of solvers in memory if solvers are built on first use.
     """
 
     def __init__(
-        self, bodies: tuple[RemainingBody, ...], make: Callable[[Anatomy], Fem], ahead: bool = False, kept: int = 4
+        self, bodies: tuple[RemainingBody, ...], build: Callable[[Anatomy], Fem], eager: bool = False, limit: int = 4
     ):
         self.lock = RLock()
         self._bodies = bodies
-        self._solver = lru_cache(len(bodies) if ahead else kept)(lambda done: make(bodies[done].anatomy))
+        self._solver = lru_cache(len(bodies) if eager else limit)(lambda done: build(bodies[done].anatomy))
         self._rows = lru_cache(None)(lambda done: _list_memory_rows(self._solver(done)))
         self._place = lru_cache(None)(lambda done, name: _find_rows(self._rows(0)[name][0], self._rows(done)[name][0]))
-        for done in range(len(bodies) if ahead else 0):
+        for done in range(len(bodies) if eager else 0):
             self._solver(done)
 
     @property
@@ -98,15 +98,15 @@ class ResectedFem:
         cause = loads.get(Resected)
         return np.full(len(loads), len(self._bodies) - 1) if cause is None else cause.done.astype(int)
 
-    def _convert_to_stage(self, start: Deformation, stage: int, stays: bool) -> Deformation:
-        """Return `start` for the solver after `stage` steps; `stays` is True if `start` has completed as many steps."""
-        memory = dict(start.memory) if stays else self._filter_memory(start.memory, stage)
+    def _convert_to_stage(self, start: Deformation, stage: int, is_same: bool) -> Deformation:
+        """Return `start` for the solver after `stage` steps; `is_same` is True if `start` has the same number."""
+        memory = dict(start.memory) if is_same else self._filter_memory(start.memory, stage)
         memory.pop(DONE_KEY, None)
         for name, place in self._index_memories(memory, stage).items():
             if memory[name].shape[1:] == self._get_shape(name):  # a mismatch is rejected where the memory is read
                 memory[name] = memory[name][place]
         return replace(
-            start, displacement=self._mask_orphans(start, stage), memory=memory, warm=start.warm if stays else {}
+            start, displacement=self._mask_orphans(start, stage), memory=memory, warm=start.warm if is_same else {}
         )
 
     def _convert_from_stage(self, result: Deformation, stage: int) -> Deformation:
@@ -166,10 +166,10 @@ def _list_memory_rows(fem: Fem) -> dict[str, tuple[np.ndarray, int]]:
     return {MID_EDGE_KEY: (fem.space.edges, 3)} | {term.name: (term.keys, term.width) for term in terms}
 
 
-def _find_rows(whole: np.ndarray, some: np.ndarray) -> np.ndarray:
-    """Return the index (n,) in `whole` (m, k) of each row of `some` (n, k)."""
-    _, number = np.unique(np.concatenate([whole, some]), axis=0, return_inverse=True)
-    known, asked = np.split(number.ravel(), [len(whole)])
+def _find_rows(table: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return the index (n,) in `table` (m, k) of each row of `rows` (n, k)."""
+    _, number = np.unique(np.concatenate([table, rows]), axis=0, return_inverse=True)
+    known, asked = np.split(number.ravel(), [len(table)])
     order = np.argsort(known)
     return order[np.searchsorted(known, asked, sorter=order)]
 
@@ -200,13 +200,13 @@ def build_fem(
     def build(body: Anatomy) -> Fem:
         return Fem(body, (*_restrict_effects(others, anatomy, body), Held()), accuracy, device, batch, element, live)
 
-    return ResectedFem(list_remaining_bodies(anatomy, effects), build, ahead=live)
+    return ResectedFem(list_remaining_bodies(anatomy, effects), build, eager=live)
 
 
-def _restrict_effects(effects: Iterable[Effect], whole: Anatomy, body: Anatomy) -> tuple[Effect, ...]:
+def _restrict_effects(effects: Iterable[Effect], anatomy: Anatomy, remaining_anatomy: Anatomy) -> tuple[Effect, ...]:
     """Return the effects without references to the regions that resection has completely removed."""
-    present = set(body.mesh.region.tolist())
-    removed = set(whole.mesh.region.tolist()) - present
+    present = set(remaining_anatomy.mesh.region.tolist())
+    removed = set(anatomy.mesh.region.tolist()) - present
 
     def restrict(effect: Effect) -> Effect | None:
         if isinstance(effect, Pulsation) and effect.regions is not None:

@@ -19,7 +19,7 @@ from .errors import InputError
 PERPENDICULAR_TOLERANCE = 1e-6
 
 
-def _check(tool: object) -> None:
+def _check_sizes(tool: object) -> None:
     for item in fields(tool):  # pyright: ignore[reportArgumentType]
         value = getattr(tool, item.name)
         if not 0.0 < value < math.inf:
@@ -39,7 +39,7 @@ class Ball:
     radius: float
 
     def __post_init__(self) -> None:
-        _check(self)
+        _check_sizes(self)
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Capsule:
     length: float
 
     def __post_init__(self) -> None:
-        _check(self)
+        _check_sizes(self)
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Spatula:
     edge: float
 
     def __post_init__(self) -> None:
-        _check(self)
+        _check_sizes(self)
         if 2.0 * self.edge > min(self.width, self.length):
             raise InputError(
                 f"a Spatula of {1e3 * self.width:g} x {1e3 * self.length:g} mm has no room for round edges of "

@@ -109,7 +109,7 @@ def skull() -> Example:
 
     way = np.linspace(-1.0, 1.0, len(top))[:, None] * [0.8, 0.6, 0.0]
     felt, area = np.linspace(5e-3, 7e-3, len(top)), np.linspace(1e-3, 2e-3, len(top))
-    bone = Bone(top, normal, bend, np.linspace(-8e-3, 1e-3, len(top)), way, felt, area, gap=6e-3, edge=5e-3)
+    bone = Bone(top, normal, bend, np.linspace(-8e-3, 1e-3, len(top)), way, felt, area, gap=6e-3, edge_radius=5e-3)
 
     def build(device: Device) -> Term:
         return Skull(bone, ROWS // 3, 1000.0, device)

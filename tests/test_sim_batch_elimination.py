@@ -59,7 +59,7 @@ def test_elimination_out_of_budget_keeps_last_finite_state() -> None:
     problem.begin(Cases(loads_of(TOTAL[good]), np.zeros(3)))
     _, free, scale = problem.residual(problem.device.upload(found.u.numpy()[:, good]))
     np.testing.assert_allclose(found.residual[good], free / scale, rtol=1e-6)
-    np.testing.assert_array_equal(found.unfinished, good)
+    np.testing.assert_array_equal(found.unfinished_cases, good)
 
 
 def test_rounding_in_elimination_violates_no_constraint() -> None:
@@ -67,10 +67,10 @@ def test_rounding_in_elimination_violates_no_constraint() -> None:
     elimination, random = descent_of(build_batch_elimination, problem, space, LAW), np.random.default_rng(0)
 
     def rounded(x: wp.array, out: wp.array) -> None:
-        elimination.extend(x, out)
+        elimination.extend_motion(x, out)
         out.assign(out.numpy() + 1e-6 * random.normal(size=out.shape))
 
-    rough = replace(elimination, extend=rounded)
+    rough = replace(elimination, extend_motion=rounded)
     found = rough.descend(problem.device.allocate(problem.rows, len(TOTAL)), np.full(len(TOTAL), 1e-5), 1)
     assert found.u.numpy()[:, :4].any(axis=0).all()
     assert not problem.compute_gap(found.u)[1].any()

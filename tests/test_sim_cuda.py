@@ -180,7 +180,7 @@ def test_cuda_block_jacobi_agrees_with_inverse(box):
     fem = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8), "cuda", element="p1")
     reference = fem.deform(pushes()).displacement
     plain = Fem(box, (Elasticity(), Held(), ToolForce()), Accuracy(1e-8, inner=4000), "cuda", element="p1")
-    plan = replace(plain.plan, batched=None)
+    plan = replace(plain.plan, batch_solver=None)
     plain.strategy = replace(plain.strategy, preconditioner=BlockJacobi(plain.problem.device), plan=plan)
     np.testing.assert_allclose(plain.deform(pushes()).displacement, reference, atol=1e-6 * np.abs(reference).max())
 
@@ -193,7 +193,7 @@ def test_cuda_local_solution_agrees_with_whole_body():
     found = fem.deform(loads)
     assert fem.strategy.build_batch_solver() is not None and all(outcome.good for outcome in found.outcome)
     assert (fem.residual(loads, found) <= 1.5 * TRAIN.tolerance).all()
-    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, batched=None))
+    fem.strategy = replace(fem.strategy, plan=replace(fem.plan, batch_solver=None))
     plain = fem.deform(loads)
     assert np.median(found.iterations) < 0.7 * np.median(plain.iterations)
     largest = np.abs(plain.displacement).max(axis=(1, 2), keepdims=True)

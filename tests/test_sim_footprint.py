@@ -219,14 +219,14 @@ def test_finer_subdivision_changes_footprint_weights_little() -> None:
     nodes, triangles = sheet(60)
     device, point, radius = find_device("cpu", "float64"), np.zeros((1, 3)), np.array([5e-3])
     coarse, fine = (
-        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(max_edge_ratio=share))
+        ContactSurface(nodes, triangles, device, subdivision=EdgeSubdivision(max_edge_ratio=share))
         .find_footprints(point, radius)
         .to_matrix(len(nodes))
         for share in (0.12, 0.03)
     )
     assert 0.0 < np.abs((coarse - fine).toarray()).max() < 2e-3
     with pytest.raises(InputError, match="too small"):
-        ContactSurface(nodes, triangles, device, division=EdgeSubdivision(max_subdivisions=1)).find_footprints(
+        ContactSurface(nodes, triangles, device, subdivision=EdgeSubdivision(max_subdivisions=1)).find_footprints(
             point, radius
         )
 

@@ -12,7 +12,7 @@ def test_geodesic_distances_on_sphere_are_arcs():
     radius = 0.06
     lattice = build_graded_lattice(np.full(3, -0.075), np.full(3, 0.075), 0.008, 0, np.zeros_like)
     body = cut_mesh(build_uncut_mesh(lattice), lambda points: np.linalg.norm(points, axis=1) - radius)
-    body = body.select(body.inside)
+    body = body.select(body.is_inside)
     surface = find_boundary_faces(body.tets)
     source = radius * np.array([0.6, 0.0, 0.8])
     found = compute_geodesic_distances(body.nodes, surface, source, 0.08)

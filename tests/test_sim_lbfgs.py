@@ -119,11 +119,11 @@ def test_lbfgs_columns_are_independent(device: Device) -> None:
 
 def test_lbfgs_out_of_budget_returns_last_accepted_state(device: Device) -> None:
     found = descended(read_problem(device), most=6)
-    np.testing.assert_array_equal(found.unfinished, np.flatnonzero(found.status != DONE))
-    assert len(found.unfinished) >= 2
+    np.testing.assert_array_equal(found.unfinished_cases, np.flatnonzero(found.status != DONE))
+    assert len(found.unfinished_cases) >= 2
     _, free, scale = read_problem(device).residual(found.u)
     np.testing.assert_allclose(free[:-1] / scale[:-1], found.residual[:-1], rtol=1e-5)
-    assert (found.residual[found.unfinished] > FINE).all()
+    assert (found.residual[found.unfinished_cases] > FINE).all()
 
 
 def test_lbfgs_reports_non_finite_start(device: Device) -> None:

@@ -28,7 +28,7 @@ def ball(points):
 def body():
     lattice = build_graded_lattice(np.full(3, -0.04), np.full(3, 0.04), 0.008, 0, np.zeros_like)
     made = cut_mesh(build_uncut_mesh(lattice), ball)
-    return made.select(made.inside)
+    return made.select(made.is_inside)
 
 
 def test_smallest_sine_is_that_of_the_dihedral_angles(body):

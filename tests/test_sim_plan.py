@@ -73,7 +73,7 @@ def test_avoided_solver_step_is_not_planned(avoid, steps):
     plan = planned(live=True, element="smoothed", avoid=(avoid,))
     assert {count: plan.list_steps(count) for count in steps} == steps
     assert planned(**POSED, avoid=(SolverStep.CONTACT,)).contact_solver is SolverStep.NEWTON
-    assert planned(element="p2", avoid=(SolverStep.CLAMPED,)).single is None
+    assert planned(element="p2", avoid=(SolverStep.CLAMPED,)).single_solver is None
 
 
 @pytest.mark.parametrize("evaluations", [0, 1, 7])

@@ -129,7 +129,7 @@ def test_rotating_body_slides_along_a_round_skull() -> None:
                 activation=5e-5 * one,
                 area=1e-4 * one,
                 gap=5e-5,
-                edge=0.0,
+                edge_radius=0.0,
             ),
             1,
             1000.0,

@@ -172,7 +172,7 @@ def test_strained_descent_out_of_budget_is_finite() -> None:
     problem, space, rest = hard()
     descent = descent_on(problem, space)
     found = descent.descend(rest, np.full(1, 1e-12), 3)
-    assert found.status[0] == GOING and found.steps[0] <= 3 and found.unfinished.tolist() == [0]
+    assert found.status[0] == GOING and found.steps[0] <= 3 and found.unfinished_cases.tolist() == [0]
     _, free, scale = problem.residual(found.u)
     np.testing.assert_allclose(found.residual, free / scale, rtol=1e-6)
     broken = descent.descend(problem.device.upload(np.full((problem.rows, 1), np.nan)), np.full(1, 1e-12), 20)

@@ -21,7 +21,7 @@ from sim.local_solvers.strained_descent import (
     StrainedDescent,
     build_strained_part,
 )
-from sim.local_solvers.strained_frame import MATRIX_KEY, NODES_KEY, UpdatedPreconditioner, update_model_at
+from sim.local_solvers.strained_frame import MATRIX_KEY, NODES_KEY, UpdatedPreconditioner, compute_updated_model
 from sim.strategy.captured_frame import MAX_SERVED_STEPS
 from sim.strategy.frame_sequence import DeviceWarmStart
 
@@ -115,7 +115,7 @@ def test_update_matrix_agrees_with_update_by_factors(fem: Fem) -> None:
     u = problem.device.upload(fem.guess(pressed(6), last))
     part = build_strained_part(problem, factor, fem.space, SINGLE_LIMITS)
     part.prepare()
-    bent = update_model_at(part, problem.device, u)
+    bent = compute_updated_model(part, problem.device, u)
     problem.begin(Cases(pressed(6.5), np.zeros(1)))
     single = StrainedDescent(problem, factor, part, Renewal(max_reused_steps=8)).descend(u, np.full(1, 1e-2), 8, {})
     assert bent is not None and set(single.warm_start)

@@ -11,9 +11,9 @@ from surrogate.data.tool_loads import (
     TOOLS,
     PublishedSettings,
     compute_rejected_share,
-    describe_rejected,
+    describe_rejected_loads,
     draw,
-    select_spread,
+    pick_far_points,
 )
 
 
@@ -102,7 +102,7 @@ def make_small_opening(box):
 
 def test_spread_selects_points_far_from_each_other():
     points = np.random.default_rng(0).random((400, 3)) * [1, 1, 0]
-    chosen = points[select_spread(points, 9)]
+    chosen = points[pick_far_points(points, 9)]
     gaps = np.linalg.norm(chosen[:, None] - chosen, axis=2) + np.eye(9) * 9
     assert gaps.min() > 0.3  # a 3 x 3 grid has 0.33-0.5
 
@@ -125,8 +125,7 @@ def test_rejected_share_matches_random_recount(name):
 
 
 def test_rejected_share_is_described_in_words():
-    assert describe_rejected("palpation").startswith("10 % of the nominal loads of palpation")
+    assert describe_rejected_loads("palpation").startswith("10 % of the nominal loads of palpation")
     assert compute_rejected_share("mixed") == pytest.approx(np.mean([compute_rejected_share(name) for name in TOOLS]))
-    assert (
-        compute_rejected_share("seed") == compute_rejected_share("anything") == 0.0 and describe_rejected("seed") == ""
-    )
+    assert compute_rejected_share("seed") == compute_rejected_share("anything") == 0.0
+    assert describe_rejected_loads("seed") == ""

@@ -32,7 +32,7 @@ def body_of(number):
 
 
 def write(path, values):
-    with write_stream_atomically(path, path.suffix, clean=False) as stream, h5py.File(stream, "w") as file:
+    with write_stream_atomically(path, path.suffix, remove_partials=False) as stream, h5py.File(stream, "w") as file:
         for name, value in values.items():
             file[name] = value
     return MadeEpisode(path, len(values), path.stat().st_size)

@@ -105,7 +105,7 @@ def measure_mesh(trial: MeshTrial, node_count: int, batch_size: int) -> ScalingR
         preconditioner=fem.plan.preconditioner, batch=batch_size, set_up=made,
         load=float(np.median(seconds)) / batch_size, outer=float(np.median(outer)), loads=len(outer), converged=good,
         memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, card=max(card) / 2**30,
-        foreseen=0.0 if needed is None else needed.peak / 2**30,
+        foreseen=0.0 if needed is None else needed.peak_bytes / 2**30,
     )  # fmt: skip
 
 

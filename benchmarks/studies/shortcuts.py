@@ -116,7 +116,7 @@ def list_cases(site: CraniotomyFrame, run_count: int, on_cuda: bool) -> Iterator
 def is_shortcut_used(fem: Fem, step: SolverStep | None) -> bool:
     """Return True if a solver uses an acceleration on its device, with its element and effects."""
     plan = fem.plan
-    own = {plan.batched, plan.single, plan.contact_solver}
+    own = {plan.batch_solver, plan.single_solver, plan.contact_solver}
     return (
         step is None
         or step in own

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from sim.bodies.tip_distance import build_tip_gauge
     from surrogate.data.dataset import read_dataset
-    from surrogate.data.tool_loads import compute_rejected_share, describe_rejected
+    from surrogate.data.tool_loads import compute_rejected_share, describe_rejected_loads
     from surrogate.evaluation.coverage import compute_coverage, measure_distance_coverage
     from surrogate.evaluation.score import compare_forces, format_scores, score
     from surrogate.model.store import load
@@ -78,8 +78,8 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({**figures, "motion_mm": motion, "nominal_refused": compute_rejected_share(preset)}))
     else:
         print(f"{len(loads)} loads, compared with their FEM solutions:\n{format_scores(scores, motion)}")
-        if describe_rejected(preset):
-            print(describe_rejected(preset))
+        if describe_rejected_loads(preset):
+            print(describe_rejected_loads(preset))
         for name in models:
             for bound, coverage in (("bounds", bounds), ("bounds of the distance from tip to tumour", ranged)):
                 print(f"{name}: {bound} cover {coverage[name]}" if name in coverage else f"{name}: has no {bound}")

@@ -30,7 +30,7 @@ from surrogate.data.load_histories import HISTORY, sample_times
 from surrogate.data.simulate import SimulatedRows, simulate
 from surrogate.data.solution_rows import describe_tissue_source
 from surrogate.data.solver_pool import LazyFem, open_solvers
-from surrogate.data.tool_loads import OVERLOAD_PRESETS, PRESETS, compute_rejected_share, describe_rejected, draw
+from surrogate.data.tool_loads import OVERLOAD_PRESETS, PRESETS, compute_rejected_share, describe_rejected_loads, draw
 from surrogate.data.tool_poses import choose_ball, draw_poses
 
 from ..options.outputs import add_force, check_output_path, read_attributes, read_batch_size, remove_outdated_data
@@ -235,7 +235,7 @@ def _print_report(args: argparse.Namespace, solver: str, count: int, solved: Sim
     print(f"Solved by {solver}.")
     if rate is not None:
         print(f"{rate:.3g} loads per second, with sampling and writing.")
-    if not args.pose_control and describe_rejected(args.tool_preset):
-        print(describe_rejected(args.tool_preset))
+    if not args.pose_control and describe_rejected_loads(args.tool_preset):
+        print(describe_rejected_loads(args.tool_preset))
     if failed:
         print(f"{failed} solutions are unreliable (see their outcomes): they stay in the file, but no model uses them.")

@@ -15,7 +15,7 @@ from sim.runtime.partial_files import to_unfinished_path
 from sim.runtime.timing import time_stage
 from surrogate.data.dataset import Dataset, read_dataset
 from surrogate.data.splits import CALIBRATION_STRIDE
-from surrogate.data.tool_loads import compute_rejected_share, describe_rejected
+from surrogate.data.tool_loads import compute_rejected_share, describe_rejected_loads
 from surrogate.evaluation.score import find_best_score, format_scores
 from surrogate.model.guarded import describe_error, get_reported_errors
 from surrogate.model.learned import Learned
@@ -102,7 +102,7 @@ def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
 
 def _format_text(trained: Trained, out: str, failed: int, preset: str) -> str:
     notes = [f"{failed} unreliable solutions were excluded."] if failed else []
-    notes += [words for words in [describe_rejected(preset)] if words]
+    notes += [words for words in [describe_rejected_loads(preset)] if words]
     bounds = ", ".join(f"{name} {1e3 * model.bound:.3f}" for name, model in trained.models.items())
     return "\n".join(
         [

@@ -159,7 +159,7 @@ def collect(
     total = len(player.scene.times)
     check_disk_space(path, int(total * PIXEL_BYTES * player.camera.width * player.camera.height))
     right = replace(player.stage) if player.scene.viewpoint.eye == "left" else None
-    with write_stream_atomically(path, ".h5", clean=False) as stream, h5py.File(stream, "w") as file:
+    with write_stream_atomically(path, ".h5", remove_partials=False) as stream, h5py.File(stream, "w") as file:
         pictures = file.create_group("pictures")
         stores: dict[str, h5py.Dataset] = {}
         rows, loads = [], []  # a frame itself holds seven megabytes

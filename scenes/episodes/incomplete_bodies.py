@@ -37,7 +37,7 @@ def resume_data_set(path: Path, inputs: Mapping[str, str], other_folders: Sequen
     said = json.dumps(dict(inputs), sort_keys=True)
     if not _has_inputs(path, said):
         remove_data_set(path)
-        with write_atomically(path.with_suffix(NOTE), NOTE, clean=False) as partial:
+        with write_atomically(path.with_suffix(NOTE), NOTE, remove_partials=False) as partial:
             partial.write_text(said, encoding="utf-8")
     alike = [path, *(each for other in other_folders if _has_inputs(each := other / path.name, said))]
     *_, (whole, size, best) = sorted(max(_find_kept_files(each), default=(False, 0, each)) for each in alike)
@@ -55,7 +55,7 @@ def _copy(source: Path, target: Path) -> None:
     with (
         suppress(FileNotFoundError),  # from a process that has finished with it
         source.open("rb") as file,
-        write_atomically(target, target.suffix, clean=False) as partial,
+        write_atomically(target, target.suffix, remove_partials=False) as partial,
         partial.open("wb") as copy,
     ):
         shutil.copyfileobj(file, copy)

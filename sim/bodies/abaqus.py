@@ -139,9 +139,9 @@ def _parse_elements(name: str, rows: list[str]) -> tuple[str, np.ndarray]:
     return kind, np.array([int(row.split(",")[0]) for row in first], int).reshape(-1, 1)
 
 
-def _parse_set_members(rows: list[str], generate: bool, sets: Mapping[str, list[np.ndarray]]) -> list[np.ndarray]:
-    """Return the element numbers of a set: listed, as first, last, step if `generate`, or by names of other sets."""
-    if generate:
+def _parse_set_members(rows: list[str], is_range: bool, sets: Mapping[str, list[np.ndarray]]) -> list[np.ndarray]:
+    """Return the element numbers of a set: listed, as first, last, step if `is_range`, or by names of other sets."""
+    if is_range:
         return [np.arange(first, last + 1, *step) for first, last, *step in (_parse_integers([row]) for row in rows)]
     cells = [cell.strip(' "') for row in rows for cell in row.split(",")]
     named = [numbers for cell in cells for numbers in sets.get(cell.upper(), [])]

@@ -33,36 +33,36 @@ class Lattice:
     is_centre: np.ndarray
 
 
-def build_graded_lattice(low: np.ndarray, high: np.ndarray, max_edge: float, halvings: int, sizing: Sizing) -> Lattice:
+def build_graded_lattice(low: np.ndarray, high: np.ndarray, max_edge: float, max_level: int, sizing: Sizing) -> Lattice:
     """Return the lattice over the box from `low` (3,) to `high` (3,) [m].
 
-    Cells of edge `max_edge` [m] are halved up to `halvings` times, until their edge does not exceed `sizing`. Adjacent
+    Cells of edge `max_edge` [m] are halved up to `max_level` times, until their edge does not exceed `sizing`. Adjacent
     cells, including diagonal neighbours, differ by at most one halving.
     """
     count = np.ceil((high - low) / max_edge).astype(int)
     origin = 0.5 * (low + high) - 0.5 * max_edge * count
-    exists, split = _build_octree(origin, count, max_edge, halvings, sizing)
-    unit = max_edge / 2 ** (halvings + 1)  # half the finest cell: every node has whole coordinates
-    span = count * 2 ** (halvings + 1) + 1
+    exists, split = _build_octree(origin, count, max_edge, max_level, sizing)
+    unit = max_edge / 2 ** (max_level + 1)  # half the finest cell: every node has whole coordinates
+    span = count * 2 ** (max_level + 1) + 1
 
     leaves = [there & ~halved for there, halved in zip(exists, split, strict=True)]
-    corners = [np.argwhere(leaf) * 2 ** (halvings + 1 - level) for level, leaf in enumerate(leaves)]
+    corners = [np.argwhere(leaf) * 2 ** (max_level + 1 - level) for level, leaf in enumerate(leaves)]
     known = np.unique(
         np.concatenate(
             [
                 _compute_keys(
-                    (at[:, None] + 2 ** (halvings + 1 - level) * np.indices((2, 2, 2)).reshape(3, 8).T), span
+                    (at[:, None] + 2 ** (max_level + 1 - level) * np.indices((2, 2, 2)).reshape(3, 8).T), span
                 ).ravel()
                 for level, at in enumerate(corners)
             ]
         )
     )
     cells: list[np.ndarray] = []
-    for level in range(halvings + 1):
-        edge = 2 ** (halvings + 1 - level)
+    for level in range(max_level + 1):
+        edge = 2 ** (max_level + 1 - level)
         for axis in range(3):
-            cells += _build_tets_between_equals(leaves[level], axis, edge, known, span)
-            cells += _build_tets_between_unequals(leaves[level], exists[level], axis, edge)
+            cells += _build_tets_at_equal_cells(leaves[level], axis, edge, known, span)
+            cells += _build_tets_at_unequal_cells(leaves[level], exists[level], axis, edge)
     corners_of_tets = np.concatenate(cells)
     keys, tets = np.unique(_compute_keys(corners_of_tets, span), return_inverse=True)
     whole = np.stack(np.unravel_index(keys, span), axis=1)
@@ -87,53 +87,53 @@ def _build_octree(
     return [np.ones(count, bool), *[_mark_children(halved) for halved in split[:-1]]], split
 
 
-def _mark_children(halved: np.ndarray) -> np.ndarray:
-    return halved.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+def _mark_children(is_halved: np.ndarray) -> np.ndarray:
+    return is_halved.repeat(2, 0).repeat(2, 1).repeat(2, 2)
 
 
-def _compute_keys(whole: np.ndarray, span: np.ndarray) -> np.ndarray:
+def _compute_keys(coordinates: np.ndarray, grid_shape: np.ndarray) -> np.ndarray:
     """Return a unique integer for each integer coordinate triple (..., 3)."""
-    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(whole, -1, 0)), tuple(span)))
+    return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(coordinates, -1, 0)), tuple(grid_shape)))
 
 
-def _compute_face_corners(corner: np.ndarray, axis: int, edge: int, upper: bool) -> np.ndarray:
+def _compute_face_corners(corner: np.ndarray, axis: int, edge: int, is_upper: bool) -> np.ndarray:
     """Return corners (n, 4, 3), in cyclic order, of the lower or upper face across `axis` of the cells at `corner`."""
     offset = np.zeros((4, 3), int)
     offset[:, [(axis + 1) % 3, (axis + 2) % 3]] = FACE_CORNERS * edge
-    offset[:, axis] = edge * upper
+    offset[:, axis] = edge * is_upper
     return corner[:, None] + offset
 
 
-def _build_tets_between_equals(
-    leaf: np.ndarray, axis: int, edge: int, known: np.ndarray, span: np.ndarray
+def _build_tets_at_equal_cells(
+    is_leaf: np.ndarray, axis: int, edge: int, node_keys: np.ndarray, grid_shape: np.ndarray
 ) -> list[np.ndarray]:
     """Return the BCC tetrahedra around each face between two leaves of equal size, halved at edges with a midpoint."""
-    ahead = np.delete(leaf, 0, axis)
-    corner = np.argwhere(np.delete(leaf, -1, axis) & ahead) * edge
+    ahead = np.delete(is_leaf, 0, axis)
+    corner = np.argwhere(np.delete(is_leaf, -1, axis) & ahead) * edge
     below = corner + edge // 2
     above = below + edge * np.eye(3, dtype=int)[axis]
-    square, tets = _compute_face_corners(corner, axis, edge, upper=True), []
+    square, tets = _compute_face_corners(corner, axis, edge, is_upper=True), []
     for k in range(4):
         start, end = square[:, k], square[:, (k + 1) % 4]
         middle = (start + end) // 2
-        halved = np.isin(_compute_keys(middle, span), known)
+        halved = np.isin(_compute_keys(middle, grid_shape), node_keys)
         tets.append(np.stack([below, above, start, end], 1)[~halved])
         tets.append(np.stack([below, above, start, middle], 1)[halved])
         tets.append(np.stack([below, above, middle, end], 1)[halved])
     return tets
 
 
-def _build_tets_between_unequals(leaf: np.ndarray, exists: np.ndarray, axis: int, edge: int) -> list[np.ndarray]:
+def _build_tets_at_unequal_cells(is_leaf: np.ndarray, is_cell: np.ndarray, axis: int, edge: int) -> list[np.ndarray]:
     """Return the split pyramids on both sides of each face between a leaf and a leaf of twice its size."""
     tets = []
     for step in (-1, 1):
-        neighbour, rim = np.roll(exists, -step, axis), [slice(None)] * 3
+        neighbour, rim = np.roll(is_cell, -step, axis), [slice(None)] * 3
         rim[axis] = slice(-1, None) if step > 0 else slice(0, 1)
         neighbour[tuple(rim)] = True  # no cell exists beyond the box
-        index = np.argwhere(leaf & ~neighbour)
+        index = np.argwhere(is_leaf & ~neighbour)
         small = index * edge + edge // 2
         large = (index + step * np.eye(3, dtype=int)[axis]) // 2 * 2 * edge + edge
-        square = _compute_face_corners(index * edge, axis, edge, upper=step > 0)
+        square = _compute_face_corners(index * edge, axis, edge, is_upper=step > 0)
         # The larger face's centre is the corner at which both tangential indices change from even to odd.
         tangential = np.stack([index[:, (axis + 1) % 3], index[:, (axis + 2) % 3]], 1)
         first = np.argmax((FACE_CORNERS[None] == 1 - tangential[:, None] % 2).all(2), axis=1)

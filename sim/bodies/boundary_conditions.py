@@ -17,7 +17,7 @@ from .placement import Placement, find_within_outline
 def add_boundary_conditions(
     mesh: TetMesh,
     site: np.ndarray,
-    craniotomy: float,
+    diameter: float,
     settings: Placement,
     outline: np.ndarray | None = None,
     septa: Sequence[Septum] = (),
@@ -25,7 +25,7 @@ def add_boundary_conditions(
     """Return the anatomy with boundary conditions of a `mesh`, with a craniotomy around `site` (3,) [m] on the cortex.
 
     The brainstem is fixed: surface nodes within a fraction of the brain's height from the lowest (most inferior) node.
-    The craniotomy is free: surface nodes within a geodesic distance of half its diameter `craniotomy` [m] from the
+    The craniotomy is free: surface nodes within a geodesic distance of half its `diameter` [m] from the
     point nearest to `site` or, if an `outline` (n, 3) [m] is given, within this closed curve. Nodes at the dural
     sheets `septa` are fixed, except in the craniotomy.
 
@@ -43,9 +43,9 @@ def add_boundary_conditions(
     lowest, height = outer[mesh.nodes[outer, 2].argmin()], np.ptp(mesh.nodes[outer, 2])
     stem = np.zeros(len(mesh.nodes), bool)
     stem[outer] = np.linalg.norm(mesh.nodes[outer] - mesh.nodes[lowest], axis=1) <= settings.brainstem_radius * height
-    said = f"a craniotomy of {craniotomy * 1e3:g} mm" if outline is None else "the outlined opening"
+    said = f"a craniotomy of {diameter * 1e3:g} mm" if outline is None else "the outlined opening"
     if outline is None:
-        opened = compute_geodesic_distances(mesh.nodes, surface, site, 0.5 * craniotomy) <= 0.5 * craniotomy
+        opened = compute_geodesic_distances(mesh.nodes, surface, site, 0.5 * diameter) <= 0.5 * diameter
     else:
         opened = np.isin(np.arange(len(mesh.nodes)), outer) & find_within_outline(mesh.nodes, outline)
     opened &= ~stem

@@ -162,41 +162,41 @@ def read_head_masks(sources: MaskSources) -> HeadMasks:
     )
 
 
-def _note_unassigned_labels(whole: LabelMap, named: Sequence[Label]) -> tuple[str, ...]:
+def _note_unassigned_labels(label_map: LabelMap, assigned_labels: Sequence[Label]) -> tuple[str, ...]:
     """Return a note, or (), on the labels of the file to which no tissue is assigned."""
-    names = {(one.layer, one.value): one.name for one in whole.segments}
-    found = {(layer, value) for layer, present in enumerate(whole.labels_by_layer) for value in present}
-    left = [names.get(place, place[1]) for place in sorted(found - set(whole.find_layers(named)))]
+    names = {(one.layer, one.value): one.name for one in label_map.segments}
+    found = {(layer, value) for layer, present in enumerate(label_map.labels_by_layer) for value in present}
+    left = [names.get(place, place[1]) for place in sorted(found - set(label_map.find_layers(assigned_labels)))]
     return (f"neither brain nor tumour: what is labelled {format_labels(left)}",) if left else ()
 
 
 def _note_contradictions(
-    whole: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tuple[Label, ...]]
+    label_map: LabelMap, tumour: Sequence[Label], parts: Mapping[str, tuple[Label, ...]]
 ) -> tuple[str, ...]:
     """Return a note if the anatomy contradicts the labels given by the user, else ()."""
-    if whole.layers.shape[-1] > 1 or not {NECROSIS, "oedema"}.intersection(parts):
+    if label_map.layers.shape[-1] > 1 or not {NECROSIS, "oedema"}.intersection(parts):
         return ()
-    own = {name: tuple(value for _, value in whole.find_layers(labels)) for name, labels in parts.items()}
-    core, necrosis = tuple(value for _, value in whole.find_layers(tumour)), own.get(NECROSIS, ())
+    own = {name: tuple(value for _, value in label_map.find_layers(labels)) for name, labels in parts.items()}
+    core, necrosis = tuple(value for _, value in label_map.find_layers(tumour)), own.get(NECROSIS, ())
     meant = Convention("own", "", tumour=core + necrosis, necrosis=necrosis, oedema=own.get("oedema", ()))
-    found = find_contradiction(count_label_contacts(whole), meant)
+    found = find_contradiction(count_label_contacts(label_map), meant)
     return (f"{found.reason}: see that the labels mean this",) if found else ()
 
 
-def _note_tumour_side(marked: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
+def _note_tumour_side(masks: dict[str, np.ndarray], affine: np.ndarray, path: Path) -> str:
     """Return a note on the side of the tumour, for a file that would also fit with x and y negated."""
-    low, high = Mask(path, marked["brain"], affine).box
-    centre = affine[:3, :3] @ np.argwhere(marked["tumour"]).mean(axis=0) + affine[:3, 3]
+    low, high = Mask(path, masks["brain"], affine).box
+    centre = affine[:3, :3] @ np.argwhere(masks["tumour"]).mean(axis=0) + affine[:3, 3]
     return (
         f"{path}: has a grid of its own, and would fit with x and y negated, too. See that it is right that the tumour "
         f"lies {describe_side(centre, low, high)}"
     )
 
 
-def _note_voxels_outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ...]:
+def _note_voxels_outside(masks: dict[str, np.ndarray], affine: np.ndarray) -> tuple[str, ...]:
     """Return a note if a large fraction of the labelled voxels is outside the brain mask, else ()."""
-    labelled = np.logical_or.reduce([mask for name, mask in marked.items() if name != "brain"])
-    out = int((labelled & ~marked["brain"]).sum())
+    labelled = np.logical_or.reduce([mask for name, mask in masks.items() if name != "brain"])
+    out = int((labelled & ~masks["brain"]).sum())
     if out <= MAX_OUTSIDE_FRACTION * labelled.sum():
         return ()
     lost = 1e6 * out * abs(float(np.linalg.det(affine[:3, :3])))
@@ -204,32 +204,32 @@ def _note_voxels_outside(marked: dict[str, np.ndarray], affine: np.ndarray) -> t
 
 
 def _note_cavity(
-    whole: LabelMap, convention: Convention | None, named: Mapping[str, Sequence[Label]]
+    label_map: LabelMap, convention: Convention | None, assigned_labels: Mapping[str, Sequence[Label]]
 ) -> tuple[str, ...]:
     """Return a note if the convention marks a fluid-filled cavity, which the brain mask may include; else ()."""
-    fluid = _select_present(convention.csf, whole) if convention and convention.tumour else ()
-    if not fluid or set(fluid) <= {label for labels in named.values() for label in labels}:
+    fluid = _select_existing(convention.csf, label_map) if convention and convention.tumour else ()
+    if not fluid or set(fluid) <= {label for labels in assigned_labels.values() for label in labels}:
         return ()
-    ml = 1e6 * int(whole.mask(fluid).sum()) * abs(float(np.linalg.det(whole.affine[:3, :3])))
+    ml = 1e6 * int(label_map.mask(fluid).sum()) * abs(float(np.linalg.det(label_map.affine[:3, :3])))
     return (
         f"{ml:.2g} ml are a cavity, label {format_labels(fluid)}: where the mask holds it, it becomes brain. "
         f"For a region with a stiffness of its own add --ventricles {','.join(map(str, fluid))}",
     )
 
 
-def _crop_masks(marked: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _crop_masks(masks: dict[str, np.ndarray], affine: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return the masks cropped to brain and tumour with a margin of `CROP_MARGIN` voxels, and their affine (4, 4)."""
-    anything = marked["brain"] | marked["tumour"]
+    anything = masks["brain"] | masks["tumour"]
     ends = [np.flatnonzero(anything.any(axis=tuple({0, 1, 2} - {axis})))[[0, -1]] for axis in range(3)]
     low = np.maximum(0, np.array(ends)[:, 0] - CROP_MARGIN)
     part = tuple(slice(first, end[1] + 1 + CROP_MARGIN) for first, end in zip(low, ends, strict=True))
     moved = affine.copy()
     moved[:3, 3] += affine[:3, :3] @ low
-    return {name: np.ascontiguousarray(mask[part]) for name, mask in marked.items()}, moved
+    return {name: np.ascontiguousarray(mask[part]) for name, mask in masks.items()}, moved
 
 
 def _select_labels(
-    whole: LabelMap, sources: MaskSources, convention: Convention | None
+    label_map: LabelMap, sources: MaskSources, convention: Convention | None
 ) -> tuple[tuple[Label, ...], tuple[Label, ...]]:
     """Return the labels of brain and of tumour: the user's, or those of the convention that the file contains."""
     brain, tumour = sources.brain, sources.tumour
@@ -237,32 +237,32 @@ def _select_labels(
         necrosis = sources.parts.get(NECROSIS, ())
         parts = tuple(label for name, labels in sources.parts.items() if name != NECROSIS for label in labels)
         given = brain + parts + (() if sources.tumour_file else tumour + necrosis)
-        named = {value for _, value in whole.find_layers(given)}
+        named = {value for _, value in label_map.find_layers(given)}
         checked = convention.innermost or (convention.tumour and not sources.tumour and not sources.parts)
-        doubts = (build_contradiction_check(whole, convention),) if checked else ()
-        check_labels_fit(sources.labels, convention, whole.labels, named, *doubts)
-        _check_hemispheres(whole, convention)
+        doubts = (build_contradiction_check(label_map, convention),) if checked else ()
+        check_labels_fit(sources.labels, convention, label_map.labels, named, *doubts)
+        _check_hemispheres(label_map, convention)
         if not brain and not sources.mask:
-            brain = _select_present(convention.brain, whole)
+            brain = _select_existing(convention.brain, label_map)
         if not tumour and not sources.tumour_file:
-            tumour = _select_present(convention.tumour, whole)
+            tumour = _select_existing(convention.tumour, label_map)
     options = {"brain": "--brain" if sources.brain else "--convention", "tumour": "--tumour"}
     own = {"brain": brain, "tumour": tumour, **sources.parts}
     elsewhere = ("tumour", NECROSIS) if sources.tumour_file else ()
     _check_labels_unique(
-        whole, {name: (options.get(name, f"--{name}"), of) for name, of in own.items() if name not in elsewhere}
+        label_map, {name: (options.get(name, f"--{name}"), of) for name, of in own.items() if name not in elsewhere}
     )
     return brain, tumour
 
 
-def _select_present(labels: Sequence[int], whole: LabelMap) -> tuple[int, ...]:
-    return tuple(label for label in labels if label in whole.labels)
+def _select_existing(labels: Sequence[int], label_map: LabelMap) -> tuple[int, ...]:
+    return tuple(label for label in labels if label in label_map.labels)
 
 
-def _build_part_masks(whole: LabelMap, convention: Convention) -> dict[str, np.ndarray]:
+def _build_part_masks(label_map: LabelMap, convention: Convention) -> dict[str, np.ndarray]:
     """Return the masks of other tissues of the convention that occur in the file, by name."""
     groups = {NECROSIS: convention.necrosis, "oedema": convention.oedema, "ventricles": convention.ventricles}
-    return {name: whole.mask(found) for name, of in groups.items() if (found := _select_present(of, whole))}
+    return {name: label_map.mask(found) for name, of in groups.items() if (found := _select_existing(of, label_map))}
 
 
 def _read_other_masks(sources: MaskSources, tumour: Sequence[Label]) -> dict[str, Mask]:
@@ -314,19 +314,19 @@ def _check_sources(sources: MaskSources, convention: Convention | None) -> None:
         )
 
 
-def _check_labels_unique(whole: LabelMap, named: Mapping[str, tuple[str, Sequence[Label]]]) -> None:
-    """Reject a label that two options assign; `named` maps each tissue to its option and its labels.
+def _check_labels_unique(label_map: LabelMap, assigned_labels: Mapping[str, tuple[str, Sequence[Label]]]) -> None:
+    """Reject a label that two options assign; `assigned_labels` maps each tissue to its option and its labels.
 
     A label of a part of the brain may also be assigned to brain, and a label of necrosis also to tumour.
     """
-    for (one, (option, labels)), (two, (other, others)) in combinations(named.items(), 2):
+    for (one, (option, labels)), (two, (other, others)) in combinations(assigned_labels.items(), 2):
         if one == _get_enclosing_mask(two):
             continue
-        places = whole.find_layers(labels)
-        both = [label for label, place in zip(others, whole.find_layers(others), strict=True) if place in places]
+        places = label_map.find_layers(labels)
+        both = [label for label, place in zip(others, label_map.find_layers(others), strict=True) if place in places]
         if both:
             raise InputError(
-                f"{whole.path}: label {format_labels(both)} is named by {option} and by {other}: "
+                f"{label_map.path}: label {format_labels(both)} is named by {option} and by {other}: "
                 "give it to one of them."
             )
 
@@ -336,14 +336,14 @@ def _get_enclosing_mask(part: str) -> str:
     return "" if part in ("brain", "tumour") else "tumour" if part == NECROSIS else "brain"
 
 
-def _check_hemispheres(whole: LabelMap, convention: Convention) -> None:
+def _check_hemispheres(label_map: LabelMap, convention: Convention) -> None:
     """Reject a file with labels of the left hemisphere on the right side, since its orientation is wrong."""
     right = []
     for side in (convention.left, convention.right):
-        index = np.argwhere(np.isin(whole.layers[..., 0], side))
-        right.append(float((index @ whole.affine[0, :3]).mean()) if len(index) else 0.0)
+        index = np.argwhere(np.isin(label_map.layers[..., 0], side))
+        right.append(float((index @ label_map.affine[0, :3]).mean()) if len(index) else 0.0)
     if right[0] > right[1]:
         raise InputError(
-            f"{whole.path}: its labels of the left half lie {1e3 * (right[0] - right[1]):.0f} mm to the right of those "
-            "of the right half. Its affine is mirrored, or it is LPS declared as RAS: export it again."
+            f"{label_map.path}: its labels of the left half lie {1e3 * (right[0] - right[1]):.0f} mm to the right of "
+            "those of the right half. Its affine is mirrored, or it is LPS declared as RAS: export it again."
         )

@@ -79,9 +79,9 @@ def _find_skull_path() -> Path:
     return path
 
 
-def _scale_head(healthy: HealthyHead, volume: float) -> HealthyHead:
-    centre, own = measure_centroid_and_volume(healthy.mask, healthy.affine)
-    factor, grey = (volume / own) ** (1.0 / 3.0), healthy.intensity
+def _scale_head(head: HealthyHead, volume: float) -> HealthyHead:
+    centre, own = measure_centroid_and_volume(head.mask, head.affine)
+    factor, grey = (volume / own) ** (1.0 / 3.0), head.intensity
     if grey is not None:
         grey = Intensity(grey.values, scale_affine(grey.affine, centre, factor, centre))
-    return replace(healthy, affine=scale_affine(healthy.affine, centre, factor, centre), intensity=grey)
+    return replace(head, affine=scale_affine(head.affine, centre, factor, centre), intensity=grey)

@@ -44,45 +44,45 @@ class IsosurfaceStuffingOptions:
 
     Parameters
     ----------
-    snap_long, snap_short
+    long_edge_snap_fraction, short_edge_snap_fraction
         Fractions of a long and of a short lattice edge. If a crossing is nearer to a node than this fraction, the node
         moves to the surface. On an ungraded lattice every dihedral angle exceeds 10.7 degrees (section 4 of the paper).
-    snap_other
+    cut_edge_snap_fraction
         Same fraction for an edge that ends at a node of an earlier cut, for which the paper gives no value.
-    snap_shortest
+    max_snap_fraction
         Maximum snapping distance, as a fraction of the shortest edge at the node. Where the cell size changes, the
         fraction of a long edge could otherwise invert the small tetrahedra at the node.
-    bisections
+    max_bisections
         Bisection steps per edge: 24 steps leave an error of 6e-8 of the edge length.
     """
 
-    snap_long: float = 0.24999
-    snap_short: float = 0.41189
-    snap_other: float = 0.35
-    snap_shortest: float = 0.4
-    bisections: int = 24
+    long_edge_snap_fraction: float = 0.24999
+    short_edge_snap_fraction: float = 0.41189
+    cut_edge_snap_fraction: float = 0.35
+    max_snap_fraction: float = 0.4
+    max_bisections: int = 24
 
 
 @dataclass(frozen=True, eq=False)
 class CutMesh:
     """Tetrahedra that do not cross any of the surfaces at which the mesh was cut.
 
-    `nodes` (V, 3) [m]; `node_kinds` (V,): CENTRE, CORNER or CUT; `tets` (T, 4), positively oriented; `inside` (T,) bool
-    and `on_surface` (V,) bool with respect to the surface of the last cut.
+    `nodes` (V, 3) [m]; `node_kinds` (V,): CENTRE, CORNER or CUT; `tets` (T, 4), positively oriented; `is_inside` (T,)
+    and `is_on_surface` (V,) with respect to the surface of the last cut.
     """
 
     nodes: np.ndarray
     node_kinds: np.ndarray
     tets: np.ndarray
-    inside: np.ndarray
-    on_surface: np.ndarray
+    is_inside: np.ndarray
+    is_on_surface: np.ndarray
 
     def select(self, mask: np.ndarray) -> CutMesh:
         """Return the mesh of the tetrahedra marked in `mask` (T,); their nodes are renumbered in the same order."""
         used = np.zeros(len(self.nodes), bool)
         used[self.tets[mask]] = True
         tets = (np.cumsum(used) - 1)[self.tets[mask]]
-        return CutMesh(self.nodes[used], self.node_kinds[used], tets, self.inside[mask], self.on_surface[used])
+        return CutMesh(self.nodes[used], self.node_kinds[used], tets, self.is_inside[mask], self.is_on_surface[used])
 
 
 def build_uncut_mesh(lattice: Lattice) -> CutMesh:
@@ -94,28 +94,28 @@ def build_uncut_mesh(lattice: Lattice) -> CutMesh:
 def cut_mesh(
     mesh: CutMesh,
     field: Field,
-    fixed: np.ndarray | None = None,
+    fixed_nodes: np.ndarray | None = None,
     settings: IsosurfaceStuffingOptions = IsosurfaceStuffingOptions(),
 ) -> CutMesh:
     """Return `mesh` split along the zero level set of `field`.
 
-    Nodes near the surface are moved onto the surface, except those marked in `fixed` (V,), which count as on it.
+    Nodes near the surface are moved onto the surface, except those marked in `fixed_nodes` (V,), which count as on it.
     """
     nodes = mesh.nodes.copy()
     values = field(nodes)
     edges = _find_crossed_edges(mesh.tets, values)
-    at = _find_crossings(field, nodes, edges, values, settings.bisections)
+    at = _find_crossings(field, nodes, edges, values, settings.max_bisections)
     snapped, onto = _select_snapped_nodes(edges, at, _compute_snap_fractions(mesh, edges, settings))
     values[snapped] = 0.0
-    loose = snapped if fixed is None else snapped[~fixed[snapped]]
-    onto = onto if fixed is None else onto[~fixed[snapped]]
+    loose = snapped if fixed_nodes is None else snapped[~fixed_nodes[snapped]]
+    onto = onto if fixed_nodes is None else onto[~fixed_nodes[snapped]]
     start, end = nodes[edges[onto, 0]], nodes[edges[onto, 1]]
     nodes[loose] = start + at[onto, None] * (end - start)
 
     crossed = values[edges[:, 0]] * values[edges[:, 1]] < 0.0
     edges, at = edges[crossed], at[crossed, None]
     added = nodes[edges[:, 0]] + at * (nodes[edges[:, 1]] - nodes[edges[:, 0]])
-    tets, inside = _split(mesh.tets, np.sign(values).astype(int), edges)
+    tets, inside = _split_tetrahedra(mesh.tets, np.sign(values).astype(int), edges)
     nodes = np.concatenate([nodes, added])
     flat = (np.append(values, np.zeros(len(added)))[tets] == 0.0).all(axis=1)
     inside[flat] = field(nodes[tets[flat]].mean(axis=1)) < 0.0
@@ -150,11 +150,11 @@ def _find_crossings(
 def _compute_snap_fractions(pieces: CutMesh, edges: np.ndarray, settings: IsosurfaceStuffingOptions) -> np.ndarray:
     """Return the fraction (E, 2) of each edge, from either end, within which a crossing snaps this end."""
     kinds = pieces.node_kinds[edges]
-    share = np.where(kinds[:, 0] == kinds[:, 1], settings.snap_long, settings.snap_short)
-    share = np.where((kinds == CUT).any(axis=1), settings.snap_other, share)
+    share = np.where(kinds[:, 0] == kinds[:, 1], settings.long_edge_snap_fraction, settings.short_edge_snap_fraction)
+    share = np.where((kinds == CUT).any(axis=1), settings.cut_edge_snap_fraction, share)
     ends, shortest = pieces.tets[:, EDGES].reshape(-1, 2), np.full(len(pieces.nodes), np.inf)
     np.minimum.at(shortest, ends.ravel(), np.repeat(_compute_lengths(pieces.nodes, ends), 2))
-    farthest = settings.snap_shortest * shortest[edges]
+    farthest = settings.max_snap_fraction * shortest[edges]
     return np.minimum(share[:, None], farthest / _compute_lengths(pieces.nodes, edges)[:, None])
 
 
@@ -162,14 +162,14 @@ def _compute_lengths(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.linalg.norm(nodes[edges[:, 1]] - nodes[edges[:, 0]], axis=1)
 
 
-def _select_snapped_nodes(edges: np.ndarray, at: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _select_snapped_nodes(edges: np.ndarray, fractions: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes (S,) to be moved onto the surface, and for each node the edge (S,) whose crossing is its target.
 
     Closest pairs come first. A moved node removes the crossings of all its edges; its neighbours may then stay.
     """
     node, edge = edges.T.ravel(), np.tile(np.arange(len(edges)), 2)
-    share = np.concatenate([at, 1.0 - at])
-    near = np.flatnonzero(share < reach.T.ravel())
+    share = np.concatenate([fractions, 1.0 - fractions])
+    near = np.flatnonzero(share < limit.T.ravel())
     near = near[np.lexsort((edge[near], node[near], share[near]))]
     pulled: dict[int, int] = {}
     for n, e, other in zip(
@@ -180,7 +180,7 @@ def _select_snapped_nodes(edges: np.ndarray, at: np.ndarray, reach: np.ndarray) 
     return np.array(list(pulled.keys()), int), np.array(list(pulled.values()), int)
 
 
-def _split(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _split_tetrahedra(tets: np.ndarray, side: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return tetrahedra split at the crossings of `edges`, and a mask of those inside; crossings follow the nodes."""
     sides = side[tets]
     inner, outer = (sides < 0).sum(axis=1), (sides > 0).sum(axis=1)

@@ -35,9 +35,9 @@ class LabelContacts:
     areas: np.ndarray
     voxels: np.ndarray
 
-    def measure_contact(self, labels: Collection[int], others: Collection[int]) -> float:
-        """Return the fraction of the surface of `labels` that touches the labels `others`; 0 without a surface."""
-        inside, there = np.isin(self.labels, list(labels)), np.isin(self.labels, list(others))
+    def measure_contact(self, labels: Collection[int], other_labels: Collection[int]) -> float:
+        """Return the fraction of the surface of `labels` that touches `other_labels`; 0 without a surface."""
+        inside, there = np.isin(self.labels, list(labels)), np.isin(self.labels, list(other_labels))
         surface = self.areas[inside][:, ~inside].sum()
         return float(self.areas[inside][:, there & ~inside].sum() / surface) if surface else 0.0
 
@@ -92,32 +92,32 @@ def find_contradiction(contacts: LabelContacts, convention: Convention) -> Contr
         least = contacts.measure_contact(necrosis, outside) - CONTRADICTION.min_difference
         if found < max(CONTRADICTION.min_outer_fraction, min(CONTRADICTION.certain_outer_fraction, least)):
             return Contradiction(
-                f"label {_to_text(oedema)} would be oedema and lies inside the tumour, {found:.0%} of its surface at "
-                "healthy tissue"
+                f"label {_format_label_set(oedema)} would be oedema and lies inside the tumour, {found:.0%} of its "
+                "surface at healthy tissue"
             )
     found = contacts.measure_contact(tumour - necrosis, necrosis)
     if found > max(CONTRADICTION.max_wrapped_fraction, contacts.measure_contact(necrosis, tumour)):
         return Contradiction(
-            f"label {_to_text(necrosis)} would be necrosis and lies round the enhancing tumour, of whose surface it "
-            f"covers {found:.0%}",
+            f"label {_format_label_set(necrosis)} would be necrosis and lies round the enhancing tumour, of whose "
+            f"surface it covers {found:.0%}",
             is_certain=False,
         )
     return None
 
 
-def build_contradiction_check(label_map: LabelMap, chosen: Convention) -> Callable[[Convention], str]:
+def build_contradiction_check(label_map: LabelMap, convention: Convention) -> Callable[[Convention], str]:
     """Return a function of a convention that gives the reason why the anatomy contradicts it; empty without a reason.
 
-    An uncertain contradiction counts against the `chosen` convention only if another convention fits.
+    An uncertain contradiction counts against `convention` only if another convention fits.
     """
     if label_map.layers.shape[-1] > 1:
         return lambda _: ""
     contacts = count_label_contacts(label_map)
-    rivals = [one for one in CONVENTIONS.values() if one is not chosen and one.is_compatible(label_map.labels)]
+    rivals = [one for one in CONVENTIONS.values() if one is not convention and one.is_compatible(label_map.labels)]
 
     def find_reason(candidate: Convention) -> str:
         found = find_contradiction(contacts, candidate)
-        if found is None or not (found.is_certain or candidate is not chosen or any(map(is_supported, rivals))):
+        if found is None or not (found.is_certain or candidate is not convention or any(map(is_supported, rivals))):
             return ""
         return found.reason
 
@@ -135,5 +135,5 @@ def _has_oedema_outside(contacts: LabelContacts, convention: Convention) -> bool
     )
 
 
-def _to_text(labels: Collection[int]) -> str:
+def _format_label_set(labels: Collection[int]) -> str:
     return " and ".join(map(str, sorted(labels)))

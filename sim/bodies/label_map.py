@@ -79,7 +79,7 @@ class LabelMap:
         InputError
             A label does not occur or is 0, or several layers use the same number.
         """
-        found = [self._place(label) for label in labels]
+        found = [self._find_matches(label) for label in labels]
         missing = [label for label, at in zip(labels, found, strict=True) if not at]
         if missing or 0 in labels:
             wrong = (
@@ -91,7 +91,7 @@ class LabelMap:
                 raise InputError(f"{self.path}: several segments {self._format_conflict(label, at)}.")
         return [at[0] for at in found]
 
-    def _place(self, label: Label) -> list[tuple[int, int]]:
+    def _find_matches(self, label: Label) -> list[tuple[int, int]]:
         if isinstance(label, int):
             return [(layer, label) for layer, present in enumerate(self.labels_by_layer) if label in present]
         composed = {one: unicodedata.normalize("NFC", one.name) for one in self.segments}
@@ -100,13 +100,13 @@ class LabelMap:
         alike = alike or [one for one, name in composed.items() if name.casefold() == wanted.casefold()]
         return [(one.layer, one.value) for one in alike if one.value in self.labels_by_layer[one.layer]]
 
-    def _format_conflict(self, label: Label, at: list[tuple[int, int]]) -> str:
+    def _format_conflict(self, label: Label, matches: list[tuple[int, int]]) -> str:
         """Return a message that several segments match one label, with the remedy."""
         if isinstance(label, int):
-            names = ", ".join(sorted(one.name for one in self.segments if (one.layer, one.value) in at))
+            names = ", ".join(sorted(one.name for one in self.segments if (one.layer, one.value) in matches))
             return f"have the label {label}: name one of {names}"
-        numbers = sorted(value for _, value in at)
-        clear = all(len(self._place(number)) == 1 for number in numbers)
+        numbers = sorted(value for _, value in matches)
+        clear = all(len(self._find_matches(number)) == 1 for number in numbers)
         remedy = f"give its number, of {', '.join(map(str, numbers))}" if clear else "rename all but one in 3D Slicer"
         return f"are called {label}: {remedy}"
 
@@ -197,8 +197,8 @@ class Mask:
         return found.view(bool)
 
 
-def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple[np.ndarray, np.ndarray]:
-    """Return the padding (3, 2) [voxels] of each axis that a grid needs to contain `other`, and the new affine (4, 4).
+def widen_grid(shape: tuple[int, ...], affine: np.ndarray, mask: Mask) -> tuple[np.ndarray, np.ndarray]:
+    """Return the padding (3, 2) [voxels] of each axis that a grid needs to contain `mask`, and the new affine (4, 4).
 
     If the grids differ, a margin of one voxel is added.
 
@@ -208,14 +208,14 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
         The padded grid would exceed `MAX_VOXELS`.
     """
     inverse = np.linalg.inv(affine)
-    index = other.outline @ inverse[:3, :3].T + inverse[:3, 3]
-    margin = 0 if _is_same_grid(shape, affine, other) else 1
+    index = mask.outline @ inverse[:3, :3].T + inverse[:3, 3]
+    margin = 0 if _is_same_grid(shape, affine, mask) else 1
     low = np.maximum(0, margin - np.floor(index.min(axis=0)).astype(int))
     high = np.maximum(0, margin + np.ceil(index.max(axis=0)).astype(int) - np.array(shape) + 1)
     voxels = float(np.prod(np.array(shape, float) + low + high))
     if voxels > MAX_VOXELS:
         raise InputError(
-            f"{other.path}: on the labels' grid it takes {voxels:.3g} voxels; the maximum is {MAX_VOXELS:.3g}. "
+            f"{mask.path}: on the labels' grid it takes {voxels:.3g} voxels; the maximum is {MAX_VOXELS:.3g}. "
             "Resample the labels more coarsely."
         )
     moved = affine.copy()
@@ -223,9 +223,9 @@ def widen_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> tuple
     return np.stack([low, high], axis=1), moved
 
 
-def _is_same_grid(shape: tuple[int, ...], affine: np.ndarray, other: Mask) -> bool:
-    """Return True if the mask `other` has this grid."""
-    return shape == other.voxels.shape and np.allclose(affine, other.affine, rtol=0.0, atol=1e-9)
+def _is_same_grid(shape: tuple[int, ...], affine: np.ndarray, mask: Mask) -> bool:
+    """Return True if `mask` has this grid."""
+    return shape == mask.voxels.shape and np.allclose(affine, mask.affine, rtol=0.0, atol=1e-9)
 
 
 def count_border(mask: np.ndarray) -> int:

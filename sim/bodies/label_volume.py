@@ -95,7 +95,7 @@ def build_masked_subject(
     solid = fill_brain(masks, notes, settings)
     inside = _extract_tumour(masks.name, solid, masks.tumour, voxel, notes, settings)
     cortex, interface = find_boundary_voxels(solid, affine), find_boundary_voxels(inside, affine)
-    pieces = _list_pieces(inside, affine)
+    pieces = _list_components(inside, affine)
     return Subject(
         brain=compute_level_set(solid, affine, settings.blur),
         tumour=compute_level_set(_extend_tumour(inside, solid, settings.tumour_extension), affine, settings.blur),
@@ -157,22 +157,22 @@ def fill_brain(masks: HeadMasks, notes: list[str], settings: MaskSettings = Mask
     return solid
 
 
-def _extract_brain(brain: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str]) -> np.ndarray:
+def _extract_brain(brain: np.ndarray, tumour: np.ndarray, voxel_volume: float, notes: list[str]) -> np.ndarray:
     """Return the component of the union of brain and tumour that contains most of the brain, with filled holes."""
     component, _ = cast(tuple[np.ndarray, int], ndimage.label(brain | tumour))
     solid = component == np.bincount(component[brain]).argmax()
     lost = int((brain & ~solid).sum())
     if lost:
-        notes.append(f"left out {lost * voxel * 1e6:.2g} ml of brain that is not connected to the rest")
+        notes.append(f"left out {lost * voxel_volume * 1e6:.2g} ml of brain that is not connected to the rest")
     filled = cast(np.ndarray, ndimage.binary_fill_holes(solid))
     holes = int((filled & ~solid).sum())
     if holes:
-        notes.append(f"filled {holes * voxel * 1e6:.2g} ml of holes in the brain")
+        notes.append(f"filled {holes * voxel_volume * 1e6:.2g} ml of holes in the brain")
     return filled
 
 
 def _extract_tumour(
-    name: str, solid: np.ndarray, tumour: np.ndarray, voxel: float, notes: list[str], settings: MaskSettings
+    name: str, solid: np.ndarray, tumour: np.ndarray, voxel_volume: float, notes: list[str], settings: MaskSettings
 ) -> np.ndarray:
     """Return the mask of the tumour components in the solid, without components that are too small."""
     inside = tumour & solid
@@ -181,9 +181,9 @@ def _extract_tumour(
     outside = tumour & ~solid
     if 2 * outside.sum() > tumour.sum():
         raise InputError(
-            f"{name}: {outside.sum() * voxel * 1e6:.3g} of {tumour.sum() * voxel * 1e6:.3g} ml of the tumour lie "
-            "outside the brain, without touching it. Say what is round it, such as oedema or necrosis: --brain takes "
-            "several labels."
+            f"{name}: {outside.sum() * voxel_volume * 1e6:.3g} of {tumour.sum() * voxel_volume * 1e6:.3g} ml of the "
+            "tumour lie outside the brain, without touching it. Say what is round it, such as oedema or necrosis: "
+            "--brain takes several labels."
         )
     component, count = cast(tuple[np.ndarray, int], ndimage.label(inside, np.ones((3, 3, 3))))
     size, fewest = np.bincount(component.ravel(), minlength=count + 1), settings.min_tumour_voxels
@@ -197,17 +197,17 @@ def _extract_tumour(
     result = kept[component]
     for lost, where in ((outside, "outside the brain"), (inside & ~result, "in specks")):
         if lost.any():
-            notes.append(f"left out {lost.sum() * voxel * 1e6:.2g} ml of tumour {where}")
+            notes.append(f"left out {lost.sum() * voxel_volume * 1e6:.2g} ml of tumour {where}")
     return result
 
 
-def _extend_tumour(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray:
-    """Return the tumour with the voxels, up to `by` voxels outside the brain, whose nearest brain voxel is tumour.
+def _extend_tumour(tumour: np.ndarray, solid: np.ndarray, max_voxels: int) -> np.ndarray:
+    """Return the tumour with the voxels, at most `max_voxels` outside the brain, whose nearest brain voxel is tumour.
 
     The tumour's level set then crosses the cortex instead of touching the cortex.
     """
     (box,) = cast(list[tuple[slice, ...]], ndimage.find_objects(tumour.astype(np.uint8)))
-    wide = tuple(slice(max(part.start - by, 0), part.stop + by) for part in box)
+    wide = tuple(slice(max(part.start - max_voxels, 0), part.stop + max_voxels) for part in box)
     if solid[wide].all():
         return tumour
     nearest = ndimage.distance_transform_edt(~solid[wide], return_distances=False, return_indices=True)
@@ -216,7 +216,7 @@ def _extend_tumour(tumour: np.ndarray, solid: np.ndarray, by: int) -> np.ndarray
     return extended
 
 
-def _list_pieces(tumour: np.ndarray, affine: np.ndarray) -> tuple[TumourPiece, ...]:
+def _list_components(tumour: np.ndarray, affine: np.ndarray) -> tuple[TumourPiece, ...]:
     """Return the connected components of the tumour, largest first; the centre is the mean of the boundary voxels."""
     component, count = cast(tuple[np.ndarray, int], ndimage.label(tumour, np.ones((3, 3, 3))))
     voxel, pieces = abs(float(np.linalg.det(affine[:3, :3]))), []

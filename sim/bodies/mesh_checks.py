@@ -155,7 +155,7 @@ def collect_regions(mesh: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str
     names = {int(v[0]): name for name, v in groups.items() if v.dtype.kind in "iu" and v.size == 2 and v[1] == 3}
     names |= {number: ", ".join(said) for number, said in getattr(mesh, "cell_tags", {}).items()}
     if not varied:
-        return _from_sets(mesh, blocks)
+        return _assign_regions_by_sets(mesh, blocks)
     name, region = next(iter(varied.items()))
     if any(not np.array_equal(region, other) for other in varied.values()):
         said = ", ".join(f"`{one}`" for one in varied)
@@ -178,7 +178,7 @@ def _to_integers(values: np.ndarray) -> np.ndarray | None:
     return whole if np.array_equal(values, whole) else None
 
 
-def _from_sets(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
+def _assign_regions_by_sets(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return the regions (T,) by the named cell sets of a file, or 0 if no set divides the mesh, and a note."""
     marked, total = {}, sum(len(raw.cells[number].data) for number in blocks)
     for name, on in raw.cell_sets.items():
@@ -194,26 +194,26 @@ def _from_sets(raw: Any, blocks: list[int]) -> tuple[np.ndarray, tuple[str, ...]
     if np.sum([*marked.values()], axis=0).max() > 1:
         raise InputError(f"its sets of cells {', '.join(marked)} overlap: store cell data `region` in their place.")
     region = np.select([*marked.values()], range(1, len(marked) + 1), 0).astype(np.int32)
-    return _match_group_names(region, dict(enumerate(marked, 1)), "its sets of cells", free=True)
+    return _match_group_names(region, dict(enumerate(marked, 1)), "its sets of cells", can_renumber=True)
 
 
 def _match_group_names(
-    region: np.ndarray, names: Mapping[int, str], said: str, free: bool = False
+    region: np.ndarray, names: Mapping[int, str], group_kind: str, can_renumber: bool = False
 ) -> tuple[np.ndarray, tuple[str]]:
     """Return the regions (T,), renumbered to match the group `names`, and a note.
 
-    Numbers from the file are kept if they do not contradict a known name; `free` numbers are not from the file.
+    Numbers from the file are kept if they contradict no known name; with `can_renumber`, numbers are not from it.
     """
     known = {number: SPELLINGS.get(names.get(number, "").strip().lower()) for number in np.unique(region).tolist()}
     wrong = [number for number, name in known.items() if name and REGION_NAMES[name] != number]
-    if wrong or (free and any(known.values())):
+    if wrong or (can_renumber and any(known.values())):
         number = {old: REGION_NAMES[name] for old, name in known.items() if name}
         spare = iter(new for new in range(1, 2**16) if new not in REGION_NAMES.values())
-        kept = {old for old in known if old not in number and old not in REGION_NAMES.values() and not free}
+        kept = {old for old in known if old not in number and old not in REGION_NAMES.values() and not can_renumber}
         number |= {old: old if old in kept or old == 0 else next(spare) for old in known if old not in number}
         region = np.array([number[old] for old in known], np.int32)[np.searchsorted([*known], region)]
         names = {number[old]: names.get(old, f"group {old}") for old in known}
     parts = (
         describe_region(one) + (f" from {names[one]}" if names.get(one) else "") for one in np.unique(region).tolist()
     )
-    return region, (f"regions are those of {said}: {', '.join(parts)}",)
+    return region, (f"regions are those of {group_kind}: {', '.join(parts)}",)

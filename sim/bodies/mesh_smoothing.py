@@ -64,18 +64,18 @@ def fit_nodes(
     nodes: np.ndarray,
     triangles: np.ndarray,
     field: Field,
-    movable: np.ndarray,
+    movable_mask: np.ndarray,
     volume: float | None = None,
     settings: Smoothing = Smoothing(),
 ) -> np.ndarray:
-    """Return nodes (V, 3) [m], of which `movable` ones are moved to fit the closed surface `triangles` to `field`.
+    """Return nodes (V, 3) [m], of which `movable_mask` ones are moved to fit the closed surface `triangles` to `field`.
 
     A triangle with its corners on a curved surface is on the concave side. Each node therefore moves by the mean
     deviation of its triangles. The mean is 3/4 of the value at the centroid, since the deviation is quadratic and zero
     at the corners. If a `volume` [m^3] is given, a uniform shift corrects the enclosed volume.
     """
     on = np.unique(triangles)
-    on = on[movable[on]]
+    on = on[movable_mask[on]]
     if len(on) == 0:
         return nodes
     middle, area = _compute_centres_and_areas(nodes, triangles)
@@ -88,7 +88,7 @@ def fit_nodes(
     nodes = nodes.copy()
     nodes[on] = project_onto_level(field, nodes[on], level)
     if volume is not None:
-        moving = movable[triangles].mean(axis=1)  # a triangle sweeps volume in proportion to its movable corners
+        moving = movable_mask[triangles].mean(axis=1)  # a triangle sweeps volume in proportion to its movable corners
         for _ in range(2):
             _, area = _compute_centres_and_areas(nodes, triangles)
             missing = (volume - compute_enclosed_volume(nodes, triangles)) / (area @ moving)
@@ -120,7 +120,7 @@ def _compute_centres_and_areas(nodes: np.ndarray, triangles: np.ndarray) -> tupl
 
 
 def improve_mesh(
-    nodes: np.ndarray, tets: np.ndarray, project: Projection, settings: Smoothing = Smoothing()
+    nodes: np.ndarray, tets: np.ndarray, project_nodes: Projection, settings: Smoothing = Smoothing()
 ) -> np.ndarray:
     """Return nodes (V, 3) [m], moved until all dihedral angles are good or no bad angle improves any more.
 
@@ -145,7 +145,7 @@ def improve_mesh(
         edges = np.linalg.norm(corners - nodes[movers][row, None], axis=2)
         length = np.minimum.reduceat(np.where(own, np.inf, edges).min(axis=1), first)
         trials = nodes[movers, None] + (step[movers] * length)[:, None, None] * DIRECTIONS
-        placed = project(trials.reshape(-1, 3), np.repeat(movers, len(DIRECTIONS))).reshape(trials.shape)
+        placed = project_nodes(trials.reshape(-1, 3), np.repeat(movers, len(DIRECTIONS))).reshape(trials.shape)
         astray = np.linalg.norm(placed - trials, axis=2) > (step[movers] * length)[:, None]
         trials = np.where(astray[..., None], nodes[movers, None], placed)
         tried = np.where(own[:, None, :, None], trials[row][:, :, None], corners[:, None])
@@ -175,6 +175,6 @@ def _select_independent_nodes(tets: np.ndarray, sines: np.ndarray, step: np.ndar
     return movers[~beaten[movers]]
 
 
-def _compute_penalties(sines: np.ndarray, good: float) -> np.ndarray:
+def _compute_penalties(sines: np.ndarray, good_sine: float) -> np.ndarray:
     """Return the squared deficits of the sines, the objective of node moves; squares emphasise the worst angles."""
-    return np.maximum(good - sines, 0.0) ** 2
+    return np.maximum(good_sine - sines, 0.0) ** 2

@@ -33,7 +33,7 @@ class Meshing:
         Relative deviations from the requested number of nodes: the search ends below the first, fails above the second.
     max_trials
         Maximum number of lattices that the search builds.
-    fine_ratio
+    fine_size_ratio
         Cell size at the tumour and the craniotomy, the regions of interest, as a fraction of the coarsest cell size.
     cells_per_radius
         Minimum number of cells per tumour radius, to resolve the tumour's shape.
@@ -59,7 +59,7 @@ class Meshing:
     tolerance: float = 0.03
     max_deviation: float = 0.1
     max_trials: int = 8
-    fine_ratio: float = 0.5
+    fine_size_ratio: float = 0.5
     cells_per_radius: float = 2.5
     edge_growth: float = 0.5
     rounding: float = 2.0**0.5
@@ -84,7 +84,7 @@ class Solids:
         Corners (3,) [m] of a bounding box of the solid.
     tumour_volume
         Prescribed tumour volume [m^3], without pieces that the mesh does not resolve; matched as far as possible.
-    interface, opening
+    interface_points, craniotomy_points
         Points (n, 3) [m] on the tumour's surface and on the cortex to be exposed, where the mesh is refined.
     pieces
         Connected components of the tumour, if there are several.
@@ -95,8 +95,8 @@ class Solids:
     low: np.ndarray
     high: np.ndarray
     tumour_volume: float
-    interface: np.ndarray
-    opening: np.ndarray
+    interface_points: np.ndarray
+    craniotomy_points: np.ndarray
     pieces: Sequence[TumourPiece] = ()
 
 
@@ -172,8 +172,9 @@ def _build_mesh_or_reason(solids: Solids, count: int, settings: Meshing) -> TetM
 def cut_lattice(solids: Solids, max_edge: float, settings: Meshing = Meshing()) -> CutMesh:
     """Return the solid, cut from a lattice with coarsest cell `max_edge` [m] and split along the tumour's surface."""
     radius = (0.75 / np.pi * solids.tumour_volume) ** (1.0 / 3.0)
-    fine, growth = settings.fine_ratio * max_edge, settings.edge_growth
-    wanted = ((KDTree(solids.interface), min(fine, radius / settings.cells_per_radius)), (KDTree(solids.opening), fine))
+    fine, growth = settings.fine_size_ratio * max_edge, settings.edge_growth
+    tumour, craniotomy = KDTree(solids.interface_points), KDTree(solids.craniotomy_points)
+    wanted = ((tumour, min(fine, radius / settings.cells_per_radius)), (craniotomy, fine))
     levels = min(int(np.rint(np.log2(max_edge / wanted[0][1]))), settings.max_halvings)
 
     def compute_size(points: np.ndarray) -> np.ndarray:
@@ -181,9 +182,9 @@ def cut_lattice(solids: Solids, max_edge: float, settings: Meshing = Meshing()) 
 
     lattice = build_graded_lattice(solids.low - max_edge, solids.high + max_edge, max_edge, levels, compute_size)
     body = cut_mesh(build_uncut_mesh(lattice), solids.brain, settings=settings.stuffing)
-    if not body.inside.any():
+    if not body.is_inside.any():
         raise InputError(TOO_COARSE)
-    body = body.select(body.inside)
+    body = body.select(body.is_inside)
     body = body.select(select_manifold(body.tets))
     surface = np.zeros(len(body.nodes), bool)
     surface[find_boundary_faces(body.tets)] = True
@@ -192,9 +193,9 @@ def cut_lattice(solids: Solids, max_edge: float, settings: Meshing = Meshing()) 
 
 def _fit_mesh_or_reason(solids: Solids, pieces: CutMesh, settings: Meshing) -> TetMesh | tuple[str, str]:
     """Return the fitted mesh, or reason and remedy. A failed fit is repeated without moves that invert tetrahedra."""
-    if not pieces.inside.any():
+    if not pieces.is_inside.any():
         raise InputError(TOO_COARSE)
-    lost = find_lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.inside], settings)
+    lost = find_lost_pieces(solids.pieces, pieces.nodes, pieces.tets[pieces.is_inside], settings)
     missing = sum(piece.volume for piece, one in zip(solids.pieces, lost, strict=True) if one)
     if missing > settings.max_volume_error * solids.tumour_volume:
         be = "is" if sum(lost) == 1 else "are"
@@ -204,23 +205,23 @@ def _fit_mesh_or_reason(solids: Solids, pieces: CutMesh, settings: Meshing) -> T
             solids, _fit_to_surfaces(solids, pieces, solids.tumour_volume - missing, settings, fold), settings
         )
         if compute_smallest_sines(found.nodes[found.tets]).min() >= np.sin(np.radians(SLIVER_DEGREES)):
-            mesh = TetMesh(found.nodes, found.tets, np.where(found.inside, TUMOUR_LABEL, BRAIN_LABEL))
-            volume = mesh.volumes[found.inside].sum()
+            mesh = TetMesh(found.nodes, found.tets, np.where(found.is_inside, TUMOUR_LABEL, BRAIN_LABEL))
+            volume = mesh.volumes[found.is_inside].sum()
             return mesh if abs(volume / solids.tumour_volume - 1.0) <= settings.max_volume_error else INTRICATE
     return INTRICATE
 
 
-def _fit_to_surfaces(solids: Solids, pieces: CutMesh, volume: float, settings: Meshing, fold: bool) -> CutMesh:
+def _fit_to_surfaces(solids: Solids, pieces: CutMesh, volume: float, settings: Meshing, allow_folds: bool) -> CutMesh:
     """Return `pieces` with nodes fitted to the outer surface, then to the tumour's surface with `volume` [m^3].
 
-    If `fold` is False, nodes keep their position where a tetrahedron would be inverted.
+    If `allow_folds` is False, nodes keep their position where a tetrahedron would be inverted.
     """
     (surface, _), smoothing = _mark_surfaces(pieces), settings.smoothing
-    outer, inner = find_boundary_faces(pieces.tets), find_boundary_faces(pieces.tets[pieces.inside])
+    outer, inner = find_boundary_faces(pieces.tets), find_boundary_faces(pieces.tets[pieces.is_inside])
     nodes = fit_nodes(pieces.nodes, outer, solids.brain, surface, settings=smoothing)
-    nodes = nodes if fold else prevent_folds(pieces.nodes, nodes, pieces.tets)
+    nodes = nodes if allow_folds else prevent_folds(pieces.nodes, nodes, pieces.tets)
     moved = fit_nodes(nodes, inner, solids.tumour, ~surface, volume, smoothing)
-    return replace(pieces, nodes=moved if fold else prevent_folds(nodes, moved, pieces.tets))
+    return replace(pieces, nodes=moved if allow_folds else prevent_folds(nodes, moved, pieces.tets))
 
 
 def _improve_pieces(solids: Solids, pieces: CutMesh, settings: Meshing) -> CutMesh:
@@ -237,14 +238,14 @@ def _mark_surfaces(pieces: CutMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return two masks (V,): nodes on the outer surface, and nodes on the surface of the tumour."""
     marks = np.zeros((2, len(pieces.nodes)), bool)
     marks[0, find_boundary_faces(pieces.tets)] = True
-    marks[1, find_boundary_faces(pieces.tets[pieces.inside])] = True
+    marks[1, find_boundary_faces(pieces.tets[pieces.is_inside])] = True
     return marks[0], marks[1]
 
 
 def _build_projection(solids: Solids, pieces: CutMesh, slack: float) -> Projection:
     """Return a projection that keeps the level set value of each surface node within `slack` [m] of its current one."""
     surface, interface = _mark_surfaces(pieces)
-    interface[np.setdiff1d(pieces.tets[pieces.inside], pieces.tets[~pieces.inside])] = False  # tumour cortex
+    interface[np.setdiff1d(pieces.tets[pieces.is_inside], pieces.tets[~pieces.is_inside])] = False  # tumour cortex
     levels = solids.brain(pieces.nodes), solids.tumour(pieces.nodes)
 
     def project(points: np.ndarray, nodes: np.ndarray) -> np.ndarray:

@@ -124,8 +124,8 @@ def _read_with_meshio(path: Path) -> meshio.Mesh:
         raise InputError(next((own.format(*found.groups()) for found, own in known if found), reason)) from error
 
 
-def _build_mesh_file(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) -> MeshFile:
-    """Return the mesh of a parsed file whose length unit is `metre` metres."""
+def _build_mesh_file(path: Path, raw: meshio.Mesh | AbaqusMesh, unit_size: float) -> MeshFile:
+    """Return the mesh of a parsed file whose length unit is `unit_size` [m]."""
     kinds = {block.type for block in raw.cells}
     found = kinds.intersection(CELLS.values())
     if not found:
@@ -152,7 +152,7 @@ def _build_mesh_file(path: Path, raw: meshio.Mesh | AbaqusMesh, metre: float) ->
     if merged:
         notes.append(f"merged {merged} nodes with others at the same place: results are numbered without them")
     tets, middles = np.split(table, [4], axis=1)
-    mesh = TetMesh(points * metre, tets, region, middles if middles.size else None)
+    mesh = TetMesh(points * unit_size, tets, region, middles if middles.size else None)
     check_overlaps(points, tets)
     if turned:
         notes.append(f"turned {turned} tetrahedra of negative orientation")

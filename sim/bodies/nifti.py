@@ -122,9 +122,9 @@ def read_mgh(path: Path, spec: VoxelSpec) -> Volume:
     return Volume(np.asanyarray(image.dataobj), _scale_affine(image, 1e-3))
 
 
-def _scale_affine(image: Nifti1Image | MGHImage, metre: float) -> np.ndarray:
+def _scale_affine(image: Nifti1Image | MGHImage, unit: float) -> np.ndarray:
     affine = np.array(image.affine, np.float64)
-    affine[:3] *= metre
+    affine[:3] *= unit
     return affine
 
 
@@ -135,20 +135,20 @@ def _check_voxel_count(path: Path, shape: tuple[int, ...]) -> None:
         raise InputError(f"{path}: has {voxels:.3g} voxels; the maximum is {MAX_VOXELS:.3g}. Resample it.")
 
 
-def _check_file_length(path: Path, needed: int) -> None:
+def _check_file_length(path: Path, length: int) -> None:
     """Reject a file with fewer bytes than it declares, before memory is allocated."""
     held = 0
     with open_volume(path) as file:
         while piece := file.read(BLOCK):  # to the end, where gzip stores its checksum
             held += len(piece)
-            if held > needed + SURPLUS:
+            if held > length + SURPLUS:
                 break
-    if held < needed:
-        raise InputError(f"{path}: ends after {held:,} of {needed:,} bytes. Copy or export it again.")
+    if held < length:
+        raise InputError(f"{path}: ends after {held:,} of {length:,} bytes. Copy or export it again.")
 
 
-def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: VoxelSpec) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the affine (4, 4) from voxel indices to metres (RAS), and notes; the unit of the image is `metre` metres.
+def _read_affine(path: Path, image: Nifti1Image, unit: float, voxels: VoxelSpec) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the affine (4, 4) from voxel indices to metres (RAS), and notes; the image has the unit `unit` [m].
 
     Raises
     ------
@@ -161,11 +161,11 @@ def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: VoxelSpec
     except ValueError:  # the qform is not a rotation; nibabel ignores it if the sform is valid
         qform = None
     if sform is None and qform is None:
-        return _build_centred_affine(path, image, metre, voxels.axes), ()
+        return _build_centred_affine(path, image, unit, voxels.axes), ()
     if sform is None or qform is None:
-        return _scale_affine(image, metre), voxels.ignored_axes_note
+        return _scale_affine(image, unit), voxels.ignored_axes_note
     corners = np.stack([*np.ndindex(2, 2, 2)]) * (np.array(image.shape[:3]) - 1)
-    apart = metre * np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1).max()
+    apart = unit * np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1).max()
     note = f"its sform and qform place it up to {apart * 1e3:.3g} mm apart: the sform is taken"
     if np.linalg.det(sform[:3, :3]) * np.linalg.det(qform[:3, :3]) < 0.0:
         note = "its sform and qform mirror each other: left and right are swapped in one of them. The sform is taken"
@@ -174,13 +174,13 @@ def _read_affine(path: Path, image: Nifti1Image, metre: float, voxels: VoxelSpec
             f"its sform and qform disagree on which side is left (up to {apart * 1e3:.3g} mm apart): left and right "
             "are swapped in one of them. The sform is taken"
         )
-    return _scale_affine(image, metre), (
+    return _scale_affine(image, unit), (
         *voxels.ignored_axes_note,
         note,
     ) if apart > voxels.max_sform_difference else voxels.ignored_axes_note
 
 
-def _build_centred_affine(path: Path, image: Nifti1Image, metre: float, axes: str) -> np.ndarray:
+def _build_centred_affine(path: Path, image: Nifti1Image, unit: float, axes: str) -> np.ndarray:
     """Return the affine (4, 4) from indices to metres of a volume centred at the origin, with directions `axes`."""
     if not axes:
         raise InputError(
@@ -193,6 +193,6 @@ def _build_centred_affine(path: Path, image: Nifti1Image, metre: float, axes: st
     affine = np.eye(4)
     affine[:3, :3] = 0.0
     for axis, (row, letter) in enumerate(zip(rows, axes.upper(), strict=True)):
-        affine[row, axis] = metre * float(image.header.get_zooms()[axis]) * (1.0 if letter in "RAS" else -1.0)
+        affine[row, axis] = unit * float(image.header.get_zooms()[axis]) * (1.0 if letter in "RAS" else -1.0)
     affine[:3, 3] = -0.5 * affine[:3, :3] @ (np.array(image.shape[:3]) - 1)
     return affine

@@ -135,7 +135,7 @@ def _parse_dtype(path: Path, fields: Mapping[str, str]) -> np.dtype:
     return np.dtype(ENDIAN[endian] + TYPES[kind])
 
 
-def _read_voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: int) -> bytes:
+def _read_voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], length: int) -> bytes:
     """Return the decompressed voxel data; memory is allocated only for data that the file can contain."""
     if any(float(fields.get(skip, 0)) for skip in ("byte skip", "byteskip", "line skip", "lineskip")):
         raise InputError(f"{path}: skips bytes before its voxels. {ONE_FILE}")
@@ -149,14 +149,14 @@ def _read_voxels(path: Path, file: BinaryIO, fields: Mapping[str, str], needed: 
     else:
         raise InputError(f"{path}: its voxels are coded as {coding!r}: must be raw, gzip or bzip2. Save it again.")
     size = path.stat().st_size
-    if needed > (size if stream is file else max(BZIP2_ALLOWANCE * (coding[0] == "b"), MAX_INFLATION * size)):
-        raise InputError(f"{path}: is too short for its {needed:,} bytes of voxels. Copy or save it again.")
+    if length > (size if stream is file else max(BZIP2_ALLOWANCE * (coding[0] == "b"), MAX_INFLATION * size)):
+        raise InputError(f"{path}: is too short for its {length:,} bytes of voxels. Copy or save it again.")
     held = bytearray()
-    while len(held) < needed + SURPLUS and (piece := stream.read(BLOCK)):  # to the end, where gzip stores its checksum
+    while len(held) < length + SURPLUS and (piece := stream.read(BLOCK)):  # to the end, where gzip stores its checksum
         held += piece
-    if len(held) < needed:
-        raise InputError(f"{path}: ends after {len(held):,} of {needed:,} bytes of voxels. Copy or save it again.")
-    return bytes(held[:needed])
+    if len(held) < length:
+        raise InputError(f"{path}: ends after {len(held):,} of {length:,} bytes of voxels. Copy or save it again.")
+    return bytes(held[:length])
 
 
 def _parse_affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.ndarray, list[int]]:
@@ -183,17 +183,17 @@ def _parse_affine(path: Path, fields: Mapping[str, str], axes: int) -> tuple[np.
     return affine, across
 
 
-def _parse_segments(path: Path, keys: Mapping[str, str], layers: int) -> tuple[Segment, ...]:
+def _parse_segments(path: Path, header: Mapping[str, str], layer_count: int) -> tuple[Segment, ...]:
     """Return the segments that Slicer wrote. Old files have one layer of ones for each segment and no layer keys."""
-    numbers = sorted({int(found[1]) for key in keys if (found := re.match(r"Segment(\d+)_", key))})
+    numbers = sorted({int(found[1]) for key in header if (found := re.match(r"Segment(\d+)_", key))})
     segments = tuple(
         Segment(
-            keys.get(f"Segment{number}_Name", f"Segment_{number + 1}"),
-            int(keys.get(f"Segment{number}_Layer", number if layers > 1 else 0)),
-            int(keys.get(f"Segment{number}_LabelValue", 1)),
+            header.get(f"Segment{number}_Name", f"Segment_{number + 1}"),
+            int(header.get(f"Segment{number}_Layer", number if layer_count > 1 else 0)),
+            int(header.get(f"Segment{number}_LabelValue", 1)),
         )
         for number in numbers
     )
-    if any(not 0 <= segment.layer < layers for segment in segments):
+    if any(not 0 <= segment.layer < layer_count for segment in segments):
         raise InputError(f"{path}: has a segment in a missing layer. Save it again.")
     return segments

@@ -73,7 +73,7 @@ def describe_side(point: np.ndarray, low: np.ndarray, high: np.ndarray, settings
 def find_reachable_site(cortex: np.ndarray, centre: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
     """Return the point (3,) [m] of `cortex` (n, 3) nearest to `centre` (3,) that is accessible through the skull."""
     floor = min(cortex[:, 2].min() + settings.min_height * np.ptp(cortex[:, 2]), centre[2])
-    return _find_nearest_outer(cortex[cortex[:, 2] >= floor], centre, cortex, settings)
+    return _find_outer_point(cortex[cortex[:, 2] >= floor], centre, cortex, settings)
 
 
 def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
@@ -85,7 +85,7 @@ def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement =
         The point is not finite, is over the brainstem, or is more than `max_surface_distance` from accessible cortex.
     """
     _check_finite(point, "--opening-at")
-    site = _find_nearest_outer(cortex, point, cortex, settings)
+    site = _find_outer_point(cortex, point, cortex, settings)
     apart = float(np.linalg.norm(site - point))
     if apart > settings.max_surface_distance:
         raise InputError(
@@ -93,7 +93,7 @@ def find_opening_at(cortex: np.ndarray, point: np.ndarray, settings: Placement =
             f"covers; {settings.max_surface_distance * 1e3:g} mm is the most. {_format_box(cortex)} Over a deep point, "
             "give --opening-over."
         )
-    return _check_not_over_stem(cortex, site, settings)
+    return _check_not_over_brainstem(cortex, site, settings)
 
 
 def find_opening_over(
@@ -112,7 +112,7 @@ def find_opening_over(
             f"the point {_to_mm(point)} mm lies {-depth * 1e3:.0f} mm outside the brain: give a point inside. "
             f"{_format_box(cortex)}"
         )
-    return _check_not_over_stem(cortex, find_reachable_site(cortex, point, settings), settings)
+    return _check_not_over_brainstem(cortex, find_reachable_site(cortex, point, settings), settings)
 
 
 def find_opening_within(cortex: np.ndarray, outline: np.ndarray, settings: Placement = Placement()) -> np.ndarray:
@@ -153,10 +153,10 @@ def find_within_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     return found
 
 
-def _find_nearest_outer(points: np.ndarray, place: np.ndarray, cortex: np.ndarray, settings: Placement) -> np.ndarray:
-    """Return the point nearest to `place` (3,) among those `points` (k, 3) that are near the hull of the `cortex`."""
+def _find_outer_point(points: np.ndarray, target: np.ndarray, cortex: np.ndarray, settings: Placement) -> np.ndarray:
+    """Return the point nearest to `target` (3,) among those `points` (k, 3) that are near the hull of the `cortex`."""
     hull = ConvexHull(cortex).equations
-    order = np.argsort(np.linalg.norm(points - place, axis=1), kind="stable")
+    order = np.argsort(np.linalg.norm(points - target, axis=1), kind="stable")
     parts = (points[order[first : first + BLOCK_SIZE]] for first in range(0, len(order), BLOCK_SIZE))
     outer = (part[-(part @ hull[:, :3].T + hull[:, 3]).max(axis=1) <= settings.max_hull_depth] for part in parts)
     return next(part[0] for part in outer if len(part))
@@ -167,7 +167,7 @@ def _check_finite(point: np.ndarray, option: str) -> None:
         raise InputError(f"{option} {_to_mm(point)}: every coordinate must be a finite number [mm].")
 
 
-def _check_not_over_stem(cortex: np.ndarray, site: np.ndarray, settings: Placement) -> np.ndarray:
+def _check_not_over_brainstem(cortex: np.ndarray, site: np.ndarray, settings: Placement) -> np.ndarray:
     lowest, height = cortex[cortex[:, 2].argmin()], np.ptp(cortex[:, 2])
     if np.linalg.norm(site - lowest) <= settings.brainstem_radius * height:
         raise InputError(

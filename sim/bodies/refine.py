@@ -84,26 +84,26 @@ def refine(anatomy: Anatomy, near_opening: bool = False) -> Anatomy:
     return Anatomy(fine, fixed[halved], normal[halved], (craniotomy & free)[halved])
 
 
-def _make_conforming(table: np.ndarray, halved: np.ndarray) -> np.ndarray:
-    """Return the mask `halved` (N,) of midpoints, extended until the halved edges of each element form a pattern."""
-    halved, middles = halved.copy(), table[:, 4:]
+def _make_conforming(elements: np.ndarray, is_halved: np.ndarray) -> np.ndarray:
+    """Return the mask `is_halved` (N,) of midpoints, extended until the halved edges of each element form a pattern."""
+    is_halved, middles = is_halved.copy(), elements[:, 4:]
     while True:
-        asked = halved[middles]
+        asked = is_halved[middles]
         cut = CLOSING_PATTERNS[asked @ (1 << np.arange(6))]
         if (cut == asked).all():
-            return halved
-        halved[middles[cut]] = True
+            return is_halved
+        is_halved[middles[cut]] = True
 
 
-def _build_children(nodes: np.ndarray, table: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return child tetrahedra (C, 4) and their parents (C,), sorted by parent; `cut` (T, 6) marks the halved edges."""
+def _build_children(nodes: np.ndarray, elements: np.ndarray, is_halved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return child tetrahedra (C, 4) and their parents (C,), sorted by parent; `is_halved` (T, 6) marks edges."""
     tets, parent = [], []
     for pattern, parts in PATTERNS.items():
-        rows = np.flatnonzero((cut == np.isin(np.arange(4, 10), pattern)).all(axis=1))
-        tets.append(table[rows][:, parts].reshape(-1, 4))
+        rows = np.flatnonzero((is_halved == np.isin(np.arange(4, 10), pattern)).all(axis=1))
+        tets.append(elements[rows][:, parts].reshape(-1, 4))
         parent.append(np.repeat(rows, len(parts)))
-    rows = np.flatnonzero(cut.all(axis=1))
-    whole = table[rows]
+    rows = np.flatnonzero(is_halved.all(axis=1))
+    whole = elements[rows]
     ends = nodes[whole[:, DIAGONALS]]
     shortest = np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2).argmin(axis=1)
     around = DIAGONAL_RINGS[shortest]

@@ -52,7 +52,7 @@ def build_sample_head(brain: TetMesh, head: SampleHead = SampleHead()) -> tuple[
     return Intensity(labels, affine), Intensity(_draw_t1(mask, tumour, head), affine)
 
 
-def _draw_t1(mask: np.ndarray, tumour: np.ndarray, head: SampleHead) -> np.ndarray:
+def _draw_t1(mask: np.ndarray, tumour_distance: np.ndarray, head: SampleHead) -> np.ndarray:
     """Return grey values (I, J, K) uint8, from a brain mask and the signed distance to the tumour, each (I, J, K) [m].
 
     The sulci are the zero crossings of band-pass filtered noise.
@@ -63,5 +63,5 @@ def _draw_t1(mask: np.ndarray, tumour: np.ndarray, head: SampleHead) -> np.ndarr
     depth = np.asarray(ndimage.distance_transform_edt(mask, sampling=head.voxel))
     sulcus = 0.25 * head.sulcus_distance * np.abs(wave) / wave.std() + np.maximum(depth - head.sulcus_depth, 0.0)
     grey = np.interp(np.minimum(depth, sulcus), head.layers, head.greys)
-    grey = np.where(tumour < 0.0, head.tumour_grey, grey) * mask
+    grey = np.where(tumour_distance < 0.0, head.tumour_grey, grey) * mask
     return np.rint(ndimage.gaussian_filter(grey, 0.5)).astype(np.uint8)

@@ -28,7 +28,7 @@ def is_mirroring_ambiguous(brain: Mask, tumour: Mask) -> bool:
     apart = (boxes[0][0] > boxes[1][1]).any() or (boxes[1][0] > boxes[0][1]).any()
     points = _compute_positions(tumour.grid, _thin_points(np.argwhere(tumour.voxels)))
     planes = ConvexHull(_widen_outline(brain)).equations
-    within, turned = (_share_within(planes, points * signs) for signs in (np.ones(3), LPS))
+    within, turned = (_compute_fraction_within(planes, points * signs) for signs in (np.ones(3), LPS))
     if within < MIN_INSIDE_FRACTION and turned > MIN_MIRRORED_FRACTION:
         raise InputError(
             f"{tumour.path}: its tumour lies at {_format_box(boxes[1])}, and the brain of {brain.path} at "
@@ -61,7 +61,7 @@ def check_scan_space(brain: Mask, scan: VoxelGrid, grids: Iterable[VoxelGrid]) -
         )
 
 
-def check_not_negated(grid: VoxelGrid, other: VoxelGrid) -> None:
+def check_not_negated(grid: VoxelGrid, other_grid: VoxelGrid) -> None:
     """Reject two grids if one grid equals the other with x and y negated.
 
     Raises
@@ -69,13 +69,13 @@ def check_not_negated(grid: VoxelGrid, other: VoxelGrid) -> None:
     InputError
         The grids are equal with x and y negated.
     """
-    negated = np.array([*LPS, 1.0])[:, None] * other.affine
-    if _is_same_grid(grid, VoxelGrid(other.path, other.shape, negated)):
-        raise InputError(f"{other.path}: has the grid of {grid.path}, but with x and y negated: {EXPORT_REMEDY}")
+    negated = np.array([*LPS, 1.0])[:, None] * other_grid.affine
+    if _is_same_grid(grid, VoxelGrid(other_grid.path, other_grid.shape, negated)):
+        raise InputError(f"{other_grid.path}: has the grid of {grid.path}, but with x and y negated: {EXPORT_REMEDY}")
 
 
-def _is_same_grid(grid: VoxelGrid, other: VoxelGrid) -> bool:
-    return grid.shape == other.shape and np.allclose(grid.affine, other.affine, rtol=0.0, atol=1e-6)
+def _is_same_grid(grid: VoxelGrid, other_grid: VoxelGrid) -> bool:
+    return grid.shape == other_grid.shape and np.allclose(grid.affine, other_grid.affine, rtol=0.0, atol=1e-6)
 
 
 def _thin_points(points: np.ndarray) -> np.ndarray:
@@ -101,7 +101,7 @@ def _widen_outline(mask: Mask) -> np.ndarray:
     return np.concatenate([mask.outline - half, mask.outline + half])
 
 
-def _share_within(planes: np.ndarray, points: np.ndarray) -> float:
+def _compute_fraction_within(planes: np.ndarray, points: np.ndarray) -> float:
     """Return the fraction of points (n, 3) that are inside all planes of a convex hull."""
     outermost = np.full(len(points), -np.inf)
     for part in np.array_split(planes, max(1, len(planes) // 64)):

@@ -135,7 +135,7 @@ def make_anatomy(subject: Subject, plan: MeshPlan) -> Anatomy:
     solids = Solids(
         subject.brain, subject.tumour, low, high, subject.tumour_volume, subject.interface, opening, subject.pieces
     )
-    mesh = _assign_parts(build_mesh(solids, plan.nodes, plan.meshing), subject)
+    mesh = _assign_regions(build_mesh(solids, plan.nodes, plan.meshing), subject)
     made = add_boundary_conditions(mesh, subject.site, craniotomy, plan.placement, subject.outline, subject.septa)
     return refine(made, near_opening=True) if plan.fine_opening else made
 
@@ -151,7 +151,7 @@ def choose_diameter(subject: Subject, plan: MeshPlan) -> float:
     return float(np.clip(2.0 * (np.percentile(aside, 95.0) + TUMOUR_MARGIN), USUAL_CRANIOTOMY, MAX_CRANIOTOMY))
 
 
-def _assign_parts(mesh: TetMesh, subject: Subject) -> TetMesh:
+def _assign_regions(mesh: TetMesh, subject: Subject) -> TetMesh:
     """Return the mesh with the regions of the subject's parts.
 
     Tetrahedra are assigned to a part in order of their fraction inside it, until the volumes agree best.

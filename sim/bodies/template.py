@@ -211,11 +211,11 @@ def build_synthetic_subject(tumour: Tumour, healthy: HealthyHead, head: HeadScal
     brain, cortex = compute_level_set(healthy.mask, healthy.affine), find_boundary_voxels(healthy.mask, healthy.affine)
     if tumour.middle is None:
         site, inward = _find_site(brain, cortex, healthy.origin, tumour.site, head.smoothing_length)
-        shape = _round(
+        shape = _build_tumour_shape(
             tumour, lambda unit, scale: site + (tumour.cover + scale * unit.compute_radius(-inward[None])[0]) * inward
         )
     else:
-        shape = _round(tumour, lambda unit, scale: np.array(tumour.middle))
+        shape = _build_tumour_shape(tumour, lambda unit, scale: np.array(tumour.middle))
         site = find_reachable_site(cortex, shape.middle)
     interface = shape.middle + _sample_sphere(400) * shape.compute_radius(_sample_sphere(400))[:, None]
     if (brain(interface) > -head.clearance).any():
@@ -258,28 +258,28 @@ def _load_scaled_template(head: HeadScaling) -> HealthyHead:
 
 
 def _find_site(
-    brain: Field, cortex: np.ndarray, seen_from: tuple[float, float, float] | None, name: str, smooth: float
+    brain: Field, cortex: np.ndarray, centre: tuple[float, float, float] | None, name: str, smoothing_length: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the point (3,) [m] at which the ray to the site `name` leaves the brain, and the inward normal (3,)."""
     middle = 0.5 * (cortex.min(axis=0) + cortex.max(axis=0))
-    outward = 1e-3 * np.array(SITES[name]) - (middle if seen_from is None else np.array(seen_from))
+    outward = 1e-3 * np.array(SITES[name]) - (middle if centre is None else np.array(centre))
     outward /= np.linalg.norm(outward)
     along = np.arange(0.02, 0.15, 1e-5)
     site = middle + along[np.flatnonzero(brain(middle + along[:, None] * outward) < 0.0)[-1]] * outward
-    near = cortex[np.linalg.norm(cortex - site, axis=1) <= 3.0 * smooth]
+    near = cortex[np.linalg.norm(cortex - site, axis=1) <= 3.0 * smoothing_length]
     normal = np.linalg.eigh(np.cov(near.T))[1][:, 0]
     return site, -normal * np.sign(normal @ outward)
 
 
-def _round(tumour: Tumour, middle: Callable[[Lobed, float], np.ndarray]) -> Lobed:
-    """Return the tumour shape; `middle` is a function of the unit-scale shape and the scale that returns the centre."""
+def _build_tumour_shape(tumour: Tumour, compute_centre: Callable[[Lobed, float], np.ndarray]) -> Lobed:
+    """Return the tumour shape; `compute_centre` returns the centre for the unit-scale shape and the scale."""
     rng, lobes = np.random.default_rng(tumour.seed), tumour.lobes
     directions = rng.normal(size=(lobes.count if tumour.shape == "lobed" else 0, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     heights = rng.uniform(0.3, 1.0, len(directions)) * lobes.height
     unit = Lobed(np.zeros(3), directions, heights, 1.0, lobes.sharpness)
     scale = tumour.radius / (unit.compute_radius(_sample_sphere(20_000)) ** 3).mean() ** (1.0 / 3.0)
-    return Lobed(middle(unit, scale), directions, heights, scale, lobes.sharpness)
+    return Lobed(compute_centre(unit, scale), directions, heights, scale, lobes.sharpness)
 
 
 def _sample_sphere(count: int) -> np.ndarray:

@@ -46,15 +46,15 @@ class TipGauge:
     @cached_property
     def nodes(self) -> np.ndarray:
         """Sorted mesh vertices (n,) whose displacement is required: exposed cortex and surface of the tumour."""
-        return np.union1d(self._open[0], self._tumour[0])
+        return np.union1d(self._open_surface[0], self._tumour_surface[0])
 
     @cached_property
-    def _open(self) -> tuple[np.ndarray, np.ndarray]:
+    def _open_surface(self) -> tuple[np.ndarray, np.ndarray]:
         """Mesh vertices (m,) of the exposed cortex, and its triangles (S, 3) as indices into these vertices."""
         return np.unique(self.anatomy.open_surface, return_inverse=True)
 
     @cached_property
-    def _tumour(self) -> tuple[np.ndarray, np.ndarray]:
+    def _tumour_surface(self) -> tuple[np.ndarray, np.ndarray]:
         return np.unique(self.anatomy.tumour_surface, return_inverse=True)
 
     def compute_distances(
@@ -88,31 +88,31 @@ class TipGauge:
                 f"the distance from tip to tumour needs vertex {self.nodes[row[self.nodes] < 0][0]}, which the "
                 "displacements lack: request the open cortex and the tumour."
             )
-        tips = self._compute_tips(loads, displacement, row[self._open[0]], tool, lift)
-        found, at = np.empty(len(loads)), row[self._tumour[0]]
+        tips = self._compute_tips(loads, displacement, row[self._open_surface[0]], tool, lift)
+        found, at = np.empty(len(loads)), row[self._tumour_surface[0]]
         for first in range(0, len(loads), self.block_size):
             some = slice(first, first + self.block_size)
-            tumour = self.anatomy.mesh.nodes[self._tumour[0]] + displacement[some][:, at]
-            near = find_closest_points(tips[some], tumour[:, self._tumour[1]]).point
+            tumour = self.anatomy.mesh.nodes[self._tumour_surface[0]] + displacement[some][:, at]
+            near = find_closest_points(tips[some], tumour[:, self._tumour_surface[1]]).point
             found[some] = np.linalg.norm(near - tips[some], axis=1)
         return found
 
     def _compute_tips(
-        self, loads: Loads, displacement: np.ndarray, row: np.ndarray, tool: BuiltIn | None, lift: float
+        self, loads: Loads, displacement: np.ndarray, cortex_rows: np.ndarray, tool: BuiltIn | None, lift: float
     ) -> np.ndarray:
-        """Return the tip positions (B, 3) [m]; `row` (m,) are the rows of the exposed cortex in `displacement`."""
+        """Return the tip positions (B, 3) [m]; `cortex_rows` (m,): those of the exposed cortex in `displacement`."""
         axis, touching = self.cortex.axis, loads.get(Touching)
         if touching is not None and tool is not None:
             return find_foremost_points(tool, touching.pose[:, 0], axis)
         pushed = loads.get(Pushed)
         if pushed is None:
             raise InputError("the loads have no tip: give pushing tools, or poses and their tool.")
-        nodes, triangles = self._open
+        nodes, triangles = self._open_surface
         rest, tips = self.anatomy.mesh.nodes[nodes], np.empty((len(loads), 3))
         for first in range(0, len(loads), self.block_size):
             some = slice(first, first + self.block_size)
             _, triangle, weights = find_closest_points(pushed.point[some], rest[triangles])
-            surface = rest + displacement[some][:, row]
+            surface = rest + displacement[some][:, cortex_rows]
             corners = surface[np.arange(len(surface))[:, None], triangles[triangle]]
             through = np.einsum("bc,bci->bi", weights, corners)
             tips[some] = find_resting_tips(surface, triangles, through, axis, pushed.footprint[some])

@@ -77,22 +77,22 @@ def check_vtu_size(path: Path, max_bytes: int) -> bool:
     return not raw
 
 
-def _parse_blocks(inside: str | bytes, word: np.dtype) -> tuple[int, Iterator[bytes]]:
+def _parse_blocks(content: str | bytes, header_type: np.dtype) -> tuple[int, Iterator[bytes]]:
     """Return the declared size of an array [bytes], and an iterator over its compressed blocks.
 
     The blocks follow a header: number of blocks, size of a block, size of the last block, compressed size of each.
-    `inside` contains raw bytes, or header and blocks in base64.
+    `content` contains raw bytes, or header and blocks in base64.
     """
 
     def read_part(start: int, size: int) -> bytes:
-        if isinstance(inside, bytes):
-            return inside[start : start + size]
-        return base64.b64decode(inside[start : start + _count_base64_characters(size)])
+        if isinstance(content, bytes):
+            return content[start : start + size]
+        return base64.b64decode(content[start : start + _count_base64_characters(size)])
 
-    count = int(np.frombuffer(read_part(0, word.itemsize), word, 1)[0])
-    header = word.itemsize * (3 + count)
-    size, _, *sizes = map(int, np.frombuffer(read_part(0, header), word)[1 : 3 + count])
-    packed = read_part(header if isinstance(inside, bytes) else _count_base64_characters(header), sum(sizes))
+    count = int(np.frombuffer(read_part(0, header_type.itemsize), header_type, 1)[0])
+    header = header_type.itemsize * (3 + count)
+    size, _, *sizes = map(int, np.frombuffer(read_part(0, header), header_type)[1 : 3 + count])
+    packed = read_part(header if isinstance(content, bytes) else _count_base64_characters(header), sum(sizes))
     ends = [0, *accumulate(sizes)]
     return count * size, (packed[start:end] for start, end in pairwise(ends))
 
@@ -102,12 +102,12 @@ def _count_base64_characters(size: int) -> int:
     return -(-size // 3) * 4
 
 
-def _measure_inflated_size(opener: Callable[[], Any], block: bytes, most: int) -> int:
-    """Return the decompressed size [bytes] of all streams of a block, or any number above `most` if it is exceeded."""
+def _measure_inflated_size(opener: Callable[[], Any], block: bytes, max_size: int) -> int:
+    """Return the decompressed size [bytes] of all streams of a block, or any number above `max_size` if larger."""
     total, rest = 0, block
-    while rest and total <= most:
+    while rest and total <= max_size:
         opened = opener()
-        while total <= most and not opened.eof:
+        while total <= max_size and not opened.eof:
             piece, rest = opened.decompress(rest, BLOCK), getattr(opened, "unconsumed_tail", b"")
             total += len(piece)
             if not piece and not rest:

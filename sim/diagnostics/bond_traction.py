@@ -53,11 +53,11 @@ class BondTraction:
 
     Tension and shear are combined as sqrt((t_n / tension)^2 + (t_s / shear)^2): the quadratic nominal stress criterion
     of cohesive layers (Camanho, Davila 2002, NASA/TM-2002-211737, eq. 16). Pressure never breaks the bond. Tractions
-    are averaged over a radius `around` [m] of each node, since tractions are singular at the edge of a craniotomy, but
+    are averaged over a `radius` [m] of each node, since tractions are singular at the edge of a craniotomy, but
     averages are not.
     """
 
-    def __init__(self, effect: Bonded, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 5e-3):
+    def __init__(self, effect: Bonded, anatomy: Anatomy, space: Discretisation, device: Device, radius: float = 5e-3):
         self._effect, self._device = effect, device
         covered, corners = (anatomy.slide_normal != 0.0).any(axis=1), space.mesh.surface
         wall = (covered | anatomy.fixed.all(axis=1))[corners].all(axis=1) & covered[corners].any(axis=1)
@@ -66,7 +66,7 @@ class BondTraction:
         # For quadratic triangles, the integrals of the corners' shape functions are zero.
         area = np.bincount(triangles[:, -3:].ravel(), share.ravel(), space.count)
         nodes = np.unique(triangles)
-        near = KDTree(space.nodes[nodes]).query_ball_point(space.nodes[nodes], around)
+        near = KDTree(space.nodes[nodes]).query_ball_point(space.nodes[nodes], radius)
         normal = space.extend_normals(anatomy.slide_normal, anatomy.fixed)[nodes]
         kept = np.flatnonzero(normal.any(axis=1) & np.array([area[nodes[patch]].any() for patch in near], bool))
         patches = [nodes[near[patch]] for patch in kept]
@@ -88,12 +88,12 @@ class BondTraction:
         """Return the largest relative traction (B,); above 1 the bond would fail. NaN without a skull."""
         return self._compute_largest_ratio(force).numpy() if len(self.nodes) else np.full(force.shape[1], np.nan)
 
-    def _compute_largest_ratio(self, force: wp.array, share: wp.array | None = None) -> wp.array:
+    def _compute_largest_ratio(self, force: wp.array, ratios: wp.array | None = None) -> wp.array:
         """Return the largest relative traction (B,) of each load case, as a device array.
 
-        If `share` is given, the relative tractions (n, B) of all nodes are written to this array.
+        If `ratios` is given, the relative tractions (n, B) of all nodes are written to this array.
         """
         most = wp.zeros(force.shape[1], dtype=wp.float64, device=self._device.name)
         inputs = [force, *self._arrays, wp.float64(self._effect.tension), wp.float64(self._effect.shear)]
-        self._device.launch(build_kernel(self._device), (len(self.nodes), force.shape[1]), inputs, [share, most])
+        self._device.launch(build_kernel(self._device), (len(self.nodes), force.shape[1]), inputs, [ratios, most])
         return most

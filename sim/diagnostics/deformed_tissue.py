@@ -19,10 +19,10 @@ class Diagnostics:
     """Diagnostics of deformations of an anatomy under given effects."""
 
     def __init__(
-        self, anatomy: Anatomy, space: Discretisation, effects: Iterable[Effect], device: Device, limit_strain: bool
+        self, anatomy: Anatomy, space: Discretisation, effects: Iterable[Effect], device: Device, has_strain_limit: bool
     ):
         self._leak, self._stretch = SkullLeak(anatomy, space, device), TissueStretch(space, device)
-        self._limit_strain = limit_strain
+        self._limit_strain = has_strain_limit
         bonded = (effect for effect in effects if isinstance(effect, Bonded))
         self._bond = next((BondTraction(effect, anatomy, space, device) for effect in bonded), None)
 

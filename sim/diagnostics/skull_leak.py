@@ -51,7 +51,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         patch_start: wp.array(dtype=wp.int32),
         nodes: wp.array(dtype=wp.int32),
         vectors: wp.array(dtype=wp.vec3d),
-        covered: wp.array(dtype=wp.int32),
+        is_covered: wp.array(dtype=wp.int32),
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
@@ -61,7 +61,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         for i in range(patch_start[s], patch_start[s + 1]):
             for k in range(3):
                 v += vectors[i][k] * wp.float64(u[3 * nodes[i] + k, c])
-        if covered[s] == 0:
+        if is_covered[s] == 0:
             wp.atomic_add(out, 1, c, wp.abs(v))
         elif v > wp.float64(0.0):
             wp.atomic_add(out, 0, c, v)
@@ -72,17 +72,17 @@ def build_kernel(device: Device) -> wp.Kernel:
 class SkullLeak:
     """Tissue volume that passes outwards through the closed skull, relative to the volume swept by the open surface.
 
-    The flux through each covered facet is averaged over all facets within `around` [m], the size of a palpating tool.
+    The flux through each covered facet is averaged over all facets within `radius` [m], the size of a palpating tool.
     Sums over the facets of one node would not show a leak: for a node that slides perpendicular to the mean normal of
     its facets, this sum is zero by construction.
     """
 
-    def __init__(self, anatomy: Anatomy, space: Discretisation, device: Device, around: float = 7e-3):
+    def __init__(self, anatomy: Anatomy, space: Discretisation, device: Device, radius: float = 7e-3):
         solid = (anatomy.slide_normal != 0.0).any(axis=1) | anatomy.fixed.all(axis=1)
         covered = solid[space.mesh.surface].all(axis=1)
         vectors = integrate_facet_normals(space.nodes, space.surface)
         corners = space.nodes[space.surface[:, :3]]
-        near = KDTree(corners.mean(axis=1)).query_ball_point(corners.mean(axis=1), around)
+        near = KDTree(corners.mean(axis=1)).query_ball_point(corners.mean(axis=1), radius)
         size = compute_areas(corners)
         patches = [
             np.array([row]) if not covered[row] else np.array(some)[covered[some]] for row, some in enumerate(near)

@@ -68,7 +68,7 @@ def build_kernels(device: Device) -> ConstraintKernels:
         fixed: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
         drag: wp.array(dtype=vec),
-        value: wp.array2d(dtype=scalar),
+        prescribed: wp.array2d(dtype=scalar),
         u: wp.array2d(dtype=scalar),
         # outputs
         gap: wp.array2d(dtype=scalar),
@@ -76,11 +76,11 @@ def build_kernels(device: Device) -> ConstraintKernels:
         """Compute gap_i = value - u if fixed, n (drag . value - n . u) if sliding, zero elsewhere."""
         i, c = wp.tid()
         x, n = vec(u[3 * i, c], u[3 * i + 1, c], u[3 * i + 2, c]), normal[i]
-        dragged = wp.dot(drag[i], vec(value[3 * i, c], value[3 * i + 1, c], value[3 * i + 2, c]))
+        dragged = wp.dot(drag[i], vec(prescribed[3 * i, c], prescribed[3 * i + 1, c], prescribed[3 * i + 2, c]))
         slip = (dragged - wp.dot(n, x)) * n
         for k in range(3):
             r = 3 * i + k
-            gap[r, c] = wp.where(fixed[i, k] == wp.int8(0), slip[k], value[r, c] - x[k])
+            gap[r, c] = wp.where(fixed[i, k] == wp.int8(0), slip[k], prescribed[r, c] - x[k])
 
     @forward_kernel(module="unique")
     def compute_mean(
@@ -124,13 +124,13 @@ class Constraint:
         components are constrained so that the node stays in its tangent plane.
     device
         Device of the arrays.
-    freedom
+    min_free
         Thresholds below which motion counts as fixed.
     """
 
-    def __init__(self, fixed: np.ndarray, normal: np.ndarray, device: Device, freedom: MinFreeDofs = MinFreeDofs()):
-        self.fixed, self._freedom = fixed, freedom
-        self.normal, drag = _restrict_normals(fixed, normal, freedom.normal_norm)
+    def __init__(self, fixed: np.ndarray, normal: np.ndarray, device: Device, min_free: MinFreeDofs = MinFreeDofs()):
+        self.fixed, self._freedom = fixed, min_free
+        self.normal, drag = _restrict_normals(fixed, normal, min_free.normal_norm)
         self.device = device
         self._fixed = device.upload(fixed.astype(np.int8), wp.int8)
         self._normal = device.upload(self.normal, device.vector)
@@ -249,14 +249,14 @@ class Constraint:
         self.device.launch(build_kernels(self.device).distribute, (len(self.fixed), v.shape[1]), inputs, [v])
 
 
-def _restrict_normals(fixed: np.ndarray, normal: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the slide normals (N, 3) without their fixed components, normalised; zero if the norm is below `limit`.
+def _restrict_normals(fixed: np.ndarray, normal: np.ndarray, min_norm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slide normals (N, 3) without their fixed components, normalised; zero if the norm is below `min_norm`.
 
     Also return `drag` (N, 3): motion along the normal per unit of each fixed component that keeps a node in its plane.
     """
     inside = np.where(fixed, 0.0, normal)
     length = np.linalg.norm(inside, axis=1, keepdims=True)
-    left = length > limit
+    left = length > min_norm
     unit = np.divide(inside, length, out=np.zeros_like(inside), where=left)
     drag = np.divide(inside - normal, length, out=np.zeros_like(inside), where=left)
     return unit, drag

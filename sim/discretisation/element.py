@@ -43,40 +43,40 @@ class Elements:
         return replace(self, table=np.searchsorted(nodes, self.table).astype(self.table.dtype), node_count=len(nodes))
 
 
-def build_linear_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
-    """Return linear elements with one quadrature point, for the tetrahedra marked in `selected` (T,)."""
-    tets = mesh.tets[selected]
+def build_linear_elements(mesh: TetMesh, tet_mask: np.ndarray) -> Elements:
+    """Return linear elements with one quadrature point, for the tetrahedra marked in `tet_mask` (T,)."""
+    tets = mesh.tets[tet_mask]
     corners = mesh.nodes[tets]
     jacobian = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     inverse = np.linalg.inv(jacobian)  # rows: gradients of barycentric coordinates 1, 2, 3
     gradient = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
-    weight = mesh.volumes[selected][:, None]
-    return Elements(tets, gradient[:, None], weight, len(mesh.nodes), np.flatnonzero(selected), tets)
+    weight = mesh.volumes[tet_mask][:, None]
+    return Elements(tets, gradient[:, None], weight, len(mesh.nodes), np.flatnonzero(tet_mask), tets)
 
 
-def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, selected: np.ndarray) -> Elements:
+def build_quadratic_elements(nodes: np.ndarray, table: np.ndarray, tet_mask: np.ndarray) -> Elements:
     """Return ten-node tetrahedral elements, straight or curved, with eight quadrature points of degree 3.
 
     Zienkiewicz, Taylor 2005, "The Finite Element Method", section 4.7. nodes (N, 3) [m]; table (T, 10): corners, then
-    midpoints of `QUADRATIC_EDGES`; the mask `selected` (T,) selects elements.
+    midpoints of `QUADRATIC_EDGES`; `tet_mask` (T,) selects elements.
 
     Raises
     ------
     InputError
         The mid-edge nodes fold an element.
     """
-    table, slope = table[selected], compute_quadratic_gradients(EIGHT_POINTS)
+    table, slope = table[tet_mask], compute_quadratic_gradients(EIGHT_POINTS)
     jacobian = np.einsum("tai,qaj->tqij", nodes[table], slope)
     volume = np.linalg.det(jacobian)
     folded = np.flatnonzero((volume <= 0.0).any(axis=1))
     if len(folded):
         raise InputError(
-            f"quadratic tetrahedron {np.flatnonzero(selected)[folded[0]]} (and {len(folded) - 1} more) is folded over "
+            f"quadratic tetrahedron {np.flatnonzero(tet_mask)[folded[0]]} (and {len(folded) - 1} more) is folded over "
             "by its mid-edge nodes: move them towards the middles of their edges."
         )
     gradient = np.einsum("qaj,tqji->tqai", slope, np.linalg.inv(jacobian))
     weight = volume * EIGHT_WEIGHTS / 6.0
-    return Elements(table, gradient, weight, len(nodes), np.flatnonzero(selected), table[:, :4])
+    return Elements(table, gradient, weight, len(nodes), np.flatnonzero(tet_mask), table[:, :4])
 
 
 def pack_gradients(
@@ -121,10 +121,10 @@ def assemble_hooke_stiffness(elements: Elements, mu: np.ndarray, lam: np.ndarray
     Finite Element Method", section 2.8.
     """
 
-    def build_factors(part: np.ndarray, point: np.ndarray, slope: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
+    def build_factors(part: np.ndarray, point: np.ndarray, gradients: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
         for modulus, of in ((2.0 * mu[part], _build_strain), (lam[part], _build_divergence)):
             if modulus.any():
-                blocks, weight = of(slope), (modulus[:, None] * elements.weight[part]).ravel()
+                blocks, weight = of(gradients), (modulus[:, None] * elements.weight[part]).ravel()
                 yield blocks, weight[point][:, None, None] * blocks
 
     return _assemble_products(elements, build_factors)
@@ -137,10 +137,10 @@ def assemble_tangent_stiffness(elements: Elements, tangent: np.ndarray) -> sp.cs
     Continuum Mechanics for Finite Element Analysis", section 9.4.
     """
 
-    def build_factors(part: np.ndarray, point: np.ndarray, slope: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
+    def build_factors(part: np.ndarray, point: np.ndarray, gradients: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
         own = (elements.weight[part][..., None, None] * tangent[part]).reshape(-1, 9, 3, 3)
-        blocks = (slope[:, None, :, None] * np.eye(3)[:, None]).reshape(-1, 9, 3)
-        x, y, z = (own[..., j][point] * slope[:, j, None, None] for j in range(3))
+        blocks = (gradients[:, None, :, None] * np.eye(3)[:, None]).reshape(-1, 9, 3)
+        x, y, z = (own[..., j][point] * gradients[:, j, None, None] for j in range(3))
         yield blocks, x + y + z
 
     return _assemble_products(elements, build_factors)
@@ -167,16 +167,16 @@ def _assemble_products(elements: Elements, build_factors: Factors, block_size: i
     return sp.csc_array(total.T)  # symmetric
 
 
-def _build_divergence(slope: np.ndarray) -> np.ndarray:
+def _build_divergence(gradients: np.ndarray) -> np.ndarray:
     """Return the blocks (M, 1, 3) of the divergence operator, for shape functions with gradients (M, 3)."""
-    return slope[:, None]
+    return gradients[:, None]
 
 
-def _build_strain(slope: np.ndarray) -> np.ndarray:
+def _build_strain(gradients: np.ndarray) -> np.ndarray:
     """Return the blocks (M, 6, 3) of the small-strain operator in Mandel notation: xx, yy, zz, sqrt(2) yz, xz, xy."""
-    blocks = np.zeros((len(slope), 6, 3))
+    blocks = np.zeros((len(gradients), 6, 3))
     for i in range(3):
-        blocks[:, i, i] = slope[:, i]
+        blocks[:, i, i] = gradients[:, i]
     for row, (i, j) in enumerate(((1, 2), (0, 2), (0, 1)), start=3):
-        blocks[:, row, i], blocks[:, row, j] = np.sqrt(0.5) * slope[:, j], np.sqrt(0.5) * slope[:, i]
+        blocks[:, row, i], blocks[:, row, j] = np.sqrt(0.5) * gradients[:, j], np.sqrt(0.5) * gradients[:, i]
     return blocks

@@ -20,19 +20,19 @@ STABILISATION = 0.1  # Share of linear interpolation on a face: stiffens oscilla
 RADIUS = 1.1  # Support radius, relative to the distance of the farthest node of the support.
 
 
-def build_element_free(mesh: TetMesh, selected: np.ndarray) -> Elements:
-    """Return one integration cell for each tetrahedron marked in `selected` (T,).
+def build_element_free(mesh: TetMesh, tet_mask: np.ndarray) -> Elements:
+    """Return one integration cell for each tetrahedron marked in `tet_mask` (T,).
 
     grad N_a = 1/V sum over faces of N_a(centroid) n A. Adjacent cells use the same N_a at a common face, so gradients
     sum to the surface integral of N_a n. At outer surfaces and region interfaces, N_a = 1/3 at the three vertices of a
     face: loads and fixed nodes act as on linear tetrahedra, strain may jump, and no support crosses such a face.
     """
-    tets = mesh.tets[selected]
+    tets = mesh.tets[tet_mask]
     corner = tets[:, FACES].reshape(-1, 3)
     _, first, face = np.unique(compute_row_keys(corner), return_index=True, return_inverse=True)
     cell = np.repeat(np.arange(len(tets)), len(FACES))
     # Faces with a tetrahedron of the same region on both sides.
-    label = np.unique(mesh.region[selected], return_inverse=True)[1][cell]
+    label = np.unique(mesh.region[tet_mask], return_inverse=True)[1][cell]
     count, total, square = (np.bincount(face, label**power) for power in range(3))
     inside = (count == 2) & (total**2 == 2.0 * square)
     across, corners = inside[face], corner[first]
@@ -44,12 +44,12 @@ def build_element_free(mesh: TetMesh, selected: np.ndarray) -> Elements:
     own = compute_shape_functions(centroid, mesh.nodes[support], support >= 0)
     table[inside, 3:], shape[inside, 3:] = support, (1.0 - STABILISATION) * own
     a, b, c = np.moveaxis(mesh.nodes[corner], 1, 0)
-    area = np.cross(b - a, c - a) / (2.0 * mesh.volumes[selected][cell, None])
+    area = np.cross(b - a, c - a) / (2.0 * mesh.volumes[tet_mask][cell, None])
     entry, column = np.nonzero(table[face] >= 0)
     slope = area[entry] * shape[face[entry], column][:, None]
     nodes, size, gradient = pack_gradients(cell[entry], table[face[entry], column], slope)
-    weight = mesh.volumes[selected][:, None]
-    return Elements(nodes, gradient, weight, len(mesh.nodes), np.flatnonzero(selected), tets, size)
+    weight = mesh.volumes[tet_mask][:, None]
+    return Elements(nodes, gradient, weight, len(mesh.nodes), np.flatnonzero(tet_mask), tets, size)
 
 
 def compute_shape_functions(points: np.ndarray, nodes: np.ndarray, mask: np.ndarray) -> np.ndarray:

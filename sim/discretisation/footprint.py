@@ -68,13 +68,13 @@ class Footprints:
 
 @dataclass(frozen=True, eq=False)
 class FootprintArrays:
-    """Device arrays for B footprints: `tools` (B,) as point and radius [m], `contacts` (B,) as point and distance.
+    """Device arrays for B footprints: `tools` (B,) as point and radius [m], `contact_points` (B,) with distance.
 
     `levels` (n, B) are reduction levels of the nearest points; `weight` (M, B) and `sums` (B,) are as in `Footprints`.
     """
 
     tools: wp.array
-    contacts: wp.array
+    contact_points: wp.array
     levels: tuple[wp.array, ...]
     weight: wp.array
     sums: wp.array
@@ -93,7 +93,7 @@ class ContactSurface:
         Device of the arrays.
     name
         Name for messages.
-    division
+    subdivision
         Subdivision of the triangles under a footprint.
     """
 
@@ -103,16 +103,16 @@ class ContactSurface:
         triangles: np.ndarray,
         device: Device,
         name: str = "surface",
-        division: EdgeSubdivision = EdgeSubdivision(),
+        subdivision: EdgeSubdivision = EdgeSubdivision(),
     ):
-        self.device, self._name, self._division = device, name, division
+        self.device, self._name, self._division = device, name, subdivision
         self.nodes, table = np.unique(triangles, return_inverse=True)
         self.numbers = device.upload(self.nodes, wp.int32)
         corners = nodes[triangles[:, :3]]
         centre = corners.mean(axis=1)
         reach = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
         edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0)
-        self._least = edge / (division.max_edge_ratio * division.max_subdivisions)
+        self._least = edge / (subdivision.max_edge_ratio * subdivision.max_subdivisions)
         self._corners = device.upload(corners, wp.vec3d)
         self._ball = device.upload(np.column_stack([centre, reach]), wp.vec4d)
         self._table = device.upload(table.reshape(triangles.shape), wp.int32)
@@ -123,7 +123,7 @@ class ContactSurface:
         """Return the surface point nearest to each of B points [m], and its distance, inf if > `max_distance` (B,)."""
         imprint = self.allocate_footprints(self._pack_tools(points, max_distance))
         self._find_contacts(imprint)
-        touched = imprint.contacts.numpy().reshape(-1, 4)
+        touched = imprint.contact_points.numpy().reshape(-1, 4)
         return touched[:, :3], touched[:, 3]
 
     def find_footprints(self, points: np.ndarray, radii: np.ndarray) -> Footprints:
@@ -158,7 +158,7 @@ class ContactSurface:
         self._find_contacts(footprints)
         footprints.weight.zero_()
         footprints.sums.zero_()
-        inputs = [self._corners, self._ball, self._table, self._position, footprints.tools, footprints.contacts]
+        inputs = [self._corners, self._ball, self._table, self._position, footprints.tools, footprints.contact_points]
         inputs += [self._division.max_edge_ratio, self._division.min_subdivisions, self._division.max_subdivisions]
         self.device.launch(
             _integrate_footprint, (len(self._ball), len(footprints.tools)), inputs, [footprints.weight, footprints.sums]
@@ -183,12 +183,12 @@ class ContactSurface:
             )
         imprint = self.allocate_footprints(self._pack_tools(points, radii))
         self.compute_footprints(imprint)
-        self._check_touching(points, radii, imprint.contacts.numpy().reshape(-1, 4)[:, 3])
+        self._check_touching(points, radii, imprint.contact_points.numpy().reshape(-1, 4)[:, 3])
         return Footprints(self.nodes, imprint.weight, imprint.sums)
 
-    def _check_touching(self, points: np.ndarray, radii: np.ndarray, away: np.ndarray) -> None:
-        """Reject tools whose distance `away` (B,) from the surface is infinite."""
-        missed = np.flatnonzero(np.isinf(away))
+    def _check_touching(self, points: np.ndarray, radii: np.ndarray, distances: np.ndarray) -> None:
+        """Reject tools whose `distances` (B,) from the surface are infinite."""
+        missed = np.flatnonzero(np.isinf(distances))
         if len(missed):
             number = missed[0]
             raise InputError(
@@ -199,11 +199,11 @@ class ContactSurface:
     def _pack_tools(self, points: np.ndarray, radii: np.ndarray) -> wp.array:
         return self.device.upload(np.column_stack([points, radii]), wp.vec4d)
 
-    def _find_contacts(self, imprint: FootprintArrays) -> None:
+    def _find_contacts(self, footprints: FootprintArrays) -> None:
         """Find the contact point of each tool and its distance, which is inf if larger than the radius of the tool."""
-        inputs = [self._corners, self._ball, imprint.tools]
-        self.device.launch(_search_chunk, imprint.levels[0].shape, inputs, [imprint.levels[0]])
-        for some, fewer in pairwise(imprint.levels):
+        inputs = [self._corners, self._ball, footprints.tools]
+        self.device.launch(_search_chunk, footprints.levels[0].shape, inputs, [footprints.levels[0]])
+        for some, fewer in pairwise(footprints.levels):
             self.device.launch(_reduce_candidates, fewer.shape, [some], [fewer])
 
 

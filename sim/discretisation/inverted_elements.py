@@ -41,23 +41,23 @@ class InversionCounter:
     """Counter of tetrahedra that are inverted or collapsed at any quadrature point.
 
     Linear tetrahedra have one point, quadratic ones eight. Smoothed and element-free strains are averages, but the test
-    uses single tetrahedra. A tetrahedron with J below `collapsed` counts, since the sign of J is then round-off.
-    `bounded` is True if the energy of the law is infinite for inverted (averaged) deformation gradients.
+    uses single tetrahedra. A tetrahedron with J below `min_ratio` counts, since the sign of J is then round-off.
+    `is_bounded` is True if the energy of the law is infinite for inverted (averaged) deformation gradients.
     """
 
-    def __init__(self, space: Discretisation, device: Device, bounded: bool = False, collapsed: float = 1e-6):
+    def __init__(self, space: Discretisation, device: Device, is_bounded: bool = False, min_ratio: float = 1e-6):
         every, quadratic = np.ones(len(space.mesh.tets), bool), space.element == "p2"
         elements = (
             build_quadratic_elements(space.nodes, space.table, every)
             if quadratic
             else build_linear_elements(space.mesh, every)
         )
-        self._telling = not (bounded and space.element in ("smoothed", "element-free"))
-        self._device, self._collapsed = device, collapsed
+        self._telling = not (is_bounded and space.element in ("smoothed", "element-free"))
+        self._device, self._collapsed = device, min_ratio
         self._table = device.upload(elements.table, wp.int32)
         self._gradient = device.upload(elements.gradient, device.vector)
 
-    def find_suspect(self, counts: np.ndarray) -> np.ndarray:
+    def find_unreliable(self, counts: np.ndarray) -> np.ndarray:
         """Return a mask (B,) of load cases whose inverted tetrahedra, `counts` (B,) > 0, make the equilibrium suspect.
 
         The mask is False if the law is `bounded` and uses averages: a descent cannot invert the averages, and a strong

@@ -146,18 +146,18 @@ def _find_nearest(
 
 
 @wp.func
-def _compute_face_height(point: wp.vec3d, centre: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.float64:
+def _compute_face_height(point: wp.vec3d, centre: wp.vec3d, axes: wp.mat33d, sizes: wp.vec3d) -> wp.float64:
     """Return the height of a point above a flat box if the point is over the upper face; else -1."""
     none = wp.float64(0.0)
     local = wp.transpose(axes) @ (point - centre)
-    within = wp.abs(local[0]) <= half[0] and wp.abs(local[1]) <= half[1] and local[2] >= none
-    return wp.where(within and half[2] == none and half[0] > none and half[1] > none, local[2], wp.float64(-1.0))
+    within = wp.abs(local[0]) <= sizes[0] and wp.abs(local[1]) <= sizes[1] and local[2] >= none
+    return wp.where(within and sizes[2] == none and sizes[0] > none and sizes[1] > none, local[2], wp.float64(-1.0))
 
 
 @wp.func
-def _find_nearest_in_box(point: wp.vec3d, centre: wp.vec3d, axes: wp.mat33d, half: wp.vec3d) -> wp.vec3d:
+def _find_nearest_in_box(point: wp.vec3d, centre: wp.vec3d, axes: wp.mat33d, sizes: wp.vec3d) -> wp.vec3d:
     """Return the point of the box nearest to a point."""
     local = wp.transpose(axes) @ (point - centre)
     for i in range(3):
-        local[i] = wp.clamp(local[i], -half[i], half[i])
+        local[i] = wp.clamp(local[i], -sizes[i], sizes[i])
     return centre + axes @ local

@@ -53,19 +53,19 @@ def list_remaining_bodies(anatomy: Anatomy, effects: Iterable[Effect]) -> tuple[
     return compute_remaining_bodies(whole, cut, bool(kinds & {Bonded, Slide}))
 
 
-def compute_remaining_bodies(anatomy: Anatomy, effect: Resection, sliding: bool = True) -> tuple[RemainingBody, ...]:
-    """Return the remaining bodies after 0, 1, ... all steps; `sliding` is True if slide normals also support tissue.
+def compute_remaining_bodies(anatomy: Anatomy, effect: Resection, can_slide: bool = True) -> tuple[RemainingBody, ...]:
+    """Return the remaining bodies after 0, 1, ... all steps; `can_slide` is True if slide normals also support tissue.
 
     Raises
     ------
     InputError
         The body is not fixed, a step contains a tetrahedron that the mesh does not have, or no tetrahedron remains.
     """
-    return tuple(_iterate_bodies(anatomy, effect, sliding))
+    return tuple(_iterate_bodies(anatomy, effect, can_slide))
 
 
-def _iterate_bodies(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterator[RemainingBody]:
-    normal = anatomy.slide_normal if slides else np.zeros_like(anatomy.slide_normal)
+def _iterate_bodies(anatomy: Anatomy, effect: Resection, can_slide: bool) -> Iterator[RemainingBody]:
+    normal = anatomy.slide_normal if can_slide else np.zeros_like(anatomy.slide_normal)
     check_fixed(anatomy.mesh, anatomy.fixed, normal)  # else all of it would count as disconnected
     yield RemainingBody(0, anatomy, np.zeros(0, np.int64))
     taken: set[int] = set()
@@ -75,7 +75,7 @@ def _iterate_bodies(anatomy: Anatomy, effect: Resection, slides: bool) -> Iterat
         try:
             left = anatomy.remove_elements(removed)
             kept = np.setdiff1d(np.arange(len(anatomy.mesh.tets)), removed)
-            loose = kept[find_loose_tetrahedra(left, slides)]
+            loose = kept[find_loose_tetrahedra(left, can_slide)]
             yield RemainingBody(
                 done, anatomy.remove_elements(np.concatenate([removed, loose])) if len(loose) else left, loose
             )

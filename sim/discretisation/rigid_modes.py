@@ -48,9 +48,9 @@ def check_fixed(mesh: TetMesh, fixed: np.ndarray, normal: np.ndarray, tolerance:
         )
 
 
-def find_loose_tetrahedra(anatomy: Anatomy, sliding: bool = True, tolerance: float = 1e-6) -> np.ndarray:
-    """Return tetrahedra (n,) that can move rigidly despite fixed nodes and, if `sliding`, slide normals."""
-    normal = anatomy.slide_normal if sliding else np.zeros_like(anatomy.slide_normal)
+def find_loose_tetrahedra(anatomy: Anatomy, can_slide: bool = True, tolerance: float = 1e-6) -> np.ndarray:
+    """Return tetrahedra (n,) that can move rigidly despite fixed nodes and, if `can_slide`, slide normals."""
+    normal = anatomy.slide_normal if can_slide else np.zeros_like(anatomy.slide_normal)
     cluster, nodes = _label_clusters(anatomy.mesh.tets), anatomy.mesh.nodes
     loose = []
     for number in np.unique(cluster):
@@ -63,9 +63,9 @@ def find_loose_tetrahedra(anatomy: Anatomy, sliding: bool = True, tolerance: flo
     return np.concatenate(loose) if loose else np.zeros(0, np.int64)
 
 
-def _label_components(first: np.ndarray, second: np.ndarray, count: int) -> np.ndarray:
+def _label_components(edge_starts: np.ndarray, edge_ends: np.ndarray, count: int) -> np.ndarray:
     """Return the connected component number (count,) of each vertex of a graph with edges (first, second)."""
-    graph = sp.coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    graph = sp.coo_array((np.ones(len(edge_starts)), (edge_starts, edge_ends)), shape=(count, count))
     return sp.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 

@@ -12,26 +12,26 @@ from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys
 from .element import Elements, build_linear_elements, pack_gradients
 
 
-def build_edge_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
-    """Return one element per edge and region, from the `selected` tetrahedra (T,) bool around the edge."""
-    ends = np.sort(mesh.tets[selected][:, EDGES].reshape(-1, 2))
-    return _build_averaged_elements(mesh, selected, compute_row_keys(ends).reshape(-1, len(EDGES)), ends)
+def build_edge_elements(mesh: TetMesh, tet_mask: np.ndarray) -> Elements:
+    """Return one element per edge and region, from the tetrahedra in `tet_mask` (T,) around the edge."""
+    ends = np.sort(mesh.tets[tet_mask][:, EDGES].reshape(-1, 2))
+    return _build_averaged_elements(mesh, tet_mask, compute_row_keys(ends).reshape(-1, len(EDGES)), ends)
 
 
-def build_node_elements(mesh: TetMesh, selected: np.ndarray) -> Elements:
-    """Return one element per node and region, from the `selected` tetrahedra (T,) bool around the node."""
-    corners = mesh.tets[selected].astype(np.int64)
-    return _build_averaged_elements(mesh, selected, corners, corners.reshape(-1, 1))
+def build_node_elements(mesh: TetMesh, tet_mask: np.ndarray) -> Elements:
+    """Return one element per node and region, from the tetrahedra in `tet_mask` (T,) around the node."""
+    corners = mesh.tets[tet_mask].astype(np.int64)
+    return _build_averaged_elements(mesh, tet_mask, corners, corners.reshape(-1, 1))
 
 
-def _build_averaged_elements(mesh: TetMesh, chosen: np.ndarray, key: np.ndarray, vertices: np.ndarray) -> Elements:
+def _build_averaged_elements(mesh: TetMesh, tet_mask: np.ndarray, key: np.ndarray, vertices: np.ndarray) -> Elements:
     """Return one element per distinct number in `key` (T, k); tetrahedron t adds V_t / k to each element it belongs to.
 
     `vertices` (T k, n) are the mesh vertices that identify each entry of `key`. Elements do not mix regions.
     """
-    linear = build_linear_elements(mesh, chosen)
+    linear = build_linear_elements(mesh, tet_mask)
     count, lent = key.shape
-    _, region = np.unique(mesh.region[chosen], return_inverse=True)
+    _, region = np.unique(mesh.region[tet_mask], return_inverse=True)
     key = key * (region.max(initial=0) + 1) + region[:, None]
     _, first, domain = np.unique(key.ravel(), return_index=True, return_inverse=True)
     share = np.repeat(linear.weight[:, 0] / lent, lent)

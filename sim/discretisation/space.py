@@ -74,8 +74,8 @@ class Discretisation:
         middles = self.table[:, 4:].ravel()[first[np.searchsorted(key, asked)]]
         return np.column_stack([corners, middles.reshape(-1, 3)])
 
-    def build_elements(self, selected: np.ndarray) -> tuple[ElementPart, ...]:
-        """Return the elements on the `selected` tetrahedra (T,) bool.
+    def build_elements(self, tet_mask: np.ndarray) -> tuple[ElementPart, ...]:
+        """Return the elements on the tetrahedra in `tet_mask` (T,).
 
         Raises
         ------
@@ -83,12 +83,12 @@ class Discretisation:
             A quadratic element is folded.
         """
         if self.element == "p1":
-            return (ElementPart(build_linear_elements(self.mesh, selected), "whole"),)
+            return (ElementPart(build_linear_elements(self.mesh, tet_mask), "whole"),)
         if self.element == "springs":
-            return (ElementPart(build_linear_elements(self.mesh, selected), "springs"),)
+            return (ElementPart(build_linear_elements(self.mesh, tet_mask), "springs"),)
         if self.element == "p2":
-            return (ElementPart(build_quadratic_elements(self.nodes, self.table, selected), "whole"),)
-        return _build_averaged_parts(self.mesh, self.element, selected.tobytes())
+            return (ElementPart(build_quadratic_elements(self.nodes, self.table, tet_mask), "whole"),)
+        return _build_averaged_parts(self.mesh, self.element, tet_mask.tobytes())
 
     def extend_fixed(self, fixed: np.ndarray) -> np.ndarray:
         """Return the mask (N, 3) of fixed components of all nodes, from the mask (V, 3) of the mesh vertices.
@@ -133,9 +133,9 @@ class Discretisation:
 
 
 @lru_cache(2)  # shared by effects, tissues and diagnostics: 10 % of a locator's set-up on a GPU
-def _build_averaged_parts(mesh: TetMesh, element: str, chosen: bytes) -> tuple[ElementPart, ...]:
-    """Return smoothed or element-free elements on the tetrahedra of the mask `chosen` (T,), given as bytes."""
-    tets = np.frombuffer(chosen, bool)
+def _build_averaged_parts(mesh: TetMesh, element: str, mask_bytes: bytes) -> tuple[ElementPart, ...]:
+    """Return smoothed or element-free elements on the tetrahedra of a mask (T,), given as bytes."""
+    tets = np.frombuffer(mask_bytes, bool)
     if element == "element-free":
         return (ElementPart(build_element_free(mesh, tets), "whole"),)
     return ElementPart(build_edge_elements(mesh, tets), "shape"), ElementPart(build_node_elements(mesh, tets), "volume")

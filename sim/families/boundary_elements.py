@@ -25,16 +25,16 @@ CHUNK = 8  # Collocation points whose integrals are computed together.
 class _Region:
     """Region of uniform tissue, with its boundary.
 
-    `members` (n,) are its vertices, `triangles` (S, 3) its outward boundary by vertex numbers. `displaced` (u, 3 S)
-    sums triangle corners to unknown displacements, `loaded` (t, 3 S) to unknown tractions and then unit forces.
+    `members` (n,) are its vertices, `triangles` (S, 3) its outward boundary by vertex numbers. Triangle corners are
+    summed to unknown displacements by `motion_sums` (u, 3 S), to tractions, forces by `traction_sums` (t, 3 S).
     """
 
     nodes: np.ndarray
     members: np.ndarray
     triangles: np.ndarray
     lame: tuple[float, float]
-    displaced: sp.csr_array
-    loaded: sp.csr_array
+    motion_sums: sp.csr_array
+    traction_sums: sp.csr_array
 
     def integrate(self, vertices: np.ndarray, column: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
         """Yield boundary integrals for loads at the `vertices` (n,) of the region, for a few vertices at a time.
@@ -53,7 +53,7 @@ class _Region:
             total = blocks[1].sum(axis=0) + inside[some, None] * np.eye(3).ravel()
             motion, force = (
                 (matrix @ each.reshape(-1, 9 * count)).reshape(-1, count, 3, 3).transpose(1, 2, 0, 3)
-                for matrix, each in ((self.displaced, blocks[1]), (self.loaded, blocks[0] / self.lame[0]))
+                for matrix, each in ((self.motion_sums, blocks[1]), (self.traction_sums, blocks[0] / self.lame[0]))
             )
             own = np.flatnonzero(column[some] >= 0)
             motion[own, :, column[some][own]] -= total[own].reshape(-1, 3, 3)
@@ -104,19 +104,19 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
     mesh, parts = body.anatomy.mesh, _find_tissues(body)
     boundaries = [find_boundary_faces(mesh.tets[some]) for some, _ in parts]
     triangles, region = np.vstack(boundaries), np.repeat(np.arange(len(parts)), [len(each) for each in boundaries])
-    inner = ~_is_among(triangles, mesh.surface)
+    inner = ~_is_in_table(triangles, mesh.surface)
     covered = body.fixed[triangles].all(axis=1) & ~inner
-    _check_places(body, triangles[covered], np.unique(triangles[inner]))
+    _check_supports(body, triangles[covered], np.unique(triangles[inner]))
     # Refine the free surface, triangles with a vertex on it, and, if these include it, the interface.
     marked = np.any(np.isin(triangles, triangles[~covered & ~inner]), axis=1)
     marked = marked | (inner & np.any(marked[inner]))
     walls, whole = triangles[covered][:, TRIANGLE_EDGES].reshape(-1, 2), triangles
-    nodes, triangles, parent, edges = _refine(mesh.nodes, whole, marked)
+    nodes, triangles, parent, edges = _divide_triangles(mesh.nodes, whole, marked)
     region, inner, covered = region[parent], inner[parent], covered[parent]
-    fixed, count = np.append(body.fixed, _is_among(edges, walls)), len(nodes)
-    move = _number(np.setdiff1d(triangles, np.flatnonzero(fixed)), count)
-    pull = _number(np.unique(triangles[covered | inner]), count)
-    act, density = _number(np.asarray(body.loaded), count), np.zeros(count)
+    fixed, count = np.append(body.fixed, _is_in_table(edges, walls)), len(nodes)
+    move = _index_vertices(np.setdiff1d(triangles, np.flatnonzero(fixed)), count)
+    pull = _index_vertices(np.unique(triangles[covered | inner]), count)
+    act, density = _index_vertices(np.asarray(body.loaded), count), np.zeros(count)
     # All triangles at `acting` are refined. `halved`: ends of the edge that a node halves; for a vertex, itself twice.
     density[body.loaded] = 0.25 / compute_vertex_areas(nodes, triangles[~inner])[body.loaded]
     halved, regions = np.vstack([np.arange(len(mesh.nodes)).repeat(2).reshape(-1, 2), edges]), []
@@ -124,53 +124,53 @@ def _build_regions(body: LinearBody) -> tuple[list[_Region], np.ndarray, np.ndar
         own = region == number
         ends, within, unknown = triangles[own].ravel(), np.repeat(inner[own], 3), np.repeat((inner | covered)[own], 3)
         sign = np.where(within & (number == 0), -1.0, 1.0)
-        reaction = _distribute(np.where(unknown, pull[ends], -1), sign, pull.max() + 1)
+        reaction = _build_sparse_matrix(np.where(unknown, pull[ends], -1), sign, pull.max() + 1)
         load = sum(
-            _distribute(
+            _build_sparse_matrix(
                 np.where(within, -1, act[corner]),
                 (4.0 * (halved[ends] == corner[:, None]).mean(axis=1) - 1.0) * density[corner],
                 len(body.loaded),
             )
             for corner in whole[parent[own]].T.repeat(3, axis=1)
         )
-        displaced = _distribute(move[ends], np.ones(len(ends)), move.max() + 1)
+        displaced = _build_sparse_matrix(move[ends], np.ones(len(ends)), move.max() + 1)
         members, loaded = np.unique(mesh.tets[some]), sp.csr_array(sp.vstack([reaction, load]))
         regions.append(_Region(nodes, members, triangles[own], lame, displaced, loaded))
     return regions, move, pull
 
 
-def _refine(nodes: np.ndarray, triangles: np.ndarray, marked: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Divide the triangles (S, 3) that are marked in `marked` (S,) into four.
+def _divide_triangles(nodes: np.ndarray, triangles: np.ndarray, is_divided: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Divide the triangles (S, 3) that are marked in `is_divided` (S,) into four.
 
     Return the nodes (N, 3) [m], given nodes first; the triangles; the original triangle of each; and the edges (E, 2)
     whose midpoints are the new nodes. New nodes may lie on edges of undivided triangles, since these triangles are
     fixed, and tractions may be discontinuous.
     """
-    edges = triangles[marked][:, TRIANGLE_EDGES].reshape(-1, 2)
+    edges = triangles[is_divided][:, TRIANGLE_EDGES].reshape(-1, 2)
     _, first, place = np.unique(compute_row_keys(edges), return_index=True, return_inverse=True)
-    (a, b, c), (ab, bc, ca) = triangles[marked].T, len(nodes) + place.reshape(-1, 3).T
+    (a, b, c), (ab, bc, ca) = triangles[is_divided].T, len(nodes) + place.reshape(-1, 3).T
     parts = np.array([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]).transpose(2, 0, 1).reshape(-1, 3)
-    parent = np.append(np.flatnonzero(~marked), np.repeat(np.flatnonzero(marked), 4))
+    parent = np.append(np.flatnonzero(~is_divided), np.repeat(np.flatnonzero(is_divided), 4))
     edges = edges[first]
-    return np.vstack([nodes, nodes[edges].mean(axis=1)]), np.vstack([triangles[~marked], parts]), parent, edges
+    return np.vstack([nodes, nodes[edges].mean(axis=1)]), np.vstack([triangles[~is_divided], parts]), parent, edges
 
 
-def _number(vertices: np.ndarray, count: int) -> np.ndarray:
+def _index_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
     """Return, for each of `count` vertices, its index in `vertices`, or -1 if it is not there."""
     numbers = np.full(count, -1)
     numbers[vertices] = np.arange(len(vertices))
     return numbers
 
 
-def _distribute(row: np.ndarray, value: np.ndarray, count: int) -> sp.csr_array:
-    """Return the sparse matrix (count, n) with `value` (n,) in `row` (n,) of each column; -1 makes a column empty."""
+def _build_sparse_matrix(row: np.ndarray, entries: np.ndarray, count: int) -> sp.csr_array:
+    """Return the sparse matrix (count, n) with `entries` (n,) in `row` (n,) of each column; -1 makes a column empty."""
     some = np.flatnonzero(row >= 0)
-    return sp.csr_array((value[some], (row[some], some)), shape=(count, len(row)))
+    return sp.csr_array((entries[some], (row[some], some)), shape=(count, len(row)))
 
 
-def _is_among(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return a mask (n,) of rows (n, k) of vertex numbers that occur in `others` (m, k), in any order of numbers."""
-    keys = compute_row_keys(np.vstack([rows, others]))
+def _is_in_table(rows: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Return a mask (n,) of rows (n, k) of vertex numbers that occur in `table` (m, k), in any order of numbers."""
+    keys = compute_row_keys(np.vstack([rows, table]))
     return np.isin(keys[: len(rows)], keys[len(rows) :])
 
 
@@ -188,7 +188,7 @@ def _find_tissues(body: LinearBody) -> list[tuple[np.ndarray, tuple[float, float
     return tissues if len({lame for _, lame in tissues}) > 1 else [(np.ones_like(tissues[0][0]), tissues[0][1])]
 
 
-def _check_places(body: LinearBody, covered: np.ndarray, interface: np.ndarray) -> None:
+def _check_supports(body: LinearBody, fixed_triangles: np.ndarray, interface: np.ndarray) -> None:
     """Reject fixed vertices or forces that boundary elements cannot represent."""
     surface = np.isin(np.arange(len(body.fixed)), body.anatomy.mesh.surface)
     inner = surface < ~body.anatomy.orphaned
@@ -199,7 +199,7 @@ def _check_places(body: LinearBody, covered: np.ndarray, interface: np.ndarray) 
             f"vertex {bad[0]} (and {len(bad) - 1} more) is fixed inside the body or at the tumour's surface: boundary "
             "elements need vertices that are fixed on the brain's outer surface only."
         )
-    if not len(covered):
+    if not len(fixed_triangles):
         raise InputError("no surface triangle has three fixed vertices: fix a part of the surface.")
     if len(np.unique(acting)) < len(acting) or (body.fixed | ~surface)[acting].any():
         raise InputError("acting has vertices twice, fixed or inside: forces act on distinct vertices of free surface.")

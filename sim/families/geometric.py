@@ -24,7 +24,7 @@ def compute_kelvinlet_response(body: LinearBody, nodes: np.ndarray) -> np.ndarra
     Forces at fixed vertices cancel the motion there (section 6 of the paper cited in `compute_kelvinlets`). The
     infinite body has the tissue of the largest region.
     """
-    points, pins, (mu, nu) = body.anatomy.mesh.nodes, _choose_pins(body), _find_main_tissue(body)
+    points, pins, (mu, nu) = body.anatomy.mesh.nodes, _choose_fixed_vertices(body), _find_main_tissue(body)
     sources, places = (points[np.concatenate([some, pins])] for some in (body.loaded, nodes))
     whole = compute_kelvinlets(places, sources, _compute_spacing(body), nu) / (4.0 * np.pi * mu)
     whole = whole.reshape(3 * len(sources), 3 * len(places))
@@ -55,10 +55,10 @@ def compute_thin_plate_response(body: LinearBody, nodes: np.ndarray) -> np.ndarr
 
     Bookstein 1989, "Principal warps", IEEE Trans. Pattern Anal. Mach. Intell. 11:567-585, in three dimensions.
     """
-    points, controls = body.anatomy.mesh.nodes, np.concatenate([body.loaded, _choose_pins(body)])
+    points, controls = body.anatomy.mesh.nodes, np.concatenate([body.loaded, _choose_fixed_vertices(body)])
     unit = np.eye(len(controls))[:, : len(body.loaded)]
     spline = RBFInterpolator(points[controls], unit, kernel="linear", degree=1)
-    return _continue_half_space(body, spline(points[nodes]))
+    return _extrapolate_half_space(body, spline(points[nodes]))
 
 
 def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
     Sederberg, Parry 1986, "Free-form deformation of solid geometric models"; with the B-splines of Rueckert et al.
     1999, IEEE Trans. Med. Imaging 18:712-721, fitted by least squares with a penalty on the differences of neighbours.
     """
-    points, controls = body.anatomy.mesh.nodes, np.concatenate([body.loaded, _choose_pins(body)])
+    points, controls = body.anatomy.mesh.nodes, np.concatenate([body.loaded, _choose_fixed_vertices(body)])
     low, high = points.min(axis=0), points.max(axis=0)
     cell = (high - low).max() / LATTICE
     count = np.ceil((high - low) / cell).astype(int) + 3
@@ -77,10 +77,10 @@ def compute_lattice_response(body: LinearBody, nodes: np.ndarray) -> np.ndarray:
         weights.resize(len(some), count.prod())  # SciPy leaves out columns behind the last one in use
     rough = LaplacianNd(tuple(count)).tosparse()
     factor = splu(sp.csc_array(fit.T @ fit - SMOOTHING * rough))
-    return _continue_half_space(body, read @ factor.solve(fit[: len(body.loaded)].T.toarray()))
+    return _extrapolate_half_space(body, read @ factor.solve(fit[: len(body.loaded)].T.toarray()))
 
 
-def _continue_half_space(body: LinearBody, weight: np.ndarray) -> np.ndarray:
+def _extrapolate_half_space(body: LinearBody, weight: np.ndarray) -> np.ndarray:
     """Return displacements (a, 3, n, 3) [m/N] at n points: `weight` (n, a) times the motion of the loaded vertices.
 
     The loaded vertices move like the surface of a half-space under unit forces at these vertices.
@@ -111,7 +111,7 @@ def _compute_spacing(body: LinearBody) -> float:
     return float(np.sqrt(compute_areas(mesh.nodes[mesh.surface]).sum() / (np.pi * len(np.unique(mesh.surface)))))
 
 
-def _choose_pins(body: LinearBody) -> np.ndarray:
+def _choose_fixed_vertices(body: LinearBody) -> np.ndarray:
     """Return at most `PINS` fixed vertices of the surface that are far from each other."""
     points, fixed = body.anatomy.mesh.nodes, np.setdiff1d(body.anatomy.mesh.surface, body.loaded)
     chosen, far = [0], np.full(len(fixed), np.inf)

@@ -57,12 +57,12 @@ class Relaxation:
 
 
 class _ForceModel(ABC):
-    """Base class of deformation models under forces; inversion and strain are measured in the elements `watched`."""
+    """Base class of deformation models under forces; inversion and strain are measured in the elements of `space`."""
 
-    def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], watched: Discretisation, device: Device):
+    def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], space: Discretisation, device: Device):
         self._name, self.anatomy, self.effects, self.lock = name, anatomy, tuple(effects), RLock()
         self._surface = ContactSurface(anatomy.mesh.nodes, anatomy.mesh.surface, device)
-        self._stretch, self._inversion = TissueStretch(watched, device), InversionCounter(watched, device)
+        self._stretch, self._inversion = TissueStretch(space, device), InversionCounter(space, device)
 
     @lock_method
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
@@ -84,7 +84,7 @@ class _ForceModel(ABC):
     def _deform(self, loads: Loads, nodes: np.ndarray) -> Deformation:
         """Return the deformation under `loads` at the vertices `nodes` (n,)."""
 
-    def _measure(self, loads: Loads, u: wp.array, outcome: np.ndarray) -> dict[str, Any]:
+    def _measure_result(self, loads: Loads, u: wp.array, outcome: np.ndarray) -> dict[str, Any]:
         """Return `Deformation` fields, by name, for displacements u (3N, b) [m] of the watched elements.
 
         `outcome` (b,) applies to load cases without inverted or overstrained elements.
@@ -146,7 +146,7 @@ class RelaxationModel(_ForceModel):
             nodes=nodes,
             iterations=np.full(len(loads), steps),
             residual=residual,
-            **self._measure(loads, u, outcome),
+            **self._measure_result(loads, u, outcome),
             cost=Cost({"steps": time.perf_counter() - begun}),
             source=self._source,
         )
@@ -179,7 +179,7 @@ class LinearModel(_ForceModel):
     def __init__(self, name: str, anatomy: Anatomy, effects: Iterable[Effect], respond: Respond, outcome: Outcome):
         effects, mesh = tuple(effects), anatomy.mesh
         self._body, self._good = build_linear_body(name, anatomy, effects), outcome
-        self._respond = lru_cache(2)(partial(self._build_table, respond))
+        self._respond = lru_cache(2)(partial(self._build_response_table, respond))
         free = np.isin(mesh.tets, self._body.loaded).any(axis=1) | anatomy.in_tumour
         self._watched, table = np.unique(mesh.tets[free].astype(np.int64), return_inverse=True)
         part = discretise(TetMesh(mesh.nodes[self._watched], table.reshape(-1, 4), mesh.region[free]), "p1")
@@ -199,12 +199,12 @@ class LinearModel(_ForceModel):
             nodes=nodes,
             iterations=np.zeros(len(loads), int),
             residual=np.full(len(loads), np.nan),
-            **self._measure(loads, u, np.full(len(loads), self._good)),
+            **self._measure_result(loads, u, np.full(len(loads), self._good)),
             cost=Cost({"response": time.perf_counter() - begun}),
             source=f"{self._name} ({self._body.tissue})",
         )
 
-    def _build_table(self, respond: Respond, vertices: bytes) -> np.ndarray:
+    def _build_response_table(self, respond: Respond, vertices: bytes) -> np.ndarray:
         """Return the responses at `vertices` (n,), given as bytes of int64; responses of fixed vertices are zero."""
         nodes = np.frombuffer(vertices, np.int64)
         needed = 2 * 9 * 8 * len(self._body.loaded) * len(nodes)
@@ -217,10 +217,10 @@ class LinearModel(_ForceModel):
         table[:, :, self._body.fixed[nodes]] = 0.0
         return table
 
-    def _compute_motion(self, force: np.ndarray, acting: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Return displacements (B, n, 3) [m] of `nodes` under forces (B, a, 3) [N], nonzero only at rows `acting`."""
-        table = self._respond(nodes.tobytes())[acting]
-        return np.tensordot(force[:, acting], table, axes=2)
+    def _compute_motion(self, force: np.ndarray, loaded_rows: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """Return displacements (B, n, 3) [m] of `nodes` under forces (B, a, 3) [N], nonzero only at `loaded_rows`."""
+        table = self._respond(nodes.tobytes())[loaded_rows]
+        return np.tensordot(force[:, loaded_rows], table, axes=2)
 
     def _compute_forces(self, loads: Loads) -> np.ndarray:
         """Return the forces (B, a, 3) [N] at `body.loaded`; forces at fixed vertices have no effect."""

@@ -63,7 +63,7 @@ def add_displacement(u: wp.array2d(dtype=wp.float64), node: int, c: int, increme
 @forward_kernel
 def solve_constraints(
     order: wp.array(dtype=wp.int32),
-    table: wp.array2d(dtype=wp.int32),
+    elements: wp.array2d(dtype=wp.int32),
     ends: wp.array2d(dtype=wp.int32),
     nodes: wp.array(dtype=wp.vec3d),
     gradient: wp.array2d(dtype=wp.vec3d),
@@ -80,8 +80,8 @@ def solve_constraints(
     t, c = wp.tid()
     e = order[t]
     for k in range(6):
-        i = int(table[e, ends[k, 0]])
-        j = int(table[e, ends[k, 1]])
+        i = int(elements[e, ends[k, 0]])
+        j = int(elements[e, ends[k, 1]])
         L = nodes[j] - nodes[i]
         l = L + get_displacement(u, j, c) - get_displacement(u, i, c)
         size = wp.length(l)
@@ -94,15 +94,15 @@ def solve_constraints(
             add_displacement(u, j, c, (inverse[j] * change / size) * l)
     F = wp.identity(n=3, dtype=wp.float64)
     for k in range(4):
-        F += wp.outer(get_displacement(u, table[e, k], c), gradient[e, k])
+        F += wp.outer(get_displacement(u, elements[e, k], c), gradient[e, k])
     cof = cofactor_matrix(F)
     total = compliance[e, 6]
     for k in range(4):
-        total += inverse[table[e, k]] * wp.length_sq(cof * gradient[e, k])
+        total += inverse[elements[e, k]] * wp.length_sq(cof * gradient[e, k])
     step = -(wp.determinant(F) - wp.float64(1.0) + compliance[e, 6] * multiplier[e, 6, c]) / total
     multiplier[e, 6, c] += step
     for k in range(4):
-        i = int(table[e, k])
+        i = int(elements[e, k])
         add_displacement(u, i, c, inverse[i] * step * (cof * gradient[e, k]))
 
 

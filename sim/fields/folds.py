@@ -109,17 +109,17 @@ def unfold_field(field: np.ndarray, inside: np.ndarray, collar: np.ndarray, spac
     return float(found.min())
 
 
-def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing: float) -> None:
-    """Change nodes in the mask `near` of a field part (3, I, J, K) [m], in place, until no cell is folded."""
-    shape = near.shape
-    near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
-    cells = np.argwhere(ndimage.maximum_filter(near, 2, origin=-1)[:-1, :-1, :-1])
+def _repair_cells(field: np.ndarray, mask: np.ndarray, weights: np.ndarray, spacing: float) -> None:
+    """Change nodes in `mask` of a field part (3, I, J, K) [m], in place, until no cell is folded."""
+    shape = mask.shape
+    mask[[0, -1]] = mask[:, [0, -1]] = mask[:, :, [0, -1]] = False
+    cells = np.argwhere(ndimage.maximum_filter(mask, 2, origin=-1)[:-1, :-1, :-1])
     used, corners = np.unique(find_corner_nodes(cells, shape), return_inverse=True)
     corners, signs = corners.reshape(-1, 4), np.tile(CORNER_SIGNS, len(cells))
-    flat = part.reshape(3, -1)
+    flat = field.reshape(3, -1)
     rest = flat[:, used].T / spacing + np.stack(np.unravel_index(used, shape), axis=-1)
-    free = np.flatnonzero(near.reshape(-1)[used])
-    held = stiff.reshape(-1)[used[free], None]
+    free = np.flatnonzero(mask.reshape(-1)[used])
+    held = weights.reshape(-1)[used[free], None]
 
     def compute_cost(variables: np.ndarray) -> tuple[float, np.ndarray]:
         change, places = variables.reshape(-1, 3), rest.copy()
@@ -137,6 +137,6 @@ def _repair_cells(part: np.ndarray, near: np.ndarray, stiff: np.ndarray, spacing
 
     options = {"maxiter": UNFOLDING.max_iterations}
     found = minimize(compute_cost, np.zeros(3 * len(free)), jac=True, method="L-BFGS-B", options=options)
-    change = (spacing * found.x.reshape(-1, 3).T).astype(part.dtype)
-    for values, more in zip(part, change, strict=True):
+    change = (spacing * found.x.reshape(-1, 3).T).astype(field.dtype)
+    for values, more in zip(field, change, strict=True):
         values[np.unravel_index(used[free], shape)] += more

@@ -63,15 +63,15 @@ def invert_by_newton(grid: Grid, forward: np.ndarray, points: np.ndarray, guess:
     return best
 
 
-def _compute_newton_step(grid: Grid, forward: np.ndarray, at: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Return the Newton steps (n, 3) [m] at positions `at` (n, 3) [m] with residuals `rest` (n, 3)."""
+def _compute_newton_step(grid: Grid, forward: np.ndarray, positions: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+    """Return the Newton steps (n, 3) [m] at `positions` (n, 3) [m] with `residuals` (n, 3)."""
     half, columns = 0.25 * grid.spacing, []
     for axis in np.eye(3):
-        ahead, behind = (grid.interpolate(forward, at + sign * half * axis) for sign in (1.0, -1.0))
+        ahead, behind = (grid.interpolate(forward, positions + sign * half * axis) for sign in (1.0, -1.0))
         columns.append((ahead - behind) / (2.0 * half) + axis)
     matrix = np.stack(columns, axis=-1)
     flat = np.abs(np.linalg.det(matrix)) < 1e-3
     matrix[flat] = np.eye(3)
-    step = -np.linalg.solve(matrix, rest[..., None])[..., 0]
+    step = -np.linalg.solve(matrix, residuals[..., None])[..., 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)
     return step * np.minimum(1.0, INVERSION.max_newton_step * grid.spacing / np.maximum(length, 1e-30))

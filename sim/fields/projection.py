@@ -67,7 +67,7 @@ def project_field(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.
     flat, bad = field.reshape(3, -1), np.zeros(len(body.tets), bool)
     for some in _sample_tetrahedra(grid, body, np.arange(len(body.tets)), PROJECTION.test_density):
         numbers, weights = grid.find_corners(some.points)
-        error = np.linalg.norm(_read(flat, numbers, weights) - some.values, axis=1)
+        error = np.linalg.norm(_interpolate_flat_field(flat, numbers, weights) - some.values, axis=1)
         bad[some.simplex[error > PROJECTION.fit_tolerance]] = True
     free = np.zeros(flat.shape[1], bool)
     for some in _sample_tetrahedra(grid, body, np.flatnonzero(bad), PROJECTION.fit_density):
@@ -86,30 +86,30 @@ def project_field(grid: Grid, field: np.ndarray, inside: np.ndarray, collar: np.
         rows = _build_rows(column, numbers, weights)
         weighted = rows.T.multiply(some.weights).tocsr()
         matrix = matrix + weighted @ rows
-        side += weighted @ (some.values - _read(flat, numbers, weights))
+        side += weighted @ (some.values - _interpolate_flat_field(flat, numbers, weights))
     scale, change = sparse.diags(1.0 / np.asarray(matrix.diagonal(), np.float64)), np.zeros_like(field)
     for part, right in zip(change.reshape(3, -1), side.T, strict=True):
         part[nodes] = cg(matrix, right, rtol=PROJECTION.solver_tolerance, maxiter=PROJECTION.max_iterations, M=scale)[0]
     field += change
 
 
-def _read(flat: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return values (n, 3) of a flattened field (3, N), by node numbers (n, m) and weights (n, m)."""
-    return np.stack([np.einsum("nc,nc->n", part[numbers], weights) for part in flat], axis=-1)
+def _interpolate_flat_field(field: np.ndarray, node_numbers: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return values (n, 3) of a flattened `field` (3, N), by node numbers (n, m) and weights (n, m)."""
+    return np.stack([np.einsum("nc,nc->n", part[node_numbers], weights) for part in field], axis=-1)
 
 
-def _sample_tetrahedra(grid: Grid, body: NodalField, which: np.ndarray, density: float) -> Iterator[_Samples]:
-    """Yield samples of tetrahedra `which`, `density` per grid spacing along the longest edge, weighted by volume."""
-    corners = body.nodes[body.tets[which]]
+def _sample_tetrahedra(grid: Grid, body: NodalField, tet_numbers: np.ndarray, density: float) -> Iterator[_Samples]:
+    """Yield samples of the tetrahedra, `density` per grid spacing along the longest edge, weighted by volume."""
+    corners = body.nodes[body.tets[tet_numbers]]
     volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / (6.0 * grid.spacing**3)
-    for some in _sample_simplices(grid, body, body.tets[which], volumes, density):
-        yield some._replace(simplex=which[some.simplex])
+    for some in _sample_simplices(grid, body, body.tets[tet_numbers], volumes, density):
+        yield some._replace(simplex=tet_numbers[some.simplex])
 
 
-def _sample_surface(grid: Grid, body: NodalField, touched: np.ndarray) -> Iterator[_Samples]:
-    """Yield samples of the surface triangles that have a vertex in the mask `touched` (V,)."""
+def _sample_surface(grid: Grid, body: NodalField, vertex_mask: np.ndarray) -> Iterator[_Samples]:
+    """Yield samples of the surface triangles that have a vertex in `vertex_mask` (V,)."""
     faces = find_boundary_faces(body.tets)
-    faces = faces[touched[faces].any(axis=1)]
+    faces = faces[vertex_mask[faces].any(axis=1)]
     a, b, c = body.nodes[faces].transpose(1, 0, 2)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / (2.0 * grid.spacing**2)
     return _sample_simplices(grid, body, faces, PROJECTION.surface_weight * areas, PROJECTION.surface_density)
@@ -144,12 +144,12 @@ def _build_lattice(order: int, size: int) -> np.ndarray:
     return weights[weights[:, -1] >= 0] / order
 
 
-def _build_rows(column: np.ndarray, numbers: np.ndarray, weights: np.ndarray) -> sparse.csr_matrix:
+def _build_rows(column: np.ndarray, node_numbers: np.ndarray, weights: np.ndarray) -> sparse.csr_matrix:
     """Return the sparse matrix (n, free) of sums over free nodes, with node numbers (n, m) and weights (n, m)."""
-    columns = column[numbers]
+    columns = column[node_numbers]
     free = columns >= 0
-    row = np.repeat(np.arange(len(numbers)), free.sum(axis=1))
-    shape = len(numbers), int(column.max()) + 1
+    row = np.repeat(np.arange(len(node_numbers)), free.sum(axis=1))
+    shape = len(node_numbers), int(column.max()) + 1
     return sparse.csr_matrix((np.broadcast_to(weights, columns.shape)[free], (row, columns[free])), shape)
 
 

@@ -144,16 +144,16 @@ def compute_warp_fields(
     anatomy: Anatomy,
     displacement: np.ndarray,
     spacing: float,
-    remaining: Anatomy | None = None,
+    remaining_anatomy: Anatomy | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> WarpFields:
     """Return forward and backward fields of a displacement (V, 3) [m] on a grid with a `spacing` [m].
 
-    `remaining` is the remaining anatomy after a resection. Outside the mesh the fields fade to zero. The function
+    `remaining_anatomy` is the anatomy after a resection. Outside the mesh the fields fade to zero. The function
     `progress` is called after each of the two fields.
     """
     displacement = remove_negligible(displacement)
-    body, grid = remaining or anatomy, build_warp_grid(anatomy, displacement[None], spacing)
+    body, grid = remaining_anatomy or anatomy, build_warp_grid(anatomy, displacement[None], spacing)
     mesh = body.mesh
     forward, least_forward = compute_forward(grid, body, displacement)
     progress()

@@ -63,18 +63,18 @@ def compute_bounding_balls(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
 
 
-def _list_candidates(points: np.ndarray, middle: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Return the triangles (B, k) that may be closest to each point; `middle` and `reach` are their bounding balls.
+def _list_candidates(points: np.ndarray, centres: np.ndarray, radii: np.ndarray) -> np.ndarray:
+    """Return the triangles (B, k) that may be closest to each point; `centres` and `radii` are their bounding balls.
 
     A triangle is omitted if no point of this triangle can be closer than the nearest centroid.
 
     Each row starts with the possibly closest triangles in ascending order, so that of equally close triangles the first
     is found. The remainder of the row repeats its first triangle.
     """
-    x, y, z = (points[:, axis, None] - middle[:, axis] for axis in range(3))
+    x, y, z = (points[:, axis, None] - centres[:, axis] for axis in range(3))
     away = np.sqrt(x * x + y * y + z * z)
-    maybe = ~(away - reach > (1.0 + DISTANCE_TOLERANCE) * away.min(axis=1, keepdims=True))
-    row, triangle = np.divmod(np.flatnonzero(maybe), len(middle))
+    maybe = ~(away - radii > (1.0 + DISTANCE_TOLERANCE) * away.min(axis=1, keepdims=True))
+    row, triangle = np.divmod(np.flatnonzero(maybe), len(centres))
     count = np.bincount(row, minlength=len(points))
     first = np.cumsum(count) - count
     near = np.repeat(triangle[first][:, None], count.max(), axis=1)

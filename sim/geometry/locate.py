@@ -43,9 +43,9 @@ class _Cells(NamedTuple):
     An inverse maps a position relative to the first corner to the barycentric weights of the other three corners.
     """
 
-    middles: KDTree
-    corner: np.ndarray
-    inverse: np.ndarray
+    centroids: KDTree
+    first_corners: np.ndarray
+    inverse_edges: np.ndarray
 
 
 @lru_cache(maxsize=4)
@@ -58,8 +58,8 @@ def _build_cells(mesh: TetMesh) -> _Cells:
 def _choose_tetrahedra(mesh: TetMesh, points: np.ndarray, candidates: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the tetrahedra (n,) with the largest minimum weight among the nearest `candidates`, and weights (n, 4)."""
     cells, count = _build_cells(mesh), min(candidates, len(mesh.tets))
-    near = cells.middles.query(points, k=count)[1].reshape(len(points), count)
-    inner = np.einsum("nkij,nkj->nki", cells.inverse[near], points[:, None] - cells.corner[near])
+    near = cells.centroids.query(points, k=count)[1].reshape(len(points), count)
+    inner = np.einsum("nkij,nkj->nki", cells.inverse_edges[near], points[:, None] - cells.first_corners[near])
     weights = np.concatenate([1.0 - inner.sum(axis=-1, keepdims=True), inner], axis=-1)
     best, row = weights.min(axis=-1).argmax(axis=1), np.arange(len(points))
     return near[row, best], weights[row, best]

@@ -105,7 +105,7 @@ class TetMesh:
             raise InputError(f"region has shape {self.region.shape}: give one label for each of {len(self.tets)} tets.")
         if self.middles is not None:
             object.__setattr__(self, "middles", np.array(self.middles, np.int32, order="C"))
-            _check_middles(self)
+            _check_mid_edge_nodes(self)
         longest = np.linalg.norm(
             self.nodes[self.tets[:, EDGES[:, 0]]] - self.nodes[self.tets[:, EDGES[:, 1]]], axis=2
         ).max(axis=1)
@@ -115,7 +115,7 @@ class TetMesh:
                 f"tetrahedron {bad[0]} (and {len(bad) - 1} more) has volume {self.volumes[bad[0]]:.3g} m^3: "
                 "zero or negative. Remove degenerate elements, or turn negative ones with `orient_tetrahedra`."
             )
-        _warn_of_doubtful(self)
+        _warn_of_poor_elements(self)
         for array in self.arrays:
             array.flags.writeable = False
 
@@ -199,7 +199,7 @@ def _check_corners(nodes: np.ndarray, tets: np.ndarray) -> None:
         raise InputError(f"tets name node {min(least, 0) or most}, but the mesh has nodes 0 to {len(nodes) - 1}.")
 
 
-def _check_middles(mesh: TetMesh) -> None:
+def _check_mid_edge_nodes(mesh: TetMesh) -> None:
     middles, count = mesh.middles, len(mesh.tets)
     assert middles is not None
     if middles.shape != (count, 6):
@@ -214,7 +214,7 @@ def _check_middles(mesh: TetMesh) -> None:
         raise InputError("tetrahedra that share an edge disagree on its middle node: the mesh does not conform.")
 
 
-def _warn_of_doubtful(mesh: TetMesh) -> None:
+def _warn_of_poor_elements(mesh: TetMesh) -> None:
     size = float(np.ptp(mesh.nodes[np.unique(mesh.tets)], axis=0).max())
     if not 1e-3 <= size <= 10.0:
         unit, held = ("m", "metres") if size < 1.0 else ("mm", "millimetres")

@@ -64,10 +64,10 @@ def build_multigrid_cycle(
     return solver
 
 
-def _build_direct_solver(stiffness: sp.csc_array, motions: sp.csc_array, size: int, direct: Direct) -> Preconditioner:
+def _build_direct_solver(stiffness: sp.csc_array, motions: sp.csc_array, size: int, solver: Direct) -> Preconditioner:
     """Return a direct solver over the motions, `size` per node; zero motions of small aggregates are omitted."""
     moving = np.flatnonzero(abs(motions).sum(axis=0) > 0.0)
-    return direct(stiffness, motions[:, moving], moving // size)
+    return solver(stiffness, motions[:, moving], moving // size)
 
 
 def _to_bsr(matrix: sp.bsr_matrix) -> sp.bsr_array:

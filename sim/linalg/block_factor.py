@@ -49,12 +49,12 @@ def build_functions(device: Device) -> BlockFactorFunctions:
         ...
 
     @wp.func
-    def factor(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int) -> bool:
+    def factor(a: wp.array3d(dtype=wp.float64), size: int, c: int, thread: int) -> bool:
         """Factorise A = L L' in place, from the upper half of A; return False if A is not positive definite.
 
         In this case the contents of `a` are invalid.
         """
-        i0, j0 = me // across, me % across
+        i0, j0 = thread // across, thread % across
         for k in range(size):
             pivot = a[c, k, k]
             if not pivot > wp.float64(0.0):
@@ -70,29 +70,29 @@ def build_functions(device: Device) -> BlockFactorFunctions:
                 a[c, i, j] = a[c, i, j] / root
                 a[c, j, i] = a[c, i, j]
         wait()
-        for i in range(me, size, threads):
+        for i in range(thread, size, threads):
             a[c, i, i] = wp.sqrt(a[c, i, i])
         wait()
         return True
 
     @wp.func
-    def solve(a: wp.array3d(dtype=wp.float64), size: int, c: int, me: int, x: wp.array2d(dtype=wp.float64)):
+    def solve(a: wp.array3d(dtype=wp.float64), size: int, c: int, thread: int, x: wp.array2d(dtype=wp.float64)):
         """Solve A x = b in place in `x`, with the result of `factor`."""
         for k in range(size):
             y = x[c, k] / a[c, k, k]
-            for i in range(k + 1 + me, size, threads):
+            for i in range(k + 1 + thread, size, threads):
                 x[c, i] = x[c, i] - a[c, k, i] * y
             wait()
-            if me == 0:
+            if thread == 0:
                 x[c, k] = y
         wait()
         for n in range(size):
             k = size - 1 - n
             y = x[c, k] / a[c, k, k]
-            for i in range(me, k, threads):
+            for i in range(thread, k, threads):
                 x[c, i] = x[c, i] - a[c, k, i] * y
             wait()
-            if me == 0:
+            if thread == 0:
                 x[c, k] = y
         wait()
 

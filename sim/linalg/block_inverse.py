@@ -124,7 +124,7 @@ def eliminate_unknowns(
     whole = sp.csc_array(sp.block_array([[matrix, border], [border.T, None]]))
     *rows, last = to_lower_block_rows(whole, [*cuts, stop], device)
     for k in range(len(rows)):
-        _eliminate(rows[k], [*rows[k + 1 :], last])
+        _eliminate_block(rows[k], [*rows[k + 1 :], last])
     while rows:  # back substitution
         row = rows.pop()
         own = slice(row.shape[1] - len(row), row.shape[1])
@@ -133,13 +133,13 @@ def eliminate_unknowns(
     return last[:, : cuts[-1]].T.to(torch.float32).cpu().numpy(), -last[:, cuts[-1] :].cpu().numpy()
 
 
-def _eliminate(row: torch.Tensor, below: Sequence[torch.Tensor]) -> None:
+def _eliminate_block(row: torch.Tensor, lower_rows: Sequence[torch.Tensor]) -> None:
     """Eliminate the unknowns of a block from the rows below; the block's columns then store the solution."""
     stop = row.shape[1]
     own = slice(stop - len(row), stop)
-    across = torch.cat([later[:, own].T for later in below], dim=1)
+    across = torch.cat([later[:, own].T for later in lower_rows], dim=1)
     solved = _invert_block(row[:, own]) @ across
-    for later in below:
+    for later in lower_rows:
         mine = slice(later.shape[1] - len(later) - stop, later.shape[1] - stop)
         later[:, stop:].addmm_(across[:, mine].T, solved[:, : mine.stop], alpha=-1.0)
         later[:, own] = solved[:, mine].T

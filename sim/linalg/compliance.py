@@ -92,17 +92,17 @@ class Compliance:
         acting = np.flatnonzero(to_host((force != 0.0).any(1)))
         return self.columns[acting].T @ to_double(force[acting])
 
-    def build_matrix(self, loaded: np.ndarray) -> Any:
-        """Return H (3n, 3n) [m/N] between `nodes`; only the columns of nodes marked in `loaded` (n,) are valid."""
-        self.ensure_columns(loaded)
+    def build_matrix(self, node_mask: np.ndarray) -> Any:
+        """Return H (3n, 3n) [m/N] between `nodes`; only the columns of nodes marked in `node_mask` (n,) are valid."""
+        self.ensure_columns(node_mask)
         return self.columns.T
 
-    def ensure_columns(self, loaded: np.ndarray) -> None:
-        """Compute missing columns of nodes marked in `loaded` (n,), stored as rows, and mark them in `known` (n,)."""
-        missing = loaded & ~self.known
+    def ensure_columns(self, node_mask: np.ndarray) -> None:
+        """Compute missing columns of nodes in `node_mask` (n,), stored as rows, and mark them in `known` (n,)."""
+        missing = node_mask & ~self.known
         if missing.any() and isinstance(self._preconditioner, SparseFactor):
             self.columns[:], self.known[:] = self._preconditioner.compute_compliance(self.rows).T, True
-        for block in self._find_blocks(np.repeat(loaded & ~self.known, 3)):
+        for block in self._find_blocks(np.repeat(node_mask & ~self.known, 3)):
             self._block(block)
 
     def _find_blocks(self, rows: np.ndarray) -> list[int]:

@@ -134,7 +134,7 @@ class DenseInverse:
     def prepare(self, problem: Problem, columns: int) -> None:
         """Do nothing, since the undeformed stiffness does not depend on the state."""
 
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+    def apply(self, r: wp.array, case_mask: np.ndarray, out: wp.array) -> None:
         """Multiply r by the dense matrix, in the stream of Warp."""
         device, count = self._device, r.shape[1]
         room, some = self._get_buffers(count), ROWS_PER_THREAD if count > 1 else 1
@@ -143,7 +143,7 @@ class DenseInverse:
         add_dots(device, r, r, room.square_norm)
         inputs = [*self._into, self._scale, room.square_norm, r]
         device.launch(restrict, (-(-self._scale.shape[0] // some), count), inputs, [room.right_side])
-        if self._reads_half(count):
+        if self._can_use_symmetry(count):
             room.solution.zero_()
             add_product(self._tiles, wp.from_torch(self._inverse), room.right_side.flatten(), room.solution.flatten())
         else:
@@ -152,7 +152,7 @@ class DenseInverse:
         inputs = [*self._back, room.square_norm, room.solution]
         device.launch(extend, (-(-r.shape[0] // some), count), inputs, [out])
 
-    def _reads_half(self, count: int) -> bool:
+    def _can_use_symmetry(self, count: int) -> bool:
         """Return True if only half of the matrix is read: for one load case, reading determines the time."""
         return count == 1 and self._inverse.dtype == torch.float16
 
@@ -161,7 +161,7 @@ class DenseInverse:
         if count not in self._rooms:
             self._rooms = {width: room for width, room in self._rooms.items() if is_workspace_width(width)}
             low, name = LOW_TYPES[self._device.precision], self._device.name
-            if self._reads_half(count):
+            if self._can_use_symmetry(count):
                 low = wp.float32
             shape = (self._size, -(-count // TILE) * TILE if count > 1 else 1)
             right, solved = (wp.zeros(shape, dtype=low, device=name) for _ in range(2))
@@ -169,12 +169,12 @@ class DenseInverse:
         return self._rooms[count]
 
 
-def _build_matrix(rows: list[torch.Tensor], scale: torch.Tensor, size: int, kind: torch.dtype) -> torch.Tensor:
+def _build_matrix(rows: list[torch.Tensor], scale: torch.Tensor, size: int, dtype: torch.dtype) -> torch.Tensor:
     """Return the scaled matrix (size, size), whose negative lower half is given by the block rows `rows`.
 
     The list `rows` is emptied to free its memory.
     """
-    out = torch.zeros((size, size), dtype=kind, device=scale.device)
+    out = torch.zeros((size, size), dtype=dtype, device=scale.device)
     while rows:
         row = rows.pop()
         stop = row.shape[1]

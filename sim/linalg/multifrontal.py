@@ -100,15 +100,15 @@ class SparseFactor:
     def prepare(self, problem: Problem, columns: int) -> None:
         """Do nothing, since the undeformed stiffness does not depend on the state."""
 
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+    def apply(self, r: wp.array, case_mask: np.ndarray, out: wp.array) -> None:
         """Solve for the live load cases only, by one forward and one backward sweep; other cases would cost as much."""
         values = r.numpy()
         solved = np.zeros_like(values)
-        x = self._transposed @ values[:, live]
+        x = self._transposed @ values[:, case_mask]
         # Scaled, because single precision cannot represent forces of 1e-40 N in a product with load cases of 1 N.
         size = np.abs(x).max(axis=0, initial=0.0)
         size[size == 0.0] = 1.0
-        solved[:, live] = self._motions @ (self._solve_columns((x / size).astype(self._precision)) * size)
+        solved[:, case_mask] = self._motions @ (self._solve_columns((x / size).astype(self._precision)) * size)
         out.assign(solved)
 
     def compute_compliance(self, rows: np.ndarray) -> np.ndarray:
@@ -127,8 +127,8 @@ class SparseFactor:
                 panels.append(panel)
         out, size = np.empty((len(rows), len(rows)), self._precision), self._settings.strip_size
 
-        def fill_strips(firsts: range) -> None:
-            for first in firsts:
+        def fill_strips(first_columns: range) -> None:
+            for first in first_columns:
                 strip = slice(first, first + size)
                 x = unit[:, strip].toarray(order="C").astype(self._precision)
                 out[:, strip] = chosen @ _apply_sweeps(panels, x)
@@ -219,15 +219,15 @@ def factorise_panels(
 class _Fronts:
     """Elimination of the fronts of a sparse matrix; fronts in different parts may be eliminated at the same time."""
 
-    def __init__(self, matrix: sp.csc_array, panels: Sequence[FrontPanel], singular: float):
+    def __init__(self, matrix: sp.csc_array, panels: Sequence[FrontPanel], pivot_tolerance: float):
         self._matrix, self._panels = matrix, panels
-        self._least = singular * matrix.diagonal()
+        self._least = pivot_tolerance * matrix.diagonal()
         sizes = [len(panel.values) for panel in panels]
         self._owner = np.repeat(np.arange(len(panels)), sizes)
 
-    def eliminate(self, numbers: range, updates: Updates) -> None:
-        """Fill the panels of fronts `numbers`, with their pending `updates`; add updates of later fronts."""
-        for number in numbers:
+    def eliminate(self, front_numbers: range, updates: Updates) -> None:
+        """Fill the panels of fronts `front_numbers`, with their pending `updates`; add updates of later fronts."""
+        for number in front_numbers:
             panel = self._panels[number]
             front, size = panel.front, len(panel.values)
             whole = self._assemble_rows(front)

@@ -115,12 +115,12 @@ class TwoLevelCycle:
     def prepare(self, problem: Problem, columns: int) -> None:
         """Do nothing: the undeformed stiffness is used at every state."""
 
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+    def apply(self, r: wp.array, case_mask: np.ndarray, out: wp.array) -> None:
         """Compute `out` from `r` by one cycle, for the live load cases."""
-        if live.all():
+        if case_mask.all():
             wp.copy(out, self._run_cycle(r))
             return
-        columns = np.flatnonzero(live)
+        columns = np.flatnonzero(case_mask)
         scatter_columns(self._device, self._run_cycle(gather_columns(self._device, r, columns)), columns, out)
 
     def _run_cycle(self, r: wp.array) -> wp.array:
@@ -181,11 +181,11 @@ class ReducedPreconditioner:
     def prepare(self, problem: Problem, columns: int) -> None:
         """Do nothing: the undeformed stiffness is used at every state."""
 
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+    def apply(self, r: wp.array, case_mask: np.ndarray, out: wp.array) -> None:
         """Compute out = L M L^T r: restrict r, apply the coarse preconditioner, and prolong the result."""
         right = self._down.multiply(r)
         solved = self._device.allocate(*right.shape)
-        self.coarse.apply(right, live, solved)
+        self.coarse.apply(right, case_mask, solved)
         wp.copy(out, self._up.multiply(solved))
 
 

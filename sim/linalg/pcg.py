@@ -32,8 +32,8 @@ class Preconditioner(Protocol):
         """Prepare `apply` for the last linearisation, if needed; `columns` is the width of the batch."""
         ...
 
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
-        """Compute out = M^-1 r (3N, b) for load cases `live` (b,); the other columns may have any finite values."""
+    def apply(self, r: wp.array, case_mask: np.ndarray, out: wp.array) -> None:
+        """Compute out = M^-1 r (3N, b) for cases in `case_mask` (b,); other columns may have any finite values."""
         ...
 
 
@@ -89,7 +89,7 @@ class BlockJacobi:
         self._device.launch(build_block_kernels(self._device)[0], blocks.shape, [], [blocks])
         self._blocks = blocks
 
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+    def apply(self, r: wp.array, case_mask: np.ndarray, out: wp.array) -> None:
         """Compute out = B^-1 r with the diagonal blocks B."""
         assert self._blocks is not None
         self._device.launch(build_block_kernels(self._device)[1], self._blocks.shape, [self._blocks, r], [out])

@@ -67,7 +67,7 @@ def condense_exterior(
 
 
 def _compute_reduction(
-    stiffness: sp.csr_array, motions: sp.csc_array, coupling: sp.csc_array, device: Device, strip: int
+    stiffness: sp.csr_array, motions: sp.csc_array, coupling: sp.csc_array, device: Device, strip_size: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return -L (L^T K L)^-1 L^T B (3N, m) and the Schur reduction (m, m), for motions L and a coupling B (3N, m).
 
@@ -86,11 +86,11 @@ def _compute_reduction(
     solver = build_direct_solver(sp.csc_array(stiffness), motions, find_moved_nodes(motions), fine, "float64")
     count = len(coupling.indptr) - 1
     follow, taken = np.zeros((len(stiffness.indptr) - 1, count), device.precision), np.zeros((count, count))
-    for first in range(0, count, strip):
-        some = coupling[:, first : first + strip].toarray()
+    for first in range(0, count, strip_size):
+        some = coupling[:, first : first + strip_size].toarray()
         out = fine.allocate(*some.shape)
         solver.apply(fine.upload(some), np.ones(some.shape[1], bool), out)
         moved = out.numpy()
-        follow[:, first : first + strip] = -moved
-        taken[:, first : first + strip] = coupling.T @ moved
+        follow[:, first : first + strip_size] = -moved
+        taken[:, first : first + strip_size] = coupling.T @ moved
     return follow, taken

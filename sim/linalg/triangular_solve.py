@@ -65,12 +65,12 @@ BACKWARD_CODE = """
 
 
 @cache
-def build_kernel(device: Device, code: str) -> wp.Kernel:
+def build_kernel(device: Device, sweep_code: str) -> wp.Kernel:
     """Return the kernel that eliminates (`FORWARD_CODE`) or back-substitutes (`BACKWARD_CODE`) rows of xs (b, n)."""
     scalar = device.scalar
     real = {"float32": "float", "float64": "double"}[device.precision]
 
-    @wp.func_native(code.replace("real", real))
+    @wp.func_native(sweep_code.replace("real", real))
     def sweep_row(
         column: int,
         fronts: wp.array2d(dtype=wp.int64),

@@ -65,7 +65,7 @@ class BatchElimination:
         Rows (3n,) of the near part among the 3N rows of the whole mesh, on the device.
     part, lbfgs
         Subproblem of the near part within the condensed far part, and its solver.
-    shared_rows, extend
+    shared_rows, extend_motion
         Rows (m,) that near and far part share, on the device; function that writes the motion of the far part to
         out (3N, b), from the motion x (m, b) of the shared rows.
     limits, size
@@ -78,7 +78,7 @@ class BatchElimination:
     part: LocalProblem
     lbfgs: Lbfgs
     shared_rows: wp.array
-    extend: Callable[[wp.array, wp.array], None]
+    extend_motion: Callable[[wp.array, wp.array], None]
     limits: CycleLimits = DEFAULT_CYCLE_LIMITS
     size: NearPart = NEAR_PART
 
@@ -87,15 +87,15 @@ class BatchElimination:
     ) -> DescentResult:
         """Return the result as `Lbfgs.descend`, after at most `max_iter` cycles, without an L-BFGS history."""
 
-        def cycle(judge: ResidualEvaluator, now: ResidualState, force: np.ndarray) -> ResidualState:
-            return judge(self._run_cycle(now.u, now.g, force))
+        def run_cycle(evaluate: ResidualEvaluator, state: ResidualState, tolerance: np.ndarray) -> ResidualState:
+            return evaluate(self._run_cycle(state.u, state.g, tolerance))
 
-        return run_cycles(self.problem, start, tolerance, max_iter, self.limits, cycle)
+        return run_cycles(self.problem, start, tolerance, max_iter, self.limits, run_cycle)
 
-    def _run_cycle(self, u: wp.array, g: wp.array, force: np.ndarray) -> wp.array:
+    def _run_cycle(self, u: wp.array, g: wp.array, tolerance: np.ndarray) -> wp.array:
         """Return the next state (3N, b) after one cycle from u (3N, b) with the residual g (3N, b).
 
-        The near part is solved until its residual is below `force` (b,) [N].
+        The near part is solved until its residual is below `tolerance` (b,) [N].
         """
         device, count = self.problem.device, u.shape[1]
         every = np.ones(count, bool)
@@ -113,11 +113,11 @@ class BatchElimination:
         self.part.set_force(combine_columns(device, load, -1.0, g, load))
         part.constraint.project_nodes(g)
         found = self.lbfgs.descend(
-            near, np.zeros(count), self.size.max_iterations, None, force, self.size.straggler_fraction, (g, back)
+            near, np.zeros(count), self.size.max_iterations, None, tolerance, self.size.straggler_fraction, (g, back)
         )
         missed = combine_columns(device, found.u, -1.0, aim, aim)
         followed = wp.empty_like(out)
-        self.extend(take_rows(device, missed, self.shared_rows), followed)
+        self.extend_motion(take_rows(device, missed, self.shared_rows), followed)
         self.problem.constraint.project_nodes(followed)  # removes motion off the sliding planes by rounding
         combine_columns(device, out, 1.0, followed, out)
         put_rows(device, found.u, self.rows, out)
@@ -166,5 +166,5 @@ def build_batch_elimination(
         part=part,
         lbfgs=Lbfgs(part.problem, solver),
         shared_rows=device.upload(around.rows, wp.int32),
-        extend=build_product(around.extension, device, reduced=True),
+        extend_motion=build_product(around.extension, device, is_reduced=True),
     )

@@ -35,7 +35,7 @@ class ClampedSize:
     min_strain, max_fraction
         Tetrahedra belong to the part if the displacement gradient of the linear solution has a larger norm than
         `min_strain`; at most this fraction, the most strained first. Tetrahedra that touch these are added.
-    residual_factor, max_added
+    residual_factor, max_added_nodes
         If a cycle leaves more than this fraction of the residual, and at most this number of nodes outside the part
         have most of the residual, the tetrahedra that touch these nodes are added to the part.
     max_backtracks
@@ -45,7 +45,7 @@ class ClampedSize:
     min_strain: float = 0.15
     max_fraction: float = 0.03
     residual_factor: float = 0.8
-    max_added: int = 60
+    max_added_nodes: int = 60
     max_backtracks: int = 6
 
 
@@ -76,60 +76,56 @@ class ClampedElimination:
         self, start: wp.array, tolerance: np.ndarray, max_iter: int, warm_start: Mapping[str, np.ndarray] | None = None
     ) -> DescentResult:
         """Return the result as `Lbfgs.descend`, for one load case, after at most `max_iter` cycles; without history."""
-        chosen, part, pairs = (
-            np.zeros(len(self.space.table), bool),
-            None,
-            build_empty_history(self.problem.rows, self.problem.device.precision),
-        )
-        z = np.zeros(0)
+        chosen, part = np.zeros(len(self.space.table), bool), None
+        pairs, z = build_empty_history(self.problem.rows, self.problem.device.precision), np.zeros(0)
 
-        def cycle(judge: ResidualEvaluator, now: ResidualState, force: np.ndarray) -> ResidualState:
+        def run_cycle(evaluate: ResidualEvaluator, state: ResidualState, tolerance: np.ndarray) -> ResidualState:
             nonlocal chosen, part, pairs, z
             if part is None:
-                z = self._compute_response(now.g)
-                chosen = self._mark_touching(self._find_strained_nodes(now.u.numpy()[:, 0] - z))
+                z = self._compute_response(state.g)
+                chosen = self._mark_adjacent_tets(self._find_strained_nodes(state.u.numpy()[:, 0] - z))
                 if not chosen.any():
-                    return replace(now, norm=np.full(1, np.inf))
-                part = ClampedPart(self.problem, self.effects, self.space, chosen, judge.constant, now.u)
-                new = judge(part.solve_part(now.u, force[0]))
+                    return replace(state, norm=np.full(1, np.inf))
+                part = ClampedPart(self.problem, self.effects, self.space, chosen, evaluate.constant, state.u)
+                new = evaluate(part.solve_part(state.u, tolerance[0]))
                 z = self._compute_response(new.g)
                 return new
-            new = self._search_line(
-                judge, now, part, -z - pairs.compute_motion(pairs.compute_weights(_copy_to_host(now.g))), force[0]
-            )
+            d = -z - pairs.compute_motion(pairs.compute_weights(_copy_to_host(state.g)))
+            new = self._search_line(evaluate, state, part, d, tolerance[0])
             if not new.is_finite[0]:
                 return new
             after = self._compute_response(new.g)
-            s, y = _copy_to_host(new.u) - _copy_to_host(now.u), _copy_to_host(new.g) - _copy_to_host(now.g)
+            s, y = _copy_to_host(new.u) - _copy_to_host(state.u), _copy_to_host(new.g) - _copy_to_host(state.g)
             if s @ y > 0.0:
                 pairs = pairs.add_pair(s, y, after - z)
-            if new.norm[0] > self.size.residual_factor * now.norm[0]:
+            if new.norm[0] > self.size.residual_factor * state.norm[0]:
                 more = self._find_residual_nodes(_copy_to_host(new.g), part.nodes)
                 if len(more):
-                    chosen |= self._mark_touching(more)
-                    part = ClampedPart(self.problem, self.effects, self.space, chosen, judge.constant, new.u)
+                    chosen |= self._mark_adjacent_tets(more)
+                    part = ClampedPart(self.problem, self.effects, self.space, chosen, evaluate.constant, new.u)
             z = after
             return new
 
-        return run_cycles(self.problem, start, tolerance, max_iter, self.limits, cycle)
+        return run_cycles(self.problem, start, tolerance, max_iter, self.limits, run_cycle)
 
     def _search_line(
-        self, judge: ResidualEvaluator, now: ResidualState, part: ClampedPart, d: np.ndarray, force: float
+        self, evaluate: ResidualEvaluator, state: ResidualState, part: ClampedPart, d: np.ndarray, tolerance: float
     ) -> ResidualState:
-        """Return the state accepted by a line search along d (3N,), with the part solved to `force` [N] at each trial.
+        """Return the state accepted by a line search along d (3N,), the part solved to `tolerance` [N] at each trial.
 
         The residual of the returned state is not finite if no trial step is accepted.
         """
-        predicted, device = -float(_copy_to_host(now.g) @ d), self.problem.device
+        predicted, device = -float(_copy_to_host(state.g) @ d), self.problem.device
         way = device.upload(d[:, None])
-        length = float(self.problem.longest_step(now.u, way)[0])
+        length = float(self.problem.longest_step(state.u, way)[0])
         for _ in range(self.size.max_backtracks if predicted > 0.0 else 0):
-            new = judge(part.solve_part(combine_columns(device, now.u, length, way, wp.empty_like(way)), force))
+            trial = combine_columns(device, state.u, length, way, wp.empty_like(way))
+            new = evaluate(part.solve_part(trial, tolerance))
             slope = float(_copy_to_host(new.g) @ d)
             if new.is_finite[0] and not is_step_too_long(slope, predicted):
                 return new
             length *= backtrack_by_slopes(slope, predicted)
-        return replace(now, norm=np.full(1, np.inf))
+        return replace(state, norm=np.full(1, np.inf))
 
     def _compute_response(self, g: wp.array) -> np.ndarray:
         """Return the linear response (3N,) [m] of the undeformed mesh to a force g (3N, 1) [N]."""
@@ -141,7 +137,7 @@ class ClampedElimination:
     def _find_strained_nodes(self, u: np.ndarray) -> np.ndarray:
         """Return the nodes (k,) of the tetrahedra that are strained most at the displacement u (3N,) [m]."""
         table = self.space.table
-        slope = np.einsum("tai,taj->tij", u.reshape(-1, 3)[table[:, :4]], self._slopes)
+        slope = np.einsum("tai,taj->tij", u.reshape(-1, 3)[table[:, :4]], self._shape_gradients)
         strain = np.sqrt(np.einsum("tij,tij->t", slope, slope))
         most = min(int(self.size.max_fraction * len(strain)), int((strain > self.size.min_strain).sum()))
         return table[np.argsort(-strain)[:most]].ravel()
@@ -153,17 +149,17 @@ class ClampedElimination:
         """
         square = (g.reshape(-1, 3).astype(np.float64) ** 2).sum(axis=1)
         square[nodes] = 0.0
-        most = np.argsort(-square)[: self.size.max_added]
+        most = np.argsort(-square)[: self.size.max_added_nodes]
         return most if 2.0 * square[most].sum() > square.sum() else most[:0]
 
-    def _mark_touching(self, nodes: np.ndarray) -> np.ndarray:
+    def _mark_adjacent_tets(self, nodes: np.ndarray) -> np.ndarray:
         """Return a mask (T,) of the tetrahedra that contain any of the `nodes` (k,)."""
         touched = np.zeros(self.space.count, bool)
         touched[nodes] = True
         return touched[self.space.table].max(axis=1)
 
     @cached_property
-    def _slopes(self) -> np.ndarray:
+    def _shape_gradients(self) -> np.ndarray:
         every = np.ones(len(self.space.mesh.tets), bool)
         return build_linear_elements(self.space.mesh, every).gradient[:, 0].astype(np.float32)
 

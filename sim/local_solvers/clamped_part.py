@@ -46,9 +46,9 @@ class ClampedPart:
         Problem of the whole mesh, which has begun with this load case only.
     effects, space
         Effects and discretisation from which the problem was compiled.
-    chosen
+    tet_mask
         Mask (T,) of the tetrahedra of the part, at least one.
-    constant
+    constant_gradient
         Gradient (3N, 1) [N] of the loads, which does not depend on the displacements.
     u
         Approximate displacements (3N, 1) [m], at which the stiffness is factorised.
@@ -61,20 +61,20 @@ class ClampedPart:
         problem: Problem,
         effects: Iterable[Effect],
         space: Discretisation,
-        chosen: np.ndarray,
-        constant: wp.array,
+        tet_mask: np.ndarray,
+        constant_gradient: wp.array,
         u: wp.array,
         limits: PartLimits = PartLimits(),
     ):
         self._limits = limits
-        device, self.nodes = problem.device, np.unique(space.table[chosen])
+        device, self.nodes = problem.device, np.unique(space.table[tet_mask])
         self._rows = (3 * self.nodes[:, None] + np.arange(3)).ravel()
-        part = compile_clamped_part(effects, space, problem, chosen, self.nodes)
+        part = compile_clamped_part(effects, space, problem, tet_mask, self.nodes)
         self._part = part.problem
-        part.set_force(device.upload(-constant.numpy()[self._rows]))
+        part.set_force(device.upload(-constant_gradient.numpy()[self._rows]))
         values = u.numpy()[self._rows]
-        if not (values.any() and self._begin_at(device.upload(values))):
-            self._begin_with(self._part.rest_curvature())
+        if not (values.any() and self._try_tangent_stiffness(device.upload(values))):
+            self._factorise_hessian(self._part.rest_curvature())
 
     def solve_part(self, u: wp.array, force_tolerance: float) -> wp.array:
         """Return u (3N, 1) with the part in equilibrium, up to a residual of about `force_tolerance` [N].
@@ -94,19 +94,19 @@ class ClampedPart:
             budget = Accuracy(aim, limits.max_outer, limits.max_inner, device.precision, 0)
             end = find_equilibrium(part, NewtonCG(self._factor, limits.max_inner), end, budget).u
         if found.steps[0] > limits.stale_iterations:
-            self._begin_at(end)
+            self._try_tangent_stiffness(end)
         values[self._rows] = end.numpy()
         return device.upload(values)
 
-    def _begin_at(self, u: wp.array) -> bool:
+    def _try_tangent_stiffness(self, u: wp.array) -> bool:
         """Set the initial Hessian of L-BFGS to the tangent stiffness at u (3n, 1); return False if it is indefinite."""
         try:
-            self._begin_with(self._part.assemble_stiffness(u))
+            self._factorise_hessian(self._part.assemble_stiffness(u))
         except RuntimeError:
             return False
         return True
 
-    def _begin_with(self, stiffness: sp.csc_array) -> None:
+    def _factorise_hessian(self, stiffness: sp.csc_array) -> None:
         """Set the initial Hessian of L-BFGS to a `stiffness` (3n, 3n) [N/m]."""
         basis = self._part.constraint.build_basis()
         self._factor = SparseFactor(stiffness, basis, find_moved_nodes(basis), self._part.device)

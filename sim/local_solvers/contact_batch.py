@@ -51,16 +51,16 @@ class Batch:
     evaluator, state
         Function that evaluates residuals, and the current state.
     history, model
-        L-BFGS histories, or models of strained tissue that correct the undeformed compliance. `stale` (b,) bool marks
+        L-BFGS histories, or models of strained tissue that correct the undeformed compliance. `is_stale` (b,) marks
         models that must be recomputed.
     force, response, target_force
         Tool forces (3n, b) [N]; linear response (3N, b) [m] of the undeformed mesh to the residual with these forces;
         tool forces (3n, b) [N] after the step, if there is a model.
-    d, length, decrease
+    d, step_length, predicted_decrease
         Direction (3N, b) [m], trial step length (b,), and predicted decrease of the energy (b,) [J].
-    proximal, stalls, steps
+    proximal, stall_counts, steps
         Proximal coefficient (b,), number (b,) of successive steps with little progress, and number (b,) of steps.
-    failures, waiting, ended
+    failure_counts, is_waiting, has_ended
         Number (b,) of successive failures of the contact forces; mask (b,) of load cases to be tried again; mask (b,)
         of load cases that have ended, but are still in the arrays.
     """
@@ -69,19 +69,19 @@ class Batch:
     state: ContactState
     history: BatchHistory
     model: StrainedModel | None
-    stale: np.ndarray
+    is_stale: np.ndarray
     force: Any
     response: Any
     target_force: Any
     d: Any
-    length: np.ndarray
-    decrease: np.ndarray
+    step_length: np.ndarray
+    predicted_decrease: np.ndarray
     proximal: np.ndarray
-    stalls: np.ndarray
+    stall_counts: np.ndarray
     steps: np.ndarray
-    failures: np.ndarray
-    waiting: np.ndarray
-    ended: np.ndarray
+    failure_counts: np.ndarray
+    is_waiting: np.ndarray
+    has_ended: np.ndarray
 
     def keep(self, columns: np.ndarray) -> None:
         """Keep only the load cases `columns` (k,)."""
@@ -92,7 +92,8 @@ class Batch:
             self.model = self.model.select(columns)
         self.force, self.target_force = self.force[:, columns], self.target_force[:, columns]
         self.response, self.d = self.response[:, columns], self.d[:, columns]
-        for name in ("stale", "length", "decrease", "proximal", "stalls", "steps", "failures", "waiting", "ended"):
+        names = ("is_stale", "is_waiting", "has_ended", "steps", "proximal")
+        for name in (*names, "step_length", "predicted_decrease", "stall_counts", "failure_counts"):
             setattr(self, name, getattr(self, name)[columns])
 
     @property

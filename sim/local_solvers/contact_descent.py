@@ -74,7 +74,7 @@ class ContactDescent:
         return compliance
 
     @cached_property
-    def _strained(self) -> StrainedPart | None:
+    def _strained_part(self) -> StrainedPart | None:
         """Builder of models of strained tissue; None with multigrid, where the compliance takes too long."""
         if not is_exact(self.preconditioner) or self.strains is None:
             return None
@@ -83,24 +83,24 @@ class ContactDescent:
     @cached_property
     def captured_steps(self) -> ContactSteps | None:
         """Captured steps for single load cases, or None if steps are not captured."""
-        if self._strained is None or not self.uses_graphs:
+        if self._strained_part is None or not self.uses_graphs:
             return None
-        self._strained.prepare()
-        size = self._strained.size
+        self._strained_part.prepare()
+        size = self._strained_part.size
         return ContactSteps(self.problem, self.preconditioner, self.barrier, self.compliance, size)
 
     @cached_property
-    def _rows(self) -> Any:
+    def _touchable_rows(self) -> Any:
         """Rows (3n,) of the touchable nodes, on the device."""
         return self.compliance.places[: 3 * len(self.barrier.touchable_nodes)]
 
     @cached_property
     def _scratch(self) -> Callable[[int, int, int], Scratch]:
         """Function `allocate_scratch` with a cache of the last two results, since allocation is slow."""
-        return lru_cache(2)(partial(allocate_scratch, self._exact))
+        return lru_cache(2)(partial(allocate_scratch, self._device))
 
     @property
-    def _exact(self) -> Device:
+    def _device(self) -> Device:
         """Device of the problem, with double precision."""
         return replace(self.problem.device, precision="float64")
 
@@ -115,7 +115,7 @@ class ContactDescent:
                 self._run_captured(self.captured_steps, batch, tolerance, max_iter)
             ready = np.ones(count, bool)
             while True:
-                over = ready & self._find_ended(batch, tolerance[live], max_iter)
+                over = ready & self._find_ended_cases(batch, tolerance[live], max_iter)
                 done = over & (batch.state.relative <= tolerance[live])
                 if (ready & ~over).any():
                     over |= self._compute_directions(batch, ready & ~over, tolerance[live])
@@ -125,11 +125,11 @@ class ContactDescent:
                     to_view(result)[:, there] = batch.state.u[:, leave]
                     status[there] = np.where(done, DONE, np.where(batch.state.is_finite, LIVE, NOT_FINITE))[leave]
                     steps[there], residual[there] = batch.steps[leave], batch.state.relative[leave]
-                    batch.ended |= over
-                    if batch.ended.all():
+                    batch.has_ended |= over
+                    if batch.has_ended.all():
                         return DescentResult(result, status, steps, residual, {})
-                    if batch.ended.mean() >= limits.ended_fraction:
-                        stay = np.flatnonzero(~batch.ended)
+                    if batch.has_ended.mean() >= limits.max_ended_fraction:
+                        stay = np.flatnonzero(~batch.has_ended)
                         batch.keep(stay)
                         live = live[stay]
                 ready = self._try_steps(batch)
@@ -140,15 +140,15 @@ class ContactDescent:
         force, none = self._compute_balancing_forces(now), np.zeros(count)
         rest = self._compute_response(now.smooth_gradient, force)
         model = None
-        if self._strained is not None and self.strains is not None and count <= self.strains.max_cases:
-            model = self._strained.build_model(start, np.arange(count))
+        if self._strained_part is not None and self.strains is not None and count <= self.strains.max_cases:
+            model = self._strained_part.build_model(start, np.arange(count))
         pairs = BatchHistory(self.problem.device, self.problem.rows, count if model is None else 0)
         slow, steps, failed = np.zeros((3, count), int)
-        stale, waiting, ended = np.zeros((3, count), bool)
+        stale, wait, end = np.zeros((3, count), bool)
         return Batch(
-            evaluator=judge, state=now, history=pairs, model=model, stale=stale, force=force, response=rest,
-            target_force=force + 0.0, d=0.0 * rest, length=none, decrease=none.copy(), proximal=none.copy(),
-            stalls=slow, steps=steps, failures=failed, waiting=waiting, ended=ended,
+            evaluator=judge, state=now, history=pairs, model=model, is_stale=stale, force=force, response=rest,
+            target_force=force + 0.0, d=0.0 * rest, step_length=none, predicted_decrease=none.copy(),
+            proximal=none.copy(), stall_counts=slow, steps=steps, failure_counts=failed, is_waiting=wait, has_ended=end,
         )  # fmt: skip
 
     def _run_captured(self, steps: ContactSteps, batch: Batch, tolerance: np.ndarray, max_iter: int) -> None:
@@ -160,7 +160,7 @@ class ContactDescent:
         if batch.model is None or not steps.load_tools(judge.constant):
             return
         batch.state, batch.force, batch.response, batch.d = steps.load_state(batch.state, batch.force, batch.response)
-        while not self._find_ended(batch, tolerance, max_iter).any():
+        while not self._find_ended_cases(batch, tolerance, max_iter).any():
             self._rebuild_models(batch, np.ones(1, bool))
             if batch.model is not known:
                 known = batch.model
@@ -171,34 +171,34 @@ class ContactDescent:
                 return
             if self._increase_proximal_term(batch, said[[STATUS]] != SOLVED).any():
                 return
-            if batch.waiting.any():
+            if batch.is_waiting.any():
                 # The load case's model may have been reset.
-                known = None if batch.failures[0] % limits.max_failures == 0 else known
+                known = None if batch.failure_counts[0] % limits.max_failures == 0 else known
                 continue
-            batch.decrease[:] = said[PREDICTED_DECREASE]
+            batch.predicted_decrease[:] = said[PREDICTED_DECREASE]
             while True:
                 t, ahead, free, scale = read_step_result(said, judge.norms)
                 there, misled = self._take_steps(batch, t, ahead, free)
                 if there.any() or misled.any():
                     break
-                said = steps.shorten_step(batch.length[0])
+                said = steps.shorten_step(batch.step_length[0])
             if there.any():
                 steps.take_step()
                 batch.state.norm[:], batch.state.scale[:] = free, scale
             else:  # the load case's model has been reset
                 known = None
 
-    def _find_ended(self, batch: Batch, tolerance: np.ndarray, max_iter: int) -> np.ndarray:
+    def _find_ended_cases(self, batch: Batch, tolerance: np.ndarray, max_iter: int) -> np.ndarray:
         """Return a mask (b,) of load cases that have ended, in equilibrium or not."""
-        lost = (batch.stalls >= self.limits.patience) | (batch.steps >= max_iter) | ~batch.state.is_finite
+        lost = (batch.stall_counts >= self.limits.patience) | (batch.steps >= max_iter) | ~batch.state.is_finite
         return lost | (batch.state.relative <= tolerance)
 
     def _rebuild_models(self, batch: Batch, mask: np.ndarray) -> None:
         """Recompute the stale models of the load cases in the mask `mask` (b,)."""
-        renewed = np.flatnonzero(mask & batch.stale)
-        if batch.model is not None and self._strained is not None and len(renewed):
-            fresh = self._strained.build_model(from_view(self.problem.device, batch.state.u), renewed)
-            batch.stale &= ~mask
+        renewed = np.flatnonzero(mask & batch.is_stale)
+        if batch.model is not None and self._strained_part is not None and len(renewed):
+            fresh = self._strained_part.build_model(from_view(self.problem.device, batch.state.u), renewed)
+            batch.is_stale &= ~mask
             batch.model = batch.model.merge_columns(renewed, fresh)
 
     def _compute_force_tolerance(self, batch: Batch, tolerance: np.ndarray) -> np.ndarray:
@@ -227,17 +227,17 @@ class ContactDescent:
 
     def _find_nonconvex(self, batch: Batch) -> np.ndarray:
         """Return a mask (b,) of load cases for which a nonconvex model is accepted."""
-        return batch.failures >= 2 * self.limits.max_failures
+        return batch.failure_counts >= 2 * self.limits.max_failures
 
-    def _increase_proximal_term(self, batch: Batch, waiting: np.ndarray) -> np.ndarray:
-        """Increase the proximal coefficient of the `waiting` cases (b,), and return a mask (b,) of cases to give up."""
+    def _increase_proximal_term(self, batch: Batch, case_mask: np.ndarray) -> np.ndarray:
+        """Increase the proximal coefficient of cases in `case_mask` (b,); return a mask (b,) of cases to give up."""
         times = self.limits.max_failures
-        batch.waiting = waiting
-        batch.failures = np.where(waiting, batch.failures + 1, 0)
-        fresh = waiting & (batch.failures % times == 0)
+        batch.is_waiting = case_mask
+        batch.failure_counts = np.where(case_mask, batch.failure_counts + 1, 0)
+        fresh = case_mask & (batch.failure_counts % times == 0)
         batch.reset_model(np.flatnonzero(fresh))
-        batch.proximal = np.where(fresh, 0.0, np.where(waiting, self._raise_proximal(batch.proximal), batch.proximal))
-        return batch.failures >= 3 * times
+        batch.proximal = np.where(fresh, 0.0, np.where(case_mask, self._raise_proximal(batch.proximal), batch.proximal))
+        return batch.failure_counts >= 3 * times
 
     def _compute_steps(self, batch: Batch, cases: np.ndarray, force: Any) -> None:
         """Compute directions, step lengths and predicted decreases of cases `cases` (k,) under tool forces (3n, b)."""
@@ -258,28 +258,28 @@ class ContactDescent:
                 history.compute_weights(self._add_forces(now.smooth_gradient, force)[:, on])
             )
         longest = self.problem.longest_step(from_view(device, now.u), from_view(device, batch.d))
-        batch.length[cases] = longest[cases]
-        batch.decrease[cases] = -_compute_dots(now.gradient[:, on], batch.d[:, on])
+        batch.step_length[cases] = longest[cases]
+        batch.predicted_decrease[cases] = -_compute_dots(now.gradient[:, on], batch.d[:, on])
 
     def _solve_forces(
         self, batch: Batch, cases: np.ndarray, tolerance: np.ndarray, limits: ForceLimits
     ) -> tuple[Any, np.ndarray]:
         """Return the tool forces (3n, k) on the models of load cases `cases` (k,), and a mask (k,) of solved cases."""
-        rows, now = self._rows, batch.state
+        rows, now = self._touchable_rows, batch.state
         on = select_columns(self.problem.device, cases, len(batch.proximal))
         barrier, known = self.barrier.reduce(cases), batch.force[:, on]
         if barrier is None:
             return known, np.ones(len(cases), bool)
         exact = self._compute_force_tolerance(batch, tolerance)[cases]
-        soft, free = ContactCompliance(self.compliance, self._exact, self._scratch), now.u[rows] - batch.response[rows]
+        soft, free = ContactCompliance(self.compliance, self._device, self._scratch), now.u[rows] - batch.response[rows]
         if batch.model is not None:
             free = free - self._compute_forces(batch, batch.force)[1]
-            soft = replace(soft, own=batch.model.change[on])
+            soft = replace(soft, strain_change=batch.model.change[on])
         free, here = free[:, on], to_double(now.u[rows][:, on])
         if batch.history.max_pairs:
             history = batch.history.get_history(cases)
             own = to_double(history.sw[:, :, rows])
-            soft = replace(soft, history=own, middle=to_double(history.middle_matrix))
+            soft = replace(soft, history=own, middle_matrix=to_double(history.middle_matrix))
             weights = history.compute_weights(self._add_forces(now.smooth_gradient, batch.force)[:, on])
             free = free - (to_double(weights).mT @ own)[:, 0].T
         return solve_contact_forces(barrier, soft, here, to_double(free), known, exact, batch.proximal[cases], limits)
@@ -294,12 +294,12 @@ class ContactDescent:
         out, change = to_view(device.allocate(*batch.response.shape)), force - batch.force
         near = batch.response[compliance.places] + cast_like(batch.response, compliance.compute_motion(change))
         own = to_view(batch.model.apply_stiffness(device, from_view(device, near)))
-        out[self._rows] = cast_like(out, change)
+        out[self._touchable_rows] = cast_like(out, change)
         out[compliance.places] += own
-        return out, cast_like(batch.response, compliance.compute_motion(own)[: len(self._rows)])
+        return out, cast_like(batch.response, compliance.compute_motion(own)[: len(self._touchable_rows)])
 
     def _raise_proximal(self, proximal: np.ndarray) -> np.ndarray:
-        return np.maximum(self.limits.proximal, self.limits.growth * proximal)
+        return np.maximum(self.limits.proximal, self.limits.proximal_growth * proximal)
 
     def _try_steps(self, batch: Batch) -> np.ndarray:
         """Evaluate the trial step of each case that does not wait; return a mask (b,) of cases that need a direction.
@@ -307,10 +307,10 @@ class ContactDescent:
         A direction is needed if the step is accepted, because the energy still decreases there, or nearly so; or if
         backtracking leaves almost no step: then the state is unchanged, and the model is reset.
         """
-        now, going = batch.state, ~(batch.waiting | batch.ended)
-        t = np.where(going, batch.length, 0.0)
+        now, going = batch.state, ~(batch.is_waiting | batch.has_ended)
+        t = np.where(going, batch.step_length, 0.0)
         if not going.any():
-            return batch.waiting & ~batch.ended
+            return batch.is_waiting & ~batch.has_ended
         new = self._evaluate_state(
             batch.evaluator, now.u + to_library(self.problem.device, t.astype(self.problem.device.precision)) * batch.d
         )
@@ -321,27 +321,26 @@ class ContactDescent:
             some = select_columns(self.problem.device, taken, len(t))
             self._update_models(batch, new, taken, some)
             now.put_columns(taken, some, new)
-        return misled | there | (batch.waiting & ~batch.ended)
+        return misled | there | (batch.is_waiting & ~batch.has_ended)
 
     def _take_steps(self, batch: Batch, t: np.ndarray, slopes: np.ndarray, norms: np.ndarray) -> tuple[np.ndarray, ...]:
         """Accept or shorten steps of length t (b,); return masks (b,) of accepted steps and of models to be reset.
 
         The decision depends on `slopes` (b,) and residual `norms` (b,) after the step.
         """
-        limits, now, going = self.limits, batch.state, ~(batch.waiting | batch.ended)
-        far = going & is_step_too_long(slopes, batch.decrease) & (t > limits.accepted_length)
-        batch.length, there = np.where(far, t * backtrack_by_slopes(slopes, batch.decrease), t), going & ~far
-        misled = far & (batch.length < limits.reset_length)
+        limits, now, going = self.limits, batch.state, ~(batch.is_waiting | batch.has_ended)
+        far = going & is_step_too_long(slopes, batch.predicted_decrease) & (t > limits.accepted_length)
+        batch.step_length = np.where(far, t * backtrack_by_slopes(slopes, batch.predicted_decrease), t)
+        there, misled = going & ~far, far & (batch.step_length < limits.reset_length)
         if misled.any():  # reading from the GPU only if needed
             misled &= batch.is_updated
         well = (t > limits.min_good_step) & (norms <= limits.residual_factor * now.norm)
-        eased = np.where(batch.proximal >= limits.proximal, batch.proximal / limits.growth, 0.0)
+        eased = np.where(batch.proximal >= limits.proximal, batch.proximal / limits.proximal_growth, 0.0)
         worse = (t < limits.min_good_step) | (norms > now.norm)
         raised = np.where(misled | (there & worse), self._raise_proximal(batch.proximal), batch.proximal)
-        drag = np.where(there & well, eased, raised)
-        batch.proximal, batch.steps = drag, batch.steps + (misled | there)
-        batch.stale |= there & (norms > limits.stale_factor * now.norm)
-        batch.stalls = np.where(there & well, 0, batch.stalls + (misled | there))
+        batch.proximal, batch.steps = np.where(there & well, eased, raised), batch.steps + (misled | there)
+        batch.is_stale |= there & (norms > limits.stale_factor * now.norm)
+        batch.stall_counts = np.where(there & well, 0, batch.stall_counts + (misled | there))
         batch.reset_model(np.flatnonzero(misled))
         return there, misled
 
@@ -363,7 +362,7 @@ class ContactDescent:
 
     def _compute_balancing_forces(self, state: ContactState) -> Any:
         """Return the forces (3n, b) at the touched nodes that balance the gradient of the smooth terms."""
-        barrier, rows = self.barrier.reduce(np.arange(len(state.norm))), self._rows
+        barrier, rows = self.barrier.reduce(np.arange(len(state.norm))), self._touchable_rows
         own = to_double(state.smooth_gradient[rows])
         if barrier is None:
             return 0.0 * own
@@ -372,10 +371,10 @@ class ContactDescent:
         touched = (slope != 0.0).reshape(shape).any(1)
         return (-own.reshape(shape) * touched[:, None]).reshape(slope.shape)
 
-    def _add_forces(self, smooth: Any, force: Any) -> Any:
+    def _add_forces(self, smooth_gradient: Any, force: Any) -> Any:
         """Return smooth gradients (3N, b) plus the forces (3n, b) on the touchable nodes."""
-        out = smooth + 0.0
-        out[self._rows] += force
+        out = smooth_gradient + 0.0
+        out[self._touchable_rows] += force
         return out
 
     def _evaluate_state(self, evaluator: ResidualEvaluator, u: Any) -> ContactState:
@@ -389,9 +388,9 @@ class ContactDescent:
         whole = to_view(found.g)
         return ContactState(to_view(place), whole - to_view(pressed), whole, found.norm, found.scale)
 
-    def _compute_response(self, smooth: Any, force: Any) -> Any:
+    def _compute_response(self, smooth_gradient: Any, force: Any) -> Any:
         """Return the linear response (3N, b) [m] of the undeformed mesh to the residual."""
-        return self.compliance.apply(self._add_forces(smooth, force))
+        return self.compliance.apply(self._add_forces(smooth_gradient, force))
 
 
 def _compute_dots(x: Any, y: Any) -> np.ndarray:

@@ -64,16 +64,16 @@ NONCONVEX = ForceLimits(nonconvex_iterations=FORCES.max_iterations)
 class ContactCompliance:
     """Compliance C at n nodes: compliance of the undeformed mesh, plus updates for each of b load cases.
 
-    `history` (b, 2m, 3n) and `middle` (b, 2m, 2m) in double precision are L-BFGS updates; None without history. `own`
-    (b, 3n, 3n) in single precision is the change by strained tissue. `get_scratch` is `allocate_scratch` or cached.
+    `history` (b, 2m, 3n) and `middle_matrix` (b, 2m, 2m) in double precision are L-BFGS updates; None without history.
+    `strain_change` (b, 3n, 3n) is the change by strained tissue, in float32. `get_scratch` allocates, or is cached.
     """
 
     undeformed: Compliance
     device: Device
     get_scratch: Callable[[int, int, int], Scratch]
     history: Any = None
-    middle: Any = None
-    own: Any = None
+    middle_matrix: Any = None
+    strain_change: Any = None
 
     def ensure_columns(self, force: Any) -> None:
         """Compute missing columns of the undeformed compliance, for the nodes on which forces (3n, b) act."""
@@ -85,14 +85,11 @@ class ContactCompliance:
     def build_model(self, columns: np.ndarray, diagonal_shift: float) -> ComplianceModel:
         """Return the compliance of the load cases `columns` (k,) as a struct for kernels."""
         out, n, count = ComplianceModel(), len(self.undeformed.rows), len(columns)
-        out.rest = from_view(self.device, self.undeformed.columns)
-        out.known = self.device.upload(self.undeformed.known, wp.int32)
+        out.undeformed = from_view(self.device, self.undeformed.columns)
+        out.has_columns = self.device.upload(self.undeformed.known, wp.int32)
         none = wp.zeros((count, 0, 0), dtype=wp.float32, device=self.device.name)
-        kinds = (
-            ("history", self.device.allocate(count, 0, n)),
-            ("middle", self.device.allocate(count, 0, 0)),
-            ("own", none),
-        )
+        matrix = self.device.allocate(count, 0, 0)
+        kinds = ("history", self.device.allocate(count, 0, n)), ("middle_matrix", matrix), ("strain_change", none)
         for name, nothing in kinds:
             known = getattr(self, name)
             some = None if known is None else known[select_columns(self.device, columns, len(known))]
@@ -164,13 +161,13 @@ def _solve_forces(
         build_kernel_limits(limits, capacity),
     )
 
-    def launch_part(first: int, stop: int) -> None:
-        inputs = [*arrays, first, *touching, model, ends, scratch]
-        launch(device, kernel, stop - first, inputs, [out, status])
+    def launch_part(first_case: int, stop: int) -> None:
+        inputs = [*arrays, first_case, *touching, model, ends, scratch]
+        launch(device, kernel, stop - first_case, inputs, [out, status])
 
     middle = count if device.on_cuda else (count + 1) // 2
     run_concurrently([partial(launch_part, 0, middle), partial(launch_part, middle, count)])
-    return to_view(out), status.numpy(), to_view(scratch.place)[:, :count]
+    return to_view(out), status.numpy(), to_view(scratch.touched_index)[:, :count]
 
 
 def build_kernel_limits(limits: ForceLimits, capacity: int) -> Limits:
@@ -191,13 +188,13 @@ def allocate_scratch(device: Device, nodes: int, columns: int, capacity: int) ->
         return wp.empty(shape, dtype=wp.int32, device=device.name)
 
     out, size = Scratch(), 3 * capacity
-    for name in ("force", "w", "at", "slope", "change", "way", "held"):
+    for name in ("force", "w", "trial", "gradient", "force_change", "direction", "proximal"):
         setattr(out, name, allocate_floats(columns, 3 * nodes).transpose())
-    out.place, out.acts = allocate_ints(columns, nodes).transpose(), allocate_ints(columns, nodes).transpose()
-    out.touched, out.acting = allocate_ints(columns, nodes), allocate_ints(columns, nodes)
+    out.touched_index, out.acting_index = (allocate_ints(columns, nodes).transpose() for _ in range(2))
+    out.touched_nodes, out.acting_nodes = allocate_ints(columns, nodes), allocate_ints(columns, nodes)
     out.counts = allocate_ints(columns, 2)
     out.middle_history = allocate_floats(columns, 2 * PAIRS, size)
-    for name in ("soft", "stiff", "both", "system"):
+    for name in ("compliance", "stiffness", "product", "system"):
         setattr(out, name, allocate_floats(columns, size, size))
     out.x, out.y = allocate_floats(columns, size), allocate_floats(columns, size)
     return out

@@ -23,9 +23,9 @@ class ContactLimits:
         Remaining fraction of the residual above which the model of strained tissue is recomputed.
     min_curvature
         Product s . y [J] at or below which a curvature pair is round-off and not stored.
-    proximal, growth, max_failures
+    proximal, proximal_growth, max_failures
         First proximal coefficient; factor of its growth and reduction; successive failures until the model is reset.
-    ended_fraction
+    max_ended_fraction
         Fraction of ended load cases at which these are removed from the batch, which copies all arrays.
     """
 
@@ -39,9 +39,9 @@ class ContactLimits:
     stale_factor: float = 0.5
     min_curvature: float = 1e-60
     proximal: float = 0.3
-    growth: float = 3.0
+    proximal_growth: float = 3.0
     max_failures: int = 5
-    ended_fraction: float = 0.125
+    max_ended_fraction: float = 0.125
 
 
 CONTACT_LIMITS = ContactLimits()  # Default.

@@ -23,7 +23,7 @@ class ContactPreconditioner:
 
     Parameters
     ----------
-    rest
+    base
         Preconditioner of the undeformed mesh.
     compliance
         Compliance of the undeformed mesh at the touchable nodes.
@@ -33,8 +33,8 @@ class ContactPreconditioner:
 
     on_device = False
 
-    def __init__(self, rest: Preconditioner, compliance: Compliance, barrier: LocalBarrier):
-        self._rest, self._compliance, self._barrier = rest, compliance, barrier
+    def __init__(self, base: Preconditioner, compliance: Compliance, barrier: LocalBarrier):
+        self._rest, self._compliance, self._barrier = base, compliance, barrier
 
         self._felt: tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
 
@@ -52,9 +52,9 @@ class ContactPreconditioner:
                     whole = np.eye(len(curvature)) + curvature @ own[np.ix_(rows, rows)]
                     self._felt = nodes, curvature, lu_factor(whole)
 
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+    def apply(self, r: wp.array, case_mask: np.ndarray, out: wp.array) -> None:
         """Compute out by the undeformed inverse of r minus the Woodbury correction for the touched nodes."""
-        self._rest.apply(r, live, out)
+        self._rest.apply(r, case_mask, out)
         if self._felt is not None:
             z, (nodes, curvature, whole) = out.numpy(), self._felt
             force = np.zeros((len(self._compliance.rows) // 3, 3))
@@ -65,16 +65,16 @@ class ContactPreconditioner:
 
 
 def build_contact_preconditioner(
-    problem: Problem, rest: Preconditioner, contact: ContactDescent | None
+    problem: Problem, base: Preconditioner, contact: ContactDescent | None
 ) -> Preconditioner:
     """Return a preconditioner with tool contact, from `contact`, or from a tool barrier if there is another barrier.
 
     If the skull can also separate, the undeformed stiffness includes half of the skull's contact stiffness.
     """
     if contact is not None:
-        return ContactPreconditioner(rest, contact.compliance, contact.barrier)
+        return ContactPreconditioner(base, contact.compliance, contact.barrier)
     tools = [barrier for barrier in problem.barriers if isinstance(barrier, LocalBarrier)]
-    if len(problem.barriers) == 1 or len(tools) != 1 or isinstance(rest, BlockJacobi):
-        return rest
+    if len(problem.barriers) == 1 or len(tools) != 1 or isinstance(base, BlockJacobi):
+        return base
     (tool,) = tools
-    return ContactPreconditioner(rest, Compliance(problem, rest, tool.touchable_nodes), tool)
+    return ContactPreconditioner(base, Compliance(problem, base, tool.touchable_nodes), tool)

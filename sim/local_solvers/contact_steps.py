@@ -175,9 +175,10 @@ class ContactSteps:
         self._compliance = from_view(exact, compliance.columns).reshape((1, *compliance.columns.shape))
         self._every = device.upload(np.arange(len(compliance.nodes))[None], wp.int32)
         self._model = ComplianceModel()
-        self._model.rest, self._model.known = self._compliance[0], device.upload(compliance.known, wp.int32)
-        self._model.history, self._model.middle = exact.allocate(1, 0, len(compliance.rows)), exact.allocate(1, 0, 0)
-        self._model.own = wp.zeros((1, count + 1, count + 1), dtype=wp.float32, device=name)
+        self._model.undeformed, self._model.has_columns = self._compliance[0], device.upload(compliance.known, wp.int32)
+        self._model.history = exact.allocate(1, 0, len(compliance.rows))
+        self._model.middle_matrix = exact.allocate(1, 0, 0)
+        self._model.strain_change = wp.zeros((1, count + 1, count + 1), dtype=wp.float32, device=name)
         self._model.diagonal_shift = FORCES.diagonal_shift
         self._scratch = allocate_scratch(exact, count // 3, 1, FORCES.first_capacity)
         self._exact, self._touch = exact, None
@@ -191,13 +192,13 @@ class ContactSteps:
 
     def load_model(self, model: StrainedModel) -> None:
         """Copy a model of strained tissue for one load case to the fixed arrays."""
-        for array in (self._nodes, self._matrix, self._model.own):
+        for array in (self._nodes, self._matrix, self._model.strain_change):
             array.zero_()
         if model.has_strained_nodes:
             count = model.nodes.shape[1]
             to_view(self._nodes)[:, :count] = model.nodes
             to_view(self._matrix)[:, : 3 * count, : 3 * count] = model.matrix
-            to_view(self._model.own)[:] = model.change
+            to_view(self._model.strain_change)[:] = model.change
 
     def compute_direction(self, tolerance: float, proximal: float, allow_nonconvex: bool = False) -> np.ndarray:
         """Solve for tool forces with a proximal term, direction and longest step; return results (`OUTPUT_SIZE`,).
@@ -250,7 +251,7 @@ class ContactSteps:
                 self._graphs[name] = capture.graph
         return self._down.numpy()
 
-    def _compute_direction(self, ends: Limits) -> None:
+    def _compute_direction(self, kernel_limits: Limits) -> None:
         device, k = self._device, build_kernels(self._device)
         assert self._touch is not None
         kernel, stage = self._touch
@@ -264,7 +265,7 @@ class ContactSteps:
         self._status.zero_()
         self._found.zero_()
         given = [self._given[TOLERANCE : TOLERANCE + 1], self._given[DRAG : DRAG + 1], 0]
-        inputs = [self._here, self._there, self._force, *given, *stage, self._model, ends, self._scratch]
+        inputs = [self._here, self._there, self._force, *given, *stage, self._model, kernel_limits, self._scratch]
         blocks.launch(self._exact, kernel, 1, inputs, [self._found, self._status])
         self._change.zero_()
         device.launch(k.compute_change, (len(self._touched),), [self._found, self._force], [self._change])

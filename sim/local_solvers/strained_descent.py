@@ -78,16 +78,16 @@ class StiffenedPreconditioner:
 
     on_device = False
 
-    def __init__(self, rest: SparseFactor, problem: Problem):
-        self._rest, self._problem = rest, problem
+    def __init__(self, base: SparseFactor, problem: Problem):
+        self._rest, self._problem = base, problem
         self.stiffening: StiffnessUpdate | None = None
 
     def prepare(self, problem: Problem, columns: int) -> None:
         """Do nothing, since factor and update do not depend on the state."""
 
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+    def apply(self, r: wp.array, case_mask: np.ndarray, out: wp.array) -> None:
         """Apply the factor and the Woodbury correction; omit the correction if the result is no descent direction."""
-        self._rest.apply(r, live, out)
+        self._rest.apply(r, case_mask, out)
         if self.stiffening is None:
             return
         z = out.numpy()[:, 0].astype(np.float32)
@@ -95,7 +95,7 @@ class StiffenedPreconditioner:
         with limit_to_one_thread():
             pull.numpy()[self.stiffening.rows, 0] = self.stiffening.compute_force(z)
         self._problem.constraint.project_nodes(pull)
-        self._rest.apply(pull, live, more)
+        self._rest.apply(pull, case_mask, more)
         whole, g = out.numpy() + more.numpy(), r.numpy()
         if (g * whole).sum(dtype=np.float64) > 0.0:
             out.assign(whole)
@@ -130,7 +130,7 @@ class StrainedDescent:
             some = min(left, self._renewal.max_evaluations)
             found = self._lbfgs.descend(u, tolerance, some)
             left, steps = left - some, steps + int(found.steps[0])
-            if not len(found.unfinished) or left <= 0:
+            if not len(found.unfinished_cases) or left <= 0:
                 break
             u = found.u
             self._preconditioner.stiffening = self._build_stiffness_update(u)

@@ -40,7 +40,7 @@ class UpdatedModel:
         return {NODES_KEY: self.nodes.numpy(), MATRIX_KEY: self.matrix.numpy()}
 
 
-def update_model_at(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel:
+def compute_updated_model(part: StrainedPart, device: Device, u: wp.array) -> UpdatedModel:
     """Return the model of a prepared part at u (3N, 1) [m], for the load case with which the problem has begun.
 
     The host does not wait for the GPU.
@@ -80,7 +80,7 @@ class UpdatedPreconditioner:
 
     Parameters
     ----------
-    rest
+    base
         Inverse of the undeformed stiffness.
     problem
         Problem of this stiffness.
@@ -88,8 +88,8 @@ class UpdatedPreconditioner:
         Number of rows 3n of the models.
     """
 
-    def __init__(self, rest: Preconditioner, problem: Problem, size: int):
-        self._rest, self._problem, self.on_device = rest, problem, rest.on_device
+    def __init__(self, base: Preconditioner, problem: Problem, size: int):
+        self._rest, self._problem, self.on_device = base, problem, base.on_device
         name = problem.device.name
         self._nodes = wp.zeros((1, size // 3), dtype=wp.int32, device=name)
         self._matrix = wp.zeros((1, size, size), dtype=wp.float32, device=name)
@@ -107,10 +107,10 @@ class UpdatedPreconditioner:
         """Prepare the preconditioner of the undeformed mesh."""
         self._rest.prepare(problem, columns)
 
-    def apply(self, r: wp.array, live: np.ndarray, out: wp.array) -> None:
+    def apply(self, r: wp.array, case_mask: np.ndarray, out: wp.array) -> None:
         """Apply the undeformed inverse to r, then to the forces that the model adds."""
         device = self._problem.device
-        self._rest.apply(r, live, out)
+        self._rest.apply(r, case_mask, out)
         self._pull.zero_()
         kernel, shape = (
             build_gemv_kernel(device, wp.float32, device.scalar, ROW_THREADS),
@@ -118,5 +118,5 @@ class UpdatedPreconditioner:
         )
         device.launch(kernel, shape, [self._matrix, self._nodes, out], [self._pull])
         self._problem.constraint.project_nodes(self._pull)
-        self._rest.apply(self._pull, live, self._more)
+        self._rest.apply(self._pull, case_mask, self._more)
         combine_columns(device, out, 1.0, self._more, out)

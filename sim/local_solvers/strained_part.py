@@ -92,17 +92,17 @@ class StrainedModel:
         """Reset the models of the load cases `columns` (k,) to the undeformed stiffness."""
         self.matrix[columns], self.change[columns] = 0.0, 0.0
 
-    def merge_columns(self, columns: np.ndarray, other: StrainedModel) -> StrainedModel:
-        """Return the models, with those of the load cases `columns` (k,) replaced by `other`."""
-        most = max(self.nodes.shape[1], other.nodes.shape[1])
-        mine, its = self._pad_nodes(most), other._pad_nodes(most)
+    def merge_columns(self, columns: np.ndarray, new_models: StrainedModel) -> StrainedModel:
+        """Return the models, with those of the load cases `columns` (k,) replaced by `new_models`."""
+        most = max(self.nodes.shape[1], new_models.nodes.shape[1])
+        mine, its = self._pad_nodes(most), new_models._pad_nodes(most)
         for one, two in ((mine.nodes, its.nodes), (mine.matrix, its.matrix), (mine.change, its.change)):
             one[columns] = two
         return mine
 
-    def _pad_nodes(self, most: int) -> StrainedModel:
-        """Return the models padded to `most` nodes."""
-        missing = most - self.nodes.shape[1]
+    def _pad_nodes(self, node_count: int) -> StrainedModel:
+        """Return the models padded to `node_count` nodes."""
+        missing = node_count - self.nodes.shape[1]
         nodes, matrix = pad_zeros(self.nodes, (missing,)), pad_zeros(self.matrix, (3 * missing, 3 * missing))
         return StrainedModel(nodes, matrix, self.change)
 
@@ -193,24 +193,24 @@ class StrainedPart:
         between = self.compliance.columns[rows[:, :, None], rows[:, None, :]]
         return 0.5 * (between + between.mT)
 
-    def _build_models(self, nodes: Any, stiffer: Any) -> StrainedModel:
+    def _build_models(self, nodes: Any, stiffness_changes: Any) -> StrainedModel:
         """Return the models from matrices D (b, 3k, 3k) [N/m] on `nodes` (b, k) of the compliance."""
         self.prepare()
-        device, count, size = self._problem.device, len(nodes), stiffer.shape[1]
+        device, count, size = self._problem.device, len(nodes), stiffness_changes.shape[1]
         # One more row and column collect the entries of nodes that cannot be touched.
         shape = count, 3 * self._touchable + 1, 3 * self._touchable + 1
         own = to_view(wp.zeros(shape, dtype=wp.float32, device=device.name))
-        matrix, axes = 0.0 * stiffer, to_library(device, np.arange(3))
+        matrix, axes = 0.0 * stiffness_changes, to_library(device, np.arange(3))
         each = max(1, self._strains.max_bytes // (6 * 8 * max(size, 1) ** 2))
         for first in range(0, count if size else 0, each):
             some = slice(first, first + each)
             rows = (3 * nodes[some][:, :, None] + axes).reshape(-1, size)
             soft = self.build_compliance(rows)
-            system = stiffer[some] @ soft
+            system = stiffness_changes[some] @ soft
             diagonal = range(size)
             system[:, diagonal, diagonal] += 1.0
             try:
-                found = get_library(device).linalg.solve(system, stiffer[some])
+                found = get_library(device).linalg.solve(system, stiffness_changes[some])
             except get_library(device).linalg.LinAlgError:
                 continue  # keep the undeformed stiffness
             matrix[some] = -0.5 * (found + found.mT)

@@ -26,13 +26,13 @@ class TangentContact:
 
     Parameters
     ----------
-    rest
+    undeformed_descent
         Contact solver with the undeformed stiffness.
     """
 
-    def __init__(self, rest: ContactDescent):
-        self._rest = self._descent = rest
-        self._state = np.zeros(rest.problem.rows)
+    def __init__(self, undeformed_descent: ContactDescent):
+        self._rest = self._descent = undeformed_descent
+        self._state = np.zeros(undeformed_descent.problem.rows)
 
     def descend(
         self, start: wp.array, tolerance: np.ndarray, max_iter: int, warm_start: Mapping[str, np.ndarray]
@@ -45,7 +45,7 @@ class TangentContact:
             some = min(left, MAX_STEPS)
             found = self._get_descent(state).descend(u, tolerance, some)
             left, steps = left - some, steps + int(found.steps[0])
-            if not len(found.unfinished) or left <= 0 or not found.steps[0]:
+            if not len(found.unfinished_cases) or left <= 0 or not found.steps[0]:
                 return replace(found, steps=np.array([steps]), warm_start={STATE_KEY: state[None]})
             u = found.u
             state = u.numpy()[:, 0].copy()

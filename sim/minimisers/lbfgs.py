@@ -55,7 +55,7 @@ class DescentResult:
     warm_start: Mapping[str, np.ndarray]
 
     @property
-    def unfinished(self) -> np.ndarray:
+    def unfinished_cases(self) -> np.ndarray:
         """Numbers (k,) of the load cases that did not end; another method can continue these."""
         return np.flatnonzero((self.status == LIVE) | (self.status == STOPPED))
 

@@ -50,15 +50,15 @@ def get_rows_per_thread(device: Device) -> int:
 
 
 @cache
-def build_kernels(device: Device, pairs: int) -> LbfgsKernels:
-    """Return the kernels for the scalar type of a device, and `pairs` curvature pairs per load case."""
+def build_kernels(device: Device, max_pairs: int) -> LbfgsKernels:
+    """Return the kernels for the scalar type of a device, and `max_pairs` curvature pairs per load case."""
     scalar = device.scalar
     several, few_scalars = (
         wp.types.vector(length=length, dtype=scalar) for length in (ROWS_PER_THREAD, get_rows_per_thread(device))
     )
-    weights = wp.types.vector(length=pairs, dtype=wp.float64)
-    products_of_pairs = wp.types.matrix(shape=(pairs, pairs), dtype=wp.float64)
-    m, chunk, some, few = pairs, CHUNK, ROWS_PER_THREAD, get_rows_per_thread(device)
+    weights = wp.types.vector(length=max_pairs, dtype=wp.float64)
+    products_of_pairs = wp.types.matrix(shape=(max_pairs, max_pairs), dtype=wp.float64)
+    m, chunk, some, few = max_pairs, CHUNK, ROWS_PER_THREAD, get_rows_per_thread(device)
     overshoot, least_kept, kept, most_kept = OVERSHOOT, MIN_BACKTRACK, DEFAULT_BACKTRACK, MAX_BACKTRACK
     cuts, least_curvature = MAX_BACKTRACKS, MIN_CURVATURE
     whole_row, free_row, slope_row = WHOLE, FREE, SLOPE

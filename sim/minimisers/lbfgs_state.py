@@ -91,17 +91,17 @@ class LbfgsWorkspace:
         Problem to solve, and its preconditioner.
     width
         Maximum number of load cases.
-    ground
+    memory
         Memory from `allocate_memory` for at least this width.
     """
 
-    def __init__(self, problem: Problem, preconditioner: Preconditioner, width: int, ground: Mapping[str, wp.array]):
+    def __init__(self, problem: Problem, preconditioner: Preconditioner, width: int, memory: Mapping[str, wp.array]):
         self.width = width
         self._problem = problem
         self._preconditioner = preconditioner
         self._kernels = build_kernels(problem.device, PAIRS)
         self._graph: wp.Graph | None = None
-        self.state = allocate_state(problem, width, ground)
+        self.state = allocate_state(problem, width, memory)
         self.columns = a = self.state.columns
         self._trial = ResidualArrays(a["new_g"], a["part"], a["sums"], a["own"])
 
@@ -153,9 +153,9 @@ class LbfgsWorkspace:
             self.columns["status"][len(columns) :].fill_(DONE)
         self.prepare()
 
-    def _pad_indices(self, stay: np.ndarray) -> np.ndarray:
+    def _pad_indices(self, columns: np.ndarray) -> np.ndarray:
         """Return the indices padded to the width of the workspace by repeating the last index."""
-        return np.append(stay, np.full(self.width - len(stay), stay[-1]))
+        return np.append(columns, np.full(self.width - len(columns), columns[-1]))
 
     def prepare(self) -> None:
         """Clear temporary arrays, and prepare a preconditioner that runs on the host for the current batch."""
@@ -238,10 +238,10 @@ class LbfgsWorkspace:
         self._problem.device.launch(self._kernels.limit_step, (self.width,), [], [bound, a["t"]])
 
 
-def _view_memory(ground: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
+def _view_memory(memory: wp.array, first: int, shape: tuple[int, ...]) -> wp.array:
     """Return a view of memory from element `first` with a `shape`; Warp slices cannot skip 2^31 elements."""
-    address = ground.ptr + first * wp.types.type_size_in_bytes(ground.dtype)
-    return wp.array(ptr=address, dtype=ground.dtype, shape=shape, device=ground.device)
+    address = memory.ptr + first * wp.types.type_size_in_bytes(memory.dtype)
+    return wp.array(ptr=address, dtype=memory.dtype, shape=shape, device=memory.device)
 
 
 def _count_values(shapes: Shapes) -> int:

@@ -83,7 +83,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
 
     @forward_kernel(module="unique")
     def project_gradient(
-        constant: wp.array2d(dtype=scalar),
+        constant_gradient: wp.array2d(dtype=scalar),
         fixed: wp.array2d(dtype=wp.int8),
         normal: wp.array(dtype=vec),
         d: wp.array2d(dtype=scalar),
@@ -97,7 +97,7 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
         first = get_first_row(thread, lanes, each)
         for i in range(first, wp.min(first + lanes * each, fixed.shape[0]), lanes):
             x = vec(total[3 * i, c], total[3 * i + 1, c], total[3 * i + 2, c])
-            y = x - vec(constant[3 * i, c], constant[3 * i + 1, c], constant[3 * i + 2, c])
+            y = x - vec(constant_gradient[3 * i, c], constant_gradient[3 * i + 1, c], constant_gradient[3 * i + 2, c])
             own += wp.float64(wp.dot(y, y))
             whole += wp.float64(wp.dot(x, x))
             n = normal[i]
@@ -118,9 +118,9 @@ def build_kernels(device: Device, spread: ThreadSpread) -> LbfgsTrialKernels:
 
 
 @cache
-def build_multiply_kernel(device: Device, pairs: int) -> wp.Kernel:
+def build_multiply_kernel(device: Device, max_pairs: int) -> wp.Kernel:
     """Return the kernel `compute_products` for a single load case, launched over (products, threads of rows)."""
-    scalar, m, spread = device.scalar, pairs, choose_thread_spread(device, 1)
+    scalar, m, spread = device.scalar, max_pairs, choose_thread_spread(device, 1)
     lanes, each = spread.lanes, spread.rows_per_thread
     gz_row, gold_row, yw_row = 2 * m + GZ, 2 * m + GZ_OLD, 2 * m + YW
 

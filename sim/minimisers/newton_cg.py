@@ -49,11 +49,11 @@ class NewtonCG:
     """Inexact Newton directions: K d = -g by truncated conjugate gradients, with a trust radius from accepted steps.
 
     The radius is in the norm of the preconditioner, and infinite until a step has been shortened (Steihaug 1983). The
-    next step may be `growth` times as long as the last accepted step.
+    next step may be `radius_growth` times as long as the last accepted step.
     """
 
-    def __init__(self, preconditioner: Preconditioner, most: int, growth: float = 2.0):
-        self._preconditioner, self._most, self._growth = preconditioner, most, growth
+    def __init__(self, preconditioner: Preconditioner, max_iterations: int, radius_growth: float = 2.0):
+        self._preconditioner, self._most, self._growth = preconditioner, max_iterations, radius_growth
         self.begin()
 
     def begin(self) -> None:
@@ -88,11 +88,11 @@ class NewtonCG:
             combine_columns(device, found.x, 1.0, gap, found.x)
         return Direction(found.x, predicted, found.iterations)
 
-    def _compute_radius(self, taken: np.ndarray) -> np.ndarray:
+    def _compute_radius(self, step_length: np.ndarray) -> np.ndarray:
         if self._radius is None:
-            return np.full(len(taken), np.inf)
-        step = self._growth * taken * self._size
-        return np.where((taken == 1.0) & ~self._truncated, np.maximum(self._radius, step), step)
+            return np.full(len(step_length), np.inf)
+        step = self._growth * step_length * self._size
+        return np.where((step_length == 1.0) & ~self._truncated, np.maximum(self._radius, step), step)
 
 
 def compute_right_hand_side(problem: Problem, g: wp.array, gap: wp.array | None) -> tuple[wp.array, np.ndarray]:

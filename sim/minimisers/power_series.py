@@ -106,13 +106,13 @@ class OutputFunctionals:
         return len(self.solutions)
 
     @cached_property
-    def _times(self) -> Callable[[wp.array, wp.array], None]:
+    def _multiply(self) -> Callable[[wp.array, wp.array], None]:
         return build_product(self.solutions, self.device)
 
     def evaluate(self, force: wp.array) -> np.ndarray:
         """Return the functionals (b, r) of the linear response to forces (3N, b) [N]."""
         out = self.device.allocate(self.count, force.shape[1])
-        self._times(force, out)
+        self._multiply(force, out)
         return out.numpy().T
 
 

@@ -38,11 +38,11 @@ def allocate_residual_arrays(problem: Problem, count: int) -> ResidualArrays:
 def compute_residual_arrays(
     problem: Problem,
     v: wp.array,
-    constant: wp.array,
+    constant_gradients: wp.array,
     d: wp.array | None = None,
     workspace: ResidualArrays | None = None,
 ) -> ResidualArrays:
-    """Return the residual at v (3N, b) [m] with `constant` gradients (3N, b) [N], and its inner products with d.
+    """Return the residual at v (3N, b) [m] with `constant_gradients` (3N, b) [N], and its inner products with d.
 
     The result is written to `workspace`, if it is given.
     """
@@ -50,7 +50,7 @@ def compute_residual_arrays(
     workspace = workspace or allocate_residual_arrays(problem, count)
     varying = [term for term in problem.terms if not term.constant]
     workspace.sums.zero_()
-    wp.copy(workspace.g, constant)
+    wp.copy(workspace.g, constant_gradients)
     if len(varying) == 1:
         varying[0].add_gradient(v, workspace.g)
         workspace = replace(workspace, term_norms=workspace.sums[OWN : OWN + 1])
@@ -61,7 +61,7 @@ def compute_residual_arrays(
             term.add_gradient(v, workspace.scratch)
             outputs = [workspace.scratch, workspace.g, workspace.term_norms[number]]
             device.launch(absorb, (-(-rows // CHUNK), count), [], outputs)
-    inputs = [constant, *problem.constraint.node_arrays, v if d is None else d]
+    inputs = [constant_gradients, *problem.constraint.node_arrays, v if d is None else d]
     spread = lbfgs_trial_kernels.choose_thread_spread(device, count)
     device.launch(
         lbfgs_trial_kernels.build_kernels(device, spread).project_gradient,

@@ -26,11 +26,11 @@ CUDA_BATCH = 4096  # The same on CUDA: they fill a GPU.
 
 
 @dataclass(frozen=True, eq=False)
-class _Some:
+class ElementBatch:
     """Batch of elements of one tissue: indices (k,), and P2 (9, 81) float32, which maps a strain to a stiffness."""
 
     elements: Elements
-    chosen: np.ndarray
+    element_numbers: np.ndarray
     tensor: np.ndarray
 
 
@@ -68,17 +68,17 @@ def compute_second_order(
         for one in _list_batches(*term.compute_second_order(), CUDA_BATCH if device.on_cuda else CPU_BATCH)
     ]
     others, done = to_library(device, second), count(1)
-    tasks = 1 if device.on_cuda else choose_threads(sum(len(each.chosen) for each in work))
+    tasks = 1 if device.on_cuda else choose_threads(sum(len(each.element_numbers) for each in work))
     tables = [to_library(device, np.zeros((len(first), len(functionals)), np.float32)) for _ in range(tasks)]
 
-    def add_batches(table: Any, batches: list[_Some]) -> None:
+    def add_batches(table: Any, batches: list[ElementBatch]) -> None:
         for batch in batches:
             add_batch(table, batch)
             progress(next(done), len(work))
 
-    def add_batch(table: Any, batch: _Some) -> None:
-        gradient = _build_gradient_matrix(batch.elements, batch.chosen)
-        weight = np.repeat(batch.elements.weight[batch.chosen].ravel(), 9)[:, None]
+    def add_batch(table: Any, batch: ElementBatch) -> None:
+        gradient = _build_gradient_matrix(batch.elements, batch.element_numbers)
+        weight = np.repeat(batch.elements.weight[batch.element_numbers].ravel(), 9)[:, None]
         strain = to_library(device, (gradient @ unit_motions.T).astype(np.float32).reshape(-1, 9, len(unit_motions)))
         lever = to_library(device, (weight * (gradient @ functionals.T)).astype(np.float32))
         tensor = to_library(device, batch.tensor)
@@ -95,19 +95,19 @@ def compute_second_order(
     return np.column_stack([first, second]), table * twice[:, None]
 
 
-def _list_batches(elements: Elements, tensors: np.ndarray, kind: np.ndarray, most: int) -> list[_Some]:
-    """Return all elements of a term, in batches of one tissue and at most `most` elements."""
+def _list_batches(elements: Elements, tensors: np.ndarray, tissues: np.ndarray, size: int) -> list[ElementBatch]:
+    """Return all elements of a term, in batches of one tissue and at most `size` elements."""
     found = []
     for each, tensor in enumerate(tensors):
-        chosen = np.flatnonzero(kind == each)
+        chosen = np.flatnonzero(tissues == each)
         flat = tensor.transpose(1, 0, 2).reshape(9, 81).astype(np.float32)
-        found += [_Some(elements, chosen[k : k + most], flat) for k in range(0, len(chosen), most)]
+        found += [ElementBatch(elements, chosen[k : k + size], flat) for k in range(0, len(chosen), size)]
     return found
 
 
-def _build_gradient_matrix(elements: Elements, chosen: np.ndarray) -> sp.csr_array:
-    """Return the matrix from displacements (3N,) to gradients (9 k q,), row by row, in elements `chosen` (k,)."""
-    table, slope = elements.table[chosen], elements.gradient[chosen]
+def _build_gradient_matrix(elements: Elements, element_numbers: np.ndarray) -> sp.csr_array:
+    """Return the matrix from displacements (3N,) to gradients (9 k q,), row by row, of `element_numbers` (k,)."""
+    table, slope = elements.table[element_numbers], elements.gradient[element_numbers]
     count, points, most = slope.shape[:3]
     row = np.arange(9 * count * points).reshape(count, points, 1, 3, 3)
     column = 3 * table[:, None, :, None, None] + np.arange(3)[:, None]

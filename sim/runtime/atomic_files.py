@@ -18,11 +18,11 @@ def explain_error(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno else "the library that writes it failed"
 
 
-def check_output(path: str | Path, suffix: str, max_age: float = STALE_SECONDS, clean: bool = True) -> Path:
+def check_output(path: str | Path, suffix: str, max_age: float = STALE_SECONDS, remove_partials: bool = True) -> Path:
     """Return a writable path, whose folder is created; call this before long work, so that no result is lost.
 
-    Unfinished files of killed runs with the same output are removed, unless `clean` is False, which saves time in very
-    large folders. Unfinished files of other machines are removed after `max_age` seconds.
+    Unfinished files of killed runs with the same output are removed, unless `remove_partials` is False, which saves
+    time in very large folders. Unfinished files of other machines are removed after `max_age` seconds.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def check_output(path: str | Path, suffix: str, max_age: float = STALE_SECONDS, 
         ) from error
     if path.is_dir():
         raise InputError(f"{path}: cannot be written, it is a folder. Choose another name.")
-    if clean:
+    if remove_partials:
         remove_partial_files(path.parent, path.name, max_age)
     probe = to_partial_path(path)
     try:  # permissions are not enough: the file system may be read-only or full
@@ -53,17 +53,17 @@ def check_output(path: str | Path, suffix: str, max_age: float = STALE_SECONDS, 
 
 
 @contextmanager
-def write_atomically(path: str | Path, suffix: str, clean: bool = True) -> Iterator[Path]:
+def write_atomically(path: str | Path, suffix: str, remove_partials: bool = True) -> Iterator[Path]:
     """Yield a temporary path next to `path`, with the same suffix, which is renamed to `path` if the block succeeds.
 
-    `clean` has the same meaning as in `check_output`.
+    `remove_partials` has the same meaning as in `check_output`.
 
     Raises
     ------
     InputError
         See `check_output`; also if writing fails.
     """
-    path = check_output(path, suffix, clean=clean)
+    path = check_output(path, suffix, remove_partials=remove_partials)
     partial = to_partial_path(path)
     try:
         yield partial
@@ -136,7 +136,7 @@ def remove_empty_parents(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def write_stream_atomically(path: str | Path, suffix: str, clean: bool = True) -> Iterator[Stream]:
+def write_stream_atomically(path: str | Path, suffix: str, remove_partials: bool = True) -> Iterator[Stream]:
     """Yield an open binary file, as `write_atomically`, for HDF5, which would end the process if its own write failed.
 
     Raises
@@ -144,7 +144,7 @@ def write_stream_atomically(path: str | Path, suffix: str, clean: bool = True) -
     InputError
         See `write_atomically`.
     """
-    with write_atomically(path, suffix, clean) as partial, partial.open("w+b", buffering=0) as raw:
+    with write_atomically(path, suffix, remove_partials) as partial, partial.open("w+b", buffering=0) as raw:
         stream = Stream(raw)
         try:
             yield stream
@@ -158,9 +158,9 @@ def write_stream_atomically(path: str | Path, suffix: str, clean: bool = True) -
 class Stream:
     """Binary file that stores its first write error in `failure`, to be raised at the end."""
 
-    def __init__(self, raw: BinaryIO) -> None:
+    def __init__(self, file: BinaryIO) -> None:
         self.failure: OSError | None = None
-        self._raw = raw
+        self._raw = file
 
     def write(self, data: bytes) -> int:
         """Write all data and return its size; after a failure, write nothing."""

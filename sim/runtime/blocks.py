@@ -19,14 +19,14 @@ def wait():
     ...
 
 
-def write_fold(fold: str) -> str:
-    """Return C++ code of a reduction over the threads, with equal bits in all; `fold` combines `value` and `other`."""
+def write_reduction_code(operation: str) -> str:
+    """Return C++ code of a reduction over the threads, equal bits in all; `operation` combines `value` and `other`."""
     return f"""
 #if defined(__CUDA_ARCH__)
     __shared__ double shares[32];
     for (int away = 16; away > 0; away /= 2) {{
         const double other = __shfl_xor_sync(0xffffffffu, value, away);
-        value = {fold};
+        value = {operation};
     }}
     __syncthreads();
     if (threadIdx.x % 32 == 0) shares[threadIdx.x / 32] = value;
@@ -34,20 +34,20 @@ def write_fold(fold: str) -> str:
     value = shares[0];
     for (int warp = 1; warp < blockDim.x / 32; ++warp) {{
         const double other = shares[warp];
-        value = {fold};
+        value = {operation};
     }}
 #endif
     return value;
 """
 
 
-@wp.func_native(snippet=write_fold("value + other"))
+@wp.func_native(snippet=write_reduction_code("value + other"))
 def get_sum(value: wp.float64) -> wp.float64:
     """Return the sum of the values of all threads."""
     ...
 
 
-@wp.func_native(snippet=write_fold("fmax(value, other)"))
+@wp.func_native(snippet=write_reduction_code("fmax(value, other)"))
 def get_max(value: wp.float64) -> wp.float64:
     """Return the maximum of the values of all threads."""
     ...

@@ -191,8 +191,8 @@ def is_workspace_width(width: int) -> bool:
 class Workspaces:
     """Arrays by number of columns; a workspace width always has the same array, as captured graphs require."""
 
-    def __init__(self, make: Callable[[int], wp.array], device: Device):
-        self._make, self._device = make, device
+    def __init__(self, allocate: Callable[[int], wp.array], device: Device):
+        self._make, self._device = allocate, device
         self._arrays: dict[int, wp.array] = {}
 
     def get_array(self, columns: int) -> wp.array:

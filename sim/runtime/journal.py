@@ -39,8 +39,8 @@ class DamageWarning(UserWarning):
 class Journal:
     """Open journal with the valid records of one run, by group and first row."""
 
-    def __init__(self, path: Path, file: BinaryIO, key: bytes, places: dict[Batch, tuple[int, int]]) -> None:
-        self._path, self._file, self._key, self._places = path, file, key, places
+    def __init__(self, path: Path, file: BinaryIO, key: bytes, record_positions: dict[Batch, tuple[int, int]]) -> None:
+        self._path, self._file, self._key, self._places = path, file, key, record_positions
 
     def __contains__(self, batch: Batch) -> bool:
         return batch in self._places
@@ -90,9 +90,9 @@ class Journal:
         _, last = next(reversed(self._places), ("row", -1))
         self.add(("row", last + 1), json.dumps(asdict(row)).encode())
 
-    def read_rows(self, kind: type[R]) -> list[R]:
-        """Return the appended rows as dataclasses of the type `kind`; raise InputError as `read`."""
-        return [kind(**json.loads(self.read(batch))) for batch in sorted(self._places)]
+    def read_rows(self, row_type: type[R]) -> list[R]:
+        """Return the appended rows as dataclasses of the type `row_type`; raise InputError as `read`."""
+        return [row_type(**json.loads(self.read(batch))) for batch in sorted(self._places)]
 
 
 @contextmanager
@@ -119,7 +119,7 @@ def open_journal(path: Path, description: Mapping[str, str]) -> Iterator[Journal
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({explain_error(error)}). Delete it.") from error
     with file:
-        _lock(path, file)
+        _lock_file(path, file)
         yield Journal(path, file, key, _restore_records(path, file, opening, key, description))
 
 
@@ -138,20 +138,20 @@ def _get_payload(data: Held) -> bytes:
 
 
 def _restore_records(
-    path: Path, file: BinaryIO, opening: bytes, key: bytes, description: Mapping[str, str]
+    path: Path, file: BinaryIO, header: bytes, key: bytes, description: Mapping[str, str]
 ) -> dict[Batch, tuple[int, int]]:
     """Return start and size of the valid records, by batch, and truncate the file after the last valid record."""
     foreign = f"{path}: is not an unfinished run, or its beginning is damaged: delete it, and run the command again."
     if not file.seek(0, os.SEEK_END):
         raise InputError(foreign)
     with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as held:
-        whole = held[: len(opening)] == opening
+        whole = held[: len(header)] == header
         if not whole and _verify_record(held, 0, b"") == (RUN_GROUP, 0):
             check_same_description(path, json.loads(_get_payload(held)), description)
-        places, damaged = _find_records(held, len(opening), key)
+        places, damaged = _find_records(held, len(header), key)
     if not whole and not places:
         raise InputError(foreign)
-    end = max((start + size for start, size in places.values()), default=len(opening))
+    end = max((start + size for start, size in places.values()), default=len(header))
     names = ([] if whole else ["its beginning"]) + [name for start, name in damaged if start < end]
     if names:
         warnings.warn(
@@ -161,7 +161,7 @@ def _restore_records(
             stacklevel=4,
         )
     file.seek(0)
-    file.write(opening)
+    file.write(header)
     file.truncate(end)  # a kill tears the last record
     return places
 
@@ -235,13 +235,13 @@ def _describe_record(data: Held, start: int) -> str:
     return "rows with an unreadable number"
 
 
-def _compute_digest(head: bytes, payload: bytes, key: bytes) -> bytes:
-    state = hashlib.sha256(key + head)  # fast, by instructions of the processor
+def _compute_digest(header: bytes, payload: bytes, key: bytes) -> bytes:
+    state = hashlib.sha256(key + header)  # fast, by instructions of the processor
     state.update(payload)
     return state.digest()[:16]
 
 
-def _lock(path: Path, file: BinaryIO) -> None:
+def _lock_file(path: Path, file: BinaryIO) -> None:
     """Lock the file against other runs until it is closed, if the system supports this."""
     try:
         import fcntl

@@ -63,7 +63,7 @@ def process_pool(devices: Sequence[str], build: Callable[..., Any], *args: Any) 
     with ExitStack() as closing:
         children = [_start_child(device, build, args, closing) for device in devices]
         for child in children:
-            _receive(child)
+            _receive_result(child)
         yield tuple(children)
 
 
@@ -80,14 +80,14 @@ def map_parallel(function: Callable[[Task], Any], tasks: Sequence[Task], count: 
 
 
 def map_unordered(
-    children: Sequence[ChildProcess], work: Callable[[Any, Task], Any], tasks: Iterable[Task]
+    children: Sequence[ChildProcess], call: Callable[[Any, Task], Any], tasks: Iterable[Task]
 ) -> Iterator[tuple[Task, Any]]:
     """Yield each task with its result `work(made, task)`, in order of completion; idle processes take the next task.
 
     Raises
     ------
     InputError
-        Raised by `work`.
+        Raised by `call`.
     LostProcessError
         A process that was killed. Finished results of the others are yielded first.
     """
@@ -97,7 +97,7 @@ def map_unordered(
     def send_next(child: ChildProcess) -> None:
         for task in waiting:
             with suppress(BrokenPipeError, ConnectionResetError):  # reported when its result is read
-                child.pipe.send((work, task))
+                child.pipe.send((call, task))
             busy[child.pipe] = child, task
             return
 
@@ -110,7 +110,7 @@ def map_unordered(
         for pipe in ready:
             child, task = busy.pop(pipe)
             try:
-                answer = _receive(child)
+                answer = _receive_result(child)
             except Exception as error:
                 lost = lost or error
                 continue
@@ -121,7 +121,7 @@ def map_unordered(
         raise lost
 
 
-def run_on_each(children: Sequence[ChildProcess], work: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
+def run_on_each(children: Sequence[ChildProcess], call: Callable[[Any, Task], Any], tasks: Sequence[Task]) -> list[Any]:
     """Return the results of one task per process; all tasks start at the same time.
 
     Raises
@@ -131,11 +131,11 @@ def run_on_each(children: Sequence[ChildProcess], work: Callable[[Any, Task], An
     """
     for child, task in zip(children, tasks, strict=True):
         with suppress(BrokenPipeError, ConnectionResetError):
-            child.pipe.send((work, task))
+            child.pipe.send((call, task))
     found, lost = [], None
     for child in children:
         try:
-            found.append(_receive(child))
+            found.append(_receive_result(child))
         except Exception as error:
             lost = lost or error
     if lost is not None:
@@ -143,7 +143,7 @@ def run_on_each(children: Sequence[ChildProcess], work: Callable[[Any, Task], An
     return found
 
 
-def _receive(child: ChildProcess) -> Any:
+def _receive_result(child: ChildProcess) -> Any:
     """Return the next result of a process.
 
     Raises
@@ -156,8 +156,8 @@ def _receive(child: ChildProcess) -> Any:
     except (EOFError, ConnectionResetError):
         child.process.join(EXIT_TIMEOUT)
         raise LostProcessError(
-            f"the process on {child.device} was ended{_note_exit(child.process.exitcode)}. If that happens again, give "
-            f"--device one {child.device} less."
+            f"the process on {child.device} was ended{_format_exit_code(child.process.exitcode)}. If that happens "
+            f"again, give --device one {child.device} less."
         ) from None
     if not isinstance(answer, Exception):
         return answer
@@ -178,11 +178,11 @@ def build_gpu_environment(device: str) -> dict[str, str]:
     return {VISIBLE_VARIABLE: cards.split(",")[int(number or 0)] if cards else number or "0"}
 
 
-def _start_child(device: str, make: Callable[..., Any], args: tuple[Any, ...], stack: ExitStack) -> ChildProcess:
+def _start_child(device: str, build: Callable[..., Any], args: tuple[Any, ...], stack: ExitStack) -> ChildProcess:
     ours, theirs = Pipe()
     variables = build_gpu_environment(device)
     own = "cuda:0" if variables else device
-    process = start_process(_run_worker, theirs, own, make, args, name=device, variables=variables)
+    process = start_process(_run_worker, theirs, own, build, args, name=device, variables=variables)
     theirs.close()
     child = ChildProcess(device, process, ours)
     stack.callback(_kill_child, child)
@@ -223,10 +223,10 @@ def _kill_child(child: ChildProcess) -> None:
     child.pipe.close()
 
 
-def _run_worker(pipe: Any, device: str, make: Callable[..., Any], args: tuple[Any, ...]) -> None:
-    """Call `make`, then run tasks from the pipe until it closes; exceptions are sent as results."""
+def _run_worker(pipe: Any, device: str, build: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    """Call `build`, then run tasks from the pipe until it closes; exceptions are sent as results."""
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        made = _try_call(make, device, *args)
+        made = _try_call(build, device, *args)
         pipe.send(made if isinstance(made, Exception) else None)
         while True:
             work, task = pipe.recv()
@@ -263,11 +263,11 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _note_exit(code: int | None) -> str:
+def _format_exit_code(exit_code: int | None) -> str:
     """Return a note in brackets on the exit code of a process."""
-    if code is None or code == 0:
+    if exit_code is None or exit_code == 0:
         return ""
-    if code > 0:
-        return f" (exit code {code})"
-    name = signal.strsignal(-code) or f"signal {-code}"
-    return f" ({name}), probably out of memory" if -code == signal.SIGKILL else f" ({name})"
+    if exit_code > 0:
+        return f" (exit code {exit_code})"
+    name = signal.strsignal(-exit_code) or f"signal {-exit_code}"
+    return f" ({name}), probably out of memory" if -exit_code == signal.SIGKILL else f" ({name})"

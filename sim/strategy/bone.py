@@ -12,7 +12,7 @@ from .strategy import Strategy
 from .time_steps import NoMotionStep
 
 
-def solve_free_of_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
+def solve_without_bone(strategy: Strategy | NoMotionStep, cases: Cases, guesses: Sequence[np.ndarray]) -> SolverResult:
     """Return the result of `Strategy.solve` for cases whose tools do not overlap bone; others keep their last guess.
 
     Bone does not deform: a solution would depend only on the barrier stiffness, and take long.

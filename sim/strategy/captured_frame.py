@@ -15,7 +15,7 @@ from ..discretisation.footprint import ContactSurface
 from ..discretisation.inverted_elements import InversionCounter
 from ..discretisation.problem import Problem
 from ..linalg.pcg import Preconditioner
-from ..local_solvers.strained_frame import UpdatedModel, UpdatedPreconditioner, update_model_at
+from ..local_solvers.strained_frame import UpdatedModel, UpdatedPreconditioner, compute_updated_model
 from ..local_solvers.strained_part import StrainedPart
 from ..minimisers.lbfgs_kernels import LIVE, PAIRS
 from ..minimisers.lbfgs_state import LbfgsState, LbfgsWorkspace, allocate_memory, allocate_state
@@ -237,7 +237,7 @@ class CapturedFrame:
     def update_model(self, steps: float) -> None:
         """Recompute the model of strained tissue if the last solution took more than `MAX_SERVED_STEPS` steps."""
         if self.part is not None and steps > MAX_SERVED_STEPS:
-            self._load_updated_model(update_model_at(self.part, self._device, self._workspace.columns["u"]))
+            self._load_updated_model(compute_updated_model(self.part, self._device, self._workspace.columns["u"]))
             self._workspace.columns["known"].zero_()  # curvature pairs are valid for their own model only
 
     def _load_updated_model(self, model: UpdatedModel | None) -> None:

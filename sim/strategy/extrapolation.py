@@ -27,46 +27,46 @@ def as_pushes(loads: Loads) -> np.ndarray | None:
     return np.column_stack([push.point, push.force, push.footprint])
 
 
-def compute_factors(push: np.ndarray, last: np.ndarray, previous: np.ndarray) -> np.ndarray:
+def compute_factors(push: np.ndarray, last_push: np.ndarray, previous_push: np.ndarray) -> np.ndarray:
     """Return the factors a (B,) of three successive pushes (B, 7); 0 without force, or if the last two are equal.
 
     Lengths are divided by the last footprint radius, forces by the last force.
     """
-    forces = np.stack([push, last, previous])[:, :, 3:6]
+    forces = np.stack([push, last_push, previous_push])[:, :, 3:6]
     size = np.sqrt((forces * forces).sum(axis=2))
-    unit = np.repeat(last[:, 6:], 7, axis=1)
+    unit = np.repeat(last_push[:, 6:], 7, axis=1)
     unit[:, 3:6] = size[1][:, None]
     unit[unit == 0.0] = 1.0
-    way, further = (last - previous) / unit, (push - last) / unit
+    way, further = (last_push - previous_push) / unit, (push - last_push) / unit
     square = (way * way).sum(axis=1)
     known = size.all(axis=0) & (square > 0.0)
     share = (further * way).sum(axis=1) / np.where(known, square, 1.0)
     return np.where(known, share.clip(MIN_FACTOR, MAX_FACTOR), 0.0)
 
 
-def has_warm_state(warm: Mapping[str, Any], last: np.ndarray) -> bool:
-    """Return True if the warm-start data contain finite values of the state before the solutions `last` (3N, B)."""
+def has_warm_state(warm: Mapping[str, Any], last_u: np.ndarray) -> bool:
+    """Return True if the warm-start data contain finite values of the state before the solutions `last_u` (3N, B)."""
     if BEFORE_KEY not in warm or PUSHES_KEY not in warm:
         return False
-    fits = warm[BEFORE_KEY].shape == last.T.shape and warm[PUSHES_KEY].shape == (last.shape[1], 2, 7)
+    fits = warm[BEFORE_KEY].shape == last_u.T.shape and warm[PUSHES_KEY].shape == (last_u.shape[1], 2, 7)
     return fits and is_all_finite(warm[BEFORE_KEY]) and is_all_finite(warm[PUSHES_KEY])
 
 
-def extrapolate_start(loads: Loads, last: np.ndarray, warm: Mapping[str, Any]) -> np.ndarray:
+def extrapolate_start(loads: Loads, last_u: np.ndarray, warm: Mapping[str, Any]) -> np.ndarray:
     """Return extrapolated starts (3N, B) [m], or the last solutions (3N, B) without data for an extrapolation."""
     now = as_pushes(loads)
-    if now is None or not has_warm_state(warm, last):
-        return last
+    if now is None or not has_warm_state(warm, last_u):
+        return last_u
     came, before = warm[PUSHES_KEY][:, 0], warm[PUSHES_KEY][:, 1]
-    return last + compute_factors(now, came, before) * (last - warm[BEFORE_KEY].T)
+    return last_u + compute_factors(now, came, before) * (last_u - warm[BEFORE_KEY].T)
 
 
 def compute_directions(
-    push: np.ndarray | None, last: np.ndarray | None, warm: Mapping[str, Any]
+    push: np.ndarray | None, last_u: np.ndarray | None, warm: Mapping[str, Any]
 ) -> dict[str, np.ndarray]:
-    """Return the warm-start entries of solutions to pushes (B, 7) that started from the solutions `last` (3N, B)."""
+    """Return the warm-start entries of solutions to pushes (B, 7) that started from the solutions `last_u` (3N, B)."""
     if push is None:
         return {}
-    if last is None or PUSHES_KEY not in warm or warm[PUSHES_KEY].shape != (len(push), 2, 7):
+    if last_u is None or PUSHES_KEY not in warm or warm[PUSHES_KEY].shape != (len(push), 2, 7):
         return {PUSHES_KEY: np.stack([push, push], axis=1)}
-    return {PUSHES_KEY: np.stack([push, warm[PUSHES_KEY][:, 0]], axis=1), BEFORE_KEY: last.T}
+    return {PUSHES_KEY: np.stack([push, warm[PUSHES_KEY][:, 0]], axis=1), BEFORE_KEY: last_u.T}

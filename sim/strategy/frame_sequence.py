@@ -131,7 +131,7 @@ class FrameSequence:
         point, force, radius = now[0, :3], now[0, 3:6], now[0, 6]
         self._last = self._here = _return_none
         found = self._frame.solve_push(point, radius, force, share)
-        if found[STATUS] != DONE or self._inversion.find_suspect(found[INVERTED]):
+        if found[STATUS] != DONE or self._inversion.find_unreliable(found[INVERTED]):
             return None
         self._frame.update_model(found[STEPS])
         warm = DeviceWarmStart(way, self._frame.state, self._lock, self._frame.bent)
@@ -159,19 +159,19 @@ class FrameSequence:
         self._last, self._here = ref(result), ref(warm)
         return result
 
-    def _load_start(self, loads: Loads, start: Deformation, last: np.ndarray) -> bool:
+    def _load_start(self, loads: Loads, start: Deformation, last_u: np.ndarray) -> bool:
         """Load a start to the device; return False if the start is not usable."""
         cases = Cases(loads, start.time, start.memory, warm=start.warm)
         self._problem.begin(cases)
-        u = self._problem.device.upload(last)
-        if self._problem.compute_gap(u)[1].any() or self._inversion.find_suspect(self._inversion.count(u)).any():
+        u = self._problem.device.upload(last_u)
+        if self._problem.compute_gap(u)[1].any() or self._inversion.find_unreliable(self._inversion.count(u)).any():
             return False
         here = self._here()
         if here is not None:
             here.copy_to_host()
         self._last = self._here = _return_none
-        past = start.warm[BEFORE_KEY].T if has_warm_state(start.warm, last) else None
-        self._frame.load_state(last, past, restore_history(cases, len(last)), self._get_updated_model(start.warm))
+        past = start.warm[BEFORE_KEY].T if has_warm_state(start.warm, last_u) else None
+        self._frame.load_state(last_u, past, restore_history(cases, len(last_u)), self._get_updated_model(start.warm))
         return True
 
     def _get_updated_model(self, warm: Mapping[str, Any]) -> UpdatedModel | None:

@@ -42,31 +42,32 @@ class MemoryEstimate:
         Number of mesh nodes, and element type.
     device
         Device of the FEM.
-    setup, constant, per_load
+    setup_bytes, constant_bytes, bytes_per_load
         Peak memory during set-up; constant memory afterwards; additional memory per load of a batch.
     batch
         Number of loads solved together.
-    free
+    free_bytes
         Free memory of the device that one process may use.
     """
 
     nodes: int
     element: str
     device: Device
-    setup: int
-    constant: int
-    per_load: int
+    setup_bytes: int
+    constant_bytes: int
+    bytes_per_load: int
     batch: int
-    free: int
+    free_bytes: int
 
     @property
-    def peak(self) -> int:
+    def peak_bytes(self) -> int:
         """Peak memory [bytes]; this includes that the workspace of a batch may be wider than the batch."""
-        return max(self.setup, self.constant + find_workspace_width(self.device, self.batch) * self.per_load)
+        workspace_bytes = find_workspace_width(self.device, self.batch) * self.bytes_per_load
+        return max(self.setup_bytes, self.constant_bytes + workspace_bytes)
 
     def __str__(self) -> str:
         loads = f"{self.batch} loads together" if self.batch > 1 else "one load at a time"
-        taken, free = format_gigabytes(self.peak), format_gigabytes(self.free)
+        taken, free = format_gigabytes(self.peak_bytes), format_gigabytes(self.free_bytes)
         return f"{self.nodes:,} nodes ({self.element}), {loads}: about {taken} of {self.device.name}, {free} free"
 
     def check_fits(self, budget: MemoryBudget = BUDGET) -> MemoryEstimate:
@@ -77,11 +78,11 @@ class MemoryEstimate:
         InputError
             There is too little free memory; the message gives the demand, the free memory, and a size that fits.
         """
-        room = budget.fraction * self.free
-        if self.peak <= room:
+        room = budget.fraction * self.free_bytes
+        if self.peak_bytes <= room:
             return self
-        fitting = find_widest_workspace(self.device, int((room - self.constant) / self.per_load))
-        fits = self.setup <= room and fitting > 0
+        fitting = find_widest_workspace(self.device, int((room - self.constant_bytes) / self.bytes_per_load))
+        fits = self.setup_bytes <= room and fitting > 0
         raise InputError(f"{self}: {f'a --batch of {fitting} fits.' if fits else MESH_REMEDY}")
 
 
@@ -91,12 +92,12 @@ def estimate_fem_memory(
     accuracy: Accuracy,
     device: str,
     batch: int | None,
-    loads: int,
-    processes: int = 1,
+    load_count: int,
+    process_count: int = 1,
 ) -> MemoryEstimate | None:
     """Return the estimated GPU memory of `Fem` for a number of loads; None on the CPU, where each batch is checked.
 
-    If `batch` is None, the largest batch that fits is assumed. `processes` processes share the GPU equally.
+    If `batch` is None, the largest batch that fits is assumed. `process_count` processes share the GPU equally.
 
     Raises
     ------
@@ -107,9 +108,9 @@ def estimate_fem_memory(
     if not where.on_cuda:
         return None
     space = discretise(anatomy.mesh, element)
-    free = measure_free_bytes(where) // processes
-    inverted = _find_invertible(_list_unknowns(space, anatomy), where)
-    return compute_memory(space, where, inverted, batch, loads, free)
+    free = measure_free_bytes(where) // process_count
+    inverted = _find_invertible_unknowns(_list_unknowns(space, anatomy), where)
+    return compute_memory(space, where, inverted, batch, load_count, free)
 
 
 def compute_memory(
@@ -117,7 +118,7 @@ def compute_memory(
     device: Device,
     inverted_rows: int,
     batch: int | None,
-    loads: int,
+    load_count: int,
     free_bytes: int,
     budget: MemoryBudget = BUDGET,
 ) -> MemoryEstimate:
@@ -129,7 +130,7 @@ def compute_memory(
     if batch is None:
         batch = choose_batch_size(rows, device, free_bytes - tables - left, budget)
     nodes, setup, constant = len(space.mesh.nodes), tables + taken, tables + left
-    return MemoryEstimate(nodes, space.element, device, setup, constant, column, min(batch, loads), free_bytes)
+    return MemoryEstimate(nodes, space.element, device, setup, constant, column, min(batch, load_count), free_bytes)
 
 
 def _list_unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
@@ -138,7 +139,7 @@ def _list_unknowns(space: Discretisation, anatomy: Anatomy) -> tuple[int, ...]:
     return (int((~space.extend_fixed(anatomy.fixed)).sum()), corners) if space.element == "p2" else (corners,)
 
 
-def _find_invertible(unknowns: tuple[int, ...], device: Device) -> int:
+def _find_invertible_unknowns(unknowns: tuple[int, ...], device: Device) -> int:
     """Return the first number in `unknowns` whose inverse fits the GPU, else that of the coarsest multigrid level."""
     from ..linalg.dense_inverse import can_invert
 

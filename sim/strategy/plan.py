@@ -60,7 +60,7 @@ class SolverPlan:
     ----------
     preconditioner
         Name of the preconditioner, from `get_preconditioner_name`.
-    batched, single
+    batch_solver, single_solver
         Local solver that is tried first for `PLAN_LIMITS.min_shared_cases` loads or more, and for one load; or None.
     contact_solver
         Solver that is tried first for loads with tools of prescribed pose; None without such tools.
@@ -76,8 +76,8 @@ class SolverPlan:
     """
 
     preconditioner: str
-    batched: SolverStep | None
-    single: SolverStep | None
+    batch_solver: SolverStep | None
+    single_solver: SolverStep | None
     contact_solver: SolverStep | None
     uses_lbfgs: bool
     captures_frames: bool
@@ -87,15 +87,16 @@ class SolverPlan:
     max_load_steps: int
     batch: int
 
-    def choose_local(self, count: int) -> SolverStep | None:
-        """Return the local solver that is tried first for `count` loads together, or None."""
-        return self.batched if count >= PLAN_LIMITS.min_shared_cases else self.single if count == 1 else None
+    def choose_local_solver(self, case_count: int) -> SolverStep | None:
+        """Return the local solver that is tried first for `case_count` loads together, or None."""
+        single = self.single_solver if case_count == 1 else None
+        return self.batch_solver if case_count >= PLAN_LIMITS.min_shared_cases else single
 
     def list_steps(self, count: int, imposed: bool = False) -> tuple[SolverStep, ...]:
         """Return the solvers for `count` loads together, in order; `imposed` is True if loads prescribe motion."""
         if imposed or not self.uses_lbfgs:
             return (SolverStep.NEWTON,)
-        first = self.choose_local(count)
+        first = self.choose_local_solver(count)
         return (*([] if first is None else [first]), SolverStep.LBFGS, SolverStep.NEWTON)
 
     def explain(self) -> tuple[str, ...]:
@@ -110,12 +111,12 @@ class SolverPlan:
         elif not self.uses_lbfgs:
             lines.append(f"Every load is solved by {SolverStep.NEWTON.value}, in at most {self.max_outer} iterations.")
         else:
-            if self.batched:
+            if self.batch_solver:
                 lines.append(
-                    f"Batches of {PLAN_LIMITS.min_shared_cases} loads and more begin with {self.batched.value}."
+                    f"Batches of {PLAN_LIMITS.min_shared_cases} loads and more begin with {self.batch_solver.value}."
                 )
-            if self.single:
-                lines.append(f"A single load begins with {self.single.value}.")
+            if self.single_solver:
+                lines.append(f"A single load begins with {self.single_solver.value}.")
             lines.append(f"{SolverStep.LBFGS.value} takes what is left, in at most {self.max_evaluations} evaluations.")
             lines.append(f"{SolverStep.NEWTON.value} solves what remains, in at most {self.max_outer} iterations.")
             lines.append(f"Loads that prescribe motion are solved by {SolverStep.NEWTON.value} alone.")
@@ -135,12 +136,12 @@ def choose_plan(
     space: Discretisation,
     accuracy: Accuracy,
     batch: int,
-    live: bool = False,
+    is_live: bool = False,
     excluded: Collection[SolverStep] = (),
 ) -> SolverPlan:
     """Return the solver plan of a problem; solvers are chosen only here.
 
-    `batch` loads are solved together unless a solver handles loads one by one; `live` loads arrive one at a time.
+    `batch` loads are solved together unless a solver handles loads one by one; loads arrive one at a time if `is_live`.
     Solvers in `excluded` are not used, except Newton-CG, which cannot be excluded.
     """
     cuda, exact = problem.device.on_cuda, is_exact(preconditioner)
@@ -151,7 +152,7 @@ def choose_plan(
     if elastic and not cuda:
         if space.element == "p2" and isinstance(preconditioner, TwoLevelCycle):
             single = SolverStep.CLAMPED
-        elif live and strained:
+        elif is_live and strained:
             single = SolverStep.STRAINED
     contact = None
     if problem.barriers:
@@ -166,8 +167,8 @@ def choose_plan(
     most = most if accuracy.evaluations is None else min(most, accuracy.evaluations)
     return SolverPlan(
         preconditioner=get_preconditioner_name(preconditioner),
-        batched=SolverStep.NEAR if small and exact and SolverStep.NEAR not in excluded else None,
-        single=single,
+        batch_solver=SolverStep.NEAR if small and exact and SolverStep.NEAR not in excluded else None,
+        single_solver=single,
         contact_solver=contact,
         uses_lbfgs=quick and most > 0 and SolverStep.LBFGS not in excluded,
         captures_frames=following and most >= MAX_FRAME_EVALUATIONS and SolverStep.FRAME not in excluded,
@@ -190,10 +191,10 @@ def build_local_solvers(
 ) -> tuple[Callable[[], BatchElimination | None], Alone | None]:
     """Return the local solvers of a plan: a function that builds the solver for many loads; the solver for one load."""
     build = partial(build_batch_elimination, problem, preconditioner, effects, space)
-    near = cache(build if plan.batched else lambda: None)
-    if plan.single is SolverStep.CLAMPED:
+    near = cache(build if plan.batch_solver else lambda: None)
+    if plan.single_solver is SolverStep.CLAMPED:
         return near, ClampedElimination(problem, preconditioner, effects, space)
-    if plan.single is SolverStep.STRAINED:
+    if plan.single_solver is SolverStep.STRAINED:
         assert isinstance(preconditioner, SparseFactor)
         return near, StrainedDescent(problem, preconditioner, build_strained_part(problem, preconditioner, space))
     return near, None

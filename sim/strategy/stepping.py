@@ -65,38 +65,38 @@ class LoadProgress:
 
     Parameters
     ----------
-    reached, step
+    reached_fraction, next_step
         Fraction (b,) of the load at the last equilibrium, and length (b,) of the next step.
-    gaps
+    path_in_gaps
         Length (b,) of the whole tool path, in units of the gap.
     """
 
-    reached: np.ndarray
-    step: np.ndarray
-    gaps: np.ndarray
+    reached_fraction: np.ndarray
+    next_step: np.ndarray
+    path_in_gaps: np.ndarray
 
     @classmethod
-    def start(cls, first: float, gaps: np.ndarray) -> Self:
-        """Return the progress at fraction 0, with a next step of length `first`."""
-        return cls(np.zeros(len(gaps)), np.full(len(gaps), first), gaps)
+    def start(cls, first_step: float, gaps: np.ndarray) -> Self:
+        """Return the progress at fraction 0, with a next step of length `first_step`."""
+        return cls(np.zeros(len(gaps)), np.full(len(gaps), first_step), gaps)
 
     def limit_steps(self, max_steps: np.ndarray, stepping: LoadStepping) -> tuple[np.ndarray, np.ndarray]:
         """Limit steps to `max_steps` (b,); return masks (b,) of cases with shorter steps and of cases to continue."""
-        shorter = self.step < max_steps
-        np.minimum(self.step, max_steps, out=self.step)
-        long_enough = self.step >= stepping.min_step * np.minimum(1.0, 4.0 * max_steps)
-        return shorter, (self.reached < 1.0) & long_enough
+        shorter = self.next_step < max_steps
+        np.minimum(self.next_step, max_steps, out=self.next_step)
+        long_enough = self.next_step >= stepping.min_step * np.minimum(1.0, 4.0 * max_steps)
+        return shorter, (self.reached_fraction < 1.0) & long_enough
 
     def propose_fractions(self, rows: np.ndarray) -> tuple[np.ndarray, float]:
         """Return the next fractions (k,) of the cases `rows` (k,), and the longest path of their tools [gaps]."""
-        aim = np.minimum(self.reached[rows] + self.step[rows], 1.0)
-        return aim, float(((aim - self.reached[rows]) * self.gaps[rows]).max())
+        aim = np.minimum(self.reached_fraction[rows] + self.next_step[rows], 1.0)
+        return aim, float(((aim - self.reached_fraction[rows]) * self.path_in_gaps[rows]).max())
 
     def take_steps(self, rows: np.ndarray, fractions: np.ndarray, good: np.ndarray) -> None:
         """Accept the steps of those cases `rows` (k,) that are `good`, and set their fraction to `fractions` (k,)."""
-        self.reached[rows[good]] = fractions[good]
+        self.reached_fraction[rows[good]] = fractions[good]
 
     def resize_steps(self, rows: np.ndarray, good: np.ndarray, growth: np.ndarray, shrink: float, widen: float) -> None:
         """Increase the steps of `good` cases in `rows` (k,); multiply other steps by `shrink`, and gaps by `widen`."""
-        self.gaps[rows] *= np.where(good, 1.0, widen)
-        self.step[rows] *= np.where(good, np.clip(growth, 0.5, 2.0), shrink)
+        self.path_in_gaps[rows] *= np.where(good, 1.0, widen)
+        self.next_step[rows] *= np.where(good, np.clip(growth, 0.5, 2.0), shrink)

@@ -92,7 +92,7 @@ class Strategy:
 
     def get_local_solver(self, count: int) -> BatchElimination | Alone | None:
         """Return the local solver for `count` loads, or None."""
-        step = self.plan.choose_local(count)
+        step = self.plan.choose_local_solver(count)
         return None if step is None else self.build_batch_solver() if step is SolverStep.NEAR else self.single_solver
 
     @cached_property
@@ -127,7 +127,7 @@ class Strategy:
                 cases = replace(cases, restarted=astray.copy())
                 problem.begin(cases)
             result = self._solve_whole_load(cases, device.upload(np.where(astray, 0.0, guess)), history)
-            lost = np.where(result.good, self.inversion.find_suspect(result.inverted), self._find_unsolved(result))
+            lost = np.where(result.good, self.inversion.find_unreliable(result.inverted), self._find_unsolved(result))
             again = np.flatnonzero(started & ~astray & lost)
             if len(again):
                 astray[again] = True
@@ -171,7 +171,7 @@ class Strategy:
             if inverted.any():
                 fewer = self.inversion.count(device.upload(other))
                 guess, inverted = np.where(fewer < inverted, other, guess), np.minimum(fewer, inverted)
-        return guess, self.inversion.find_suspect(inverted)
+        return guess, self.inversion.find_unreliable(inverted)
 
     def _find_unsolved(self, result: SolverResult) -> np.ndarray:
         """Return a mask (B,) of cases that another solver may solve; at round-off, no solver improves the result."""
@@ -210,11 +210,11 @@ class Strategy:
             outcome[found.status == DONE], outcome[found.status == NOT_FINITE] = Outcome.CONVERGED, Outcome.NOT_FINITE
             result.replace_cases(index, self._build_result(found.u, outcome, found.steps, found.residual, 0), device)
             gained = found.warm_start
-            index = index[found.unfinished]
+            index = index[found.unfinished_cases]
             if len(index) == 0:
                 break
             problem.begin(cases.select(index))
-            start = gather_columns(device, found.u, found.unfinished)
+            start = gather_columns(device, found.u, found.unfinished_cases)
         else:
             result.replace_cases(index, self._run_newton(start, self.accuracy.outer), device)
         return replace(result, warm_start=gained)
@@ -282,10 +282,10 @@ class Strategy:
         reached = np.array([ended.good for ended in outcome], float)
         return SolverResult(u, outcome, steps, residual, reached, self.inversion.count(u), linear_iterations)
 
-    def _raise_load(self, cases: Cases, failed: SolverResult, index: np.ndarray) -> SolverResult:
+    def _raise_load(self, cases: Cases, result: SolverResult, index: np.ndarray) -> SolverResult:
         """Return the equilibrium at the largest load fraction found by adaptive load steps from the undeformed state.
 
-        The cases are the rows `index` (k,) of `failed`, whose result is kept if no larger fraction is found.
+        The cases are the rows `index` (k,) of `result`, which is kept if no larger fraction is found.
         """
         problem, device = self.problem, self.problem.device
         cases = replace(cases, restarted=np.ones(len(index), bool))
@@ -295,11 +295,11 @@ class Strategy:
 
         start = device.allocate(problem.rows, len(index))
         found = self._solve_in_steps(cases, start, scale_loads, self.stepping.first_step, self.accuracy.steps)
-        outcome = failed.outcome[index]
+        outcome = result.outcome[index]
         outcome[found.reached == 1.0] = Outcome.CONVERGED_IN_STEPS
-        none = np.flatnonzero(found.reached <= failed.reached[index])
-        scatter_columns(device, failed.u, none, found.u, index[none])
-        found.residual[none], found.reached[none] = failed.residual[index[none]], failed.reached[index[none]]
+        none = np.flatnonzero(found.reached <= result.reached[index])
+        scatter_columns(device, result.u, none, found.u, index[none])
+        found.residual[none], found.reached[none] = result.residual[index[none]], result.reached[index[none]]
         return replace(found, outcome=outcome, inverted=self.inversion.count(found.u))
 
     def _move_tools(self, cases: Cases, start: wp.array) -> SolverResult:
@@ -325,25 +325,25 @@ class Strategy:
         return result
 
     def _solve_in_steps(
-        self, cases: Cases, start: wp.array, build: Callable[[Cases, np.ndarray], Cases], first_step: float, most: int
+        self, cases: Cases, start: wp.array, scale: Callable[[Cases, np.ndarray], Cases], first_step: float, limit: int
     ) -> SolverResult:
         """Solve for cases at growing fractions from `start` (3N, b); return the equilibrium at the largest fraction.
 
-        `build` returns the cases at fractions (b,). The first step has the length `first_step`. Steps are limited by
-        the motion that tools may make at once, and at most `most` steps may be shorter than this limit. A good outcome
+        `scale` returns the cases at fractions (b,). The first step has the length `first_step`. Steps are limited by
+        the motion that tools may make at once, and at most `limit` steps may be shorter than this limit. A good outcome
         requires the fraction 1; at smaller fractions, a residual at round-off is also accepted.
         """
         problem, device, count = self.problem, self.problem.device, len(cases.loads)
         gaps = np.maximum.reduce([np.zeros(count), *(term.compute_path_in_gaps(cases) for term in problem.barriers)])
         shares = LoadProgress.start(first_step, gaps)
-        u, left, done = wp.clone(start), most, 1
+        u, left, done = wp.clone(start), limit, 1
         none, outcome = np.zeros(count, int), np.full(count, Outcome.BUDGET, object)
-        result = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached, none.copy(), 0)
+        result = SolverResult(u, outcome, none, np.full(count, np.inf), shares.reached_fraction, none.copy(), 0)
         outer = self.accuracy.outer
         wanted = outer if problem.barriers else self.stepping.target_iterations
         outer = outer if problem.barriers else min(self.stepping.max_iterations, outer)
         while left >= 0:
-            strides = [term.compute_stride(build(cases, shares.reached), u) for term in problem.barriers]
+            strides = [term.compute_stride(scale(cases, shares.reached_fraction), u) for term in problem.barriers]
             shorter, going = shares.limit_steps(np.minimum.reduce([np.ones(count), *strides]), self.stepping)
             rows = np.flatnonzero(going & (result.iterations < self.accuracy.most))
             patience = self.stepping.patience * self.accuracy.inner * done
@@ -351,7 +351,7 @@ class Strategy:
                 break
             aim, travel = shares.propose_fractions(rows)
             left -= int(shorter[rows].any())
-            part = build(cases.select(rows), aim)
+            part = scale(cases.select(rows), aim)
             found = self._solve_contact(part, gather_columns(device, u, rows), outer, travel)
             good = found.good | ((found.outcome == Outcome.ROUND_OFF) & (aim < 1.0))
             done += int(good.any())
@@ -365,17 +365,17 @@ class Strategy:
             if count == 1:
                 cases = replace(cases, warm={**cases.warm, **found.warm_start})
                 result = replace(result, warm_start=found.warm_start)
-        return self._mark_bad(cases, build, result)
+        return self._mark_failed_cases(cases, scale, result)
 
-    def _mark_bad(
-        self, cases: Cases, build: Callable[[Cases, np.ndarray], Cases], result: SolverResult
+    def _mark_failed_cases(
+        self, cases: Cases, scale: Callable[[Cases, np.ndarray], Cases], result: SolverResult
     ) -> SolverResult:
         """Return the result after the last step, with marks for cases pierced by a tool or below the whole load."""
         problem, u, outcome, reached = self.problem, result.u, result.outcome, result.reached
         short = np.flatnonzero(reached < 1.0)
         outcome[short] = [Outcome.BUDGET if ended.good else ended for ended in outcome[short]]
         if problem.barriers and len(short) < len(reached):
-            problem.begin(build(cases, np.ones(len(reached))))
+            problem.begin(scale(cases, np.ones(len(reached))))
             buried = np.logical_or.reduce([term.find_penetrating(u) for term in problem.barriers])
             pierced = (problem.find_overlaps(u)[0] | buried) & (reached == 1.0)
             outcome[pierced], reached[pierced] = Outcome.PIERCED, 0.0

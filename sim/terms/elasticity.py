@@ -298,9 +298,9 @@ def _build_unit_element(elements: Elements) -> Elements:
     return Elements(table, slope, weight, 4, np.zeros(1, int), mark, size)
 
 
-def _get_coefficients(part: _Part, numbers: wp.array | None) -> wp.array:
-    """Return the coefficients of a block: its own, or its rows of `numbers` (T, q, k, b) if these vary."""
-    return part.coefficients if numbers is None else numbers[part.first : part.first + part.count]
+def _get_coefficients(part: _Part, point_coefficients: wp.array | None) -> wp.array:
+    """Return the coefficients of a block: its own, or its rows of `point_coefficients` (T, q, k, b) if these vary."""
+    return part.coefficients if point_coefficients is None else point_coefficients[part.first : part.first + part.count]
 
 
 def _slice_rows(array: wp.array, first: int, stop: int) -> wp.array:

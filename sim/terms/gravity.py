@@ -103,16 +103,16 @@ PRISM = np.array([[0, 1, 2, 5], [0, 1, 4, 5], [0, 3, 4, 5]])
 PART_TETS = {1: np.array([[0, 1, 2, 3]]), 2: PRISM, 3: PRISM}  # tetrahedra of the part, by number of corners below
 
 
-def cut_below_plane(height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def cut_below_plane(heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return disjoint tetrahedra that fill the part of each tetrahedron below a plane: owners and corners.
 
-    `height` (n, 4) [m] of the corners of n tetrahedra above the plane; one to three heights are negative. Return the
+    `heights` (n, 4) [m] of the corners of n tetrahedra above the plane; one to three heights are negative. Return the
     original tetrahedron (m,) of each part, and the barycentric coordinates (m, 4, 4) of the corners of the part. The
     volume fraction of a part is |determinant|, which is continuous in the position of the plane.
     """
-    order = np.argsort(height, axis=1)
-    corner, sorted_height = np.eye(4)[order], np.take_along_axis(height, order, axis=1)
-    under = (height < 0.0).sum(axis=1)
+    order = np.argsort(heights, axis=1)
+    corner, sorted_height = np.eye(4)[order], np.take_along_axis(heights, order, axis=1)
+    under = (heights < 0.0).sum(axis=1)
     owners, parts = [np.zeros(0, int)], [np.zeros((0, 4, 4))]
     for count, ends in CUT_CORNERS.items():
         mine = np.flatnonzero(under == count)

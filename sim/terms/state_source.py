@@ -25,12 +25,12 @@ class StateSource(Protocol):
         """Number of history variables per point that `end` returns."""
         ...
 
-    def build_law(self, inner: Law, count: int) -> Law:
-        """Return a law based on `inner`, with the `count` coefficients of `inner` followed by those of the source."""
+    def build_law(self, base_law: Law, count: int) -> Law:
+        """Return a law based on `base_law`, with its `count` coefficients followed by those of the source."""
         ...
 
-    def fill(self, cases: Cases, first: int, out: wp.array) -> None:
-        """Write the coefficients of the load cases to out (T, q, n, b), from the coefficient index `first`."""
+    def fill(self, cases: Cases, first_index: int, out: wp.array) -> None:
+        """Write the coefficients of the load cases to out (T, q, n, b), from the coefficient index `first_index`."""
         ...
 
     def end(self, cases: Cases, strains: wp.array) -> np.ndarray | None:

@@ -130,13 +130,13 @@ class Swelling:
         self._theta, self._device = theta, device
         self._swells = device.upload(mask.astype(np.float64))
 
-    def build_law(self, inner: Law, count: int) -> Law:
-        """Return the law that applies `inner` to the elastic part of the deformation."""
-        return build_swollen_law(inner, self._device, count)
+    def build_law(self, base_law: Law, count: int) -> Law:
+        """Return the law that applies `base_law` to the elastic part of the deformation."""
+        return build_swollen_law(base_law, self._device, count)
 
-    def fill(self, cases: Cases, first: int, out: wp.array) -> None:
+    def fill(self, cases: Cases, first_index: int, out: wp.array) -> None:
         """Write the ratio r at every point."""
-        inputs = [self._swells, self._compute_linear_strain(cases), first]
+        inputs = [self._swells, self._compute_linear_strain(cases), first_index]
         self._device.launch(build_kernels(self._device).write_ratio, (*out.shape[:2], out.shape[3]), inputs, [out])
 
     def end(self, cases: Cases, strains: wp.array) -> None:

@@ -12,7 +12,7 @@ terms. If a law splits into deviatoric and volumetric parts, as Ogden's law, psi
 the papers. For other laws psi(Fb) must not be used: it grows faster than psi(F) under compression; tissue collapses.
 
 The stable neo-Hookean law is finite at J = 0, but Cb is not, so any load on Cb causes collapse. This law has its own
-split (`build_own_split`): mu relaxes, K does not. The potential of a step is psi - (1 - f) psi_shape + C : A / 2, and S
+split (`build_user_split`): mu relaxes, not K. The potential of a step is psi - (1 - f) psi_shape + C : A / 2, and S
 acts on C = F^T F, as in finite linear viscoelasticity: Christensen 1980, "A Nonlinear Theory of Viscoelasticity for
 Application to Elastomers", J. Appl. Mech. 47:762-768.
 """
@@ -182,13 +182,13 @@ class Prony:
         self.width = TENSOR_COMPONENTS * (most + 1)
         self._shape = len(coefficients) * points, self.width
 
-    def build_law(self, inner: Law, count: int) -> Law:
-        """Return the law `inner` with a relaxing deviatoric part."""
-        return build_relaxing_law(inner, self._device, count)
+    def build_law(self, base_law: Law, count: int) -> Law:
+        """Return the law `base_law` with a relaxing deviatoric part."""
+        return build_relaxing_law(base_law, self._device, count)
 
-    def fill(self, cases: Cases, first: int, out: wp.array) -> None:
+    def fill(self, cases: Cases, first_index: int, out: wp.array) -> None:
         """Write f - 1 and A at every point."""
-        inputs = [*self._series, *self._get_history(cases), first]
+        inputs = [*self._series, *self._get_history(cases), first_index]
         self._device.launch(self._kernels.write_relaxation, (*out.shape[:2], out.shape[3]), inputs, [out])
 
     def end(self, cases: Cases, strains: wp.array) -> np.ndarray:

@@ -146,7 +146,7 @@ class Dataset:
             ]
         lost = np.flatnonzero(~np.concatenate([whole for _, whole in rows]))
         if len(lost):
-            raise InputError(_format_damaged(self.path, lost, "answers"))
+            raise InputError(_format_damage(self.path, lost, "answers"))
         found = np.concatenate([each["reaction"] for each, _ in rows])
         return found if np.isfinite(found[self.good]).all() else None
 
@@ -174,7 +174,7 @@ class Dataset:
                 chosen.append(field[:, nodes])
         lost, strange = np.concatenate(damaged), np.concatenate(absurd)
         if len(lost):
-            raise InputError(_format_damaged(self.path, lost, group))
+            raise InputError(_format_damage(self.path, lost, group))
         if len(strange):
             raise InputError(
                 f"{self.path}: {format_row_numbers(strange)} of `{group}` move by more than the body measures, "
@@ -187,9 +187,9 @@ class Dataset:
     seconds, displacement, reaction = estimate_seconds, read_displacement, read_reaction
 
 
-def _format_damaged(path: Path, lost: np.ndarray, group: str) -> str:
+def _format_damage(path: Path, damaged_rows: np.ndarray, group: str) -> str:
     return (
-        f"{path}: {format_row_numbers(lost)} of `{group}` are damaged. Give its `sulcus simulate` again: "
+        f"{path}: {format_row_numbers(damaged_rows)} of `{group}` are damaged. Give its `sulcus simulate` again: "
         "it solves those alone; simulate data of an earlier version again."
     )
 

@@ -158,8 +158,8 @@ def simulate(
         before = _read_earlier_loads(path, stated, loads)
         if len(before) > len(loads):
             work = SimulationPlan(deformer.anatomy, before, nodes, batch)
-        finished = _find_whole_batches(path, work)
-        if not partial.exists() and not set(work.batches) - finished and _has_same_body(path, work):
+        finished = _find_complete_batches(path, work)
+        if not partial.exists() and not set(work.batches) - finished and _has_same_anatomy(path, work):
             return SimulatedRows()
     size = sum(work.get_row_type(group).itemsize * rows for group, rows in work.row_counts.items())
     held = partial.stat().st_size if partial.exists() else 0
@@ -177,19 +177,19 @@ def simulate(
 
 
 def _fill_journal(
-    journal: Journal, work: SimulationPlan, deformer: Deformer | SolverPool, finished: set[Batch],
+    journal: Journal, plan: SimulationPlan, deformer: Deformer | SolverPool, finished_batches: set[Batch],
     progress: Callable[[int, int], None],
 ) -> dict[str, int]:  # fmt: skip
     """Solve the batches that neither the journal nor the finished file has; return the numbers of solved rows."""
-    known = [batch for batch in work.batches if batch in finished or batch in journal]
-    total, done = sum(work.row_counts.values()), sum(len(work.list_rows(batch)) for batch in known)
-    solved = dict.fromkeys(work.row_counts, 0)
+    known = [batch for batch in plan.batches if batch in finished_batches or batch in journal]
+    total, done = sum(plan.row_counts.values()), sum(len(plan.list_rows(batch)) for batch in known)
+    solved = dict.fromkeys(plan.row_counts, 0)
     progress(done, total)
     with ThreadPoolExecutor(1) as writer:
-        for name in work.row_counts:
+        for name in plan.row_counts:
             written: Future[None] | None = None
             with time_stage(STAGES[name]):
-                left = [work.build_task(batch) for batch in work.batches if batch[0] == name and batch not in known]
+                left = [plan.build_task(batch) for batch in plan.batches if batch[0] == name and batch not in known]
                 for task, rows in solve_batches(deformer, left):
                     if written is not None:
                         written.result()
@@ -202,7 +202,7 @@ def _fill_journal(
     return solved
 
 
-def _compute_rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
+def _compute_rates(path: Path, solve_counts: Mapping[str, int], seconds: Mapping[str, float]) -> dict[str, str]:
     """Compute wall times per solve [s] of the groups solved now; other groups keep the values of the finished file.
 
     All texts have the same width, so that the file size does not depend on the number of interruptions.
@@ -213,14 +213,14 @@ def _compute_rates(path: Path, solved: Mapping[str, int], seconds: Mapping[str, 
             before = read_provenance(file)
     rates = {}
     for name, words in RATE_KEYS.items():
-        if solved[name]:
-            rates[words] = f"{seconds[STAGES[name]] / solved[name]:.3e}"
+        if solve_counts[name]:
+            rates[words] = f"{seconds[STAGES[name]] / solve_counts[name]:.3e}"
         else:
             rates[words] = before.get(words, UNKNOWN_RATE)
     return rates
 
 
-def _write_data_set(path: Path, work: SimulationPlan, provenance: Mapping[str, str], journal: Journal) -> None:
+def _write_data_set(path: Path, plan: SimulationPlan, provenance: Mapping[str, str], journal: Journal) -> None:
     """Write the data set from batches in the journal and in the finished file that it replaces."""
     with write_stream_atomically(path, path.suffix) as stream, h5py.File(stream, "w", libver=HDF5_VERSIONS) as file:
         facts = {
@@ -228,54 +228,54 @@ def _write_data_set(path: Path, work: SimulationPlan, provenance: Mapping[str, s
             "length_unit": "m",
             "force_unit": "N",
             "frame": "RAS",
-            "tool": _describe_tool(work.loads, provenance),
+            "tool": _describe_tool(plan.loads, provenance),
             "compression": "none: packed, displacements are a sixth smaller",
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "sulcus version": get_version("sulcus"),
         }
         write_provenance(file, {**facts, **provenance})
-        write_embedded_anatomy(file, work.anatomy)
-        write_loads(file, work.loads)
+        write_embedded_anatomy(file, plan.anatomy)
+        write_loads(file, plan.loads)
 
-        def kinds(group: str) -> list[tuple[str, np.dtype]]:
-            return [(item, work.get_row_type(group)[item]) for item in work.get_row_type(group).names or ()]
+        def list_array_types(group: str) -> list[tuple[str, np.dtype]]:
+            return [(item, plan.get_row_type(group)[item]) for item in plan.get_row_type(group).names or ()]
 
         arrays = {
             (name, item): group.create_dataset(item, (rows, *kind.shape), kind.base)
-            for name, rows in work.row_counts.items()
+            for name, rows in plan.row_counts.items()
             for group in [file.create_group(name)]
-            for item, kind in [*kinds(name), ("checksum", CHECKSUM_TYPE)]
+            for item, kind in [*list_array_types(name), ("checksum", CHECKSUM_TYPE)]
         }
-        file["unit/node"] = np.repeat(work.nodes, 3)
+        file["unit/node"] = np.repeat(plan.nodes, 3)
         describe_arrays(file)
 
-        def taken(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
-            kind = work.get_row_type(batch[0])
-            rows = np.frombuffer(journal.read(batch), kind) if batch in journal else _read_kept_rows(path, work, batch)
+        def read_rows_of_batch(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+            kind = plan.get_row_type(batch[0])
+            rows = np.frombuffer(journal.read(batch), kind) if batch in journal else _read_old_rows(path, plan, batch)
             return rows, compute_row_checksums(rows)
 
-        for batch, (rows, sums) in _compute_ahead(taken, work.batches):
+        for batch, (rows, sums) in _compute_concurrently(read_rows_of_batch, plan.batches):
             here = slice(batch[1], batch[1] + len(rows))
-            for item, _ in kinds(batch[0]):
+            for item, _ in list_array_types(batch[0]):
                 arrays[batch[0], item][here] = rows[item]
             arrays[batch[0], "checksum"][here] = sums
 
 
-def _compute_ahead(compute: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
+def _compute_concurrently(function: Callable[[Batch], T], batches: Sequence[Batch]) -> Iterator[tuple[Batch, T]]:
     """Yield each batch with its result, in order, while a second thread computes the next result."""
     with ThreadPoolExecutor(1) as maker:
-        coming = [maker.submit(compute, batch) for batch in batches[:1]]
+        coming = [maker.submit(function, batch) for batch in batches[:1]]
         for batch, following in zip(batches, [*batches[1:], None], strict=True):
             ready = coming.pop().result()
             if following is not None:
-                coming.append(maker.submit(compute, following))
+                coming.append(maker.submit(function, following))
             yield batch, ready
 
 
-def _read_kept_rows(path: Path, work: SimulationPlan, batch: Batch) -> np.ndarray:
+def _read_old_rows(path: Path, plan: SimulationPlan, batch: Batch) -> np.ndarray:
     """Read a batch's rows from a finished file, and check them for damage again."""
     with h5py.File(path, "r") as before:
-        rows, good = _read_batch(before, work, batch)
+        rows, good = _read_batch(before, plan, batch)
     if not good.all():
         raise InputError(f"{path}: corrupted rows were found: run the command again to recompute them.")
     return rows
@@ -288,10 +288,10 @@ def _describe_tool(loads: Loads, provenance: Mapping[str, str]) -> str:
     return f"the rigid tool {provenance.get('shape', 'not stated')}, sizes in m, moved by pose: see loads/Touching"
 
 
-def _read_batch(file: h5py.File, work: SimulationPlan, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+def _read_batch(file: h5py.File, plan: SimulationPlan, batch: Batch) -> tuple[np.ndarray, np.ndarray]:
     """Read a batch's rows from a finished file; return the rows and the mask of undamaged ones."""
-    rows = work.list_rows(batch)
-    return read_rows(file, batch[0], len(work.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
+    rows = plan.list_rows(batch)
+    return read_rows(file, batch[0], len(plan.anatomy.mesh.nodes), int(rows[0]), int(rows[-1]) + 1)
 
 
 def _read_earlier_loads(path: Path, provenance: Mapping[str, str], loads: Loads) -> Loads:
@@ -308,29 +308,29 @@ def _read_earlier_loads(path: Path, provenance: Mapping[str, str], loads: Loads)
     return before
 
 
-def _has_same_body(path: Path, work: SimulationPlan) -> bool:
+def _has_same_anatomy(path: Path, plan: SimulationPlan) -> bool:
     """Return True if the anatomy in a finished file is undamaged and that of the plan."""
     with h5py.File(path, "r") as file:
         try:
-            return read_embedded_anatomy(file).digest == work.anatomy.digest
+            return read_embedded_anatomy(file).digest == plan.anatomy.digest
         except InputError:
             return False
 
 
-def _find_whole_batches(path: Path, work: SimulationPlan) -> set[Batch]:
+def _find_complete_batches(path: Path, plan: SimulationPlan) -> set[Batch]:
     """Return the batches with undamaged rows in a finished file.
 
     A short last batch of the file is used only if it is also the plan's last: else its rows belong to a longer batch.
     """
     held, damaged = set(), []
     with wrap_errors(path, "a data set", "Delete it, or choose another --out."), h5py.File(path, "r") as file:
-        rows = {name: len(read_array(file, f"{name}/checksum", "u")) for name in work.row_counts}
-        for batch in work.batches:
-            numbers = work.list_rows(batch)
+        rows = {name: len(read_array(file, f"{name}/checksum", "u")) for name in plan.row_counts}
+        for batch in plan.batches:
+            numbers = plan.list_rows(batch)
             if numbers[-1] < rows[batch[0]] and (
-                rows[batch[0]] == work.row_counts[batch[0]] or len(numbers) == work.batch_size
+                rows[batch[0]] == plan.row_counts[batch[0]] or len(numbers) == plan.batch_size
             ):
-                good = _read_batch(file, work, batch)[1]
+                good = _read_batch(file, plan, batch)[1]
                 damaged += [f"row {row} of `{batch[0]}`" for row in numbers[~good]]
                 held |= {batch} if good.all() else set()
     if damaged:

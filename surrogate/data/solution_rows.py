@@ -68,13 +68,13 @@ def get_row_dtype(vertex_count: int, tool_count: int = 0) -> np.dtype:
     )
 
 
-def to_rows(result: Deformation, unit: float, tool_count: int = 0) -> np.ndarray:
-    """Convert results at all mesh vertices to rows (B,), with displacements divided by `unit`.
+def to_rows(result: Deformation, displacement_unit: float, tool_count: int = 0) -> np.ndarray:
+    """Convert results at all mesh vertices to rows (B,), with displacements divided by `displacement_unit`.
 
     The reactions of `tool_count` tools moved by pose are NaN if the result does not contain them.
     """
     rows = np.empty(len(result), get_row_dtype(result.displacement.shape[1], tool_count))
-    rows["displacement"] = result.displacement / unit if unit != 1.0 else result.displacement
+    rows["displacement"] = result.displacement / displacement_unit if displacement_unit != 1.0 else result.displacement
     rows["outcome"] = [outcome.name for outcome in result.outcome]
     rows["iterations"] = result.iterations
     rows["residual"] = result.residual

@@ -75,11 +75,11 @@ class Solver:
 
 
 @contextmanager
-def open_solvers(fem: LazyFem, devices: Sequence[str], report: Callable[[str], object]) -> Iterator[Solver]:
+def open_solvers(fem: LazyFem, devices: Sequence[str], write_message: Callable[[str], object]) -> Iterator[Solver]:
     """Open FEM solvers on each of the devices, as a context manager; one device is used in this process.
 
     If `fem.batch` is None, the largest batch size that fits in memory is used, and GPUs get equal numbers of batches.
-    `report` first receives a description of the memory that each GPU requires.
+    `write_message` first receives a description of the memory that each GPU requires.
 
     Raises
     ------
@@ -90,13 +90,13 @@ def open_solvers(fem: LazyFem, devices: Sequence[str], report: Callable[[str], o
     """
     if len(devices) == 1:
         own = replace(fem, device=devices[0])
-        _check_all_fit([own.required_memory], report)
+        _check_all_fit([own.required_memory], write_message)
         yield Solver(own, *describe_fem_task(own, None))
         return
     most, own = max(devices.count(name) for name in devices), -(-fem.load_count // len(devices))
     with process_pool(devices, place_on_device, replace(fem, process_count=most, load_count=own)) as children:
         none = [None] * len(devices)
-        _check_all_fit(run_on_each(children, estimate_memory, none), report)
+        _check_all_fit(run_on_each(children, estimate_memory, none), write_message)
         elements, words, batches = zip(*run_on_each(children, describe_fem_task, none), strict=True)
         batch = min(batches)
         if fem.batch is None and devices[0].startswith("cuda"):
@@ -130,8 +130,8 @@ def choose_even_batch(max_batch: int, load_count: int, device_count: int) -> int
     return max(1, -(-load_count // (max(rounds, 1) * device_count)))
 
 
-def _check_all_fit(estimates: Sequence[MemoryEstimate | None], report: Callable[[str], object]) -> None:
+def _check_all_fit(estimates: Sequence[MemoryEstimate | None], write_message: Callable[[str], object]) -> None:
     for each in dict.fromkeys(map(str, filter(None, estimates))):
-        report(f"{each}.")
+        write_message(f"{each}.")
     for each in filter(None, estimates):
         each.check_fits()

@@ -9,7 +9,7 @@ from sim.loads import Pushed
 
 from .cortex_patch import Patch, find_nearest
 from .encode import split_forces
-from .tool_loads import find_perpendiculars, select_spread
+from .tool_loads import find_perpendiculars, pick_far_points
 
 CALIBRATION_STRIDE = 4  # One in this many loads is set aside, before any split, to calibrate bounds.
 MAX_CALIBRATION_LOADS = 2000  # Maximum number of loads set aside to calibrate bounds.
@@ -83,7 +83,7 @@ def hold_out_discs(points: np.ndarray, patch: Patch, settings: DiscSettings = Di
     InputError
         The loads have fewer than seven positions.
     """
-    order = select_spread(points, settings.max_positions) if len(points) else np.zeros(0, int)
+    order = pick_far_points(points, settings.max_positions) if len(points) else np.zeros(0, int)
     if len(order) < settings.min_discs + 1:
         raise InputError(
             f"the loads that converged have {len(order)} positions, too few to leave {settings.min_discs} discs out: "
@@ -97,18 +97,18 @@ def hold_out_discs(points: np.ndarray, patch: Patch, settings: DiscSettings = Di
 def _build_discs(
     points: np.ndarray, candidates: np.ndarray, patch: Patch, radius: float, settings: DiscSettings
 ) -> DiscSplit:
-    split = _split(points, candidates[: settings.min_discs], patch, radius)
+    split = _build_split(points, candidates[: settings.min_discs], patch, radius)
     for count in range(settings.min_discs + 1, len(candidates)):
         if split.area_share >= settings.held_out_share:
             break
-        more = _split(points, candidates[:count], patch, radius)
+        more = _build_split(points, candidates[:count], patch, radius)
         if more.test_mask.mean() > 0.5:
             break
         split = more
     return split
 
 
-def _split(points: np.ndarray, centres: np.ndarray, patch: Patch, radius: float) -> DiscSplit:
+def _build_split(points: np.ndarray, centres: np.ndarray, patch: Patch, radius: float) -> DiscSplit:
     which, distance = find_nearest(points, centres)
     return DiscSplit(centres, radius, np.where(distance <= radius, which, -1), patch.compute_coverage(centres, radius))
 

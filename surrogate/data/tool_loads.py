@@ -140,7 +140,7 @@ def compute_rejected_share(preset: str) -> float:
     return float(np.mean(shares)) if shares else 0.0
 
 
-def describe_rejected(preset: str) -> str:
+def describe_rejected_loads(preset: str) -> str:
     """Describe the share of a preset's rejected loads in a sentence; empty if the share is zero."""
     share = compute_rejected_share(preset)
     return (
@@ -255,7 +255,7 @@ def _place_published_loads(
             "seed, or choose another --preset here."
         )
     return build_published_loads(
-        patch, patch.points[near[select_spread(patch.points[near], settings.position_count)]], count, seed, settings
+        patch, patch.points[near[pick_far_points(patch.points[near], settings.position_count)]], count, seed, settings
     )
 
 
@@ -279,7 +279,7 @@ def build_published_loads(
     return Loads((Pushed(positions[position], force, np.full(len(position), settings.radius)),))
 
 
-def select_spread(points: np.ndarray, count: int) -> np.ndarray:
+def pick_far_points(points: np.ndarray, count: int) -> np.ndarray:
     """Select at most `count` of the `points` (n, 3) by farthest-point sampling; return their indices (k,).
 
     The first point is nearest to the mean, so that the result depends only on the points. Gonzalez 1985, Theor. Comput.

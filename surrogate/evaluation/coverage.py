@@ -99,9 +99,9 @@ def measure_coverage_shares(error: np.ndarray, bounds: np.ndarray) -> Shares:
     )
 
 
-def format_coverage(covered: Shares) -> str:
+def format_coverage(fractions: Shares) -> str:
     """Format the empirical coverage at each level as text."""
-    shares = zip(covered, LEVELS, strict=True)
+    shares = zip(fractions, LEVELS, strict=True)
     return ", ".join(
         f"no guarantee at {100 * level:g} %" if share is None else f"{100 * share:.1f} % at {100 * level:g} %"
         for share, level in shares

@@ -210,12 +210,12 @@ def time_single_loads(deformer: Deformer, loads: Loads, nodes: np.ndarray, count
     return _measure_times(lambda one: deformer.deform(one, at=nodes), single)
 
 
-def _measure_times(result: Callable[[T], object], single: Iterable[T]) -> list[float]:
-    """Measure the wall time [s] of each call of `result`, without the warm-up calls."""
+def _measure_times(function: Callable[[T], object], arguments: Iterable[T]) -> list[float]:
+    """Measure the wall time [s] of each call of `function`, without the warm-up calls."""
     seconds = []
-    for one in single:
+    for one in arguments:
         begun = time.perf_counter()
-        result(one)
+        function(one)
         seconds.append(time.perf_counter() - begun)
     return seconds[WARM_UP_LOADS:]
 
@@ -246,15 +246,15 @@ def format_scores(scores: Sequence[Score], motion_mm: float) -> str:
     verdict = f"{best.mean_mm:.4f} mm mean error at a mean motion of {motion_mm:.3f} mm"
     wins = f"{best.name} has the smallest error: {verdict}; {fastest.name} is fastest, {fastest.microseconds:.0f} us"
     few = [f"p99.9: not estimated from fewer than {MIN_LOADS_FOR_P999} loads"] if scores[0].p999_mm is None else []
-    return "\n".join([head, *rows, *few, wins if len(scores) > 1 else f"{best.name}: {verdict}", *_solve_lines(scores)])
+    return "\n".join([head, *rows, *few, wins if len(scores) > 1 else f"{best.name}: {verdict}", *_list_solves(scores)])
 
 
-def _format_number(value: float | None, form: str) -> str:
-    """Format a number by `form`; None gives a dash of the same width."""
-    return f"{'-':>{form.split('.')[0]}}" if value is None else f"{value:{form}}"
+def _format_number(value: float | None, format_spec: str) -> str:
+    """Format a number by `format_spec`; None gives a dash of the same width."""
+    return f"{'-':>{format_spec.split('.')[0]}}" if value is None else f"{value:{format_spec}}"
 
 
-def _solve_lines(scores: Sequence[Score]) -> list[str]:
+def _list_solves(scores: Sequence[Score]) -> list[str]:
     """Format the numbers of FEM solves of each model type as lines; empty if none is known."""
     known = [(row.name, row.solves) for row in scores if row.solves is not None]
     if not known:

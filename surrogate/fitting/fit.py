@@ -58,7 +58,7 @@ class ModulusSettings:
 
 
 def estimate_young_moduli(
-    anatomy: Anatomy, frames: Sequence[ObservedFrame], tissue: FittedTissue, pressing: Responses | None,
+    anatomy: Anatomy, frames: Sequence[ObservedFrame], tissue: FittedTissue, presses: Responses | None,
     device: str = "auto", progress: Callable[[int, int], object] = lambda done, total: None,
     settings: ModulusSettings = ModulusSettings(),
 ) -> np.ndarray:  # fmt: skip
@@ -71,14 +71,14 @@ def estimate_young_moduli(
     """
     columns = np.cumsum([0, *[3 * len(frame.tools) for frame in frames]])
     read = [number for number, frame in enumerate(frames) if any(tool.force is not None for tool in frame.tools)]
-    if pressing is None or not read:
+    if presses is None or not read:
         return np.zeros(0)
     total = np.zeros(len(YOUNGS))
     for done, number in enumerate(read):
         progress(done, len(read))
         evidence, own = to_evidence(anatomy, frames[number].observation), slice(columns[number], columns[number] + 3)
         tool = frames[number].tools[0]
-        total += _compute_log_likelihood(anatomy, tool, evidence, tissue, pressing, own, device, settings)
+        total += _compute_log_likelihood(anatomy, tool, evidence, tissue, presses, own, device, settings)
     progress(len(read), len(read))
     share = np.exp(total - total.max())
     step = float(np.log(YOUNGS[1] / YOUNGS[0]))
@@ -107,7 +107,7 @@ def _compute_log_likelihood(
     shapes, inside = [], []
     for exponent in EXPONENTS:
         group = Group(list(SKULLS).index(skull), skull, poisson, ratio, exponent, responses.regions)
-        sizes, rows = _solve_dents(
+        sizes, rows = _solve_indentations(
             anatomy, tool, group, evidence, responses, force * np.array(settings.force_multiples), direction, device
         )
         inside.append((asked >= np.log(sizes[0])) & (asked <= np.log(sizes[-1])))
@@ -122,7 +122,7 @@ def _compute_log_likelihood(
     return np.asarray(logsumexp(logs, axis=(0, 1)))
 
 
-def _solve_dents(
+def _solve_indentations(
     anatomy: Anatomy, tool: Tool, group: Group, evidence: Evidence, responses: Responses, sizes: np.ndarray,
     direction: np.ndarray, device: str,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
@@ -172,14 +172,14 @@ def fit_tissue(
 
 
 def fit_tissue_from_responses(
-    locator: Locator, frames: Sequence[ObservedFrame], drainage: Responses | None, pressing: Responses | None,
+    locator: Locator, frames: Sequence[ObservedFrame], drainages: Responses | None, presses: Responses | None,
     device: str = "auto", progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> FittedTissue:  # fmt: skip
     """Estimate the tissue as `fit_tissue`, from given FEM responses; `progress` receives the number of forces done."""
     with limit_to_one_thread():  # matrix products are small
-        probability = compute_probability(compute_tissue_likelihood(locator, frames, drainage, pressing))
+        probability = compute_probability(compute_tissue_likelihood(locator, frames, drainages, presses))
     tissue = FittedTissue(locator.anatomy.digest, len(frames), probability, np.zeros(0))
-    return replace(tissue, young=estimate_young_moduli(locator.anatomy, frames, tissue, pressing, device, progress))
+    return replace(tissue, young=estimate_young_moduli(locator.anatomy, frames, tissue, presses, device, progress))
 
 
 def list_fitted_regions(locator: Locator) -> tuple[Region, ...]:
@@ -188,16 +188,16 @@ def list_fitted_regions(locator: Locator) -> tuple[Region, ...]:
 
 
 def compute_tissue_likelihood(
-    locator: Locator, frames: Sequence[ObservedFrame], drainage: Responses | None, pressing: Responses | None
+    locator: Locator, frames: Sequence[ObservedFrame], drainages: Responses | None, presses: Responses | None
 ) -> np.ndarray:
     """Compute the log-likelihood (skulls, poissons, ratios) of all frames for each candidate tissue."""
     total, first = np.zeros((1, len(POISSONS), len(RATIOS))), 0
     for frame in frames:
         evidence, last = to_evidence(locator.anatomy, frame.observation), first + 3 * len(frame.tools)
-        if pressing is not None and frame.tools:
-            total = total + compute_pressing_likelihood(pressing, np.arange(first, last), evidence)
-        elif drainage is not None:
-            total = total + compute_drainage_likelihood(drainage, locator.prior, evidence)
+        if presses is not None and frame.tools:
+            total = total + compute_pressing_likelihood(presses, np.arange(first, last), evidence)
+        elif drainages is not None:
+            total = total + compute_drainage_likelihood(drainages, locator.prior, evidence)
         first = last
     return total
 

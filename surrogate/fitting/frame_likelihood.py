@@ -36,10 +36,10 @@ class LikelihoodSettings:
 LIKELIHOOD = LikelihoodSettings()
 
 
-def compute_drainage_likelihood(drainage: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
+def compute_drainage_likelihood(drainages: Responses, prior: MotionPrior, evidence: Evidence) -> np.ndarray:
     """Compute the log-likelihood (skulls, poissons, ratios) of a frame in which fluid has drained."""
     lower, seen = factorise_errors(evidence)
-    rows = {name: predict_observation(drainage, name, evidence) for name in SOLVED_SKULLS}
+    rows = {name: predict_observation(drainages, name, evidence) for name in SOLVED_SKULLS}
     own = (prior.kind == DRAINAGE) & (prior.skull == list(SKULLS).index("contact"))
     lets_go = prior.project_shapes(*evidence.weights)[:, own].T
     size = np.mean([_compute_size(each) for each in rows.values()])
@@ -49,14 +49,14 @@ def compute_drainage_likelihood(drainage: Responses, prior: MotionPrior, evidenc
     return np.stack([np.broadcast_to(found[name], shape) for name in SKULLS]) / LIKELIHOOD.evidence_divisor
 
 
-def compute_pressing_likelihood(pressing: Responses, columns: np.ndarray, evidence: Evidence) -> np.ndarray:
-    """Compute the log-likelihood (skulls, 1, 1) of a frame with tools, given `columns` (k,) of the responses.
+def compute_pressing_likelihood(presses: Responses, response_columns: np.ndarray, evidence: Evidence) -> np.ndarray:
+    """Compute the log-likelihood (skulls, 1, 1) of a frame with tools, given `response_columns` (k,) of the responses.
 
     Dents by tools determine only the skull model. Their information on Poisson's ratio and stiffness ratio is mostly
     nonlinear stiffening, which linear responses lack.
     """
     lower, seen = factorise_errors(evidence)
-    rows = {name: predict_observation(pressing, name, evidence)[:, :, columns] for name in SOLVED_SKULLS}
+    rows = {name: predict_observation(presses, name, evidence)[:, :, response_columns] for name in SOLVED_SKULLS}
     size = np.mean([_compute_size(each) for each in rows.values()])
     found = {name: _compute_log_evidence(each / size, evidence, lower, seen) for name, each in rows.items()}
     found = {name: logsumexp(each) - np.log(each.size) for name, each in found.items()}
@@ -98,10 +98,10 @@ def whiten_columns(cholesky: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return solve_triangular(cholesky, columns, lower=True, check_finite=False)
 
 
-def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, lower: np.ndarray, scale: float) -> np.ndarray:
+def _compute_log_evidence(rows: np.ndarray, evidence: Evidence, cholesky: np.ndarray, scale: float) -> np.ndarray:
     """Compute log evidence (poissons, ratios) of motions (poissons, ratios, loads, m), scaled to a mean size of 1."""
-    motion = scale * whiten_columns(lower, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
-    gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(lower, evidence.motion)
+    motion = scale * whiten_columns(cholesky, rows.reshape(-1, rows.shape[-1]).T).T.reshape(rows.shape)
+    gram, pull = motion @ motion.transpose(0, 1, 3, 2), motion @ whiten_columns(cholesky, evidence.motion)
     logs = []
     for times in LIKELIHOOD.motion_sizes:
         root = np.linalg.cholesky(np.eye(gram.shape[-1]) + times**2 * gram)
@@ -135,9 +135,9 @@ def remove_points(frames: Sequence[ObservedFrame], point_numbers: Sequence[np.nd
     ]
 
 
-def _remove_points(frame: ObservedFrame, numbers: np.ndarray) -> ObservedFrame:
+def _remove_points(frame: ObservedFrame, point_numbers: np.ndarray) -> ObservedFrame:
     seen = frame.observation
     assert seen.rest is not None
-    kept = np.delete(np.arange(len(seen.now)), numbers)
+    kept = np.delete(np.arange(len(seen.now)), point_numbers)
     sigma = None if seen.sigma is None else seen.sigma[kept]
     return replace(frame, observation=replace(seen, now=seen.now[kept], rest=seen.rest[kept], sigma=sigma))

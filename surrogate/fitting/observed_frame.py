@@ -82,7 +82,7 @@ def check_frames(anatomy: Anatomy, frames: Sequence[ObservedFrame]) -> None:
                 raise InputError("is a cloud, whose points have no names: give points and how they moved.")
             to_evidence(anatomy, frame.observation)
             for tool in frame.tools:
-                _check(anatomy, tool)
+                _check_tool(anatomy, tool)
             if len(frame.tools) > 1 and any(tool.force is not None for tool in frame.tools):
                 raise InputError("a force is read while several tools press: read it while one presses alone.")
         except InputError as error:
@@ -99,7 +99,7 @@ def find_contact_point(anatomy: Anatomy, tool: Tool) -> np.ndarray:
     return find_closest_points(np.array([tool.tip]), open_cortex(anatomy).corners).point[0]
 
 
-def _check(anatomy: Anatomy, tool: Tool) -> None:
+def _check_tool(anatomy: Anatomy, tool: Tool) -> None:
     numbers = [*tool.tip, tool.radius, tool.force or 0.0, tool.sigma or 0.0]
     if not np.isfinite(numbers).all():
         raise InputError("a tool has a number that is not finite: leave it out.")

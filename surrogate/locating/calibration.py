@@ -127,24 +127,24 @@ def compute_similarity_features(evidence: Evidence) -> np.ndarray:
 
 
 def _simulate_trial(
-    ensemble: Ensemble, members: np.ndarray, number: int, random: np.random.Generator, settings: TrialSettings
+    ensemble: Ensemble, members: np.ndarray, number: int, rng: np.random.Generator, settings: TrialSettings
 ) -> tuple[Observation, np.ndarray]:
     """Simulate an observation of one or two motions; return it and the tumour centroid's true motion (3,) [m]."""
     anatomy = ensemble.anatomy
-    here = members[ensemble.skull[members] == random.choice(np.unique(ensemble.skull[members]))]
+    here = members[ensemble.skull[members] == rng.choice(np.unique(ensemble.skull[members]))]
     several = np.intersect1d(SINGLE_CAUSES, ensemble.kind[here])
-    causes = random.permutation(several)[: 1 + (number % 3 == 0)]
-    chosen = [random.choice(here[ensemble.kind[here] == cause]) for cause in causes]
-    softer = np.exp(random.uniform(*np.log(settings.compliance_ratios)))
+    causes = rng.permutation(several)[: 1 + (number % 3 == 0)]
+    chosen = [rng.choice(here[ensemble.kind[here] == cause]) for cause in causes]
+    softer = np.exp(rng.uniform(*np.log(settings.compliance_ratios)))
     motion = softer * ensemble.motion[chosen].sum(axis=0, dtype=float)
-    count = int(np.exp(random.uniform(*np.log(settings.point_counts))))
-    evidence = sample_observed_patch(anatomy, motion, random, count, random.uniform(*settings.covered_shares))
-    sigma = np.full(len(evidence), SIGMA * np.exp(random.uniform(*np.log(settings.error_ratios))))
-    has_shift = random.uniform() >= settings.no_shift_probability
-    shift = float(np.exp(random.uniform(*np.log(settings.shift_range)))) if has_shift else 0.0
+    count = int(np.exp(rng.uniform(*np.log(settings.point_counts))))
+    evidence = sample_observed_patch(anatomy, motion, rng, count, rng.uniform(*settings.covered_shares))
+    sigma = np.full(len(evidence), SIGMA * np.exp(rng.uniform(*np.log(settings.error_ratios))))
+    has_shift = rng.uniform() >= settings.no_shift_probability
+    shift = float(np.exp(rng.uniform(*np.log(settings.shift_range)))) if has_shift else 0.0
     evidence = replace(evidence, sigma=sigma, shift_sigma=shift)
-    off = np.linalg.cholesky(evidence.compute_covariance()) @ random.standard_normal(len(evidence))
-    way = random.standard_normal((2, 3))
+    off = np.linalg.cholesky(evidence.compute_covariance()) @ rng.standard_normal(len(evidence))
+    way = rng.standard_normal((2, 3))
     way *= np.sqrt(3.0) / np.linalg.norm(way, axis=1, keepdims=True)
     shifted, turned = evidence.rigid_scale.reshape(2, 3) * way
     rest = evidence.positions[::3]
@@ -154,18 +154,18 @@ def _simulate_trial(
 
 
 def sample_observed_patch(
-    anatomy: Anatomy, motion: np.ndarray, random: np.random.Generator, count: int, area_share: float
+    anatomy: Anatomy, motion: np.ndarray, rng: np.random.Generator, count: int, area_share: float
 ) -> Evidence:
     """Sample `count` points, without errors, of a motion (V, 3) [m] on a round `area_share` of the open cortex."""
     nodes, triangles = anatomy.mesh.nodes, anatomy.open_surface
     corners = nodes[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     middles = corners.mean(axis=1)
-    order = np.argsort(((middles - middles[random.choice(len(area), p=area / area.sum())]) ** 2).sum(axis=1))
+    order = np.argsort(((middles - middles[rng.choice(len(area), p=area / area.sum())]) ** 2).sum(axis=1))
     within = np.cumsum(area[order]) <= area_share * area.sum()
     some = order[: max(4, np.count_nonzero(within))]
-    triangle = random.choice(some, count, p=area[some] / area[some].sum())
-    weights = random.dirichlet(np.ones(3), count)
+    triangle = rng.choice(some, count, p=area[some] / area[some].sum())
+    weights = rng.dirichlet(np.ones(3), count)
     vertices = triangles[triangle]
     at, moved = (np.einsum("nc,nci->ni", weights, field[vertices]) for field in (nodes, motion))
     place = LocatedPoints(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(count)]))

@@ -146,10 +146,10 @@ def build_groups(anatomy: Anatomy, seed: int = 0, causes: Causes = USUAL_CAUSES)
     return tuple(made)
 
 
-def _sample_stratified(random: np.random.Generator, count: int, limits: tuple[float, float]) -> list[float]:
+def _sample_stratified(rng: np.random.Generator, count: int, limits: tuple[float, float]) -> list[float]:
     """Sample one number in each of `count` log-equal parts of a range; return the numbers in random order."""
     low, high = np.log(limits)
-    share = (random.permutation(count) + random.uniform(size=count)) / max(count, 1)
+    share = (rng.permutation(count) + rng.uniform(size=count)) / max(count, 1)
     return np.exp(low + share * (high - low)).tolist()
 
 
@@ -187,10 +187,10 @@ def _build_posture(anatomy: Anatomy, directions: np.ndarray, fluid_share: float)
     return Posture(directions, level, np.ones(len(directions)))
 
 
-def sample_gravity_directions(random: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
+def sample_gravity_directions(rng: np.random.Generator, axis: np.ndarray, causes: Causes) -> np.ndarray:
     """Sample gravity directions (n, 3), uniform by solid angle in a cone round the inward `axis` (3,)."""
-    cosine = random.uniform(np.cos(causes.cone), 1.0, causes.drainages)
-    angle = random.uniform(0.0, 2.0 * np.pi, causes.drainages)
+    cosine = rng.uniform(np.cos(causes.cone), 1.0, causes.drainages)
+    angle = rng.uniform(0.0, 2.0 * np.pi, causes.drainages)
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     side /= np.linalg.norm(side)
     other, sine = np.cross(axis, side), np.sqrt(1.0 - cosine**2)

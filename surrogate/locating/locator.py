@@ -158,7 +158,7 @@ class Location:
 
         Empty if the observation is within its errors, or if the registration may have slipped.
         """
-        return () if self.slipped or self.within_errors else group_cause_shares(self._drawn_shares)
+        return () if self.slipped or self.within_errors else group_cause_shares(self._sampled_shares)
 
     @property
     def causes(self) -> dict[str, float]:
@@ -166,11 +166,11 @@ class Location:
 
         All shares are 0 if `cause_shares` is empty. Shares of inseparable causes are rough estimates.
         """
-        share = self._drawn_shares.mean(axis=0) if self.cause_shares else np.zeros(len(KINDS))
+        share = self._sampled_shares.mean(axis=0) if self.cause_shares else np.zeros(len(KINDS))
         return dict(zip(KINDS, share.tolist(), strict=True))
 
     @cached_property
-    def _drawn_shares(self) -> np.ndarray:
+    def _sampled_shares(self) -> np.ndarray:
         return compute_cause_shares(self.prior, self.posterior)
 
     @property
@@ -178,7 +178,7 @@ class Location:
         """Reason why the ellipsoids may be unreliable, in sentences; empty if they are calibrated."""
         if self.slipped:
             return (
-                f"It is a guess, as the registration may have slipped. {self._rigid_words} explains what was seen "
+                f"It is a guess, as the registration may have slipped. {self._rigid_error_text} explains what was seen "
                 "about as well as any motion does. The two cannot be distinguished: check it."
             )
         if not self.calibrated:
@@ -203,14 +203,14 @@ class Location:
         """Warnings about this result, in sentences: other explanations of the observation, and `doubt`."""
         named = self.is_registration_suspect and not self.slipped
         rigid = (
-            f"{self._rigid_words} would explain {self.rigid_alone.share:.0%}, with a brain at rest. The two cannot be "
-            "distinguished. If such an error is possible, give it by --rigid."
+            f"{self._rigid_error_text} would explain {self.rigid_alone.share:.0%}, with a brain at rest. The two "
+            "cannot be distinguished. If such an error is possible, give it by --rigid."
         )
         swells = self.causes["swelling"] + self.causes["oedema"] > LIMITS.swelling_share
         return tuple(said for said in (rigid if named else "", OEDEMA_WORDS if swells else "", self.doubt) if said)
 
     @property
-    def _rigid_words(self) -> str:
+    def _rigid_error_text(self) -> str:
         """Text that compares the best-fitting rigid error, with the brain undeformed, with the reported one."""
         alone = self.rigid_alone
         stated = self.posterior.evidence.rigid_scale
@@ -283,7 +283,7 @@ class Locator:
             found, near = match_and_update(prior, observation, allow_slip=True)
         some = choose_point_numbers(count)
         outliers = np.union1d(np.setdiff1d(some, near), found.outliers[found.outliers < count])
-        _check_explained(found, len(outliers), len(some))
+        _check_outliers(found, len(outliers), len(some))
         found = replace(found, covariance_factor=compute_coverage_factor(self.tried, found.evidence))
         return Location(
             prior=prior,
@@ -334,7 +334,7 @@ def _is_slip_likely(anatomy: Anatomy, posterior: Posterior) -> bool:
     return bool((other**2).sum(axis=1).mean() > sunk**2)
 
 
-def _check_explained(posterior: Posterior, outliers: int, points: int) -> None:
+def _check_outliers(posterior: Posterior, outliers: int, points: int) -> None:
     """Check that the ensemble explains the observation.
 
     Raises

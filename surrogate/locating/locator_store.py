@@ -72,7 +72,7 @@ def load_locator(path: str | Path, anatomy: Anatomy) -> Locator:
         regions = tuple(Region(**one) for one in header.get("regions", ()))
         check_regions(regions, anatomy)
         arrays = archive.read_sealed(header, [*_list_array_names(header), "tried"])
-        _check(path, anatomy, arrays)
+        _check_prior(path, anatomy, arrays)
         tried = arrays.pop("tried")
         return Locator(MotionPrior(anatomy, **arrays), tried, regions)
 
@@ -82,7 +82,7 @@ def _list_array_names(header: dict[str, Any]) -> tuple[str, ...]:
     return ARRAYS if header.get("whole", True) else (*ARRAYS, "nodes")
 
 
-def _check(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) -> None:
+def _check_prior(path: str | Path, anatomy: Anatomy, arrays: dict[str, np.ndarray]) -> None:
     """Raise InputError if the arrays of a file do not fit the anatomy or each other."""
     shape, tried, every = arrays["shape"], arrays["tried"], np.arange(len(anatomy.mesh.nodes))
     nodes = arrays.get("nodes", every)

@@ -112,7 +112,7 @@ def to_evidence(anatomy: Anatomy, observation: Observation) -> Evidence:
         larger than any brain's or too small to be observed. Points are far from the brain's surface; the message gives
         the likely reason: units, LPS instead of RAS, another anatomy.
     """
-    _check(observation)
+    _check_observation(observation)
     some = choose_point_numbers(len(observation.now))
     if observation.rest is None:
         where, near, far = observation.now[some], LIMITS.near_distance_now, LIMITS.far_distance_now
@@ -172,13 +172,13 @@ def to_deformed_evidence(
 
 
 def _build_normal_rows(
-    anatomy: Anatomy, cloud: np.ndarray, sigma: np.ndarray, number: np.ndarray, motion: np.ndarray,
+    anatomy: Anatomy, points: np.ndarray, sigma: np.ndarray, number: np.ndarray, motion: np.ndarray,
     bias: Callable[[np.ndarray], np.ndarray],
 ) -> Evidence:  # fmt: skip
     """Build one row per point, with its `number` (n,): surface displacement along the deformed normal."""
     triangles, nodes = anatomy.open_surface, anatomy.mesh.nodes
     corners = (nodes + motion)[triangles]
-    _, triangle, weights = find_closest_points(cloud - bias(cloud), corners)
+    _, triangle, weights = find_closest_points(points - bias(points), corners)
     vertices = triangles[triangle]
     # At an edge two triangles are equally near: normals of vertices do not depend on which one is found.
     normal = normalise_vectors(
@@ -187,7 +187,7 @@ def _build_normal_rows(
     at = np.einsum("nc,nci->ni", weights, nodes[vertices])
     # A fourth vertex of weight 0 gives the layout of a tetrahedron.
     place = LocatedPoints(np.column_stack([vertices, vertices[:, 0]]), np.column_stack([weights, np.zeros(len(at))]))
-    value = np.einsum("ni,ni->n", cloud - at, normal)
+    value = np.einsum("ni,ni->n", points - at, normal)
     return Evidence(place, at, normal, value, sigma, number)
 
 
@@ -200,7 +200,7 @@ def _join_evidence(parts: list[Evidence]) -> Evidence:
     return Evidence(location=place, shift_sigma=parts[0].shift_sigma, **arrays)
 
 
-def _check(observation: Observation) -> None:
+def _check_observation(observation: Observation) -> None:
     arrays = {"now": observation.now, "tips": observation.tips}
     if observation.rest is not None:
         arrays["rest"] = observation.rest

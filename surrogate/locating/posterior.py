@@ -182,7 +182,7 @@ class ObservedPrior:
     def slip_log_odds(self) -> float:
         """Log-odds of a slipped registration, as in `Posterior`."""
         best = self.log_evidence.max(axis=1)
-        return POSTERIOR.evidence_divisor * float(best[self._slips].max() - best[~self._slips].max())
+        return POSTERIOR.evidence_divisor * float(best[self._has_slip].max() - best[~self._has_slip].max())
 
     @property
     def motion_evidence(self) -> float:
@@ -190,12 +190,12 @@ class ObservedPrior:
 
         The log-odds of places are left out, as a tool tip gives no information on motion.
         """
-        logs = POSTERIOR.evidence_divisor * (self.log_evidence - self.log_odds)[~self._slips]
+        logs = POSTERIOR.evidence_divisor * (self.log_evidence - self.log_odds)[~self._has_slip]
         logs, rows = logs[np.isfinite(logs)], self.system
         return float(logsumexp(logs) - np.log(len(logs)) - 0.5 * rows.products[-1, -1] + rows.whitening.log_determinant)
 
     @property
-    def _slips(self) -> np.ndarray:
+    def _has_slip(self) -> np.ndarray:
         """Mask (h,) of the hypotheses with a slipped registration."""
         return np.isinf([hypothesis.rigid_ratio for hypothesis in self.prior.hypotheses])
 
@@ -204,7 +204,7 @@ class ObservedPrior:
 
         Hypotheses with a slipped registration are included if `allow_slip`.
         """
-        logs = self.log_evidence if allow_slip else np.where(self._slips[:, None], -np.inf, self.log_evidence)
+        logs = self.log_evidence if allow_slip else np.where(self._has_slip[:, None], -np.inf, self.log_evidence)
         best = np.argsort(-logs, axis=None, kind="stable")[: min(POSTERIOR.max_hypotheses, np.isfinite(logs).sum())]
         share = np.exp(logs.flat[best] - logs.flat[best[0]])
         share /= share.sum()
@@ -247,7 +247,7 @@ class ObservedPrior:
         """Build the normal equations of all unknowns for each skull, each divided by its prior standard deviation."""
         shared, products = self.prior.tables, self.system.products
         skulls, places = len(shared.rows), shared.place_rows
-        rows = np.concatenate([shared.rows, np.tile(self._rigid, (skulls, 1))], axis=1)
+        rows = np.concatenate([shared.rows, np.tile(self._rigid_rows, (skulls, 1))], axis=1)
         size = np.concatenate([self.motion_size * shared.deviations, np.ones((skulls, 6))], axis=1)
         # Unknowns of each place, followed by the data.
         beside = np.concatenate([places, np.full((*places.shape[:2], 1), len(products) - 1)], axis=2)
@@ -261,13 +261,13 @@ class ObservedPrior:
         return NormalEquations(np.append(shared.kind, np.full(6, RIGID_KIND)), table, place, np.zeros(skulls))
 
     @property
-    def _rigid(self) -> np.ndarray:
+    def _rigid_rows(self) -> np.ndarray:
         """Row numbers (6,) of the rigid error's components."""
         return np.arange(-7, -1) + len(self.system.products)
 
     def compute_posterior(self, hypothesis: Hypothesis, place_rows: np.ndarray, probability: float) -> HypothesisResult:
         """Compute the posterior of a hypothesis, including the shapes `place_rows` (q,) of a tool on one place."""
-        own = np.concatenate([hypothesis.rows, self._rigid, place_rows])
+        own = np.concatenate([hypothesis.rows, self._rigid_rows, place_rows])
         size = np.full(len(own), self.motion_size)
         size[: len(hypothesis.rows)] *= hypothesis.deviations
         size[len(hypothesis.rows) : len(own) - len(place_rows)] = min(hypothesis.rigid_ratio, self.slip_ratio)
@@ -310,7 +310,7 @@ def condition_prior(
         some = evidence.select(kept)
         seen = build_observed_prior(prior, some, tips)
         answers = seen.compute_posteriors(allow_slip)
-        odd = _compute_distances(seen.system, answers[0], some.point)
+        odd = _compute_outlier_distances(seen.system, answers[0], some.point)
         excess = odd / chdtri(np.unique(some.point, return_counts=True)[1], POSTERIOR.outlier_significance)
         if excess.max() <= 1.0 or len(excess) <= POSTERIOR.min_inliers:
             break
@@ -329,13 +329,13 @@ def condition_prior(
     )
 
 
-def _compute_distances(rows: WhitenedSystem, result: HypothesisResult, point: np.ndarray) -> np.ndarray:
+def _compute_outlier_distances(rows: WhitenedSystem, result: HypothesisResult, point_numbers: np.ndarray) -> np.ndarray:
     """Compute squared Mahalanobis distances (n,) of points from leave-one-out predictions under one hypothesis."""
     data = len(rows.products) - 1
     precise = rows.apply_precision(np.append(result.rows, data))
     known = precise[:, :-1] @ result.root.T
     gain = precise[:, -1] - precise[:, :-1] @ result.mean
-    number = np.unique(point, return_inverse=True)[1]
+    number = np.unique(point_numbers, return_inverse=True)[1]
     order, count = np.argsort(number, kind="stable"), np.bincount(number)
     found, first = np.empty(len(count)), np.cumsum(count) - count
     for size in np.unique(count):

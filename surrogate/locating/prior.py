@@ -148,7 +148,7 @@ class MotionPrior:
 
     def prepare(self) -> None:
         """Compute the cached tables that all observations share."""
-        _ = self.centroid_motion, self.hypotheses, self.tables, self._by_vertex
+        _ = self.centroid_motion, self.hypotheses, self.tables, self._shapes_by_vertex
 
     @cached_property
     def centroid_motion(self) -> np.ndarray:
@@ -175,13 +175,13 @@ class MotionPrior:
         return column
 
     @cached_property
-    def _by_vertex(self) -> np.ndarray:
+    def _shapes_by_vertex(self) -> np.ndarray:
         """Shapes (n, 3, r) float32 [m], with the shapes of a vertex contiguous in memory."""
         return np.ascontiguousarray(self.shape.transpose(1, 2, 0))
 
     def restrict_to_vertices(self, nodes: np.ndarray) -> np.ndarray:
         """Return the shapes (k, 3, r) float32 [m] at the vertices (k,); raises InputError as `restrict_shapes`."""
-        return self._by_vertex[self._find_columns(nodes)]
+        return self._shapes_by_vertex[self._find_columns(nodes)]
 
     def project_shapes(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Compute observed displacements (m, r) [m] of each shape, by vertices and weights of `Evidence.weights`."""

@@ -43,15 +43,15 @@ class Region:
 
 
 def build_tissue(
-    make_tissue: Callable[[float, float], Tissue], poisson: float, tumour_ratio: float, regions: tuple[Region, ...]
+    build_material: Callable[[float, float], Tissue], poisson: float, tumour_ratio: float, regions: tuple[Region, ...]
 ) -> Elasticity:
     """Build the elasticity of brain, tumour and known regions from the function `make_tissue(ratio, poisson)`.
 
     A ratio is the stiffness relative to the brain's. `poisson` is the brain's Poisson's ratio. `tumour_ratio` is the
     tumour's stiffness ratio, unless the tumour is a known region.
     """
-    known = {one.label: make_tissue(one.ratio, poisson if one.poisson is None else one.poisson) for one in regions}
-    return Elasticity(make_tissue(1.0, poisson), {TUMOUR_LABEL: make_tissue(tumour_ratio, poisson), **known})
+    known = {one.label: build_material(one.ratio, poisson if one.poisson is None else one.poisson) for one in regions}
+    return Elasticity(build_material(1.0, poisson), {TUMOUR_LABEL: build_material(tumour_ratio, poisson), **known})
 
 
 def list_known_regions(elasticity: Elasticity) -> tuple[Region, ...]:

@@ -93,10 +93,10 @@ def _get_moved_tools(effect: Effect) -> tuple[Tool, ...]:
     return effect.tools if isinstance(effect, ToolContact) else ()
 
 
-def _describe_series_change(trained: Elasticity, here: Elasticity) -> str | None:
+def _describe_series_change(old: Elasticity, new: Elasticity) -> str | None:
     """Describe the difference in relaxation of two tissues that are otherwise equal; None if there is none."""
-    learned, asked = get_relaxation_series([trained]), get_relaxation_series([here])
-    if learned == asked or here.default is None or replace(cast(Any, here.default), prony=learned) != trained.default:
+    learned, asked = get_relaxation_series([old]), get_relaxation_series([new])
+    if learned == asked or new.default is None or replace(cast(Any, new.default), prony=learned) != old.default:
         return None
     return f"it learned from tissue that {_format_series(learned)}, and here it {_format_series(asked)}"
 

@@ -110,21 +110,21 @@ def find_first_model(deformer: Deformer, result: Deformation) -> Learned | None:
     return find_model(deformer) if result.outcome[0] in (Outcome.PREDICTED, Outcome.EXTRAPOLATED) else None
 
 
-def _replace_rows(predicted: Deformation, rows: np.ndarray, solved: Deformation, keep_reaction: bool) -> Deformation:
-    """Replace `rows` (k,) of predictions by the k FEM solutions; if `keep_reaction`, the reactions are not replaced.
+def _replace_rows(predicted: Deformation, rows: np.ndarray, solution: Deformation, keeps_reaction: bool) -> Deformation:
+    """Replace `rows` (k,) of predictions by the k FEM solutions; if `keeps_reaction`, the reactions are not replaced.
 
     If the model does not predict the reaction of a pose, the reaction is not available in any row.
     """
     pick = np.arange(len(predicted))
     pick[rows] = len(predicted) + np.arange(len(rows))
     ours = replace(predicted, cost=Cost({"predict": predicted.cost.total, "solve": 0.0}))
-    theirs = solved.restrict(predicted.nodes)
-    cost = Cost({"predict": 0.0, "solve": solved.cost.total})
-    known = solved.reaction.shape[1] == predicted.reaction.shape[1] and not keep_reaction
+    theirs = solution.restrict(predicted.nodes)
+    cost = Cost({"predict": 0.0, "solve": solution.cost.total})
+    known = solution.reaction.shape[1] == predicted.reaction.shape[1] and not keeps_reaction
     theirs = replace(theirs, reaction=theirs.reaction if known else predicted.reaction[rows], cost=cost)
     source = predicted.source
     if len(rows):
-        source += f"; for {len(rows)} of {len(predicted)} loads {solved.source}"
+        source += f"; for {len(rows)} of {len(predicted)} loads {solution.source}"
     return replace(join_deformations([ours, theirs]).select(pick), source=source)
 
 

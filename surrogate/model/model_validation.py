@@ -68,7 +68,7 @@ def check_finite_state(state: Mapping[str, np.ndarray]) -> None:
 def _check_part(part: ModelPart, model: Learned) -> None:
     _require(part.encoder in ENCODERS, f"no encoder is called {part.encoder!r}")
     _check_basis(part.basis, model.anatomy)
-    features = _compute_probe(part.encoder, model)
+    features = _encode_probe_load(part.encoder, model)
     found = part.regressor.predict(features)
     _require(
         found.shape == (len(features), len(part.basis.modes)) and bool(np.isfinite(found).all()),
@@ -91,7 +91,7 @@ def _check_basis(basis: Basis, anatomy: Anatomy) -> None:
     _require(modes.dtype.kind == "f" and bool(np.isfinite(modes).all()), "its modes are no finite numbers")
 
 
-def _compute_probe(encoder: str, model: Learned) -> np.ndarray:
+def _encode_probe_load(encoder: str, model: Learned) -> np.ndarray:
     """Compute the encoder's features of one load inside the training range, without integrating a footprint."""
     if encoder in ("nodal", "rooted"):
         return np.ones((1, 3 * len(open_patch(model.anatomy).nodes)))
@@ -118,7 +118,7 @@ def _check_force(model: Learned) -> None:
     terms = 4 if model.series else 2
     _require(all(grip.shape == (terms,) for grip in grips), "what it knows of its tool's force is none")
     if model.force.regressor is not None:
-        found = model.force.regressor.predict(_compute_probe(model.force.encoder, model))
+        found = model.force.regressor.predict(_encode_probe_load(model.force.encoder, model))
         _require(found.shape == (1, 3) and bool(np.isfinite(found).all()), "it gives no force")
     if model.force.bound is not None:
         _check_bounds(model.force.bound)

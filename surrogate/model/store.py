@@ -238,9 +238,9 @@ def _rebuild_regressor(description: dict[str, Any], arrays: Mapping[str, np.ndar
     return _find_type(description["regressor"]).restored(state)
 
 
-def _describe_force(force: ForceModel, store: Any) -> dict[str, Any]:
-    learned = None if force.regressor is None else _describe_regressor(force.regressor, store)
-    return {"encoder": force.encoder, "learned": learned, "bound": _describe_bound(force.bound, store)}
+def _describe_force(force_model: ForceModel, store: Any) -> dict[str, Any]:
+    learned = None if force_model.regressor is None else _describe_regressor(force_model.regressor, store)
+    return {"encoder": force_model.encoder, "learned": learned, "bound": _describe_bound(force_model.bound, store)}
 
 
 def _rebuild_force(
@@ -256,10 +256,10 @@ def _rebuild_force(
     )
 
 
-def _describe_tip(tip: TipModel, store: Any) -> dict[str, Any]:
-    known = tip.correction
+def _describe_tip(tip_model: TipModel, store: Any) -> dict[str, Any]:
+    known = tip_model.correction
     correction = None if known is None else {name: store(array) for name, array in known.state().items()}
-    return {"correction": correction, "bound": _describe_bound(tip.bound, store)}
+    return {"correction": correction, "bound": _describe_bound(tip_model.bound, store)}
 
 
 def _rebuild_tip(description: dict[str, Any] | None, arrays: Mapping[str, np.ndarray], near: float) -> TipModel | None:

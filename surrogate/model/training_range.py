@@ -114,7 +114,7 @@ def compute_training_range(patch: Patch, pushes: Pushed) -> TrainingRange:
     magnitude, angle, overhang = measure_loads(patch, pushes)
     return TrainingRange(
         pushes.point.astype(np.float32),
-        _compute_reach(pushes.point),
+        _compute_max_spacing(pushes.point),
         float(overhang.max()),
         float(angle.max()),
         (float(magnitude.min()), float(magnitude.max())),
@@ -123,11 +123,11 @@ def compute_training_range(patch: Patch, pushes: Pushed) -> TrainingRange:
     )
 
 
-def _compute_reach(point: np.ndarray) -> float:
+def _compute_max_spacing(points: np.ndarray) -> float:
     """Compute the largest distance [m] from a point (n, 3) to its nearest neighbour; zero for a single point."""
-    if len(point) < 2:
+    if len(points) < 2:
         return 0.0
-    return float(KDTree(point).query(point, 2)[0][:, 1].max())
+    return float(KDTree(points).query(points, 2)[0][:, 1].max())
 
 
 def measure_loads(patch: Patch, pushes: Pushed) -> LoadMeasures:

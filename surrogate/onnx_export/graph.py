@@ -68,7 +68,7 @@ class Tensor(NDArrayOperatorsMixin):
         if method != "__call__" or ufunc not in OPERATORS:
             return NotImplemented
         return self.sheet.add_node(
-            OPERATORS[ufunc], ufunc(*map(_sample, operands)), *self.sheet.to_common_type(operands)
+            OPERATORS[ufunc], ufunc(*map(_get_sample, operands)), *self.sheet.to_common_type(operands)
         )
 
     def __array_function__(self, function: Callable, _: object, args: Sequence, kwargs: Mapping[str, Any]) -> Tensor:
@@ -168,7 +168,7 @@ class GraphBuilder:
 
     def to_common_type(self, operands: Sequence[Operand]) -> list[Tensor]:
         """Convert operands to tensors of their common NumPy type, because ONNX operators do not mix types."""
-        kind = np.result_type(*map(_sample, operands))
+        kind = np.result_type(*map(_get_sample, operands))
         wires = (each if isinstance(each, Tensor) else self.add_constant(np.asarray(each, kind)) for each in operands)
         return [wire.astype(kind.type) for wire in wires]
 
@@ -198,7 +198,7 @@ class GraphBuilder:
 
     def to_json(self) -> dict[str, list]:
         """Return names of inputs and outputs, and all nodes in order of evaluation, as plain types for JSON."""
-        nodes = [[node.operator, node.inputs, node.output, _to_plain(node.attributes)] for node in self._nodes]
+        nodes = [[node.operator, node.inputs, node.output, _to_json_values(node.attributes)] for node in self._nodes]
         return {
             "inputs": [port.name for port in self._inputs],
             "outputs": [port.name for port in self._outputs],
@@ -242,17 +242,17 @@ class GraphBuilder:
         return model
 
 
-def _to_plain(attributes: Mapping[str, Any]) -> dict[str, Any]:
+def _to_json_values(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Convert node attributes to types that JSON supports."""
     return {name: value if isinstance(value, str | tuple) else int(value) for name, value in attributes.items()}
 
 
-def _sample(operand: Operand) -> np.ndarray | float:
+def _get_sample(operand: Operand) -> np.ndarray | float:
     return operand.sample if isinstance(operand, Tensor) else operand
 
 
 def _concatenate(graph: GraphBuilder, arrays: Sequence[Operand], axis: int = 0) -> Tensor:
-    sample = np.concatenate([_sample(each) for each in arrays], axis)
+    sample = np.concatenate([_get_sample(each) for each in arrays], axis)
     return graph.add_node("Concat", sample, *graph.to_common_type(arrays), axis=axis)
 
 
@@ -264,16 +264,16 @@ def _stack(graph: GraphBuilder, arrays: Sequence[Tensor]) -> Tensor:
     return _concatenate(graph, [each[None] for each in arrays])
 
 
-def _select_where(graph: GraphBuilder, condition: Tensor, yes: Operand, no: Operand) -> Tensor:
-    sample = np.where(condition.sample, _sample(yes), _sample(no))
-    return graph.add_node("Where", sample, condition, *graph.to_common_type([yes, no]))
+def _select_where(graph: GraphBuilder, condition: Tensor, true_values: Operand, false_values: Operand) -> Tensor:
+    sample = np.where(condition.sample, _get_sample(true_values), _get_sample(false_values))
+    return graph.add_node("Where", sample, condition, *graph.to_common_type([true_values, false_values]))
 
 
 def _sum_products(graph: GraphBuilder, equation: str, *operands: Any) -> Tensor:
     (first, second), out = equation.partition("->")[0].split(","), equation.partition("->")[2]
     if first == out + second[-1] and first.endswith(second):  # product and sum: ten times as fast in runtimes
         return (operands[0] * operands[1]).sum(axis=len(out))
-    sample = np.einsum(equation, *map(_sample, operands))
+    sample = np.einsum(equation, *map(_get_sample, operands))
     return graph.add_node("Einsum", sample, *graph.to_common_type(operands), equation=equation)
 
 

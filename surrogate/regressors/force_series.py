@@ -113,21 +113,21 @@ class Series:
         """The maps `_frames` as one matrix (4, 4 S)."""
         return np.ascontiguousarray(self._frames.transpose(2, 1, 0).reshape(4, -1))
 
-    def _locate_points(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _locate_points(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Find the positions (B, 6) of the triangle nearest to each point (B, 3) [m], and their weights (B, 6)."""
-        local = (point @ self._columns[:3] + self._columns[3]).reshape(-1, 4, len(self.triangles))
+        local = (points @ self._columns[:3] + self._columns[3]).reshape(-1, 4, len(self.triangles))
         miss = np.absolute(local[:, 3]) - HEIGHT_EQUIVALENT * np.minimum(local[:, :3].min(axis=1), 0.0)
         best = miss.argmin(axis=1)
         frame = take_rows(best, self._frames[:, :3])
-        corner = np.maximum(np.einsum("bij,bj->bi", frame[:, :, :3], point) + frame[:, :, 3], 0.0)
+        corner = np.maximum(np.einsum("bij,bj->bi", frame[:, :, :3], points) + frame[:, :, 3], 0.0)
         corner = corner / corner.sum(axis=1, keepdims=True)
         share = [corner * (2.0 * corner - 1.0), 4.0 * corner[:, [1, 2, 0]] * corner[:, [2, 0, 1]]]
         return take_rows(best, self.triangles), np.concatenate(share, axis=1)
 
-    def _interpolate_radii(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return indices (B, k) of tabulated radii and parabola weights (B, k) to interpolate at `radius` (B,) [m]."""
+    def _interpolate_radii(self, radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return indices (B, k) of tabulated radii and parabola weights (B, k) to interpolate at `radii` (B,) [m]."""
         width = min(STENCIL_SIZE, len(self.radii))
-        inside = np.clip(radius, self.radii[0], self.radii[-1])
+        inside = np.clip(radii, self.radii[0], self.radii[-1])
         first = np.clip(np.searchsorted(self.radii, inside) - 2, 0, len(self.radii) - width)
         index = first[:, None] + np.arange(width)
         at, x = take_rows(index, np.log(self.radii)), np.log(inside)[:, None]

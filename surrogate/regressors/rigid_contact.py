@@ -121,15 +121,15 @@ class RigidContact:
     @property
     def warm_start_width(self) -> int:
         """Number of columns of `compute_warm_start`."""
-        return self._width + len(self.compliance) + 4 * MAX_STORED_POINTS
+        return self._pose_feature_count + len(self.compliance) + 4 * MAX_STORED_POINTS
 
     def compute_warm_start(self, X: np.ndarray) -> np.ndarray:
         """Return a warm start (B, h) for the next pose: features, nodal forces and contact points."""
-        return np.hstack([X[:, : self._width], self._find_contact(X)])
+        return np.hstack([X[:, : self._pose_feature_count], self._find_contact(X)])
 
     def get_warm_start_force(self, warm_start: np.ndarray) -> np.ndarray:
         """Return the nodal forces (B, 3 k) [N] in the rows of `warm_start`."""
-        return warm_start[:, self._width : self._width + len(self.compliance)]
+        return warm_start[:, self._pose_feature_count : self._pose_feature_count + len(self.compliance)]
 
     def _compute_terms(self, X: np.ndarray) -> np.ndarray:
         """Compute the terms (B, 2) of the factor's line: 1 and depth / radius; (B, 4) for relaxing tissue."""
@@ -138,12 +138,12 @@ class RigidContact:
 
     def _split_features(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Split features into tool pose, relaxed share and warm start; the last two may have no columns."""
-        more = X[:, self._width :]
+        more = X[:, self._pose_feature_count :]
         relaxed, held = np.split(more, [more.shape[1] % self.warm_start_width], axis=1)
-        return X[:, : self._width], relaxed, held
+        return X[:, : self._pose_feature_count], relaxed, held
 
     @property
-    def _width(self) -> int:
+    def _pose_feature_count(self) -> int:
         """Number of features of the tool's pose."""
         return ROD_FEATURES if len(self.core) else BALL_FEATURES
 
@@ -196,7 +196,7 @@ class RigidContact:
         return cls(**state)
 
     @cached_property
-    def _rounds(self) -> tuple[np.ndarray, np.ndarray]:
+    def _bounding_balls(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres (S, 3) [m] and radii (S,) [m] of the triangles' bounding balls."""
         return compute_bounding_balls(self.points[self.triangles])
 
@@ -213,14 +213,14 @@ class RigidContact:
         if not len(self.core):
             return [PlacedBox(point + (depth - radius) * direction, np.eye(3), np.zeros(3))], radius + MEAN_GAP, None
         there, stride = self._place_box(x), SEARCH.path_step * self.core[3]
-        steps, last = int(np.ceil(depth / stride)), x[self._width :]
+        steps, last = int(np.ceil(depth / stride)), x[self._pose_feature_count :]
         if len(last) and last[6] > 0.0:
             begun = self._place_box(last)
             far = np.linalg.norm(there.corners - begun.corners, axis=1).max()
             if (few := int(np.ceil(far / stride))) < steps:
                 back = begun.centre - there.centre
                 ways = [there.move((1.0 - k / few) * back) for k in range(1, few + 1)] or [there]
-                return [begun, *ways], self.core[3] + MEAN_GAP, last[self._width :]
+                return [begun, *ways], self.core[3] + MEAN_GAP, last[self._pose_feature_count :]
         ways = [(k / steps - 1.0) * depth * direction for k in range(1, steps + 1)]
         return [there.move(way) for way in ways], self.core[3] + MEAN_GAP, None
 
@@ -283,7 +283,7 @@ class RigidContact:
         self, stations: list[PlacedBox], radius: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Select facets (S,) within a tool's reach; return facets, nodes (n,), node indices (S, 3), compliance rows."""
-        around, wide = self._rounds
+        around, wide = self._bounding_balls
         reach = SEARCH.candidate_distance * radius
         far = wide + reach + np.linalg.norm(stations[0].half_sizes)
         ends = [stations[k] for k in sorted({0, len(stations) // 2, len(stations) - 1})]
@@ -294,9 +294,9 @@ class RigidContact:
         return some[near], nodes, table, (3 * nodes[:, None] + np.arange(3)).ravel()
 
 
-def _fit_line(terms: np.ndarray, predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Fit coefficients (k,) of terms (B, k) whose sum is the factor that scales `predicted` to `target` (B, r)."""
-    factor = np.einsum("br,br->b", predicted, target) / np.square(predicted).sum(axis=1)
+def _fit_line(terms: np.ndarray, predicted: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Fit coefficients (k,) of terms (B, k) whose sum is the factor that scales `predicted` to `targets` (B, r)."""
+    factor = np.einsum("br,br->b", predicted, targets) / np.square(predicted).sum(axis=1)
     return np.linalg.lstsq(terms, factor, rcond=None)[0]
 
 

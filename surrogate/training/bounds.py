@@ -180,17 +180,17 @@ def _mask_scale_loads(near_loads: BoundExamples) -> np.ndarray:
 class ModelErrors:
     """Errors of a model on B loads: maximum over the tumour's vertices, tip-tumour distance, and tool force.
 
-    `force` is the error of the force of a tool moved by pose; None if not available.
+    `tool_force` is the error of the force of a tool moved by pose; None if not available.
     """
 
-    tumour: BoundExamples
-    tip: BoundExamples
-    force: BoundExamples | None = None
+    tumour_motion: BoundExamples
+    tip_distance: BoundExamples
+    tool_force: BoundExamples | None = None
 
     def list_available(self) -> dict[str, BoundExamples]:
         """Return the available errors by name, with the keys of `BOUND_FITS`."""
-        found = {"tumour": self.tumour, "tip": self.tip}
-        return found if self.force is None else {**found, "force": self.force}
+        found = {"tumour": self.tumour_motion, "tip": self.tip_distance}
+        return found if self.tool_force is None else {**found, "force": self.tool_force}
 
 
 @dataclass(frozen=True, eq=False)

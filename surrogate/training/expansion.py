@@ -28,7 +28,7 @@ from ..data.cortex_patch import Patch, open_patch
 from ..data.dataset import Dataset
 from ..data.encode import Basis, compute_unit_nodal_forces, fit_basis, split_forces
 from ..data.solution_rows import read_tissue_text
-from ..data.tool_loads import select_spread
+from ..data.tool_loads import pick_far_points
 from ..model.applicability import read_trained_skull
 from ..model.kept_arrays import REMEDY
 from ..model.learned import ModelPart, get_only_pushes
@@ -125,7 +125,7 @@ class Expansion:
 
         The number of modes follows from `ExpansionSettings.table_tolerance`.
         """
-        return tuple(self._build_compliance(nodes) for nodes in self._known)
+        return tuple(self._build_compliance(nodes) for nodes in self._vertex_sets)
 
     @cached_property
     def second_order_part(self) -> ModelPart:
@@ -176,7 +176,7 @@ class Expansion:
         strongest = split_forces(get_only_pushes(self.data.loads))[0].max()
         unit = strongest ** np.repeat([1, 2, 3], [factors.shape[1] for factors in FACTORS])
         found = []
-        for added, parts, wide, basis in zip(self._beyond, self.exact_parts, self.table.bases, bases, strict=True):
+        for added, parts, wide, basis in zip(self._remainders, self.exact_parts, self.table.bases, bases, strict=True):
             # Footprints across the edge press on nodes beyond the open cortex. For others the exact parts leave no
             # residual.
             every = interpolate_table(self.positions, added @ (wide.modes @ basis.modes.T), held_out)
@@ -187,19 +187,19 @@ class Expansion:
         return found
 
     @cached_property
-    def _beyond(self) -> list[np.ndarray]:
+    def _remainders(self) -> list[np.ndarray]:
         """Tables (P, R, 19, r) of the series minus the exact parts, for the tumour and the cortex."""
         known, found = self.table, []
         for table, parts, wide in zip(known.basis_columns, self.exact_parts, known.bases, strict=True):
             added = table.copy()
             for part, order, form_of in zip(parts, ORDER_COLUMNS, (_compute_linear_form, _square_form), strict=False):
-                met = form_of(part, self._unit_shares) @ (part.basis.modes @ wide.modes.T)
+                met = form_of(part, self._unit_nodal_forces) @ (part.basis.modes @ wide.modes.T)
                 added[:, :, order] -= met.reshape(added[:, :, order].shape)
             found.append(added)
         return found
 
     @cached_property
-    def _unit_shares(self) -> np.ndarray:
+    def _unit_nodal_forces(self) -> np.ndarray:
         """Nodal forces (P R, 3, 3 m) for one newton along each axis, at each position and radius."""
         point = np.repeat(self.positions, 3 * len(self.radii), axis=0)
         radius = np.tile(np.repeat(self.radii, 3), len(self.positions))
@@ -216,7 +216,7 @@ class Expansion:
             The data set does not give its tissue.
         """
         begun = time.perf_counter()
-        contact, bases = condense_contact(self.build_fem(), self._known, self.data.tool)
+        contact, bases = condense_contact(self.build_fem(), self._vertex_sets, self.data.tool)
         return contact, bases, time.perf_counter() - begun
 
     def _build_compliance(self, nodes: np.ndarray) -> ModelPart:
@@ -235,9 +235,9 @@ class Expansion:
         """
         if self.table_path is not None and self.table_path.exists():
             with wrap_errors(self.table_path, "a table of the series", REMEDY), self.table_path.open("rb") as raw:
-                modes = [f"modes{k}" for k in range(len(self._known))]
+                modes = [f"modes{k}" for k in range(len(self._vertex_sets))]
                 file = Archive(raw, REMEDY).read_arrays([*modes, "pairs", "second", "second_modes", "table", "seconds"])
-                bases = [Basis(nodes, file[name]) for name, nodes in zip(modes, self._known, strict=True)]
+                bases = [Basis(nodes, file[name]) for name, nodes in zip(modes, self._vertex_sets, strict=True)]
                 pair_basis = Basis(self.tumour, file["second_modes"])
                 return SeriesTable(
                     bases, file["table"], file["pairs"], file["second"], pair_basis, float(file["seconds"])
@@ -273,20 +273,20 @@ class Expansion:
         Return the bases, the table, and True if the whole table was computed in this run.
         """
         count = len(self.positions)
-        few = np.sort(select_spread(self.positions, self.settings.table_places))
-        every, motions = np.concatenate(self._known), []
+        few = np.sort(pick_far_points(self.positions, self.settings.table_places))
+        every, motions = np.concatenate(self._vertex_sets), []
         for first in range(0, 3 * len(every), self.settings.strip_size):
             components = np.eye(3 * len(every))[first : first + self.settings.strip_size].reshape(-1, len(every), 3)
             reading = fem.build_reading(every, components)
             motions.append(
                 tabulate_series(fem, self.positions[few], self.radii, reading, lambda n, _: self.progress(n, count))
             )
-        cuts = 3 * np.cumsum([len(nodes) for nodes in self._known])[:-1]
+        cuts = 3 * np.cumsum([len(nodes) for nodes in self._vertex_sets])[:-1]
         parts = np.split(np.concatenate(motions, axis=-1), cuts, axis=-1)
         # The cortex's first order is given by its compliance.
         orders = (ORDER_COLUMNS, ORDER_COLUMNS[1:])
         wide = self.settings.wide_basis
-        bases = [_build_wide_basis(*each, wide) for each in zip(self._known, parts, orders, strict=False)]
+        bases = [_build_wide_basis(*each, wide) for each in zip(self._vertex_sets, parts, orders, strict=False)]
         whole = join_bases(bases)
         reading = fem.build_reading(whole.nodes, whole.modes.reshape(len(whole.modes), -1, 3))
         table = np.empty((count, *parts[0].shape[1:3], reading.count), np.float32)
@@ -304,7 +304,7 @@ class Expansion:
         return bases, table, anew
 
     @cached_property
-    def _known(self) -> list[np.ndarray]:
+    def _vertex_sets(self) -> list[np.ndarray]:
         """Vertex sets of the tumour and, if it has further vertices, of the cortex."""
         return [nodes for nodes in (self.tumour, self.cortex) if len(nodes)]
 
@@ -361,25 +361,25 @@ class SeriesTable:
         return np.split(self.table, np.cumsum([len(basis.modes) for basis in self.bases])[:-1], axis=-1)
 
 
-def _compute_linear_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
-    """Compute basis coefficients (n, 3, r) for nodal forces `shares` (n, 3, 3 m) along each axis."""
-    return part.regressor.predict(shares.reshape(-1, shares.shape[2])).reshape(*shares.shape[:2], -1)
+def _compute_linear_form(part: ModelPart, nodal_forces: np.ndarray) -> np.ndarray:
+    """Compute basis coefficients (n, 3, r) for `nodal_forces` (n, 3, 3 m) along each axis."""
+    return part.regressor.predict(nodal_forces.reshape(-1, nodal_forces.shape[2])).reshape(*nodal_forces.shape[:2], -1)
 
 
-def _square_form(part: ModelPart, shares: np.ndarray) -> np.ndarray:
-    """Compute coefficients (n, 6, r) of the direction products in `FACTORS`, for nodal forces `shares` (n, 3, 3 m)."""
-    own = [part.regressor.predict(shares[:, axis]) for axis in range(3)]
+def _square_form(part: ModelPart, nodal_forces: np.ndarray) -> np.ndarray:
+    """Compute coefficients (n, 6, r) of the direction products in `FACTORS`, for `nodal_forces` (n, 3, 3 m)."""
+    own = [part.regressor.predict(nodal_forces[:, axis]) for axis in range(3)]
     both = [
-        own[a] if a == b else part.regressor.predict(shares[:, a] + shares[:, b]) - own[a] - own[b]
+        own[a] if a == b else part.regressor.predict(nodal_forces[:, a] + nodal_forces[:, b]) - own[a] - own[b]
         for a, b in FACTORS[1].T
     ]
     return np.stack(both, axis=1)
 
 
 def _build_wide_basis(
-    nodes: np.ndarray, motions: np.ndarray, orders: Sequence[slice], wide: tuple[float, int]
+    nodes: np.ndarray, motions: np.ndarray, order_columns: Sequence[slice], basis_settings: tuple[float, int]
 ) -> Basis:
     """Compute a basis of motions (F, R, 19, 3 n) of vertices (n,), in which the given orders have equal weight."""
-    rows = [motions[:, :, order].reshape(-1, len(nodes), 3) for order in orders]
+    rows = [motions[:, :, order].reshape(-1, len(nodes), 3) for order in order_columns]
     tiny = np.finfo(np.float32).tiny
-    return fit_basis(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *wide)
+    return fit_basis(nodes, np.concatenate([each / max(np.linalg.norm(each), tiny) for each in rows]), *basis_settings)

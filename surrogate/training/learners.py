@@ -12,7 +12,7 @@ from sim.loads import Pushed
 from ..data.cortex_patch import Patch, find_nearest
 from ..data.encode import ENCODERS, Basis, fit_basis, split_forces
 from ..data.splits import DiscSplit
-from ..data.tool_loads import select_spread
+from ..data.tool_loads import pick_far_points
 from ..evaluation.score import SolveCounts
 from ..model.learned import ModelPart
 from ..model.own_learners import find_learner_name, find_own_learner
@@ -53,7 +53,7 @@ class SharedInputs:
     def series(self) -> tuple[ModelPart, ...]:
         """Parts of the power series beyond the exact parts, for the tumour and for the cortex, if any."""
         bases = self.expansion.build_bases(self.basis_examples, ADDED_BASIS, COARSE_BASIS)
-        found = self.expansion.build_series(bases, self._mask_left_out(self.expansion.positions))
+        found = self.expansion.build_series(bases, self._mask_held_out(self.expansion.positions))
         return tuple(ModelPart("tool", part, basis) for part, basis in zip(found, bases, strict=True))
 
     def count_solves(self, name: str, examples: Examples) -> SolveCounts:
@@ -64,21 +64,21 @@ class SharedInputs:
         of_tumour = name in ("linear", "residual", *SERIES_MODELS)
         if data.tool is None and (len(known.cortex) or of_tumour):
             units = len(data.unit_good)
-            inside = 3 * of_tumour * int(self._mask_left_out(known.patch.points).sum())
+            inside = 3 * of_tumour * int(self._mask_held_out(known.patch.points).sum())
             seconds.append(data.estimate_seconds("unit response", units))
         if name in CONTACT_MODELS:
             contact, _, took = known.contact
-            units, inside = contact.points.size, 3 * int(self._mask_left_out(contact.points).sum())
+            units, inside = contact.points.size, 3 * int(self._mask_held_out(contact.points).sum())
             seconds.append(took)
         if name in SERIES_MODELS:
-            places = int((~self._mask_left_out(known.positions)).sum())
+            places = int((~self._mask_held_out(known.positions)).sum())
             series = places * len(known.radii) * TERM_COUNT
             took = known.table.seconds * places / len(known.positions)
             seconds.append(took if np.isfinite(took) else None)
         total = None if None in seconds else float(sum(filter(None, seconds)))
         return SolveCounts(loads, units, series, inside, total)
 
-    def _mask_left_out(self, points: np.ndarray) -> np.ndarray:
+    def _mask_held_out(self, points: np.ndarray) -> np.ndarray:
         return np.zeros(len(points), bool) if self.split is None else self.split.is_covered(points)
 
 
@@ -131,7 +131,7 @@ class TunedRegressor:
 
 def find_inner_discs(points: np.ndarray, selection: TuningSettings = TuningSettings()) -> np.ndarray:
     """Return the mask (n,) of points (n, 3) in discs round `inner_discs` distant points, with `inner_share` of all."""
-    distance = find_nearest(points, points[select_spread(points, selection.inner_discs)])[1]
+    distance = find_nearest(points, points[pick_far_points(points, selection.inner_discs)])[1]
     return distance <= np.quantile(distance, selection.inner_share)
 
 

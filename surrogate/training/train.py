@@ -139,7 +139,7 @@ def train(
     if split is None:
         apart[len(apart) - min(len(apart) // CALIBRATION_STRIDE, MAX_CALIBRATION_LOADS) :] = True
         split = _extend_split(hold_out_discs(answers.pushes.point[~apart], answers.patch), apart)
-    chosen = [_select_first(split.training_mask, most), *([_select_first(~apart, most)] if apart.any() else [])]
+    chosen = [_limit_rows(split.training_mask, most), *([_limit_rows(~apart, most)] if apart.any() else [])]
     fits = [_build_fit(answers, rows, shared, left) for rows, left in zip(chosen, (split, None), strict=False)]
     results = {}
     for name in wanted:
@@ -187,57 +187,56 @@ class TrainingResult:
     force: ForceScore | None
 
 
-def _build_fit(solved: TrainingSolutions, rows: np.ndarray, shared: Expansion, split: DiscSplit | None) -> ModelFit:
-    examples = solved.select_examples(rows)
+def _build_fit(results: TrainingSolutions, rows: np.ndarray, expansion: Expansion, split: DiscSplit | None) -> ModelFit:
+    examples = results.select_examples(rows)
     return ModelFit(
-        rows, examples, SharedInputs(examples, shared, split), compute_training_range(solved.patch, examples.loads)
+        rows, examples, SharedInputs(examples, expansion, split), compute_training_range(results.patch, examples.loads)
     )
 
 
 def _train_and_score(
-    name: str, data: Dataset, solved: TrainingSolutions, split: DiscSplit, spare: np.ndarray, fits: Sequence[ModelFit]
+    name: str, data: Dataset, results: TrainingSolutions, split: DiscSplit, spare: np.ndarray, fits: Sequence[ModelFit]
 ) -> TrainingResult:
     """Fit a model type outside the discs and score it inside; then fit it to all loads that are not for calibration."""
-    outside, patch = fits[0], solved.patch
+    outside, patch = fits[0], results.patch
     parts, force = outside.fit_parts(name, patch)
     training = {"learner": name, **data.provenance}
     model = Learned(data.anatomy, parts, outside.envelope, training=training, tool=data.tool, force=force)
     with time_stage("score"):
-        test = solved.loads.select(np.flatnonzero(split.test_mask))
+        test = results.loads.select(np.flatnonzero(split.test_mask))
         solves = outside.inputs.count_solves(name, outside.examples)
-        scored = score(name, model, test, solved.tumour[split.test_mask], solved.nodes, solves)
-        distance = solved.compute_vertex_errors(model, split.test_mask)
-        trained, held_out = (solved.distances.select(rows) for rows in (outside.rows, split.test_mask))
+        scored = score(name, model, test, results.tumour[split.test_mask], results.nodes, solves)
+        distance = results.compute_vertex_errors(model, split.test_mask)
+        trained, held_out = (results.distances.select(rows) for rows in (outside.rows, split.test_mask))
         model, off = improve_distances(model, patch, trained, held_out)
-        far = solved.compute_errors(model, split.test_mask, distance.max(axis=1), off)
-        model = replace(
-            model, bound=min(compute_conformal_quantile(far.tumour.error, LEVELS[0]), float(far.tumour.error.max()))
-        )
+        far = results.compute_errors(model, split.test_mask, distance.max(axis=1), off)
+        error = far.tumour_motion.error
+        model = replace(model, bound=min(compute_conformal_quantile(error, LEVELS[0]), float(error.max())))
     growth = dict.fromkeys(BOUND_FITS, USUAL_GROWTH)
     of_tumour = of_tip = None
-    promised, beside = None, spare & ~split.is_covered(solved.pushes.point)
+    promised, beside = None, spare & ~split.is_covered(results.pushes.point)
     if beside.sum() >= 2 * MIN_CALIBRATION_LOADS and len(test) >= FORCE_CLASSES:
         with time_stage("calibrate"):
-            near, there = solved.compute_errors(model, beside).list_available(), far.list_available()
+            near, there = results.compute_errors(model, beside).list_available(), far.list_available()
             growth = {way: compute_growth(near[way], there[way], BOUND_FITS[way]) for way in near}
             bound = {way: compute_held_out_bounds(model, near[way], there[way], split, BOUND_FITS[way]) for way in near}
             of_tumour, of_tip = (
-                measure_bound_coverage(bound["tumour"], far.tumour),
-                measure_bound_coverage(bound["tip"], far.tip),
+                measure_bound_coverage(bound["tumour"], far.tumour_motion),
+                measure_bound_coverage(bound["tip"], far.tip_distance),
             )
-            motion = _compute_motion(solved, split.test_mask)
+            motion = _compute_motion(results, split.test_mask)
             model = replace(
-                model, held_out=measure_held_out(distance, motion, bound["tumour"][0], far.tumour.extrapolated)
+                model, held_out=measure_held_out(distance, motion, bound["tumour"][0], far.tumour_motion.extrapolated)
             )
             promised = bound.get("force")
     forces = None
-    if far.force is not None and solved.force is not None:
-        forces = score_forces(far.force.error, solved.force[split.test_mask], promised)
+    if far.tool_force is not None and results.force is not None:
+        forces = score_forces(far.tool_force.error, results.force[split.test_mask], promised)
     if spare.any():
-        model = _fit_on_all(name, model, solved, fits[1])
+        model = _fit_on_all(name, model, results, fits[1])
     if spare.sum() >= MIN_CALIBRATION_LOADS:
         with time_stage("calibrate"):
-            model = _add_bounds(model, solved.compute_errors(model, spare), growth, far)
+            model = _add_bounds(model, results.compute_errors(model, spare), growth, far)
     return TrainingResult(model, scored, of_tumour, of_tip, forces)
 
 
@@ -274,7 +273,7 @@ def _compute_motion(solutions: TrainingSolutions, rows: np.ndarray) -> np.ndarra
     return np.linalg.norm(solutions.tumour[rows], axis=2).mean(axis=1)
 
 
-def _select_first(rows: np.ndarray, max_rows: int | None) -> np.ndarray:
+def _limit_rows(rows: np.ndarray, max_rows: int | None) -> np.ndarray:
     """Keep the first `max_rows` rows of a mask (B,); None: keep all."""
     return rows if max_rows is None else rows & (np.cumsum(rows) <= max_rows)
 

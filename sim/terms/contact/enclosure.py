@@ -20,7 +20,7 @@ def build_kernel(device: Device) -> wp.Kernel:
     @forward_kernel(module="unique")
     def add_angle(
         points: wp.array2d(dtype=wp.vec3d),
-        rest: wp.array(dtype=wp.vec3d),
+        nodes: wp.array(dtype=wp.vec3d),
         triangles: wp.array2d(dtype=wp.int32),
         u: wp.array2d(dtype=scalar),
         # outputs
@@ -32,7 +32,7 @@ def build_kernel(device: Device) -> wp.Kernel:
         for row in range(3):
             i = triangles[s, row]
             for k in range(3):
-                corners[row, k] = rest[i][k] + wp.float64(u[3 * i + k, c])
+                corners[row, k] = nodes[i][k] + wp.float64(u[3 * i + k, c])
         for p in range(points.shape[0]):
             x, y, z = corners[0] - points[p, c], corners[1] - points[p, c], corners[2] - points[p, c]
             a, b, d = wp.length(x), wp.length(y), wp.length(z)
@@ -43,11 +43,11 @@ def build_kernel(device: Device) -> wp.Kernel:
 
 
 def find_enclosing_columns(
-    device: Device, points: np.ndarray, rest: wp.array, triangles: wp.array, u: wp.array
+    device: Device, points: np.ndarray, nodes: wp.array, triangles: wp.array, u: wp.array
 ) -> np.ndarray:
     """Return a mask (b,) of load cases with a point (b, p, 3) [m] inside the outward surface displaced by u (3N, b)."""
     points = np.ascontiguousarray(points.swapaxes(0, 1))
     angle = wp.zeros(points.shape[:2], dtype=wp.float64, device=device.name)
-    inputs = [device.upload(points, wp.vec3d), rest, triangles, u]
+    inputs = [device.upload(points, wp.vec3d), nodes, triangles, u]
     device.launch(build_kernel(device), (len(triangles), points.shape[1]), inputs, [angle])
     return (angle.numpy() > np.pi).any(axis=0)

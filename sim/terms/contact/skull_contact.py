@@ -268,7 +268,7 @@ class Skull:
             setattr(self._wall, name, device.upload(getattr(bone, name), wp.vec3d))
         for name in ("inside_distance", "activation", "area"):
             setattr(self._wall, name, device.upload(getattr(bone, name), wp.float64))
-        self._wall.gap, self._wall.edge, self._wall.shear = bone.gap, bone.edge, shear
+        self._wall.gap, self._wall.edge, self._wall.shear = bone.gap, bone.edge_radius, shear
         self.widen_gap(1.0)
         covered = bone.inside_distance < 0.0
         nodes, normal, times = bone.nodes[covered], bone.normal[covered], (bone.area / bone.activation)[covered]

@@ -73,7 +73,7 @@ class Bone:
         Activation distances (k,) [m], and tributary areas (k,) [m^2].
     gap
         Undeformed distance between surface and bone [m].
-    edge
+    edge_radius
         Radius of the craniotomy's edge [m].
     """
 
@@ -85,7 +85,7 @@ class Bone:
     activation: np.ndarray
     area: np.ndarray
     gap: float
-    edge: float
+    edge_radius: float
 
 
 def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: BoneSettings = BONE_SETTINGS) -> Bone:
@@ -125,7 +125,7 @@ def build_bone(anatomy: Anatomy, space: Discretisation, gap: float, settings: Bo
         activation=activation[nodes],
         area=_compute_nodal_areas(space)[nodes],
         gap=gap,
-        edge=edge,
+        edge_radius=edge,
     )
 
 
@@ -168,9 +168,9 @@ def find_opening_edge(anatomy: Anatomy) -> np.ndarray:
     return around[opened.any(axis=1) & ~opened.all(axis=1)]
 
 
-def compute_edge_radius(nodes: np.ndarray, rim: np.ndarray) -> float:
-    """Return the edge radius [m] that the triangles `rim` (R, 3) resolve: their mean edge length."""
-    return float(compute_edge_lengths(nodes[rim]).mean())
+def compute_edge_radius(nodes: np.ndarray, edge_nodes: np.ndarray) -> float:
+    """Return the edge radius [m] that the triangles `edge_nodes` (R, 3) resolve: their mean edge length."""
+    return float(compute_edge_lengths(nodes[edge_nodes]).mean())
 
 
 def measure_inside_opening(

@@ -44,17 +44,17 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
 
     @wp.func
     def find_near_pairs(
-        x: wp.array2d(dtype=wp.float64), reach: wp.float64, contact: ContactStruct, near: NearPairs, c: int, me: int
+        x: wp.array2d(dtype=wp.float64), gap: wp.float64, contact: ContactStruct, near: NearPairs, c: int, thread: int
     ) -> int:
-        """Find the pairs within the distance `reach`; return the maximum number of their sample rows."""
-        if me == 0:
+        """Find the pairs within the distance `gap`; return the maximum number of their sample rows."""
+        if thread == 0:
             near.count[c] = 0
         wait()
         tools = contact.tools.radius.shape[0]
-        for pair in range(me, contact.surface.area.shape[0] * tools, threads):
+        for pair in range(thread, contact.surface.area.shape[0] * tools, threads):
             k = pair % tools
             own = to_core_axes(get_positions(contact.surface, x, pair // tools, c), contact.tools, k, c)
-            if is_near(own, reach, contact.tools.half[k], contact.tools.radius[k]):
+            if is_near(own, gap, contact.tools.half[k], contact.tools.radius[k]):
                 near.pairs[c, wp.atomic_add(near.count, c, 1)] = pair
         wait()
         return contact.rows * near.count[c]
@@ -65,13 +65,13 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         contact: ContactStruct,
         near: NearPairs,
         c: int,
-        me: int,
+        thread: int,
         # outputs
         out: wp.array2d(dtype=wp.float64),
     ):
         """Add forces f_a += sum over points of w k b'(d) n N_a, and store the near pairs at x."""
         tools, gap = contact.tools.radius.shape[0], contact.scale.gap
-        for item in range(me, find_near_pairs(x, gap, contact, near, c, me), threads):
+        for item in range(thread, find_near_pairs(x, gap, contact, near, c, thread), threads):
             pair, i = near.pairs[c, item // contact.rows], item % contact.rows
             s, k = pair // tools, pair % tools
             n = contact.surface.pieces[s]
@@ -91,13 +91,13 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         definite: int,
         index: wp.array2d(dtype=wp.int32),
         c: int,
-        me: int,
+        thread: int,
         # outputs
         out: wp.array3d(dtype=wp.float64),
     ):
         """Add K_ab += sum over points of w k H N_a N_b between nodes with `index` >= 0, for the stored near pairs."""
         tools = contact.tools.radius.shape[0]
-        for item in range(me, contact.rows * near.count[c], threads):
+        for item in range(thread, contact.rows * near.count[c], threads):
             pair, i = near.pairs[c, item // contact.rows], item % contact.rows
             s, k = pair // tools, pair % tools
             if i < contact.surface.pieces[s]:
@@ -112,17 +112,17 @@ def build_functions(device: Device, size: int) -> BlockFunctions:
         contact: ContactStruct,
         near: NearPairs,
         c: int,
-        me: int,
+        thread: int,
     ) -> wp.float64:
         """Return the allowed fraction, at most 1, of the step `step` from x; overwrite the near pairs."""
         far = wp.float64(0.0)
-        for i in range(me, x.shape[0] // 3, threads):
+        for i in range(thread, x.shape[0] // 3, threads):
             far = wp.max(far, wp.length(wp.vec3d(step[3 * i, c], step[3 * i + 1, c], step[3 * i + 2, c])))
         farthest = get_max(far)
-        if me == 0:
+        if thread == 0:
             near.least[c] = wp.float64(1.0)
         tools = contact.tools.radius.shape[0]
-        for item in range(me, find_near_pairs(x, bulge * farthest / kept, contact, near, c, me), threads):
+        for item in range(thread, find_near_pairs(x, bulge * farthest / kept, contact, near, c, thread), threads):
             pair, i = near.pairs[c, item // contact.rows], item % contact.rows
             s, k = pair // tools, pair % tools
             n = contact.surface.pieces[s]

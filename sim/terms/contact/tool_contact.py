@@ -64,7 +64,7 @@ class ToolContactTerm:
         compute_path: Callable[[Cases], ToolPath | None],
         nodes: np.ndarray,
         triangles: np.ndarray,
-        closed: np.ndarray,
+        is_closed: np.ndarray,
         bone: np.ndarray,
         gap: float,
         shear: float,
@@ -76,7 +76,7 @@ class ToolContactTerm:
         self._owner = np.repeat(np.arange(len(tools)), [len(list_cores(tool)) for tool in tools])
         self._first, self._sag = np.unique(self._owner, return_index=True)[1], sampling.max_sag * gap
         self._nodes, self._corners = nodes, [core.corners for core in cores]
-        self._triangles, self._closed = triangles, device.upload(closed, wp.int32)
+        self._triangles, self._closed = triangles, device.upload(is_closed, wp.int32)
         self._shapes, self._way, self._device, self._touch = tools, compute_path, device, sampling
         self._kernels = build_kernels(device, triangles.shape[1])
         fine = np.sqrt(2.0 * min(core.radius for core in cores) * sampling.max_sag * gap) / MAX_SAMPLE_DISTANCE
@@ -197,7 +197,7 @@ class ToolContactTerm:
         nodes, own = self._nodes[self.touchable_nodes], np.searchsorted(self.touchable_nodes, self._triangles)
         corners, exact = own[:, :3], replace(self._device, precision="float64")
         term = ToolContactTerm(
-            self.name, self._shapes, self._way, nodes=nodes, triangles=own, closed=corners, bone=own[:0],
+            self.name, self._shapes, self._way, nodes=nodes, triangles=own, is_closed=corners, bone=own[:0],
             gap=self._asked, shear=self._shear, device=exact, sampling=self._touch,
         )  # fmt: skip
         return term, ReducedToolBarrier(term, len(nodes), own.shape[1], exact)
@@ -328,7 +328,7 @@ def build_tool_contact(
     solid = np.logical_or(anatomy.fixed.all(axis=1), anatomy.slide_normal.any(axis=1))
     bone = space.surface[solid[whole].all(axis=1)]
     return ToolContactTerm(
-        name, tools, compute_path, nodes=space.nodes, triangles=triangles, closed=whole, bone=bone,
+        name, tools, compute_path, nodes=space.nodes, triangles=triangles, is_closed=whole, bone=bone,
         gap=effect.gap, shear=shear, device=device, sampling=sampling,
     )  # fmt: skip
 
@@ -346,11 +346,11 @@ def _build_surface(nodes: np.ndarray, triangles: np.ndarray, spacing: float, dev
 
 
 def _find_path_starts(
-    past: np.ndarray | None, restarted: np.ndarray | None, retract: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
+    last: np.ndarray | None, restarted: np.ndarray | None, retract: Callable[[np.ndarray], np.ndarray], pose: np.ndarray
 ) -> np.ndarray:
     """Return path starts (B, tools, 4, 4): the last poses; without history or if `restarted`, poses without contact."""
-    begin = pose.copy() if past is None else past.copy()
-    new = np.ones(len(pose), bool) if past is None else np.zeros(len(pose), bool) if restarted is None else restarted
+    begin = pose.copy() if last is None else last.copy()
+    new = np.ones(len(pose), bool) if last is None else np.zeros(len(pose), bool) if restarted is None else restarted
     begin[new] = retract(pose[new])
     return begin
 

@@ -57,7 +57,7 @@ class ToolDistance:
 
 
 @wp.func
-def compute_core_distance(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> ToolDistance:
+def compute_core_distance(p: wp.vec3d, sizes: wp.vec3d, radius: wp.float64) -> ToolDistance:
     """Return the distance d = |v| - r to a core, v from the nearest point of the core to p, and two derivatives.
 
     These are n = v / |v| and dn = (M - n (x) n) / |v|; M selects the components in which p is outside the core.
@@ -65,8 +65,8 @@ def compute_core_distance(p: wp.vec3d, half: wp.vec3d, radius: wp.float64) -> To
     one, zero = wp.float64(1.0), wp.float64(0.0)
     v, beyond = wp.vec3d(), wp.vec3d()
     for i in range(3):
-        v[i] = p[i] - wp.clamp(p[i], -half[i], half[i])
-        beyond[i] = wp.where(v[i] != zero or half[i] == zero, one, zero)
+        v[i] = p[i] - wp.clamp(p[i], -sizes[i], sizes[i])
+        beyond[i] = wp.where(v[i] != zero or sizes[i] == zero, one, zero)
     length = wp.length(v)
     out = ToolDistance()
     out.distance = length - radius
@@ -217,33 +217,33 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
         return steep * bound_norm(subtract_centroid(x)) / (bulge * wp.float64(n))
 
     @wp.func
-    def bound_distance(x: forces, scale: wp.float64, half: wp.vec3d, radius: wp.float64) -> wp.float64:
+    def bound_distance(x: forces, scale: wp.float64, sizes: wp.vec3d, radius: wp.float64) -> wp.float64:
         """Return a lower bound of the distance of a core from a triangle scaled by `scale` about its centroid."""
         arms = subtract_centroid(x)
-        return compute_core_distance(x[0] - arms[0], half, radius).distance - scale * bound_norm(arms)
+        return compute_core_distance(x[0] - arms[0], sizes, radius).distance - scale * bound_norm(arms)
 
     @wp.func
-    def is_near(x: forces, max_distance: wp.float64, half: wp.vec3d, radius: wp.float64) -> bool:
+    def is_near(x: forces, max_distance: wp.float64, sizes: wp.vec3d, radius: wp.float64) -> bool:
         """Return True if a point of the triangle may be within `max_distance` of a core."""
-        return bound_distance(x, wp.float64(1.0), half, radius) < max_distance
+        return bound_distance(x, wp.float64(1.0), sizes, radius) < max_distance
 
     @wp.func
-    def sum_row_energy(x: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> wp.float64:
+    def sum_row_energy(x: forces, n: int, i: int, sizes: wp.vec3d, radius: wp.float64, gap: wp.float64) -> wp.float64:
         """Return the sum of b(d) over the points of a row."""
         total, pace, most, j = wp.float64(0.0), bound_spacing(x, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
-            d = compute_core_distance(compute_shapes(i, j, n) * x, half, radius).distance
+            d = compute_core_distance(compute_shapes(i, j, n) * x, sizes, radius).distance
             total += barrier(d, gap)
             j += compute_offset(d - gap, pace, most)
         return total
 
     @wp.func
-    def sum_row_forces(x: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64, gap: wp.float64) -> forces:
+    def sum_row_forces(x: forces, n: int, i: int, sizes: wp.vec3d, radius: wp.float64, gap: wp.float64) -> forces:
         """Return the sum of N_a b'(d) n over the points of a row, for each node a."""
         total, pace, most, j = forces(), bound_spacing(x, n), 2 * (n - i) - 1, wp.int32(0)
         while j < most:
             N = compute_shapes(i, j, n)
-            contact = compute_core_distance(N * x, half, radius)
+            contact = compute_core_distance(N * x, sizes, radius)
             if contact.distance < gap:
                 total += wp.outer(N, barrier_slope(contact.distance, gap) * contact.normal)
             j += compute_offset(contact.distance - gap, pace, most)
@@ -294,13 +294,13 @@ def build_functions(device: Device, size: int) -> ToolFunctions:
                                     wp.atomic_add(out, c, second + column, first + row, H[row, column])
 
     @wp.func
-    def bound_row_step(x: forces, motion: forces, n: int, i: int, half: wp.vec3d, radius: wp.float64) -> wp.float64:
+    def bound_row_step(x: forces, motion: forces, n: int, i: int, sizes: wp.vec3d, radius: wp.float64) -> wp.float64:
         """Return the fraction of a motion, at most 1, with which no point of a row reaches the centre of a core."""
         out, pace, most, j = wp.float64(1.0), bound_spacing(x, n), 2 * (n - i) - 1, wp.int32(0)
         farthest = bound_norm(motion)
         while j < most:
             N = compute_shapes(i, j, n)
-            room = compute_core_distance(N * x, half, radius).distance + radius
+            room = compute_core_distance(N * x, sizes, radius).distance + radius
             far = wp.length(N * motion)
             if far > kept * room:
                 out = wp.min(out, kept * room / far)

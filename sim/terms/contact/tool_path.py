@@ -112,21 +112,21 @@ def _find_clear_pose(
     R: np.ndarray,
     cores: Sequence[Core],
     points: np.ndarray,
-    reach: np.ndarray,
-    march: int,
+    radii: np.ndarray,
+    max_steps: int,
 ) -> np.ndarray:
     """Return the pose of `approach` along the third column of R (3, 3); `cores`, in the axes of R, contain the tool."""
     out, local = pose.copy(), (points - pose[:3, 3]) @ R
-    back, room = max(_compute_rise(core, local, reach) for core in cores), 0.0
-    for _ in range(march):
+    back, room = max(_compute_clearing_distance(core, local, radii) for core in cores), 0.0
+    for _ in range(max_steps):
         back = max(0.0, back - room)
         out[:3, 3] = pose[:3, 3] + back * R[:, 2]
-        room = max(0.0, float((compute_distances(tool, out, points) - reach).min()))
+        room = max(0.0, float((compute_distances(tool, out, points) - radii).min()))
     return out
 
 
-def _compute_rise(core: Core, local: np.ndarray, reach: np.ndarray) -> float:
+def _compute_clearing_distance(core: Core, points: np.ndarray, radii: np.ndarray) -> float:
     """Return the distance [m] by which a core must rise along its z axis to clear every surface point on its path."""
-    aside = (np.abs(local[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
-    highest = (local[:, 2] + reach)[aside <= core.radius + reach].max(initial=-np.inf)
+    aside = (np.abs(points[:, :2] - core.centre[:2]) - core.half[:2]).max(axis=1)
+    highest = (points[:, 2] + radii)[aside <= core.radius + radii].max(initial=-np.inf)
     return max(0.0, float(highest - (core.centre[2] - core.half[2] - core.radius)))

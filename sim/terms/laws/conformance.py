@@ -21,18 +21,18 @@ class TestStrains:
     ----------
     count
         Number of random displacement gradients.
-    large, small, single
+    large_deviation, small_deviation, float32_deviation
         Standard deviation of the gradients at large strain, at small strain, and in single precision.
-    step, short_step
+    energy_step, stress_step
         Step of the central differences of the energy, and of the stress.
     """
 
     count: int = 60
-    large: float = 0.3
-    small: float = 1e-6
-    single: float = 1e-3
-    step: float = 1e-5
-    short_step: float = 1e-6
+    large_deviation: float = 0.3
+    small_deviation: float = 1e-6
+    float32_deviation: float = 1e-3
+    energy_step: float = 1e-5
+    stress_step: float = 1e-6
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def check_tissue(
 
 
 def _iterate_findings(tissue: Tissue, small_strain: bool, strains: TestStrains) -> Iterator[Finding]:
-    count, step = strains.count, strains.short_step
+    count, step = strains.count, strains.stress_step
     mu, lam = tissue.lame
     if not (mu > 0.0 and 3.0 * lam + 2.0 * mu > 0.0 and np.isfinite([mu, lam]).all()):
         raise InputError(
@@ -151,7 +151,7 @@ def _iterate_findings(tissue: Tissue, small_strain: bool, strains: TestStrains) 
         )
     yield Finding("coefficients_at its own Lamé constants are its coefficients", _compute_error(again, given), 1e-12)
     double, random = build_evaluator(tissue, "float64"), np.random.default_rng(3)
-    H = random.normal(0.0, strains.large, (3 * count, 3, 3))
+    H = random.normal(0.0, strains.large_deviation, (3 * count, 3, 3))
     J = np.linalg.det(np.eye(3) + H)
     positive = tissue.functions.needs_positive_volume
     H = H[J > 0.1][:count] if positive else H[np.abs(J) > 0.02][:count]
@@ -160,7 +160,7 @@ def _iterate_findings(tissue: Tissue, small_strain: bool, strains: TestStrains) 
 
     still = double(np.zeros((1, 3, 3)))
     yield Finding("no energy and no stress at rest", max(_find_largest(still.stress), abs(still.energy[0])) / mu, 1e-9)
-    small = random.normal(0.0, strains.small, (count, 3, 3))
+    small = random.normal(0.0, strains.small_deviation, (count, 3, 3))
     for carries in ("whole", "shape", "volume"):
         share = get_lame(tissue, carries)
         stress = double.evaluate(small, None, tissue.coefficients_at(*share)).stress
@@ -180,8 +180,8 @@ def _iterate_findings(tissue: Tissue, small_strain: bool, strains: TestStrains) 
     numeric = np.zeros_like(H)
     for i, j in np.ndindex(3, 3):
         one = np.zeros((3, 3))
-        one[i, j] = strains.step
-        numeric[:, i, j] = (double(H + one).energy - double(H - one).energy) / (2.0 * strains.step)
+        one[i, j] = strains.energy_step
+        numeric[:, i, j] = (double(H + one).energy - double(H - one).energy) / (2.0 * strains.energy_step)
     yield Finding("stress is the energy's derivative", _compute_error(numeric, here.stress), 1e-6)
     numeric = (double(H + step * D).stress - double(H - step * D).stress) / (2.0 * step)
     yield Finding("stress_change is the stress's derivative", _compute_error(numeric, here.change), 1e-6)
@@ -201,7 +201,7 @@ def _iterate_findings(tissue: Tissue, small_strain: bool, strains: TestStrains) 
             "infinite energy where J < 0, which needs_positive_volume requires", float(inverted < np.inf), 0.0
         )
     single = build_evaluator(tissue, "float32")
-    strained = random.normal(0.0, strains.single, (count, 3, 3)).astype(np.float32).astype(np.float64)
+    strained = random.normal(0.0, strains.float32_deviation, (count, 3, 3)).astype(np.float32).astype(np.float64)
     yield Finding("stress in single precision", _compute_error(single(strained).stress, double(strained).stress), 1e-3)
 
 

@@ -57,7 +57,7 @@ class LawSplit:
 
 def build_law_split(law: Law, device: Device) -> LawSplit:
     """Return the split that the law defines, or else the split by the isochoric part of F."""
-    return build_isochoric_split(law, device) if law.of_shape is None else build_own_split(law, law.of_shape, device)
+    return build_isochoric_split(law, device) if law.of_shape is None else build_user_split(law, law.of_shape, device)
 
 
 @cache
@@ -116,7 +116,7 @@ def build_isochoric_split(law: Law, device: Device) -> LawSplit:
 
 
 @cache
-def build_own_split(law: Law, of_shape: wp.Function, device: Device) -> LawSplit:
+def build_user_split(law: Law, of_shape: wp.Function, device: Device) -> LawSplit:
     """Return the split whose deviatoric part is the law with coefficients `of_shape`, with E = (F^T F - I) / 2.
 
     The potential is finite if that of the law is finite; the overstress is infinite at J = 0. Fully relaxed tissue
