@@ -199,6 +199,6 @@ def test_failed_episodes_are_listed_by_file_name_only(tmp_path, monkeypatch):
     assert list_failed(tmp_path) == {3, 5} and read_failure(tmp_path, 5) == Failure(5, "no 5", lost=False)
     assert read_failure(tmp_path, 4) is None
     monkeypatch.setattr(Path, "read_text", lambda *given: pytest.fail("a file was read"))
-    assert list_failed(tmp_path) == {3, 5} and list_missing_episodes(tmp_path, set(), range(4), True, retry=True)[
+    assert list_failed(tmp_path) == {3, 5} and list_missing_episodes(tmp_path, set(), range(4), True, with_failed=True)[
         1
     ] == [0, 1, 2, 3]

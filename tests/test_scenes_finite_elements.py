@@ -52,7 +52,7 @@ def test_learners_run_in_parallel_on_spare_cores(study, cores, elements, learner
 @pytest.mark.parametrize(("cores", "learners"), [(4, 2), (16, 4)])
 def test_learners_run_together_with_fem_on_a_gpu(study, cores, learners):
     run = Rows()
-    found = [row.name for row in measure_rows(study, SPECS, run, cores, on_card=True)]
+    found = [row.name for row in measure_rows(study, SPECS, run, cores, uses_gpu=True)]
     assert found == [spec.name for spec in SPECS] and run.most == {FemVariant: 2, LearnerSpec: learners}
     begun_first = {spec.name for spec in SPECS[:4]}
     assert (set(run.begun[:4]) == begun_first) is (cores == 4)
@@ -61,7 +61,7 @@ def test_learners_run_together_with_fem_on_a_gpu(study, cores, learners):
 def test_interrupted_gpu_measurement_ends_the_learners(study):
     run, many = Rows("fem 1"), tuple(LearnerSpec(f"learner {k}") for k in range(200))
     with pytest.raises(KeyboardInterrupt):
-        list(measure_rows(study, (*SPECS[:4], *many), run, 16, on_card=True))
+        list(measure_rows(study, (*SPECS[:4], *many), run, 16, uses_gpu=True))
     assert len([name for name in run.begun if name.startswith("learner")]) < len(many)
 
 

@@ -38,5 +38,5 @@ def test_rough_estimate_is_labelled_without_largest_part():
         named = replace(error, registration=1.56e-3)
         for words in (format_errors(None, named, False)[-1], format_position_error(named)):
             assert "clinical registration, 1.6 mm per axis" in words
-    assert format_tumour_error(alone, brief=True) == "tumour <= 4.2 mm, rough estimate"
-    assert format_tumour_error(seen, brief=True) == "tumour <= 1.0 mm"
+    assert format_tumour_error(alone, is_brief=True) == "tumour <= 4.2 mm, rough estimate"
+    assert format_tumour_error(seen, is_brief=True) == "tumour <= 1.0 mm"

@@ -294,7 +294,7 @@ class TestSaid:
         ],
     )
     def test_small_images_have_brief_error_text(self, trained, promised, error, said):
-        assert format_errors(promised, error, trained, brief=True) == said
+        assert format_errors(promised, error, trained, is_brief=True) == said
 
     def test_worst_error_is_known_only_if_all_errors_are_known(self):
         errors = [TumourError(1e-3, "E"), TumourError(3e-3, "nu"), TumourError(2e-3, "E")]
@@ -323,7 +323,7 @@ class TestSaid:
         assert all(has_text(draw_cost_panel(frame, "linear"), line, TEXT_SCALE) for line in frame.head)
         thin = knowing.build_player("linear", scene).draw(3, 0.1, scene.path(0.1))
         assert thin.shown.shape == (240, 320, 3)
-        brief = format_errors(thin.model_error, thin.tumour_error, True, brief=True)
+        brief = format_errors(thin.model_error, thin.tumour_error, True, is_brief=True)
         assert " ".join(thin.head) == " ".join(brief)
         moved = wrap_line(f"moved {format_millimetres(thin.moved, thin.tumour_error.moved)}", MAX_BOTTOM_WIDTH * 320)
         for line in (*thin.head, *moved, "frame 3"):

@@ -206,7 +206,7 @@ def parse_calibration(text: str) -> Calibration:
             _read_matrix(root, key, shape)  # checked only: the matrix is for rectified images, which are not used
     (fx, _, cx), (_, fy, cy) = K[:2].tolist()
     width, height = (_read_int(root, key) for key in ("image_width", "image_height"))
-    lens, name = _read_lens(root, keys), _name(root, keys)
+    lens, name = _read_lens(root, keys), _read_name(root, keys)
     return Calibration((fx, fy), (cx, cy), width, height, lens, name, _read_readout(root, keys))
 
 
@@ -295,7 +295,7 @@ def _read_readout(root: cv2.FileNode, keys: list[str]) -> float:
     return float(node.real())
 
 
-def _name(root: cv2.FileNode, keys: list[str]) -> str:
+def _read_name(root: cv2.FileNode, keys: list[str]) -> str:
     """Read the camera's name; empty if the text has none."""
     if "camera_name" not in keys:
         return ""

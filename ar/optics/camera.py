@@ -280,38 +280,38 @@ MIN_BAND_ROWS = 4  # Minimum height of a band [rows].
 ROW_ITERATIONS = 6  # Number of fixed-point iterations for the row in which a point is seen.
 
 
-def compute_row_time(row: np.ndarray | float, height: int, readout: float) -> np.ndarray | float:
+def compute_row_time(row: np.ndarray | float, height: int, readout_time: float) -> np.ndarray | float:
     """Compute the time [s] of a row in an image of `height` rows, relative to its middle row; rows are clipped."""
-    return readout * (np.clip(np.asarray(row) / max(height - 1, 1), 0.0, 1.0) - 0.5)
+    return readout_time * (np.clip(np.asarray(row) / max(height - 1, 1), 0.0, 1.0) - 0.5)
 
 
 def split_row_bands(
-    camera_at: Callable[[float], Camera], readout: float, points: np.ndarray
+    get_camera: Callable[[float], Camera], readout_time: float, points: np.ndarray
 ) -> list[tuple[slice, Camera]]:
     """Split the image rows into bands, from top to bottom; return each band with its camera, cropped to these rows.
 
-    `camera_at` gives the camera at a time. In each band, points (n, 3) [m] move by at most `MAX_BAND_MOTION` pixels.
+    `get_camera` gives the camera at a time. In each band, points (n, 3) [m] move by at most `MAX_BAND_MOTION` pixels.
     """
-    middle = camera_at(0.0)
-    moments = readout * np.linspace(-0.5, 0.5, MOTION_SAMPLES)
-    pixels = np.stack([camera_at(float(moment)).project(points)[0] for moment in moments])
+    middle = get_camera(0.0)
+    moments = readout_time * np.linspace(-0.5, 0.5, MOTION_SAMPLES)
+    pixels = np.stack([get_camera(float(moment)).project(points)[0] for moment in moments])
     fastest = float(np.nan_to_num(np.linalg.norm(np.diff(pixels, axis=0), axis=2)).max()) * (MOTION_SAMPLES - 1)
     count = int(np.clip(np.ceil(fastest / MAX_BAND_MOTION), 1, max(middle.height // MIN_BAND_ROWS, 1)))
     edges = np.linspace(0, middle.height, count + 1).round().astype(int).tolist()
     bands = []
     for top, low in pairwise(edges):
-        camera = camera_at(float(compute_row_time(0.5 * (top + low - 1), middle.height, readout)))
+        camera = get_camera(float(compute_row_time(0.5 * (top + low - 1), middle.height, readout_time)))
         bands.append((slice(top, low), camera.crop_to(slice(top, low), slice(0, middle.width))))
     return bands
 
 
-def find_row_time(camera_at: Callable[[float], Camera], readout: float, point: np.ndarray) -> float:
+def find_row_time(get_camera: Callable[[float], Camera], readout_time: float, point: np.ndarray) -> float:
     """Compute the time [s] of the row in which a point (3,) [m] is visible; 0 if the point is not projected."""
     time = 0.0
     for _ in range(ROW_ITERATIONS):
-        camera = camera_at(time)
+        camera = get_camera(time)
         (pixel,), _ = camera.project(point[None])
         if not np.isfinite(pixel).all():
             return 0.0
-        time = float(compute_row_time(float(pixel[1]), camera.height, readout))
+        time = float(compute_row_time(float(pixel[1]), camera.height, readout_time))
     return time

@@ -191,7 +191,7 @@ def composite(
 
 
 def _draw_lines(
-    measure: Measurement, margin_layer: Layer | None, marks: Marks, opening: Opening | None, unreliable: bool,
+    measure: Measurement, margin_layer: Layer | None, marks: Marks, opening: Opening | None, is_unreliable: bool,
     box: tuple[slice, slice] | None,
 ) -> LineDrawing:  # fmt: skip
     """Draw all lines of a style; `margin_layer` is the surface with its margin, and `box` contains the surfaces."""
@@ -219,7 +219,7 @@ def _draw_lines(
             front &= ~measure.roles.occluder_mask[around]
     for trace in marks.outlines:
         draw_outline(under, part, trace)
-    draw_broken_outline(under, found, average_colour(hidden.colour), ground, unreliable)
+    draw_broken_outline(under, found, average_colour(hidden.colour), ground, is_unreliable)
     if gauge is not None or style == "cut":
         above = allocate_canvas(part)
     if gauge is not None and above is not None:
@@ -229,38 +229,38 @@ def _draw_lines(
     measure.draw(under, under if above is None else above, around)
     if style == "rings":
         thin[around] = remove_labels(bare & (under[..., 3] > 0))
-    lines = OverlayLines(average_colour(hidden.colour), not unreliable, under, above)
+    lines = OverlayLines(average_colour(hidden.colour), not is_unreliable, under, above)
     out, taken[around] = draw_overlay(picture.drawn, around, part, hidden, found, measure.roles, style, lines)
     if front is not None and crossing is not None:
-        if not unreliable:
+        if not is_unreliable:
             pieces = clip_to_mask(find_outlines(found.mask), front)
             draw_dashes(crossing, pieces, lines.colour, HIDDEN_STROKES, HIDDEN_LINE_WIDTH)
         blend_canvas(out[around], crossing, front)
     return LineDrawing(out, taken, faint, thin, around, ground)
 
 
-def _describe_motion(layer: Layer, initial: Layer, text: ImageText) -> str:
+def _describe_motion(layer: Layer, initial_layer: Layer, text: ImageText) -> str:
     """Describe the surface's mean motion, or the motion given in `text`."""
-    mean = float(np.linalg.norm(layer.vertices - initial.vertices, axis=1).mean())
+    mean = float(np.linalg.norm(layer.vertices - initial_layer.vertices, axis=1).mean())
     return f"{text.legend.motion} {format_millimetres(*((mean, None) if text.motion is None else text.motion))}"
 
 
-def _write_lines(sketch: LineDrawing, camera: Camera, text: ImageText, motion: str) -> Overlaid:
+def _write_lines(drawing: LineDrawing, camera: Camera, text: ImageText, motion: str) -> Overlaid:
     """Write the header, the motion and the warning; return the image.
 
     Texts at the top and in the corners are placed first, so that they seldom move; other texts follow by importance.
     """
-    drawn = Overlaid(sketch.colour, sketch.occupied.copy())
+    drawn = Overlaid(drawing.colour, drawing.occupied.copy())
     write_header(drawn, text.header)
     if motion:
-        firm = drawn.taken * ~sketch.margin_lines  # without the margin's line, so that the text does not move
+        firm = drawn.taken * ~drawing.margin_lines  # without the margin's line, so that the text does not move
         place_text(drawn.colour, firm, wrap_line(motion, MAX_BOTTOM_WIDTH * camera.width), (0, camera.height))
         np.bitwise_or(drawn.taken, firm, out=drawn.taken)
     write_warning(drawn, text.warning)
     return drawn
 
 
-def _write_labels(image: Overlaid, sketch: LineDrawing, measure: Measurement, keys: Sequence[LegendEntry]) -> Overlaid:
+def _write_labels(image: Overlaid, drawing: LineDrawing, measure: Measurement, keys: Sequence[LegendEntry]) -> Overlaid:
     """Write the tip's distance, the label of closed ground, the style's text and the legend; return the image."""
     out, taken = image.colour, image.taken
     whole = measure.roles.read_roles(measure.image.segmentation)
@@ -268,15 +268,15 @@ def _write_labels(image: Overlaid, sketch: LineDrawing, measure: Measurement, ke
     apart = np.zeros_like(taken)
     if measure.gauge is not None:
         before_it = taken.copy()
-        write_distance(out, taken, measure.camera, measure.gauge, front, sketch.occupied, sketch.ring_lines)
+        write_distance(out, taken, measure.camera, measure.gauge, front, drawing.occupied, drawing.ring_lines)
         # Keep the text of the style away from the number: they are unrelated.
         square = np.ones((2 * STYLE_TEXT_DISTANCE + 1,) * 2, np.uint8)
         apart = cv2.dilate(((taken > 0) & (before_it == 0)).view(np.uint8), square)
-    ground, around = sketch.ground, sketch.box
+    ground, around = drawing.ground, drawing.box
     if ground is None or around is None:
         measure.draw_insets(out, taken, front, front)
         return image
-    write_ground_label(image, around, ground, front, sketch.occupied)
+    write_ground_label(image, around, ground, front, drawing.occupied)
     sights = (whole != CLOSED_GROUND).view(np.uint8)
     needed = front.copy()
     for each in (sights, needed):
@@ -285,15 +285,15 @@ def _write_labels(image: Overlaid, sketch: LineDrawing, measure: Measurement, ke
     return replace(image, named=bool(keys) and place_inset(out, taken, draw_legend(keys), sights))
 
 
-def _check_inputs(picture: Picture, camera: Camera, style: str, covered: np.ndarray | None) -> None:
+def _check_inputs(picture: Picture, camera: Camera, style: str, occlusion_mask: np.ndarray | None) -> None:
     """Raise ValueError for an unknown style, or a camera or mask of another size than the image."""
     if style not in STYLES:
         raise ValueError(f"there is no overlay style {style!r}: choose one of {', '.join(STYLES)}.")
     shape = picture.drawn.colour.shape[1:]
     if shape != (camera.height, camera.width):
         raise ValueError(f"the image is {shape}, the camera {(camera.height, camera.width)}.")
-    if covered is not None and (covered.shape != shape or covered.dtype != bool):
-        given = f"{covered.shape} of {covered.dtype}"
+    if occlusion_mask is not None and (occlusion_mask.shape != shape or occlusion_mask.dtype != bool):
+        given = f"{occlusion_mask.shape} of {occlusion_mask.dtype}"
         raise ValueError(f"covered is {given}: give a mask (H, W) of bool as large as the image, {shape}.")
 
 
@@ -307,10 +307,10 @@ def find_ground(segmentation: np.ndarray, roles: np.ndarray, surface: Rasterised
 
 def draw_broken_outline(
     canvas: np.ndarray, surface: RasterisedSurface, colour: tuple[float, float, float], ground: Ground | None,
-    unreliable: bool,
+    is_unreliable: bool,
 ) -> None:  # fmt: skip
     """Draw broken parts of an outline in place: the whole of an unreliable one, else the parts under closed ground."""
-    if unreliable:
+    if is_unreliable:
         draw_dashes(canvas, find_outlines(surface.mask), colour, BROKEN_STROKES)
     elif ground is not None and ground.opaque.any():
         pieces = clip_to_mask(find_outlines(ground.silhouette), ground.opaque)

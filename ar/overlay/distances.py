@@ -158,7 +158,7 @@ def remove_labels(mask: np.ndarray) -> np.ndarray:
     return mask & (numbers == 0)
 
 
-def _label(canvas: np.ndarray, line: np.ndarray, text: str, occupied: np.ndarray, written: np.ndarray) -> bool:
+def _label(canvas: np.ndarray, line: np.ndarray, text: str, occupied: np.ndarray, text_mask: np.ndarray) -> bool:
     """Write a number on a line (n, 1, 2), as near its centre as `occupied` allows; return False without space."""
     (width, height), _ = cv2.getTextSize(text, FONT, TEXT_SCALE, 1)
     middle = len(line) // 2
@@ -174,7 +174,7 @@ def _label(canvas: np.ndarray, line: np.ndarray, text: str, occupied: np.ndarray
                 canvas, (left - 2, top - 2), (left + width + 1, top + height + 1), (*BORDER_COLOUR, OPAQUE), -1
             )
             cv2.putText(canvas, text, (left, top + height), FONT, TEXT_SCALE, (*RING_COLOUR, OPAQUE), 1, cv2.LINE_AA)
-            occupied[box] = written[box] = True
+            occupied[box] = text_mask[box] = True
             return True
     return False
 

@@ -67,20 +67,20 @@ def find_pixel_corners(camera: Camera, points: np.ndarray) -> np.ndarray:
     few = camera.straight[::step, ::step]
     steps = [np.abs(np.diff(few, axis=axis)).reshape(-1, 2) for axis in (0, 1)]
     room = 1.0 + np.nan_to_num(np.concatenate(steps)).max(axis=0, initial=0.0)
-    rows, columns = (step * where for where in _find_inside(few, ends.min(axis=0) - room, ends.max(axis=0) + room))
+    rows, columns = (step * where for where in _find_box_pixels(few, ends.min(axis=0) - room, ends.max(axis=0) + room))
     corners = np.zeros((0, 2))
     if len(rows):
         top, left = max(rows[0] - step, 0), max(columns[0] - step, 0)
         part = camera.straight[top : rows[-1] + step + 1, left : columns[-1] + step + 1]
-        rows, columns = _find_inside(part, ends.min(axis=0), ends.max(axis=0))
+        rows, columns = _find_box_pixels(part, ends.min(axis=0), ends.max(axis=0))
         corners = np.array([(left + columns[end], top + rows[end]) for end in (0, -1) if len(rows)]).reshape(-1, 2)
     near, _ = camera.project(points)
     return np.concatenate([corners, near[np.isfinite(near).all(axis=1)]])
 
 
-def _find_inside(straight: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_box_pixels(undistorted: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows and columns with undistorted positions (h, w, 2) between two corners (2,)."""
-    inside = np.all((straight >= low) & (straight <= high), axis=2)
+    inside = np.all((undistorted >= low) & (undistorted <= high), axis=2)
     return np.flatnonzero(np.any(inside, axis=1)), np.flatnonzero(np.any(inside, axis=0))
 
 
@@ -257,13 +257,13 @@ def compute_drawn_share(
     return _compute_share(find_colour(image, colour), (outline > 0) & (shut[1:-1, 1:-1] == 0))
 
 
-def compute_changed_share(before: np.ndarray, after: np.ndarray, mask: np.ndarray) -> float:
+def compute_changed_share(first_image: np.ndarray, second_image: np.ndarray, mask: np.ndarray) -> float:
     """Compute the share of pixels in a mask (H, W) bool, without its edge, that differ between images (H, W, 3) uint8.
 
     NaN for fewer than `MIN_PIXELS` pixels.
     """
     inner = cv2.erode(mask.astype(np.uint8), np.ones((2 * LINE_DISTANCE + 1,) * 2, np.uint8), borderValue=0) > 0
-    return _compute_share(~find_colour(cv2.absdiff(before, after), (0, 0, 0)), inner)
+    return _compute_share(~find_colour(cv2.absdiff(first_image, second_image), (0, 0, 0)), inner)
 
 
 def _compute_share(values: np.ndarray, mask: np.ndarray) -> float:

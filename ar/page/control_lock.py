@@ -23,11 +23,11 @@ class ControlLock:
     last_action: float = 0.0
     queue: tuple[int, ...] = ()
 
-    def update_clients(self, present: Collection[int], time: float) -> None:
+    def update_clients(self, present_clients: Collection[int], time: float) -> None:
         """Update the connected clients; if the holder has left, the first in the queue or the oldest gets control."""
-        self.queue = tuple(visitor for visitor in self.queue if visitor in present)
-        if self.holder not in present:
-            self._give_control((*self.queue, *sorted(present), None)[0], time)
+        self.queue = tuple(visitor for visitor in self.queue if visitor in present_clients)
+        if self.holder not in present_clients:
+            self._give_control((*self.queue, *sorted(present_clients), None)[0], time)
 
     def record_change(self, client: int, time: float) -> bool:
         """Record that a client changes a setting; return True if the client has control."""
@@ -52,9 +52,9 @@ class ControlLock:
         self.holder, self.last_action = client, time
         self.queue = tuple(other for other in self.queue if other != client)
 
-    def describe_control(self, client: int, present: Collection[int]) -> str:
+    def describe_control(self, client: int, present_clients: Collection[int]) -> str:
         """Return a client's status line in Markdown; empty if there is only one client."""
-        if len(present) < 2:
+        if len(present_clients) < 2:
             return ""
         if client == self.holder:
             asked = f" **Visitor {self.queue[0]} requests control.**" if self.queue else ""
@@ -107,10 +107,10 @@ class Clients:
                 part for part in (format_line(visitor), self.lead.describe_control(visitor, here)) if part
             )
             leads = visitor == self.lead.holder
-            _set(row.line, "content", words)
-            _set(row.request_button, "visible", not leads and visitor not in self.lead.queue)
-            _set(row.release_button, "visible", leads and bool(self.lead.queue))
-            _set(row.dim_style, "content", "" if leads else VIEW_ONLY_STYLE)
+            _set_property(row.line, "content", words)
+            _set_property(row.request_button, "visible", not leads and visitor not in self.lead.queue)
+            _set_property(row.release_button, "visible", leads and bool(self.lead.queue))
+            _set_property(row.dim_style, "content", "" if leads else VIEW_ONLY_STYLE)
 
     def add_row(self, client: viser.ClientHandle) -> ClientRow:
         """Add the elements that only this client sees; return them."""
@@ -130,7 +130,7 @@ class Clients:
         return ClientRow(gui.add_markdown("", order=self.order), ask, give, gui.add_html("", order=self.order + 0.3))
 
 
-def _set(handle: object, name: str, value: object) -> None:
+def _set_property(handle: object, name: str, value: object) -> None:
     """Set a property only if it differs, because each change is sent to the client."""
     if getattr(handle, name) != value:
         setattr(handle, name, value)

@@ -62,7 +62,7 @@ class History:
         step = max(1, math.ceil(len(kept) / MAX_DRAWN_SAMPLES))
         gaps = [None in each.values for each in kept]
         kept = [each for place, each in enumerate(kept[:-1]) if place % step == 0 or gaps[place]] + kept[-1:]
-        parts = [_plot(line, number, kept) for number, line in enumerate(self.lines)]
+        parts = [_draw_trace(line, number, kept) for number, line in enumerate(self.lines)]
         words = "; ".join(f"{line.name}: {_format_newest(kept, number)}" for number, line in enumerate(self.lines))
         size = f"0 0 {CHART_WIDTH:g} {CHART_HEIGHT * len(self.lines):g}"
         return (
@@ -71,12 +71,12 @@ class History:
         )
 
 
-def _format_newest(samples: Sequence[Sample], number: int) -> str:
-    value = samples[-1].values[number] if samples else None
+def _format_newest(samples: Sequence[Sample], trace_index: int) -> str:
+    value = samples[-1].values[trace_index] if samples else None
     return "not known" if value is None else f"{value:.2f}"
 
 
-def _plot(line: Trace, index: int, samples: Sequence[Sample]) -> str:
+def _draw_trace(trace: Trace, index: int, samples: Sequence[Sample]) -> str:
     """Draw the chart of one line: dotted without an error, interrupted without a value."""
     known = [each for each in samples if each.values[index] is not None]
     top, end = CHART_HEIGHT * index + TOP_MARGIN, samples[-1].time if samples else 0.0
@@ -100,15 +100,15 @@ def _plot(line: Trace, index: int, samples: Sequence[Sample]) -> str:
             above = [to_text(time, (each.values[index] or 0.0) + (each.errors[index] or 0.0)) for time, each in moments]
             below = [to_text(time, (each.values[index] or 0.0) - (each.errors[index] or 0.0)) for time, each in moments]
             corners = " ".join([*above, *reversed(below)])
-            drawn.append(f'<polygon points="{corners}" fill="{line.colour}" fill-opacity="0.28"/>')
+            drawn.append(f'<polygon points="{corners}" fill="{trace.colour}" fill-opacity="0.28"/>')
         dotted = ' stroke-dasharray="2 3"' if piece[-1].errors[index] is None else ""
         corners = " ".join(to_text(time, each.values[index] or 0.0) for time, each in moments)
-        drawn.append(f'<polyline points="{corners}" fill="none" stroke="{line.colour}" stroke-width="1.6"{dotted}/>')
+        drawn.append(f'<polyline points="{corners}" fill="none" stroke="{trace.colour}" stroke-width="1.6"{dotted}/>')
     if not known:
         middle = f'x="{0.5 * (LEFT_MARGIN + CHART_WIDTH):g}" y="{top + 0.5 * room + 4:g}"'
         what = "not known" if samples else "nothing yet"
         drawn.append(f'<text {middle} text-anchor="middle" opacity="0.7">{what}</text>')
-    said = f"{line.name} [{line.unit}]" + (f", {line.error_source}" if line.error_source else "")
+    said = f"{trace.name} [{trace.unit}]" + (f", {trace.error_source}" if trace.error_source else "")
     scale = "".join(
         f'<text x="{LEFT_MARGIN - 5:g}" y="{top + room * (1 - share) + 4:g}" text-anchor="end">{share * high:g}</text>'
         f'<path d="M{LEFT_MARGIN:g} {top + room * (1 - share):g}H{CHART_WIDTH - 6:g}" '

@@ -45,16 +45,16 @@ def get_chunk_size(device: str) -> int:
     return 64 if device == "cpu" else 1
 
 
-def run_in_bands(draw: Callable[[int, int], None], count: int, device: str, per_core: int = 1) -> None:
-    """Call `draw(begin, end)` on ranges that cover 0 .. count; on a CPU in parallel, with `per_core` ranges per core.
+def run_in_bands(process_band: Callable[[int, int], None], count: int, device: str, per_core: int = 1) -> None:
+    """Call `process_band(begin, end)` on ranges of 0 .. count; in parallel on a CPU, with `per_core` ranges per core.
 
     Calls must not write to the same memory, and the modules of their kernels must be loaded.
     """
     pool, cores = get_workers()
     if device != "cpu" or cores == 1:
-        return draw(0, count)
+        return process_band(0, count)
     edges = np.linspace(0, count, per_core * cores + 1).astype(int).tolist()
-    list(pool.map(draw, edges[:-1], edges[1:]))
+    list(pool.map(process_band, edges[:-1], edges[1:]))
 
 
 @cache

@@ -185,19 +185,19 @@ class Renderer:
             raise ValueError("the cameras have several sizes: draw those of each size together.")
         return self._draw_all([*cameras] * (count // len(cameras)), moved, None)
 
-    def _draw_all(self, cameras: Sequence[Camera], vertices: wp.array, backdrop: StaticBackground | None) -> Pictures:
+    def _draw_all(self, cameras: Sequence[Camera], vertices: wp.array, background: StaticBackground | None) -> Pictures:
         """Draw the image of each camera, on the static background if given."""
         count, height, width = len(cameras), cameras[0].height, cameras[0].width
         if count * max(height * width, SHADOW_PIXELS**2) >= 2**31:
             raise ValueError(f"{count} images of {width} x {height} are too many at once: draw fewer.")
         stack, vertex, face = self.stack, 0, 0
-        if backdrop is None:
+        if background is None:
             nearest, placed = allocate_z_buffer(count, height, width, self.device), stack.allocate_placed(count)
             pictures, lit_at = allocate_images(count, height, width, self.device), self.nowhere
         else:
-            vertex, face, lit_at = stack.still_vertices, stack.still_faces, backdrop.shadow_positions
-            nearest, placed = wp.clone(backdrop.z_buffer), copy_surface(backdrop.surface)
-            pictures = Pictures(*(wp.clone(array) for array in backdrop.images.arrays))
+            vertex, face, lit_at = stack.still_vertices, stack.still_faces, background.shadow_positions
+            nearest, placed = wp.clone(background.z_buffer), copy_surface(background.surface)
+            pictures = Pictures(*(wp.clone(array) for array in background.images.arrays))
         self._place(cameras, vertices, placed, vertex)
         through = build_undistortion(cameras, self.device)
         rows = slice(0, height) if through.pixels.size else self._find_rows(placed.camera_points, vertex, height)
@@ -208,30 +208,30 @@ class Renderer:
         return pictures
 
     def _shade_images(
-        self, cameras: Sequence[Camera], surface: PlacedSurface, nearest: wp.array, casting: wp.array, still: int,
+        self, cameras: Sequence[Camera], surface: PlacedSurface, z_buffer: wp.array, casting: wp.array, still: int,
         shadow_positions: wp.array, undistortion: Undistortion, images: Pictures,
     ) -> None:  # fmt: skip
         """Shade the pixels of z-buffers into images with a background; `casting` triangles cast shadows."""
-        count, height, width = nearest.shape
+        count, height, width = z_buffer.shape
         shadow = self._draw_shadow(surface, casting)
         inputs = [
-            width, height * width, nearest.flatten(), self.stack.surfaces, surface, self._get_centres(cameras),
+            width, height * width, z_buffer.flatten(), self.stack.surfaces, surface, self._get_centres(cameras),
             self.light,
             shadow, self.curve, still, shadow_positions, undistortion.pixels,
         ]  # fmt: skip
         outputs = [array.flatten() for array in images.arrays]
         launch_in_bands(shade_pixels, inputs, outputs, count * height * width, self.device, per_core=4)
 
-    def _place(self, cameras: Sequence[Camera], vertices: wp.array, surface: PlacedSurface, first: int) -> None:
-        """Place the vertices from index `first` on in each image."""
+    def _place(self, cameras: Sequence[Camera], vertices: wp.array, surface: PlacedSurface, first_vertex: int) -> None:
+        """Place the vertices from index `first_vertex` on in each image."""
         stack = self.stack
         matrices = wp.array([compute_projection(camera) for camera in cameras], dtype=wp.mat44d, device=self.device)
         inputs = [
-            first, stack.still, vertices, matrices, wp.mat44d(compute_projection(self.lamp_camera)),
+            first_vertex, stack.still, vertices, matrices, wp.mat44d(compute_projection(self.lamp_camera)),
             stack.surfaces.triangles,
             stack.around, stack.faces,
         ]  # fmt: skip
-        launch_in_bands(place_vertices, inputs, [surface], len(cameras) * (stack.vertices - first), self.device)
+        launch_in_bands(place_vertices, inputs, [surface], len(cameras) * (stack.vertices - first_vertex), self.device)
 
     def _find_rows(self, camera_points: wp.array, first_vertex: int, height: int) -> slice:
         """Return the rows that vertices from `first_vertex` on may cover; on a GPU all rows, as a test takes longer."""
@@ -239,7 +239,7 @@ class Renderer:
             return slice(0, height)
         return slice(*find_covered_rows(camera_points.numpy()[:, first_vertex:].reshape(-1, 3), NEAR_PLANE, height))
 
-    def _draw_shadow(self, surface: PlacedSurface, casting: wp.array) -> Shadow:
+    def _draw_shadow(self, surface: PlacedSurface, casting_triangles: wp.array) -> Shadow:
         """Draw the shadow map of each image; return the maps."""
         count, tiles = surface.lamp_points.shape[0], SHADOW_PIXELS // int(TILE_SIDE)
         shadow = Shadow()
@@ -247,7 +247,7 @@ class Renderer:
         shadow.depth = wp.empty(count * SHADOW_PIXELS**2, dtype=wp.float32, device=self.device)
         shadow.bounds = wp.empty(count * tiles**2, dtype=wp.vec2f, device=self.device)
         nearest = allocate_z_buffer(count, SHADOW_PIXELS, SHADOW_PIXELS, self.device)
-        draw_triangles(surface.lamp_points, casting, 0, slice(0, SHADOW_PIXELS), nearest, self.device)
+        draw_triangles(surface.lamp_points, casting_triangles, 0, slice(0, SHADOW_PIXELS), nearest, self.device)
         launch_in_bands(compute_shadow_depths, [nearest], [shadow], count * tiles**2, self.device)
         return shadow
 

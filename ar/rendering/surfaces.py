@@ -123,12 +123,12 @@ def list_vertex_faces(triangles: np.ndarray, vertex_count: int) -> tuple[np.ndar
 
 @wp.func
 def get_vertex_position(
-    image: wp.int32, vertex: wp.int32, fixed: wp.array(dtype=wp.vec3d), moving: wp.array2d(dtype=wp.vec3d)
+    image: wp.int32, vertex: wp.int32, fixed_vertices: wp.array(dtype=wp.vec3d), moving: wp.array2d(dtype=wp.vec3d)
 ) -> wp.vec3d:
     """Return the position [m] of a vertex in an image; vertices of fixed layers come first."""
-    if vertex < fixed.shape[0]:
-        return fixed[vertex]
-    return moving[image, vertex - fixed.shape[0]]
+    if vertex < fixed_vertices.shape[0]:
+        return fixed_vertices[vertex]
+    return moving[image, vertex - fixed_vertices.shape[0]]
 
 
 @wp.func

@@ -61,7 +61,7 @@ def read_images(path: Path) -> Iterator[NamedImage]:
     """
     if path.is_dir():
         files = _list_files(path)
-        return (NamedImage(files[index].name, _read_image(files[index])) for index in _compute_spread(len(files)))
+        return (NamedImage(files[index].name, _read_image(files[index])) for index in _select_image_numbers(len(files)))
     return islice(_read_video_frames(path, None), MAX_IMAGES)
 
 
@@ -131,9 +131,9 @@ def _split_name(path: Path) -> list[tuple[str, str]]:
     return [*zip(pairs[::2], pairs[1::2], strict=True), (end, "-1")]
 
 
-def _apply_sign(numbered: tuple[str, str], plain: set[str]) -> tuple[str, int]:
-    words, number = numbered
-    if words.endswith("-") and words[:-1] in plain:
+def _apply_sign(name_parts: tuple[str, str], unsigned_names: set[str]) -> tuple[str, int]:
+    words, number = name_parts
+    if words.endswith("-") and words[:-1] in unsigned_names:
         return words[:-1], -int(number)
     return words, int(number)
 
@@ -221,7 +221,7 @@ def _describe_flaw(path: Path) -> str:
     )
 
 
-def _compute_spread(count: int) -> list[int]:
+def _select_image_numbers(count: int) -> list[int]:
     """Return at most `MAX_IMAGES` integers below `count`, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, MAX_IMAGES)).round().astype(int)).tolist()
 

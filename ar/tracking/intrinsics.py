@@ -250,11 +250,11 @@ def calibrate_intrinsics(
 
 
 def _check_views(
-    views: Sequence[BoardView], excluded: int, width: int, height: int, settings: IntrinsicsSettings
+    views: Sequence[BoardView], excluded_count: int, width: int, height: int, settings: IntrinsicsSettings
 ) -> None:
     """Raise ValueError if the views do not determine a camera."""
     if len(views) < settings.min_views:
-        without = f", and {excluded} more fit badly" if excluded else ""
+        without = f", and {excluded_count} more fit badly" if excluded_count else ""
         raise ValueError(
             f"{len(views)} sharp views show the board{without}, but {settings.min_views} are needed: take 20 images or "
             "more, in good light and without motion."

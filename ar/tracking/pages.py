@@ -211,8 +211,8 @@ def _draw_board_page(target: Target) -> PrintedPage:
     _write_text(ink, f"sulcus: {target.name}", 15.0, 176.0, TITLE_HEIGHT)
     _write_text(ink, "Glue it onto a stiff, flat plate: a bent board calibrates wrongly.", 60.5, 178.5, TEXT_HEIGHT)
     _write_paragraph(ink, said, 15.0, 183.0)
-    _draw_ruler(ink, 15.0, 40.0, down=True)
-    _draw_ruler(ink, 180.0, 192.0, down=False)
+    _draw_ruler(ink, 15.0, 40.0, is_vertical=True)
+    _draw_ruler(ink, 180.0, 192.0, is_vertical=False)
     return PrintedPage(target.name, _read_pixels(page), (placed,))
 
 
@@ -223,8 +223,8 @@ def _compose_page(
     """Complete a portrait page: add the title, the text and two rulers, which start at the positions `rulers` [mm]."""
     _write_text(canvas, f"sulcus: {target.name}", 15.0, 14.0, TITLE_HEIGHT)
     _write_paragraph(canvas, lines, 15.0, 25.0)
-    _draw_ruler(canvas, *rulers[0], down=True)
-    _draw_ruler(canvas, *rulers[1], down=False)
+    _draw_ruler(canvas, *rulers[0], is_vertical=True)
+    _draw_ruler(canvas, *rulers[1], is_vertical=False)
     return PrintedPage(target.name, _read_pixels(page), faces)
 
 
@@ -269,10 +269,10 @@ def _draw_line(
         canvas.line([*map(_to_pixels, one), *map(_to_pixels, other)], fill=0, width=_to_pixels(LINE_WIDTH))
 
 
-def _draw_ruler(canvas: ImageDraw.ImageDraw, left: float, top: float, down: bool) -> None:
+def _draw_ruler(canvas: ImageDraw.ImageDraw, left: float, top: float, is_vertical: bool) -> None:
     """Draw a ruler with a mark every 10 mm, from a position downwards or to the right."""
     along, across = (
-        (np.array([0.0, 1.0]), np.array([1.0, 0.0])) if down else (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+        (np.array([0.0, 1.0]), np.array([1.0, 0.0])) if is_vertical else (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     )
     origin = np.array([left, top])
     _draw_bar(canvas, origin, origin + RULER_LENGTH * along)
@@ -281,7 +281,7 @@ def _draw_ruler(canvas: ImageDraw.ImageDraw, left: float, top: float, down: bool
         mark = origin + at * along
         _draw_bar(canvas, mark, mark + (5.0 if ends else 3.0) * across)
         if ends:
-            x, y = mark + (6.0 * across - 1.8 * along if down else 5.5 * across - 1.0 * along)
+            x, y = mark + (6.0 * across - 1.8 * along if is_vertical else 5.5 * across - 1.0 * along)
             _write_text(canvas, f"{at:.0f}" if at < RULER_LENGTH else f"{at:.0f} mm", x, y, TEXT_HEIGHT)
 
 

@@ -266,7 +266,7 @@ class Tracker:
         return TrackedTargets(number, verdicts, poses, last)
 
     def _detect_corners(
-        self, grey: np.ndarray, number: int, previous: Mapping[str, tuple[np.ndarray, int]]
+        self, grey: np.ndarray, image_number: int, previous: Mapping[str, tuple[np.ndarray, int]]
     ) -> dict[str, DetectedCorners]:
         """Detect corners near the last poses; search lost targets in the whole image, at once and at intervals."""
         settings, found = self.settings, dict[str, DetectedCorners]()
@@ -279,8 +279,8 @@ class Tracker:
                 if seen is not None and len(seen.points) >= settings.pose.min_corners:
                     found[target.name] = seen
         missing = [target.name for target in self.targets if target.name not in found]
-        just_left = any(previous.get(name, (None, -2))[1] == number - 1 for name in missing)
-        if missing and (just_left or number % settings.search_interval == 0):
+        just_left = any(previous.get(name, (None, -2))[1] == image_number - 1 for name in missing)
+        if missing and (just_left or image_number % settings.search_interval == 0):
             found |= self._detector.detect(grey, missing)
         return found
 

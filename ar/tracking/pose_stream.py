@@ -197,17 +197,17 @@ def estimate_clock_offset(
 
 
 def _refine_offset(
-    offset: float, times: np.ndarray, positions: np.ndarray, tracker_times: np.ndarray, tracked: np.ndarray,
+    offset: float, times: np.ndarray, positions: np.ndarray, tracker_times: np.ndarray, tracker_positions: np.ndarray,
     settings: ClockSettings,
 ) -> tuple[Clock, float]:  # fmt: skip
     """Refine an offset by Gauss-Newton; return the clock and the remaining sum of squares [m^2]."""
     low, high = tracker_times[0] - times[0], tracker_times[-1] - times[-1]
     speed, off = np.zeros_like(positions), np.zeros_like(positions)
     for _ in range(settings.max_iterations):
-        off = _compute_errors(times + offset, positions, tracker_times, tracked)
+        off = _compute_errors(times + offset, positions, tracker_times, tracker_positions)
         ahead, behind = min(offset + settings.offset_step, high), max(offset - settings.offset_step, low)
-        speed = _compute_errors(times + ahead, positions, tracker_times, tracked) - _compute_errors(
-            times + behind, positions, tracker_times, tracked
+        speed = _compute_errors(times + ahead, positions, tracker_times, tracker_positions) - _compute_errors(
+            times + behind, positions, tracker_times, tracker_positions
         )
         speed /= max(ahead - behind, np.finfo(float).tiny)
         step = -float((speed * off).sum() / max((speed**2).sum(), np.finfo(float).tiny))
@@ -217,7 +217,7 @@ def _refine_offset(
     moved = float(np.sqrt((speed**2).sum(axis=1).mean())) * float(times[-1] - times[0])
     if not moved > settings.min_motion:
         raise ValueError(f"the tool moves by {1e3 * moved:.1f} mm only: that says nothing of the clocks. {REMEDY}")
-    left = _sum_squares(_compute_errors(times + offset, positions, tracker_times, tracked))
+    left = _sum_squares(_compute_errors(times + offset, positions, tracker_times, tracker_positions))
     scatter = np.sqrt(left / max(off.size - 4, 1))
     return Clock(offset, float(scatter / np.sqrt((speed**2).sum()))), left
 

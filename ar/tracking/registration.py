@@ -115,7 +115,7 @@ def register_points(
     centre = scan_points.mean(axis=0)
     freedom = 3 * len(scan_points) - 6
     J = compute_jacobian(T, scan_points, centre) / _compute_scatter(off, freedom, settings)
-    return Registration(T, _widen_covariance(J.T @ J, freedom), centre, _compute_rms(off), len(scan_points))
+    return Registration(T, _compute_wide_covariance(J.T @ J, freedom), centre, _compute_rms(off), len(scan_points))
 
 
 def refine_registration(
@@ -162,7 +162,7 @@ def refine_registration(
         )
     return Registration(
         T,
-        _widen_covariance(normal, freedom + len(surface_points)),
+        _compute_wide_covariance(normal, freedom + len(surface_points)),
         centre,
         _compute_rms(off),
         len(scan_points),
@@ -170,11 +170,11 @@ def refine_registration(
     )
 
 
-def _check_shape(scan: np.ndarray, patient: np.ndarray, settings: RegistrationSettings) -> None:
+def _check_shape(scan_points: np.ndarray, patient_points: np.ndarray, settings: RegistrationSettings) -> None:
     """Raise ValueError if the point sets do not determine a rigid motion."""
-    if len(scan) < MIN_PAIRS:
-        raise ValueError(f"{len(scan)} pairs are too few: touch {MIN_PAIRS} points or more, better six.")
-    sizes = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (scan, patient)]
+    if len(scan_points) < MIN_PAIRS:
+        raise ValueError(f"{len(scan_points)} pairs are too few: touch {MIN_PAIRS} points or more, better six.")
+    sizes = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in (scan_points, patient_points)]
     for what, size in zip(("scan", "patient"), sizes, strict=True):
         if not size[1] > settings.min_spread_ratio * size[0]:
             raise ValueError(f"the points of the {what} lie on a line: choose some that lie apart from it.")
@@ -219,24 +219,24 @@ def _check_fit(scan: np.ndarray, patient: np.ndarray, residuals: np.ndarray, set
         )
 
 
-def _compute_swapped_rms(scan: np.ndarray, patient: np.ndarray) -> dict[tuple[int, int], float]:
+def _compute_swapped_rms(scan_points: np.ndarray, patient_points: np.ndarray) -> dict[tuple[int, int], float]:
     """Compute rms residuals [m] after swapping the patient's points of two pairs; return each by the pairs' indices."""
     out = {}
-    for pair in combinations(range(len(scan)), 2):
-        other = patient.copy()
-        other[list(pair)] = patient[list(pair[::-1])]
-        out[pair] = _compute_rms(fit_rigid(scan, other)[1])
+    for pair in combinations(range(len(scan_points)), 2):
+        other = patient_points.copy()
+        other[list(pair)] = patient_points[list(pair[::-1])]
+        out[pair] = _compute_rms(fit_rigid(scan_points, other)[1])
     return out
 
 
-def fit_rigid(scan: np.ndarray, patient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_rigid(scan_points: np.ndarray, patient_points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit T_patient_scan (4, 4) to n point pairs (Kabsch 1976); return the transform and the residuals (n, 3) [m]."""
-    middle, there = scan.mean(axis=0), patient.mean(axis=0)
+    middle, there = scan_points.mean(axis=0), patient_points.mean(axis=0)
     T = np.eye(4)
-    u, _, v = np.linalg.svd((patient - there).T @ (scan - middle))
+    u, _, v = np.linalg.svd((patient_points - there).T @ (scan_points - middle))
     T[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
     T[:3, 3] = there - T[:3, :3] @ middle
-    return T, scan @ T[:3, :3].T + T[:3, 3] - patient
+    return T, scan_points @ T[:3, :3].T + T[:3, 3] - patient_points
 
 
 def compute_jacobian(T: np.ndarray, points: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -247,9 +247,9 @@ def compute_jacobian(T: np.ndarray, points: np.ndarray, centre: np.ndarray) -> n
     ).reshape(-1, 6)
 
 
-def _widen_covariance(normal: np.ndarray, dof: int) -> np.ndarray:
+def _compute_wide_covariance(normal_matrix: np.ndarray, dof: int) -> np.ndarray:
     """Invert a normal matrix to a covariance (6, 6), widened as its scatter has few degrees of freedom (`dof`)."""
-    inverse = 3.0 * f.ppf(LEVEL, 3, dof) / chi2.ppf(LEVEL, 3) * np.linalg.inv(normal)
+    inverse = 3.0 * f.ppf(LEVEL, 3, dof) / chi2.ppf(LEVEL, 3) * np.linalg.inv(normal_matrix)
     return 0.5 * (inverse + inverse.T)
 
 

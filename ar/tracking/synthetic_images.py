@@ -50,7 +50,7 @@ def render_targets(image: np.ndarray, camera: Camera, targets: Sequence[tuple[Ta
     straight, inverse = camera.straight[box], np.linalg.inv(camera.K)
     by_row, by_column = (np.gradient(straight, axis=axis) for axis in (0, 1))
     ink, cover = np.zeros(straight.shape[:2]), np.zeros(straight.shape[:2])
-    for shift in _compute_shifts():
+    for shift in _compute_sample_offsets():
         nearest, grey = np.full(ink.shape, np.inf), np.zeros(ink.shape)
         for face, T, where in seen:
             part = tuple(slice(a.start - b.start, a.stop - b.start) for a, b in zip(where, box, strict=True))
@@ -81,7 +81,7 @@ def _widen_side(side: slice, size: int) -> slice:
     return slice(start, max(side.stop, start + 2))
 
 
-def _compute_shifts() -> np.ndarray:
+def _compute_sample_offsets() -> np.ndarray:
     """Compute the offsets (n, 2) [pixel] of a pixel's samples from its centre."""
     middles = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE - 0.5
     return np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
@@ -94,13 +94,13 @@ def _sample_edge(face: Face) -> np.ndarray:
     return np.column_stack([edge + 0.5 * face.size, np.zeros(len(edge))])
 
 
-def _sample_grey(face: Face, printed: np.ndarray, on_face: np.ndarray) -> np.ndarray:
+def _sample_grey(face: Face, printed: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Sample grey levels (...) at positions (..., 2) [m] on the `printed` image of a face; NaN outside its border."""
-    pixels = (on_face * (TEXTURE_PIXELS / face.square) - 0.5).astype(np.float32)
+    pixels = (positions * (TEXTURE_PIXELS / face.square) - 0.5).astype(np.float32)
     paper = cv2.remap(
         printed, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=255.0
     )
-    (x, y), (width, height) = np.moveaxis(on_face, -1, 0), face.size + BORDER_WIDTH
+    (x, y), (width, height) = np.moveaxis(positions, -1, 0), face.size + BORDER_WIDTH
     inside = (x >= -BORDER_WIDTH) & (x <= width) & (y >= -BORDER_WIDTH) & (y <= height)
     return np.where(inside, INK + (PAPER - INK) / 255.0 * paper, np.nan)
 

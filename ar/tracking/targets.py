@@ -261,10 +261,10 @@ def _detect_markers(
     """Detect markers in an image; return their corners (n, 1, 4, 2) [pixel] and their numbers (n,)."""
     corners, ids, _ = detector.detectMarkers(grey)
     which = np.zeros(0, int) if ids is None else np.asarray(ids, int).reshape(-1)
-    return np.asarray(corners, np.float32).reshape(-1, 1, 4, 2), _list_numbers(targets)[which]
+    return np.asarray(corners, np.float32).reshape(-1, 1, 4, 2), _list_marker_ids(targets)[which]
 
 
-def _list_numbers(targets: Sequence[Target]) -> np.ndarray:
+def _list_marker_ids(targets: Sequence[Target]) -> np.ndarray:
     """Return the sorted marker numbers (n,) of targets."""
     return np.sort(np.concatenate([face.ids for target in targets for face in target.faces]))
 
@@ -272,12 +272,12 @@ def _list_numbers(targets: Sequence[Target]) -> np.ndarray:
 def _build_dictionary(targets: Sequence[Target]) -> cv2.aruco.Dictionary:
     """Return a dictionary with only the targets' markers, because comparing with each marker takes most of the time."""
     whole = cv2.aruco.getPredefinedDictionary(MARKER_DICTIONARY)
-    return cv2.aruco.Dictionary(whole.bytesList[_list_numbers(targets)], whole.markerSize)
+    return cv2.aruco.Dictionary(whole.bytesList[_list_marker_ids(targets)], whole.markerSize)
 
 
-def _build_parameters(min_width: int, max_width: int) -> cv2.aruco.DetectorParameters:
-    """Build detector parameters with the threshold window widths `min_width` and `max_width` [pixel]."""
+def _build_parameters(min_marker_width: int, max_marker_width: int) -> cv2.aruco.DetectorParameters:
+    """Build detector parameters with the threshold window widths `min_marker_width` and `max_marker_width` [pixel]."""
     found = cv2.aruco.DetectorParameters()
-    found.adaptiveThreshWinSizeMin, found.adaptiveThreshWinSizeMax = min_width, max_width
-    found.adaptiveThreshWinSizeStep = max(max_width - min_width, 1)
+    found.adaptiveThreshWinSizeMin, found.adaptiveThreshWinSizeMax = min_marker_width, max_marker_width
+    found.adaptiveThreshWinSizeStep = max(max_marker_width - min_marker_width, 1)
     return found

@@ -289,12 +289,12 @@ def compute_budget(
     )
 
 
-def _mean(mask: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | None]:
-    """Return the share of True samples (S,), and its standard deviation with `bodies` (S,) as clusters.
+def _mean(mask: np.ndarray, body_numbers: Sequence[int]) -> tuple[float, float | None]:
+    """Return the share of True samples (S,), and its standard deviation with `body_numbers` (S,) as clusters.
 
     Ratio estimator: Cochran (1977), "Sampling techniques", equation 2.46.
     """
-    share, numbers = float(mask.mean()), np.unique(bodies, return_inverse=True)[1]
+    share, numbers = float(mask.mean()), np.unique(body_numbers, return_inverse=True)[1]
     excess = np.bincount(numbers, weights=mask - share)
     clusters = len(excess)
     if clusters < 2:
@@ -303,19 +303,19 @@ def _mean(mask: np.ndarray, bodies: Sequence[int]) -> tuple[float, float | None]
 
 
 def find_largest_spread(
-    nominal: SurfaceMotions, solutions: Sequence[tuple[np.ndarray, ...]], mesh_errors: np.ndarray
+    nominal_motions: SurfaceMotions, solutions: Sequence[tuple[np.ndarray, ...]], mesh_errors: np.ndarray
 ) -> int:
     """Return the time index at which sampled bodies differ most; `mesh_errors` (b,): see `compute_motion_errors`."""
     sizes = []
-    for number, here in enumerate(nominal.fields):
+    for number, here in enumerate(nominal_motions.fields):
         off = compute_motion_errors(np.stack([result[number] for result in solutions]), here, mesh_errors)
         sizes.append(float(np.linalg.norm(off, axis=2).max(axis=1).mean()))
     return int(np.argmax(sizes))
 
 
-def compute_velocity(nominal: SurfaceMotions, time_index: int) -> np.ndarray:
+def compute_velocity(nominal_motions: SurfaceMotions, time_index: int) -> np.ndarray:
     """Return the tumour surface's velocity (n, 3) [m/s] just before a time; 0 if tissue was resected in between."""
-    before, here = nominal.fields[max(time_index - 1, 0)], nominal.fields[time_index]
+    before, here = nominal_motions.fields[max(time_index - 1, 0)], nominal_motions.fields[time_index]
     if time_index == 0 or before.shape != here.shape:
         return np.zeros_like(here)
-    return (here - before) / (nominal.times[time_index] - nominal.times[time_index - 1])
+    return (here - before) / (nominal_motions.times[time_index] - nominal_motions.times[time_index - 1])

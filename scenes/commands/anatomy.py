@@ -122,17 +122,17 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _build_subject(args: argparse.Namespace, chosen: dict) -> Subject:
+def _build_subject(args: argparse.Namespace, tumour_options: dict) -> Subject:
     if args.labels is None:
         for option in list_label_options(args):
             raise InputError(f"{option} belongs to a label volume: give --labels FILE.nii.gz too, or leave it out.")
-        return build_drawn_subject(args, chosen)
+        return build_drawn_subject(args, tumour_options)
     check_no_synthetic_options(args)
     return build_masked_subject(read_head_masks(parse_sources(args)), args.t1, regions=parse_regions(args))
 
 
 def _summarise_anatomy(
-    args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost: list[bool]
+    args: argparse.Namespace, anatomy: Anatomy, subject: Subject, lost_pieces: list[bool]
 ) -> dict[str, Any]:
     mesh = anatomy.mesh
     volume = mesh.volumes[anatomy.in_tumour].sum()
@@ -164,7 +164,7 @@ def _summarise_anatomy(
         "opening": {"over": describe_craniotomy(args), **_describe_position(subject, subject.site)},
         "tumour_pieces": [
             {"ml": round(1e6 * piece.volume, 3), "lost": gone, **_describe_position(subject, piece.centre)}
-            for piece, gone in zip(subject.pieces, lost, strict=True)
+            for piece, gone in zip(subject.pieces, lost_pieces, strict=True)
         ],
         "digest": anatomy.digest,
     }

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=10, help="check every Nth frame")
     add_patient(parser)
     add_camera_options(parser)
-    add_style(parser, excluded=("none",))  # the check needs an outline in the image
+    add_style(parser, excluded_styles=("none",))  # the check needs an outline in the image
     add_json(parser)
 
 
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             "tumour_error_unobserved_mm": _to_millimetres(error.prior),
         }
         print(
-            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {_describe_compared(scene, name)}: error "
+            f"{scene.name:11s} {'FAILS' if broken else 'passes'}  {_describe_comparison(scene, name)}: error "
             f"{figures.error_mm:.3f} "
             f"mm at a motion of {figures.motion_mm:.2f} mm. Outline error {figures.drawn:.1f} px, "
             f"overlap {figures.overlap:.3f} (1 is best). {figures.leaked:.0%} leaks out of the "
@@ -131,7 +131,7 @@ def _to_millimetres(metres: float | None) -> float | None:
     return None if metres is None else 1e3 * metres
 
 
-def _describe_compared(scene: Scene, name: str) -> str:
+def _describe_comparison(scene: Scene, name: str) -> str:
     """Describe the compared tumour: that of a deformation model, or the tumour estimated from observations."""
     return f"{name}: the tumour" if scene.observation_model is None else f"{name} is the reference; tumour estimate"
 

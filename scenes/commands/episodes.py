@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
         return INTERRUPTED_CODE
 
 
-def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_if_asked: Callable[[], None]) -> int:
+def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, raise_if_stopped: Callable[[], None]) -> int:
     with require_extra("data", "sulcus episodes needs"):
         from ..episodes.engine import list_missing_episodes, make_episodes
     from ..episodes.make import choose_body, make_body, make_episode
@@ -127,7 +127,7 @@ def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_
             partial(make_episode, *given, device=workers.device),
         )
         begun = time.perf_counter()
-        with _show_progress(out, there, args.count, stop_if_asked) as heard:
+        with _show_progress(out, there, args.count, raise_if_stopped) as heard:
             tally = make_episodes(work, out, run, missing, workers, heard, there)
         seconds = time.perf_counter() - begun
         changed = tally != there
@@ -138,14 +138,14 @@ def _make_episodes(args: argparse.Namespace, plan: EpisodePlan, out: Path, stop_
     return int(tally.failed + tally.lost > 0)
 
 
-def _update_card(folder: Path, numbers: Set[int], changed: bool) -> str | None:
+def _update_card(folder: Path, numbers: Set[int], has_changes: bool) -> str | None:
     """Update the card of the data set; return the reason if this fails, else None."""
     from tqdm import tqdm
 
     from ..episodes.exports.card import update_card
 
     bar = partial(tqdm, unit="episode", desc="data sheet", file=sys.stderr, leave=False, mininterval=1.0, disable=None)
-    return update_card(folder, numbers, changed, bar)
+    return update_card(folder, numbers, has_changes, bar)
 
 
 def _start_workers(args: argparse.Namespace, device: str) -> AbstractContextManager[Workers]:
@@ -166,7 +166,7 @@ def _start_workers(args: argparse.Namespace, device: str) -> AbstractContextMana
 
 @contextmanager
 def _show_progress(
-    folder: Path, statistics: RunStatistics, total: int, stop_if_asked: Callable[[], None]
+    folder: Path, statistics: RunStatistics, total: int, raise_if_stopped: Callable[[], None]
 ) -> Iterator[ProgressListener]:
     """Yield a listener that shows the progress (frames/s, failures), and records task durations in the folder."""
     from tqdm import tqdm
@@ -186,7 +186,7 @@ def _show_progress(
         def heard(kind: str, outcome: TaskOutcome | None, workers: int) -> None:
             nonlocal done
             if outcome is None:
-                stop_if_asked()
+                raise_if_stopped()
                 bar.set_description(
                     f"{workers} workers" if workers else "waits for workers", refresh=sys.stderr.isatty()
                 )

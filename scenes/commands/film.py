@@ -134,9 +134,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_disturbances(troubles: Sequence[Disturbance], times: np.ndarray) -> None:
+def _check_disturbances(disturbances: Sequence[Disturbance], times: np.ndarray) -> None:
     """Raise InputError if a disturbance contains none of the frame `times` (F,) [s], and so would have no effect."""
-    for each in troubles:
+    for each in disturbances:
         if not ((each.start <= times) & (times < each.end)).any():
             raise InputError(
                 f"--trouble {each.kind}:{each.start:g}-{each.end:g} contains no image of this video, which ends at "

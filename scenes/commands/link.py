@@ -171,10 +171,10 @@ def is_local_host(host: str, server_address: str) -> bool:
         found = socket.getaddrinfo(host, 0, type=socket.SOCK_DGRAM)
     except OSError:
         return False
-    return any(_is_own(family, address) for family, *_, address in found)
+    return any(_is_own_address(family, address) for family, *_, address in found)
 
 
-def _is_own(family: int, address: tuple) -> bool:
+def _is_own_address(family: int, address: tuple) -> bool:
     """Return True if a socket on this machine can be bound to an address."""
     with socket.socket(family, socket.SOCK_DGRAM) as tried:
         try:
@@ -184,15 +184,15 @@ def _is_own(family: int, address: tuple) -> bool:
         return True
 
 
-def _run_link(args: argparse.Namespace, source: tuple[str, int] | None, closing: ExitStack) -> int:
+def _run_link(args: argparse.Namespace, source: tuple[str, int] | None, exit_stack: ExitStack) -> int:
     from ..link.console import format_address
 
     over = threading.Event()
 
     async def work() -> None:
         session = open_link(args)
-        closing.callback(over.wait, CLOSING_TIME)
-        closing.callback(session.end)
+        exit_stack.callback(over.wait, CLOSING_TIME)
+        exit_stack.callback(session.end)
         ready = asyncio.get_running_loop().create_future()
         ready.add_done_callback(
             lambda port: print(f"sulcus: serves {format_address(args.host, port.result())} (Ctrl-C ends)", flush=True)

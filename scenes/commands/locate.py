@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _summarise(result: Location, points: int, regions: tuple[Region, ...], out: Path | None) -> dict[str, object]:
+def _summarise(result: Location, point_count: int, regions: tuple[Region, ...], out: Path | None) -> dict[str, object]:
     return {
         "centroid_mm": (1e3 * result.centroid).tolist(),
         "covariance_mm2": (1e6 * result.centroid_covariance).tolist(),
@@ -103,7 +103,7 @@ def _summarise(result: Location, points: int, regions: tuple[Region, ...], out: 
         "within_errors": result.within_errors,
         "bias_mm": (1e3 * result.bias).tolist(),
         "bias_degrees": np.degrees(result.rotation).tolist(),
-        "points": points,
+        "points": point_count,
         "outliers": result.outliers.tolist(),
         "tips_left_out": result.outlier_tips.tolist(),
         "slipped": result.slipped,

@@ -143,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
     return _print_summary(args, report, shown, out, table)
 
 
-def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> int:
+def _serve_page(args: argparse.Namespace, is_live: bool, exit_stack: ExitStack) -> int:
     """Show a video or a live camera on a page until the time is over or a signal arrives; return 0 or 1 as `run`."""
     from ar.page.access_guard import ViserError, check_address
 
@@ -159,8 +159,8 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
     table = None if args.table is None else check_output_path(args.table, ".csv", args.force, [args.camera])
     try:
         check_address(HOST, args.port)
-        parts = _build_pipeline(args, is_video=not camera)
-        shown = (_show_camera if camera else _show_video)(args, parts, closing)
+        parts = _build_pipeline(args, is_video=not is_live)
+        shown = (_show_camera if is_live else _show_video)(args, parts, exit_stack)
     except (ValueError, OSError, ViserError) as error:
         raise InputError(str(error)) from error
     if table is not None:
@@ -170,7 +170,7 @@ def _serve_page(args: argparse.Namespace, camera: bool, closing: ExitStack) -> i
     return _print_summary(args, _summarise_run(shown, parts.model), shown, None, table)
 
 
-def _show_camera(args: argparse.Namespace, setup: Pipeline, closing: ExitStack) -> list[Overlay]:
+def _show_camera(args: argparse.Namespace, setup: Pipeline, exit_stack: ExitStack) -> list[Overlay]:
     from ar.tracking.live_camera import open_camera, read_camera_images, read_newest_images
 
     from ..tracked.follower import FollowerSettings
@@ -180,14 +180,14 @@ def _show_camera(args: argparse.Namespace, setup: Pipeline, closing: ExitStack) 
     if not source.isOpened():
         raise InputError(f"{name} cannot be opened: plug it in, see that no other program has it, and give its number.")
     images = read_newest_images(read_camera_images(source, name, again), FollowerSettings().max_gap)
-    return _build_page(args, setup, closing, name).watch(images, args.seconds)
+    return _build_page(args, setup, exit_stack, name).watch(images, args.seconds)
 
 
-def _show_video(args: argparse.Namespace, setup: Pipeline, closing: ExitStack) -> list[Overlay]:
+def _show_video(args: argparse.Namespace, setup: Pipeline, exit_stack: ExitStack) -> list[Overlay]:
     from ..tracked.seekable_video import SeekableVideo
 
     film = SeekableVideo(Path(args.pictures), args.rate)
-    return _build_page(args, setup, closing, film.path.name, film.count).play(film, args.seconds)
+    return _build_page(args, setup, exit_stack, film.path.name, film.count).play(film, args.seconds)
 
 
 def _build_page(args: argparse.Namespace, setup: Pipeline, stack: ExitStack, name: str, frames: int = 0) -> OverlayPage:

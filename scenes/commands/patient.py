@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     resumed = note.exists() and not args.force
     check_output_path(args.out, ".vtu", args.force, _list_inputs(args), resumed or args.inspect)
     if args.inspect:
-        return _inspect(args, plan, regions)
+        return _show_preview(args, plan, regions)
     from sim.runtime.device import parse_device_names
     from surrogate.training.train import check_learner_names
 
@@ -183,7 +183,7 @@ def _list_inputs(args: argparse.Namespace) -> list[Path]:
     return [path for path in (args.labels, args.mask, args.tumour_in, args.t1) if path is not None]
 
 
-def _inspect(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tissue]) -> int:
+def _show_preview(args: argparse.Namespace, plan: MeshPlan, regions: Mapping[int, Tissue]) -> int:
     """Print and draw a preview of the anatomy that would be built; return 0."""
     from ar.screen import write_png
 

@@ -159,10 +159,10 @@ def _measure_sections(args: argparse.Namespace) -> list[Section]:
             solve_reference(study, bar.update)
             solve_beyond(study, bar.update)
             if series:
-                _tabulate(study, bar)
+                _tabulate_series(study, bar)
             if full:
                 simulate_debulked(study, bar.update)
-                _tabulate(build_debulked_study(study), bar)
+                _tabulate_series(build_debulked_study(study), bar)
             for row in (
                 measure_on_workers(study, specs, args.scheduler) if args.scheduler else measure_rows(study, specs)
             ):
@@ -257,11 +257,11 @@ def _measure_seed_sections(args: argparse.Namespace) -> list[Section]:
     return sections
 
 
-def _tabulate(study: ReportStudy, bar: tqdm) -> None:
+def _tabulate_series(study: ReportStudy, progress_bar: tqdm) -> None:
     from ..report.study import tabulate_series
 
-    tabulate_series(study, lambda done, total: bar.set_postfix_str(f"series: {done} of {total} positions"))
-    bar.set_postfix_str("")
+    tabulate_series(study, lambda done, total: progress_bar.set_postfix_str(f"series: {done} of {total} positions"))
+    progress_bar.set_postfix_str("")
 
 
 def _simulate_data(path: Path, args: argparse.Namespace, count: int) -> None:

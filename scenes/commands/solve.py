@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "`start` (V, 3), an initial guess in the file's unit, and cell data `region`. Mid-edge nodes in the file "
         "are fixed only where `fixed` marks them",
     )
-    add_tissue_arguments(parser, full_help=True)
+    add_tissue_arguments(parser, with_full_help=True)
     add_element_argument(parser, "p1, the file's linear tetrahedra as every other program takes them")
     parser.add_argument("--tolerance", type=float, default=1e-6, help="tolerance of the relative residual")
     parser.add_argument(

@@ -100,8 +100,8 @@ def list_notes(data: Dataset, learners: Sequence[str]) -> list[str]:
     return notes
 
 
-def _format_text(trained: Trained, out: str, failed: int, preset: str) -> str:
-    notes = [f"{failed} unreliable solutions were excluded."] if failed else []
+def _format_text(trained: Trained, out: str, failed_count: int, preset: str) -> str:
+    notes = [f"{failed_count} unreliable solutions were excluded."] if failed_count else []
     notes += [words for words in [describe_rejected_loads(preset)] if words]
     bounds = ", ".join(f"{name} {1e3 * model.bound:.3f}" for name, model in trained.models.items())
     return "\n".join(
@@ -138,7 +138,7 @@ def _describe_error(model: Learned) -> dict[str, object]:
     return {"bound_mm": 1e3 * reported.bound, "discs": discs, "weak": reported.is_weak}
 
 
-def _format_json(trained: Trained, out: str, failed: int, preset: str) -> str:
+def _format_json(trained: Trained, out: str, failed_count: int, preset: str) -> str:
     split = trained.split
     return json.dumps(
         {
@@ -155,7 +155,7 @@ def _format_json(trained: Trained, out: str, failed: int, preset: str) -> str:
             "left_out": {name: asdict(found) for name, found in trained.held_out_coverage.items()},
             "distance_left_out": {name: asdict(found) for name, found in trained.held_out_distance_coverage.items()},
             "force": {name: asdict(found) for name, found in trained.force.items()},
-            "not_converged": failed,
+            "not_converged": failed_count,
             "nominal_refused": compute_rejected_share(preset),
         }
     )

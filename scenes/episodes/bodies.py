@@ -140,7 +140,7 @@ def write_body(
         write_intensity(to_intensity_path(body.anatomy), scan)
     before = False
     if bodies.learner.name != NO_LEARNER and not _can_use_shipped_model(body, anatomy):
-        before = _train(body, anatomy, plan, seed, number, device, other_folders)
+        before = _train_model(body, anatomy, plan, seed, number, device, other_folders)
     (folder / BODY_FILE).write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
     return before
 
@@ -198,7 +198,7 @@ def _can_use_shipped_model(body: EpisodeBody, anatomy: Anatomy) -> bool:
     return any(find_rejection(model, effects, recommend_element(anatomy.mesh)) is None for model in models.values())
 
 
-def _train(
+def _train_model(
     body: EpisodeBody, anatomy: Anatomy, plan: EpisodePlan, seed: int, number: int, device: str, others: Sequence[Path]
 ) -> bool:
     """Train a model on simulated loads, which are removed afterwards; return True if earlier loads were reused."""

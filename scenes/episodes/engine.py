@@ -68,7 +68,7 @@ class RunStatistics:
 
 
 def list_missing_episodes(
-    folder: Path, existing: Set[int], numbers: range, first_client: bool, retry: bool = False
+    folder: Path, existing: Set[int], numbers: range, is_first_client: bool, with_failed: bool = False
 ) -> tuple[RunStatistics, list[int]]:
     """Count the episodes that exist or have failed permanently, and list the missing episodes in order of execution.
 
@@ -79,14 +79,14 @@ def list_missing_episodes(
     ----------
     existing
         Numbers of all existing episodes in the folder.
-    retry
+    with_failed
         True to retry episodes that have failed permanently.
     """
     there = existing & set(numbers)
-    gone = set() if retry else {number for number, one in list_failures(folder).items() if not one.lost}
+    gone = set() if with_failed else {number for number, one in list_failures(folder).items() if not one.lost}
     gone = gone.intersection(numbers) - there
     missing = [number for number in numbers if number not in there and number not in gone]
-    if not first_client:
+    if not is_first_client:
         random.shuffle(missing)
     return RunStatistics(skipped=len(there), failed=len(gone)), missing
 
@@ -158,7 +158,7 @@ def make_episodes(
                 submit(EPISODE, number, work.make_episode, bodies[body])
             if not busy:
                 return tally
-            for future, outcome in _collect_outcomes(_collect_ended(ended), workers, ended):
+            for future, outcome in _collect_outcomes(_collect_ended_futures(ended), workers, ended):
                 kind, number, _ = busy.pop(str(future.key))
                 record(kind, replace(outcome, number=number))
             if monotonic() - counted > POLL_INTERVAL:
@@ -169,19 +169,19 @@ def make_episodes(
             workers.client.cancel([future for _, _, future in busy.values()])
 
 
-def _collect_ended(ended: SimpleQueue[Future]) -> list[Future]:
+def _collect_ended_futures(ended_queue: SimpleQueue[Future]) -> list[Future]:
     """Return all ended futures; wait for the first future for at most `POLL_INTERVAL`."""
     found = []
     try:
-        found.append(ended.get(timeout=POLL_INTERVAL))
+        found.append(ended_queue.get(timeout=POLL_INTERVAL))
         while True:
-            found.append(ended.get_nowait())
+            found.append(ended_queue.get_nowait())
     except Empty:
         return found
 
 
 def _collect_outcomes(
-    futures: Sequence[Future], workers: Workers, ended: SimpleQueue[Future]
+    futures: Sequence[Future], workers: Workers, ended_queue: SimpleQueue[Future]
 ) -> Iterator[tuple[Future, TaskOutcome]]:
     """Yield finished tasks with their outcomes; a task whose result was lost with its worker will finish again."""
     for future in futures:
@@ -191,7 +191,7 @@ def _collect_outcomes(
         try:  # briefly, as the worker may have to be restarted
             outcome = future.result(timeout=POLL_INTERVAL)
         except TimeoutError:
-            future.add_done_callback(ended.put)
+            future.add_done_callback(ended_queue.put)
         except CancelledError as error:  # state of all futures when the scheduler is gone
             raise describe_scheduler_end(workers.description) from error
         else:

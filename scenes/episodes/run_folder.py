@@ -210,7 +210,7 @@ def _check_same_run(folder: Path, stored: RunSettings, run: RunSettings, force: 
         )
 
 
-def describe_other_versions(others: Mapping[str, str], own: Mapping[str, str]) -> str:
+def describe_other_versions(other_versions: Mapping[str, str], own: Mapping[str, str]) -> str:
     """Describe the packages whose versions differ; empty if all versions agree."""
-    names = [name for name in sorted({*others, *own}) if others.get(name) != own.get(name)]
-    return ", ".join(f"{name} {others.get(name, 'none')} and not {own.get(name, 'none')}" for name in names)
+    names = [name for name in sorted({*other_versions, *own}) if other_versions.get(name) != own.get(name)]
+    return ", ".join(f"{name} {other_versions.get(name, 'none')} and not {own.get(name, 'none')}" for name in names)

@@ -141,16 +141,16 @@ def try_task(
     )
 
 
-def _explain_unfit_worker(folder: Path, run: RunSettings) -> str:
+def _explain_unfit_worker(folder: Path, run_settings: RunSettings) -> str:
     """Return the reason why this worker cannot work for the run; empty if it can."""
     here = platform.node()
-    other = describe_other_versions(get_versions(), run.versions)
+    other = describe_other_versions(get_versions(), run_settings.versions)
     if other:
         return f"the worker on {here} has {other}. Install the same there."
     found = read_run(folder)
     if found is None:
         return f"the worker on {here} does not see {folder}. Give all machines one folder under the same name."
-    if (found.digest, found.seed) != (run.digest, run.seed):
+    if (found.digest, found.seed) != (run_settings.digest, run_settings.seed):
         return f"{folder}: is that of another plan or seed by now, as the worker on {here} sees it."
     return ""
 

@@ -88,7 +88,7 @@ def silence_dask() -> None:
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
-def _start_worker(address: str, security: Security, device: str, times: int) -> _WorkerProcess:
+def _start_worker(address: str, security: Security, device: str, start_count: int) -> _WorkerProcess:
     ours, theirs = Pipe(duplex=False)
     card = build_gpu_environment(device)
     resources = {GPU_RESOURCE: 1.0} if card else None
@@ -96,7 +96,7 @@ def _start_worker(address: str, security: Security, device: str, times: int) -> 
         _run_worker, address, security, resources, theirs, name="worker", variables={**ONE_THREAD_VARIABLES, **card}
     )
     theirs.close()
-    return _WorkerProcess(process, ours, times)
+    return _WorkerProcess(process, ours, start_count)
 
 
 def _has_served(worker: _WorkerProcess) -> bool:
@@ -111,18 +111,18 @@ def _close_worker(worker: _WorkerProcess) -> None:
     worker.connection.close()
 
 
-def _run_worker(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
+def _run_worker(address: str, security: Security, resources: dict[str, float] | None, ready_pipe: Any) -> None:
     silence_dask()
     # Profiles keep references to closed files, and HTTP services need no keys.
     with config.set({"distributed.worker.profile.enabled": False, "distributed.worker.http.routes": []}):
-        asyncio.run(_work(address, security, resources, connected))
+        asyncio.run(_serve_tasks(address, security, resources, ready_pipe))
 
 
-async def _work(address: str, security: Security, resources: dict[str, float] | None, connected: Any) -> None:
+async def _serve_tasks(address: str, security: Security, resources: dict[str, float] | None, ready_pipe: Any) -> None:
     # No memory limit: a worker paused near its limit never resumes, because Dask does not manage its memory.
     settings = {"nthreads": 1, "host": LOCAL_HOST, "memory_limit": 0, "resources": resources, "dashboard": False}
     async with Worker(address, security=security, **settings) as worker:
-        connected.send_bytes(b"yes")
+        ready_pipe.send_bytes(b"yes")
         await worker.finished()
 
 

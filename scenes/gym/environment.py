@@ -28,7 +28,7 @@ METADATA: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": ro
 
 
 def open_environment_setting(
-    task: str, observation: str, render_mode: str | None, settings: Mapping[str, Any], batched: bool | None = None
+    task: str, observation: str, render_mode: str | None, settings: Mapping[str, Any], is_batched: bool | None = None
 ) -> TaskSetting:
     """Open the shared setting of environments; `settings` contains the arguments `ARGUMENTS` of `open_setting`.
 
@@ -41,7 +41,7 @@ def open_environment_setting(
         raise InputError(f"observation is {observation!r:.80}: choose one of {', '.join(KINDS)}.")
     if render_mode is not None and render_mode not in RENDER_MODES:
         raise InputError(f"render_mode is {render_mode!r:.80}: choose {', '.join(RENDER_MODES)}, or None.")
-    return open_setting(find_task(task), *check_arguments(settings), batched)
+    return open_setting(find_task(task), *check_arguments(settings), is_batched)
 
 
 class SurgeryEnv(gymnasium.Env):
@@ -249,7 +249,7 @@ class SurgeryVectorEnv(VectorEnv):
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
 
 
-def make_many(task: str, count: int, processes: bool = False, **given: Any) -> VectorEnv:
+def make_many(task: str, count: int, processes: bool = False, **settings: Any) -> VectorEnv:
     """Make `count` environments of a task by `gymnasium.make_vec`.
 
     Parameters
@@ -257,7 +257,7 @@ def make_many(task: str, count: int, processes: bool = False, **given: Any) -> V
     processes
         True for one process per environment. Since processes are spawned (a process that uses a GPU cannot be forked),
         the script needs `if __name__ == "__main__":`.
-    given
+    settings
         Other arguments of `SurgeryEnv`.
 
     Raises
@@ -267,5 +267,5 @@ def make_many(task: str, count: int, processes: bool = False, **given: Any) -> V
     """
     name = f"{NAMESPACE}/{find_task(task).name.capitalize()}-v0"
     if processes:
-        return make_vec(name, count, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **given)
-    return make_vec(name, count, **given)
+        return make_vec(name, count, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **settings)
+    return make_vec(name, count, **settings)

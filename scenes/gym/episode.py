@@ -65,12 +65,12 @@ class EpisodeScore:
         return REWARD.share_reward * self.cut_shares - away - min(self.amount_error, 1.0)
 
 
-def compute_reward(previous: EpisodeScore, current: EpisodeScore, success: bool, is_aborted: bool) -> float:
+def compute_reward(previous: EpisodeScore, current_score: EpisodeScore, is_success: bool, is_aborted: bool) -> float:
     """Return the reward of a step from the scores before and after it; `is_aborted`: the episode ends at a limit."""
-    reward = current.potential - previous.potential - REWARD.step_penalty
-    if current.load_ratio > 1.0:
+    reward = current_score.potential - previous.potential - REWARD.step_penalty
+    if current_score.load_ratio > 1.0:
         reward -= REWARD.limit_penalty
-    return float(reward + (REWARD.success_reward if success else REWARD.abort_reward if is_aborted else 0.0))
+    return float(reward + (REWARD.success_reward if is_success else REWARD.abort_reward if is_aborted else 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +246,7 @@ class Episode:
         planned = replace(goal, position=self._compute_planned_target())
         return compute_states(task, planned, tracked, sensed, time, done, self.frame, self.setting.site.origin)
 
-    def _collect_truth(self, response: Response, target: np.ndarray, success: bool) -> dict[str, Any]:
+    def _collect_truth(self, response: Response, target: np.ndarray, is_success: bool) -> dict[str, Any]:
         """Return the ground truth, which is not observed, by name (see docs/gym.md). Arrays are new in each step."""
         assert self.judged is not None and self.drawn is not None
         setting = self.setting
@@ -259,5 +259,5 @@ class Episode:
             "tumour_nodes": now, "tumour_middle": now[left].mean(axis=0), "model_error": response.error,
             "target": target.copy(), "away": self.judged.distance, "asked": float(self.drawn.goal.amount),
             "reached": self._compute_reached(response), "load": self.judged.load_ratio, "violations": self.violations,
-            "success": success, "reliable": response.reliable, "steps_done": self.shown,
+            "success": is_success, "reliable": response.reliable, "steps_done": self.shown,
         }  # fmt: skip

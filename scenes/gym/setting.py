@@ -122,7 +122,7 @@ def open_setting(
     device: str,
     size: tuple[int, int],
     model: str | None = None,
-    batched: bool | None = None,
+    is_batched: bool | None = None,
 ) -> TaskSetting:
     """Open a task on an anatomy; the result is cached for all environments of a process.
 
@@ -141,7 +141,7 @@ def open_setting(
     model
         File of trained models. None: the file next to the anatomy, or the shipped file for template and spatula.
         Regions have the tissue with which the models were trained.
-    batched
+    is_batched
         True to solve all environments in one batch; None: only on a GPU. On the CPU a batch is several times as fast,
         but the last digits of results depend on the other environments.
 
@@ -157,7 +157,7 @@ def open_setting(
     scene, tool = task.build_scene(size), task.tool
     scene = scene.replace_regions(find_trained_regions(scene.elasticity, patient.learned_tissue))
     card = find_device(device, LIVE.precision).name != "cpu"
-    at_once = card if batched is None else batched
+    at_once = card if is_batched is None else is_batched
     ball = Hertz(tool.radius, _find_touched_tissue(task, scene, patient.site)) if isinstance(tool, Probe) else None
     if physics != "fem":
         refused = _list_rejections(task, scene, patient)

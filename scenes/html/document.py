@@ -139,8 +139,8 @@ def build_html(patient: PatientSetup, scene: Scene, exported: ExportedModel) -> 
         "bound": model.bound if np.isfinite(model.bound) else None,
         **_describe_errors(patient, scene),
     }
-    script = "\n".join(_read(name) for name in SCRIPTS)
-    style = _read("page.css")
+    script = "\n".join(_read_text(name) for name in SCRIPTS)
+    style = _read_text("page.css")
     fields = {
         "title": escape(f"sulcus: {scene.name}"),
         "heading": escape(f"Simulation: {describe_location(patient.anatomy)} tumour, scene {scene.name}"),
@@ -151,9 +151,9 @@ def build_html(patient: PatientSetup, scene: Scene, exported: ExportedModel) -> 
         "legend": _format_legend(),
         "most": f"{most:g}",
     }
-    return Template(_read("page.html")).substitute(
+    return Template(_read_text("page.html")).substitute(
         fields, style=style, style_digest=_compute_digest(style), script=script, script_digest=_compute_digest(script),
-        scene=_to_script_json(described), arrays=packed, shaders=_read("shaders.glsl"),
+        scene=_to_script_json(described), arrays=packed, shaders=_read_text("shaders.glsl"),
     )  # fmt: skip
 
 
@@ -204,7 +204,7 @@ def _format_legend() -> str:
     )
 
 
-def _read(name: str) -> str:
+def _read_text(name: str) -> str:
     return files("scenes.html").joinpath(name).read_text(encoding="utf-8")
 
 

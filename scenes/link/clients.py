@@ -263,9 +263,9 @@ class LinkClients:
             self._note(f"rejected: {text or reason}")
 
 
-def _find_message(newest: Mapping[str, tuple[bytes, ...]], message_type: str, name: str) -> bytes | None:
+def _find_message(newest_messages: Mapping[str, tuple[bytes, ...]], message_type: str, name: str) -> bytes | None:
     """Return the message with a type and name, else the newest message of the type; None if there is no such type."""
-    every = [(read_header(each[: HEADER.size]), each) for messages in newest.values() for each in messages]
+    every = [(read_header(each[: HEADER.size]), each) for messages in newest_messages.values() for each in messages]
     alike = [(header, each) for header, each in every if header.kind == message_type]
     named = (each for header, each in alike if header.name == name)
     return next(named, max(alike, key=lambda pair: pair[0].stamp)[1] if alike else None)

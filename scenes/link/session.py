@@ -280,7 +280,7 @@ class LinkSession:
             words += f"; other transforms received: {', '.join(self._others)}"
         return words
 
-    async def _keep_drawing(self, eye: OverlayCamera, thread: ThreadPoolExecutor) -> None:
+    async def _keep_drawing(self, overlay_camera: OverlayCamera, thread: ThreadPoolExecutor) -> None:
         """Draw the overlay on the newest image and publish the image, repeatedly."""
         while True:
             await self._pictured.wait()
@@ -289,7 +289,7 @@ class LinkSession:
                 continue
             (colour, stamp), heard = self._picture, self._heard
             camera = self._answers.find_camera(heard, self._loop.time(), stamp)
-            drawn = await self._loop.run_in_executor(thread, eye.draw, colour, self._shown.tracking, camera)
+            drawn = await self._loop.run_in_executor(thread, overlay_camera.draw, colour, self._shown.tracking, camera)
             self.clients.publish("picture", (pack_message("IMAGE", "Overlay", encode_image(drawn), stamp),))
 
     def _get_max_size(self, message_type: str) -> int:

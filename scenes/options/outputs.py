@@ -128,11 +128,11 @@ def check_no_foreign_files(mesh_path: Path, digest: str, force: bool) -> list[Pa
     return found
 
 
-def remove_outdated_data(path: Path, expected: Mapping[str, str]) -> None:
-    """Remove a complete or unfinished data set if its attributes differ from `expected`."""
+def remove_outdated_data(path: Path, expected_attributes: Mapping[str, str]) -> None:
+    """Remove a complete or unfinished data set if its attributes differ from `expected_attributes`."""
     for each in (path, to_unfinished_path(path)):
         found = read_attributes(each)
-        if any(found.get(name) != expected.get(name) for name in UNCHANGED_ATTRIBUTES):
+        if any(found.get(name) != expected_attributes.get(name) for name in UNCHANGED_ATTRIBUTES):
             each.unlink(missing_ok=True)
 
 

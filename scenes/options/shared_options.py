@@ -63,11 +63,11 @@ def _replace_non_finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def add_style(parser: argparse.ArgumentParser, excluded: tuple[Style, ...] = ()) -> None:
-    """Add the option --style of the overlay to a parser, without the styles `excluded`."""
+def add_style(parser: argparse.ArgumentParser, excluded_styles: tuple[Style, ...] = ()) -> None:
+    """Add the option --style of the overlay to a parser, without the styles `excluded_styles`."""
     from ar.overlay.styles import STYLES
 
-    styles: list[Style] = [style for style in STYLES if style not in excluded]
+    styles: list[Style] = [style for style in STYLES if style not in excluded_styles]
     descriptions = "; ".join(f"{style}: {STYLES[style]}" for style in styles if style != "none")
     parser.add_argument("--style", choices=styles, default="window", help=f"overlay style; {descriptions}")
 

@@ -77,17 +77,17 @@ def parse_sources(args: argparse.Namespace) -> MaskSources:
         args.convention,
         args.mask,
         args.tumour_in,
-        _get_parts(args),
+        _get_part_labels(args),
         args.axes,
     )
 
 
 def parse_regions(args: argparse.Namespace) -> tuple[str, ...]:
     """Return the names of the parts of brain and tumour that become regions of the mesh."""
-    return tuple(dict.fromkeys((*(name for name in _get_parts(args) if name in PART_LABELS), *args.regions)))
+    return tuple(dict.fromkeys((*(name for name in _get_part_labels(args) if name in PART_LABELS), *args.regions)))
 
 
-def _get_parts(args: argparse.Namespace) -> dict[str, tuple[Label, ...]]:
+def _get_part_labels(args: argparse.Namespace) -> dict[str, tuple[Label, ...]]:
     return {name: getattr(args, name) for name in (*PART_LABELS, *SEPTA) if getattr(args, name) is not None}
 
 
@@ -106,7 +106,7 @@ def to_label_args(args: argparse.Namespace) -> list[str]:
         "--convention": args.convention,
         "--mask": args.mask,
         "--tumour-in": args.tumour_in,
-        **{f"--{name}": ",".join(map(str, found)) for name, found in _get_parts(args).items()},
+        **{f"--{name}": ",".join(map(str, found)) for name, found in _get_part_labels(args).items()},
         "--regions": ",".join(args.regions) or None,
         "--axes": args.axes or None,
     }

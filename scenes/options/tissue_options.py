@@ -34,14 +34,14 @@ AS_LEARNED = f"as in the models' training data, or {AS_BRAIN}"  # Default tissue
 
 
 def add_tissue_arguments(
-    parser: argparse.ArgumentParser, full_help: bool = False, default_regions: str = AS_BRAIN
+    parser: argparse.ArgumentParser, with_full_help: bool = False, default_regions: str = AS_BRAIN
 ) -> None:
     """Add --material, the constants of its laws, and --region to a parser.
 
-    `default_regions` describes the default of --region. If `full_help`, the help describes each named tissue.
+    `default_regions` describes the default of --region. If `with_full_help`, the help describes each named tissue.
     """
     sets = f"{', '.join(MATERIALS)}; see docs/concepts/physics.md"
-    if full_help:
+    if with_full_help:
         each = (f"{name} holds for {preset.time_scale}. Source: {preset.source}" for name, preset in MATERIALS.items())
         sets = ". ".join(each)
     parser.add_argument(
@@ -116,7 +116,7 @@ def parse_tissue(args: argparse.Namespace) -> Tissue:
     """
     tissue = _parse_tissue(args)
     if args.young is not None:
-        _warn(f"--young {args.young:g}", tissue)
+        _warn_of_stiffness(f"--young {args.young:g}", tissue)
     if args.prony is None:
         return tissue
     try:
@@ -218,7 +218,7 @@ def parse_region_tissues(texts: Sequence[str], tissue: Tissue, mesh: TetMesh | N
             marks = f" `sulcus patient --{name}` marks it." if (name := name_region(label)) in PART_LABELS else ""
             raise InputError(f"--region {label}: {missing}{marks}")
     for text, (_, one) in zip(texts, pairs, strict=True):
-        _warn(f"--region {text}", one)
+        _warn_of_stiffness(f"--region {text}", one)
     return dict(sorted(pairs))
 
 
@@ -238,7 +238,7 @@ def check_stiffness(tissue: Tissue) -> str:
     )
 
 
-def _warn(option: str, tissue: Tissue) -> None:
+def _warn_of_stiffness(option: str, tissue: Tissue) -> None:
     doubt = check_stiffness(tissue)
     if doubt:
         warnings.warn(f"{option}: {doubt}", stacklevel=1)

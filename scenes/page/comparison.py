@@ -191,9 +191,9 @@ class AccuracyTimeTable:
         return float(np.median([times[load] for load in loads])), float(np.median([errors[load] for load in loads]))
 
 
-def _store_recent(numbers: dict[str, float], load: str, value: float) -> None:
+def _store_recent(numbers: dict[str, float], load_id: str, value: float) -> None:
     """Store the newest value of a load; above `MAX_RECENT_LOADS` loads, drop the oldest load."""
-    numbers.pop(load, None)
-    numbers[load] = value
+    numbers.pop(load_id, None)
+    numbers[load_id] = value
     if len(numbers) > MAX_RECENT_LOADS:
         del numbers[next(iter(numbers))]

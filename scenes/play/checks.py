@@ -135,7 +135,7 @@ def measure_frames(
     ]
     finite = [_is_finite(frame) and _is_cortex_embedded(player, frame) for frame in frames]
     misses = [
-        _measure_miss(player, get_camera(frame.time), frame, reference, row) if finite[row] else WORST_MISS
+        _compare_frame(player, get_camera(frame.time), frame, reference, row) if finite[row] else WORST_MISS
         for row, frame in enumerate(frames)
     ]
     overlap, error, pixels, drawn, visible, honestly = zip(*misses, strict=True)
@@ -181,21 +181,21 @@ def is_within_surface(surface: Layer, point: np.ndarray) -> bool:
     return bool((np.einsum("fi,fi->f", np.cross(b - a, c - a), point - a) <= 0.0).all())
 
 
-def _compute_removed_share(player: Player, frames: Sequence[Frame], truth: Deformation) -> float:
+def _compute_removed_share(player: Player, frames: Sequence[Frame], true_solutions: Deformation) -> float:
     """Compute 1 - (sum of errors) / (sum of motions) over tumour vertices and frames; NaN without estimates."""
     if not any(frame.estimate for frame in frames):
         return np.nan
     nodes, rest = player.site.anatomy.tumour_nodes, player.site.anatomy.mesh.nodes
-    true = np.stack([player.compute_positions(truth, row)[nodes] for row in range(len(frames))])
+    true = np.stack([player.compute_positions(true_solutions, row)[nodes] for row in range(len(frames))])
     believed = np.stack([player.estimate_positions(frame)[nodes] for frame in frames])
     left, moved = (np.linalg.norm(apart, axis=2).sum() for apart in (believed - true, true - rest[nodes]))
     return float(1.0 - left / moved) if moved > 0.0 else np.nan
 
 
-def _list_unreliable(frames: Sequence[Frame], truth: Deformation) -> list[str]:
+def _list_unreliable(frames: Sequence[Frame], true_solutions: Deformation) -> list[str]:
     """List a sentence for each drawn or FEM solution with a bad outcome: frame, source and outcome."""
     found = []
-    for frame, true in zip(frames, truth.outcome, strict=True):
+    for frame, true in zip(frames, true_solutions.outcome, strict=True):
         outcomes = {"as drawn": frame.deformation.outcome[0], "by the finite elements": true}
         found += [f"frame {frame.number} {whose}, {one.value}" for whose, one in outcomes.items() if not one.good]
     return found
@@ -241,7 +241,7 @@ def _is_cortex_embedded(player: Player, frame: Frame) -> bool:
     return float(np.abs(aside).max()) < MAX_ASIDE and float(np.einsum("mi,mi->m", away, normal).max()) < MAX_ASIDE
 
 
-def _measure_miss(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
+def _compare_frame(player: Player, camera: Camera, frame: Frame, truth: Deformation, row: int) -> tuple[float, ...]:
     """Compare one frame with row `row` of the FEM solution `truth`.
 
     Returns overlap, mean distance [m], projection and outline distances [pixel], the share of the drawn silhouette that

@@ -24,15 +24,15 @@ FOLD_START = 9e-3  # Distance from the hole at which the folds have their height
 
 
 @lru_cache(maxsize=4)
-def build_drape(site: CraniotomyFrame, segment_id: int, folded: bool) -> Layer:
+def build_drape(site: CraniotomyFrame, segment_id: int, is_folded: bool) -> Layer:
     """Build the drape: the brain surface moved outwards, with a round hole over the open cortex and a wall round it.
 
-    If `folded`, the drape is cloth with soft folds that begin at the edge of the hole. The result is cached for all
+    If `is_folded`, the drape is cloth with soft folds that begin at the edge of the hole. The result is cached for all
     scenes of a patient.
     """
     points, triangles, rim = cut_hole(site)
     colour = np.broadcast_to(DRAPE_COLOUR, points.shape)
-    if folded:
+    if is_folded:
         points, triangles, rim, colour = fold_cloth(site, points, triangles)
     # The wall has its own vertices: normals shared with the drape would round its edge off.
     low = points[rim] + (DRAPE_HEIGHT + DRAPE_DEPTH) * site.axis

@@ -89,7 +89,7 @@ NOT_KNOWN_WORDS = "tumour position error: not known"
 
 
 def format_errors(
-    model_bound: float | None, tumour_error: TumourError, is_surrogate: bool, warning: str = "", brief: bool = False,
+    model_bound: float | None, tumour_error: TumourError, is_surrogate: bool, warning: str = "", is_brief: bool = False,
     figures: FamilyFigures | None = None,
 ) -> list[str]:  # fmt: skip
     """Build the lines for an image: error of the model (unless there is a warning or an observation), position error.
@@ -102,14 +102,14 @@ def format_errors(
         Error bound guaranteed by the model [m]; None if the model has no bound.
     is_surrogate
         True if another model than FEM computed the deformation.
-    brief
+    is_brief
         True for the short form, for a small image.
     figures
         Recorded figures of a model family other than FEM; their error replaces `model_bound`.
     """
     modelled = tumour_error.observed is None and not warning
-    model = figures.describe_error(brief) if figures else format_model_error(model_bound, is_surrogate, brief)
-    return [*([model] if modelled else []), format_tumour_error(tumour_error, brief)]
+    model = figures.describe_error(is_brief) if figures else format_model_error(model_bound, is_surrogate, is_brief)
+    return [*([model] if modelled else []), format_tumour_error(tumour_error, is_brief)]
 
 
 def is_by_other_family(deformation: Deformation) -> bool:
@@ -118,22 +118,22 @@ def is_by_other_family(deformation: Deformation) -> bool:
     return method in FAMILIES or method in OTHER_METHODS.values()
 
 
-def format_model_error(bound: float | None, is_surrogate: bool, brief: bool = False) -> str:
+def format_model_error(bound: float | None, is_surrogate: bool, is_brief: bool = False) -> str:
     """Format the error bound [m] of a surrogate relative to FEM, or state that the result is the FEM reference."""
     if not is_surrogate:
-        return "FEM reference" if brief else "FEM reference (no surrogate)"
+        return "FEM reference" if is_brief else "FEM reference (no surrogate)"
     if bound is None:
-        return "model: not known" if brief else "model error relative to FEM: not known"
+        return "model: not known" if is_brief else "model error relative to FEM: not known"
     within = format_bound(bound, 2)
-    return f"model <= {within}" if brief else f"surrogate error <= {within} (95 %, relative to FEM)"
+    return f"model <= {within}" if is_brief else f"surrogate error <= {within} (95 %, relative to FEM)"
 
 
-def format_tumour_error(error: TumourError, brief: bool = False) -> str:
+def format_tumour_error(error: TumourError, is_brief: bool = False) -> str:
     """Format the error of the drawn tumour position relative to the position in the patient."""
     if error.bound is None:
-        return "tumour: not known" if brief else NOT_KNOWN_WORDS
+        return "tumour: not known" if is_brief else NOT_KNOWN_WORDS
     within, guess = format_bound(error.bound, 1), ", rough estimate" if error.is_rough else ""
-    if brief:
+    if is_brief:
         return f"tumour <= {within}{guess if error.observed is None else ''}"
     said = f"tumour position error <= {within} (95 %)"
     of = error.registration_text

@@ -104,7 +104,7 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
     across = np.arccos(np.clip(-field, -1.0, 1.0)) / np.pi  # 0 in a sulcus, 1 on a crown
     strength *= np.clip(2.2 - 5.0 * across, 0.0, 1.0) * np.clip(0.9 + 0.2 * smooth(6e-3), 0.4, 1.0)
     away *= MAP_SPACING
-    strength[_find_short((strength > 0.05) & (away < 2.0 * GYRI.sulcus_width), GYRI.sulcus_length)] = 0.0
+    strength[_find_short_lines((strength > 0.05) & (away < 2.0 * GYRI.sulcus_width), GYRI.sulcus_length)] = 0.0
     crown = GYRI.crown_height * (1.0 - across) ** 2
     depth = crown + GYRI.sulcus_depth * strength * np.exp(-((away / GYRI.sulcus_width) ** 2))
     hollow = np.maximum(depth - 0.4 * gaussian_filter(depth, 2e-3 / MAP_SPACING), 0.0)  # ambient occlusion
@@ -113,7 +113,7 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
 
     # Veins lie in some of the sulci.
     radius = GYRI.vein_radius * np.clip(0.25 + 0.6 * smooth(9e-3), 0.0, 1.0) * np.clip(3.0 * strength - 0.6, 0.0, 1.0)
-    radius[_find_short(away < radius, GYRI.vein_length)] = 0.0
+    radius[_find_short_lines(away < radius, GYRI.vein_length)] = 0.0
     vein = np.clip((radius - away) / (1.5 * MAP_SPACING) + 0.5, 0.0, 1.0) * (radius > 0.15e-3)
     top = crown + 0.3e-3 - np.sqrt(np.maximum(radius**2 - away**2, 0.0))
     depth += vein * np.minimum(top - depth, 0.0)
@@ -130,11 +130,11 @@ def build_cortex_maps(site: CraniotomyFrame, intensity: Intensity | None) -> Cor
     return CortexMaps(np.concatenate([depth[..., None], colour.clip(0.0, 1.0)], axis=2).astype(np.float32), half)
 
 
-def _find_short(lines: np.ndarray, length: float) -> np.ndarray:
+def _find_short_lines(line_mask: np.ndarray, length: float) -> np.ndarray:
     """Return the connected parts of a mask (n, n) that are shorter than `length` [m], which is estimated from area."""
-    parts = np.zeros(lines.shape, np.int32)
-    label(lines, output=parts)
-    return lines & (np.bincount(parts.ravel()) < LINE_WIDTH * length / MAP_SPACING**2)[parts]
+    parts = np.zeros(line_mask.shape, np.int32)
+    label(line_mask, output=parts)
+    return line_mask & (np.bincount(parts.ravel()) < LINE_WIDTH * length / MAP_SPACING**2)[parts]
 
 
 def _find_sulci(field: np.ndarray, wavelength: float) -> tuple[np.ndarray, np.ndarray]:

@@ -22,18 +22,18 @@ def find_trained_regions(
     return {label: _scale_tissue(brain, one, trained_tissue.default) for label, one in others.items()}
 
 
-def _scale_tissue(brain: Tissue, region: Tissue, learned: Tissue) -> Tissue:
+def _scale_tissue(brain: Tissue, region: Tissue, learned_brain: Tissue) -> Tissue:
     """Scale a trained region's tissue to the scene's `brain`; return `brain` if the material laws cannot be scaled."""
-    if isinstance(region, IsotropicTissue) and _remove_relaxation(brain) == _remove_relaxation(learned):
+    if isinstance(region, IsotropicTissue) and _remove_relaxation(brain) == _remove_relaxation(learned_brain):
         return replace(region, prony=brain.prony)
     if not (
         isinstance(brain, IsotropicTissue)
         and isinstance(region, IsotropicTissue)
-        and isinstance(learned, IsotropicTissue)
+        and isinstance(learned_brain, IsotropicTissue)
     ):
         return brain
-    poisson = brain.poisson if region.poisson == learned.poisson else region.poisson
-    return brain.replace_constants(brain.young * region.young / learned.young, poisson)
+    poisson = brain.poisson if region.poisson == learned_brain.poisson else region.poisson
+    return brain.replace_constants(brain.young * region.young / learned_brain.young, poisson)
 
 
 def _remove_relaxation(tissue: Tissue) -> Tissue:

@@ -213,18 +213,18 @@ class Stage:
         return self._draw(camera, self.build_layers(positions, pose))
 
     def render_view(
-        self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, coarse: bool, frame_number: int = 0
+        self, camera: Camera, positions: np.ndarray, pose: np.ndarray | None, is_coarse: bool, frame_number: int = 0
     ) -> Picture:
         """Render frame `frame_number` with blur and noise, and with the round field of view of a microscope if any.
 
-        If `coarse`, the image is rendered with half the resolution and enlarged.
+        If `is_coarse`, the image is rendered with half the resolution and enlarged.
         """
-        seen_by, look = _halve_resolution(camera) if coarse else camera, self.scene.look
+        seen_by, look = _halve_resolution(camera) if is_coarse else camera, self.scene.look
         picture = self.render(seen_by, positions, pose)
         picture = add_camera_effects(picture, seen_by, self.site.origin, look.aperture, look.noise, frame_number)
         if self.scene.viewpoint.field is not None:
             picture = add_vignette(picture, self.scene.viewpoint.field)
-        return scale_image(picture, camera.width, camera.height) if coarse else picture
+        return scale_image(picture, camera.width, camera.height) if is_coarse else picture
 
     def render_with_corners(self, camera: Camera, positions: np.ndarray, corners: np.ndarray | None) -> Picture:
         """Render the layers with a tool given by its surface corners (t, 3) [m]; None: without tool."""

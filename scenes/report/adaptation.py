@@ -38,12 +38,12 @@ def debulk_tumour(anatomy: Anatomy) -> Anatomy:
 
 def build_debulked_study(study: ReportStudy) -> ReportStudy:
     """Return the study of the debulked anatomy, whose data set `simulate_debulked` has written."""
-    return replace(study, data=_to_answers_path(study))
+    return replace(study, data=_to_data_path(study))
 
 
 def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> None:
     """Solve the data set's loads on the debulked anatomy; `progress` receives the number of newly solved loads."""
-    path = _to_answers_path(study)
+    path = _to_data_path(study)
     if path.exists():
         progress(len(study.dataset.loads) + len(study.dataset.unit_good))
         return
@@ -61,7 +61,7 @@ def simulate_debulked(study: ReportStudy, progress: Callable[[int], object]) -> 
 
 def read_simulation_seconds(study: ReportStudy) -> float | None:
     """Read the duration [s] of the solves of `simulate_debulked`, without set-up; None without such a data set."""
-    if not _to_answers_path(study).exists():
+    if not _to_data_path(study).exists():
         return None
     data = build_debulked_study(study).dataset
     loads, units = len(data.loads), len(data.unit_good)
@@ -69,5 +69,5 @@ def read_simulation_seconds(study: ReportStudy) -> float | None:
     return None if None in seconds else sum(filter(None, seconds))
 
 
-def _to_answers_path(study: ReportStudy) -> Path:
+def _to_data_path(study: ReportStudy) -> Path:
     return study.folder / "answers" / f"debulked-{study.digest}.h5"

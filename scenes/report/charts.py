@@ -123,14 +123,14 @@ def _scatter(
     rows: Sequence[ReportRow],
     title: str,
     x: str,
-    find: Callable[[ReportRow], Place | None],
+    find_point: Callable[[ReportRow], Place | None],
     get_errors: Callable[[ReportRow], Sequence[float]] = attrgetter("load_mm"),
 ) -> ChartPanel | None:
-    """Build a scatter chart of rows at the positions that `find` returns; None if there is no position.
+    """Build a scatter chart of rows at the positions that `find_point` returns; None if there is no position.
 
     The Pareto front is drawn; other rows are pale. Bars are the central 95 % of the load errors [mm] of `get_errors`.
     """
-    places = {row.name: place for row in rows if row.against != TOLERANCE_ALONE and (place := find(row))}
+    places = {row.name: place for row in rows if row.against != TOLERANCE_ALONE and (place := find_point(row))}
     best = find_pareto_front(
         {row.name: places[row.name] for row in rows if row.name in places and row.against == ERROR}
     )
@@ -141,7 +141,7 @@ def _scatter(
             *places[row.name],
             is_pale=row.name not in best,
             y_range=_find_central_range(get_errors(row)),
-            hint=_describe(row),
+            hint=_describe_row(row),
         )
         for row in rows
         if row.name in places
@@ -156,7 +156,7 @@ def _find_central_range(load_mm: Sequence[float]) -> tuple[float, float] | None:
     return (low, high) if low > 0.0 else None
 
 
-def _describe(row: ReportRow) -> str:
+def _describe_row(row: ReportRow) -> str:
     """Describe a row in one line: errors, times and command."""
     assert row.reference is not None
     error = f"mean {format_number(row.reference.mm.mean)} mm ({format_number(row.reference.percent.mean)} %)"

@@ -116,9 +116,9 @@ def _format_summary(rows: Sequence[ReportRow]) -> str:
     return format_table(SUMMARY_HEADS, lines) if lines else ""
 
 
-def format_table(heads: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
+def format_table(headings: Sequence[str], lines: Iterable[tuple[str, Sequence[str]]]) -> str:
     """Format an HTML table from column titles and lines, each a CSS class and its cells."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    head = "".join(f"<th>{escape(text)}</th>" for text in headings)
     body = "".join(
         f'<tr class="{kind}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>' for kind, cells in lines
     )

@@ -52,7 +52,7 @@ def solve_reference(study: ReportStudy, progress: Callable[[int], object], accur
         )
         return fem, locate(body.mesh, study.anatomy.mesh.nodes[study.read_nodes])
 
-    _solve(study, "reference", study.test_loads, made, progress)
+    _solve_missing_loads(study, "reference", study.test_loads, made, progress)
 
 
 def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
@@ -63,43 +63,43 @@ def solve_beyond(study: ReportStudy, progress: Callable[[int], object]) -> None:
         fem = Fem(body, build_push_effects(body, study.get_tissue_on(body)), TRAIN, study.device, None, study.element)
         return fem, locate(body.mesh, body.mesh.nodes[body.tumour_nodes])
 
-    _solve(study, "beyond", study.loads_beyond, made, progress)
+    _solve_missing_loads(study, "beyond", study.loads_beyond, made, progress)
 
 
 def get_reference(study: ReportStudy) -> ReferenceSolutions:
     """Read the stored solutions of `solve_reference`, at `study.read_nodes`."""
-    return _read(study, "reference", len(study.test_loads))
+    return _read_solutions(study, "reference", len(study.test_loads))
 
 
 def get_solutions_beyond(study: ReportStudy) -> ReferenceSolutions:
     """Read the stored solutions of `solve_beyond`, at the tumour's vertices."""
-    return _read(study, "beyond", len(study.loads_beyond))
+    return _read_solutions(study, "beyond", len(study.loads_beyond))
 
 
-def _solve(
+def _solve_missing_loads(
     study: ReportStudy,
-    kind: str,
+    load_kind: str,
     loads: Loads,
-    made: Callable[[], tuple[Fem, LocatedPoints]],
+    build_model: Callable[[], tuple[Fem, LocatedPoints]],
     progress: Callable[[int], object],
 ) -> None:
-    missing = np.array([row for row in range(len(loads)) if not _to_answers_path(study, kind, row).exists()], int)
+    missing = np.array([row for row in range(len(loads)) if not _to_solution_path(study, load_kind, row).exists()], int)
     progress(len(loads) - len(missing))
     if not len(missing):
         return
-    fem, located = made()
+    fem, located = build_model()
     for rows in np.array_split(missing, -(-len(missing) // min(fem.batch, BATCH_LOADS))):
         result = fem.deform(loads.select(rows))
         for row, field, outcome in zip(rows, located.interpolate(result.displacement), result.outcome, strict=True):
-            with write_atomically(_to_answers_path(study, kind, row), ".npz") as partial:
+            with write_atomically(_to_solution_path(study, load_kind, row), ".npz") as partial:
                 np.savez(partial, displacement=field, good=outcome.good, seconds=result.cost.total / len(rows))
         progress(len(rows))
 
 
-def _read(study: ReportStudy, kind: str, count: int) -> ReferenceSolutions:
+def _read_solutions(study: ReportStudy, load_kind: str, count: int) -> ReferenceSolutions:
     kept = []
     for row in range(count):
-        path = _to_answers_path(study, kind, row)
+        path = _to_solution_path(study, load_kind, row)
         with wrap_errors(path, "a solution of the reference", REMEDY), path.open("rb") as raw:
             names = "displacement", "good", "seconds"
             arrays = Archive(raw, REMEDY).read_arrays(names)
@@ -107,5 +107,5 @@ def _read(study: ReportStudy, kind: str, count: int) -> ReferenceSolutions:
     return ReferenceSolutions(*(np.stack(part) for part in zip(*kept, strict=True)))
 
 
-def _to_answers_path(study: ReportStudy, kind: str, row: int) -> Path:
-    return study.folder / "answers" / f"{kind}-{study.digest}-{row:04d}.npz"
+def _to_solution_path(study: ReportStudy, load_kind: str, row: int) -> Path:
+    return study.folder / "answers" / f"{load_kind}-{study.digest}-{row:04d}.npz"

@@ -88,11 +88,11 @@ def compute_figures(result: np.ndarray, reference: np.ndarray, loads: Loads) -> 
 
 
 def compare_with_reference(
-    study: ReportStudy, result: np.ndarray, good: np.ndarray, nodes: np.ndarray
+    study: ReportStudy, result: np.ndarray, converged: np.ndarray, nodes: np.ndarray
 ) -> ErrorFigures | None:
     """Compute errors of `result` (n, k, 3) [m] at vertices `nodes` (k,), for test loads with both solutions good."""
     truth = get_reference(study)
-    rows = np.flatnonzero(good & truth.good)
+    rows = np.flatnonzero(converged & truth.good)
     known = np.isin(study.read_nodes, nodes)
     return compute_figures(result[rows], truth.displacement[rows][:, known], study.test_loads.select(rows))
 
@@ -219,10 +219,10 @@ class ReportRow:
         return None if self.solving is None else self.learning + self.solving
 
 
-def describe_reference_error(finer_mesh: bool, rows: Sequence[ReportRow]) -> str:
+def describe_reference_error(is_finer_mesh: bool, rows: Sequence[ReportRow]) -> str:
     """Describe the error of the reference, from the row "FEM p2" on the mesh with edges twice as long."""
     coarse = next((row.reference for row in rows if row.name == "FEM p2"), None)
-    if not finer_mesh or coarse is None:
+    if not is_finer_mesh or coarse is None:
         return (
             "Error of the reference: not measured. Without --quick its mesh is finer, and is compared with p2 on this."
         )

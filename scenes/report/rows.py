@@ -135,11 +135,11 @@ def list_learner_specs(series: bool = True) -> tuple[LearnerSpec, ...]:
     return tuple(LearnerSpec(name) for name in LEARNERS if series or name not in SERIES_MODELS)
 
 
-def measure_in_process(slot: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
-    """Measure a row in its own process, which starts immediately, and begins to measure when `slot` is free."""
+def measure_in_process(free_slot: AbstractContextManager[object], study: ReportStudy, spec: Spec) -> ReportRow:
+    """Measure a row in its own process, which starts immediately, and begins to measure when `free_slot` is free."""
     try:
         # Data that the study has already read are not copied to the process.
-        with process_pool(["cpu"], prepare_rows, replace(study)) as children, slot:
+        with process_pool(["cpu"], prepare_rows, replace(study)) as children, free_slot:
             return run_on_each(children, measure_row, [spec])[0]
     except LostProcessError:
         return ReportRow(spec.name, FAMILY_NAMES[type(spec)], state="its process was killed, probably out of memory")
@@ -198,24 +198,24 @@ def measure_on_workers(study: ReportStudy, specs: Sequence[Spec], address: str) 
 def measure_rows(
     study: ReportStudy,
     specs: Sequence[Spec],
-    run: Run | None = None,
-    cores: int | None = None,
-    on_card: bool | None = None,
+    measure: Run | None = None,
+    core_count: int | None = None,
+    uses_gpu: bool | None = None,
 ) -> Iterator[ReportRow]:
     """Yield a row for each of the `specs`; rows with unchanged inputs are read from files.
 
     Measured rows are stored immediately. By default each row has its own process. FEM rows are measured one at a
     time; trained models are measured in parallel, one for every `CORES` CPU cores. With FEM on a GPU, FEM takes
-    one of these places, and trained models are measured at the same time. If `run` measures rows in this process,
-    they are measured one at a time unless `cores` is given.
+    one of these places, and trained models are measured at the same time. If `measure` measures rows in this process,
+    they are measured one at a time unless `core_count` is given.
     """
-    cores = cores or (1 if run else os.cpu_count() or 1)
-    beside = cores >= 2 * CORES and (study.on_card if on_card is None else on_card)
+    core_count = core_count or (1 if measure else os.cpu_count() or 1)
+    beside = core_count >= 2 * CORES and (study.on_card if uses_gpu is None else uses_gpu)
     stopped, groups = Event(), []
     for kind, alike in groupby(specs, type):
-        together = 1 if kind is not LearnerSpec else max(1, cores // CORES - beside)
-        measuring = run or partial(measure_in_process, BoundedSemaphore(together))
-        ahead = together if cores >= CORES else 0
+        together = 1 if kind is not LearnerSpec else max(1, core_count // CORES - beside)
+        measuring = measure or partial(measure_in_process, BoundedSemaphore(together))
+        ahead = together if core_count >= CORES else 0
         groups.append(_run_ahead(partial(_get_row, study, measuring), list(alike), ahead))
     if not beside or len(groups) < 2:
         yield from chain.from_iterable(groups)
@@ -250,7 +250,7 @@ def _get_row(study: ReportStudy, run: Run, spec: Spec) -> ReportRow:
     stem = f"{study.data.stem} {spec.name}".replace(" ", "-")
     path = study.folder / "rows" / f"{stem}.json"
     digest = _compute_row_digest(study, spec)
-    kept = _read_kept_row(path, digest)
+    kept = _read_stored_row(path, digest)
     if kept is None:
         kept = run(study, spec)
         if kept.state == "measured":
@@ -269,7 +269,7 @@ def _compute_row_digest(study: ReportStudy, spec: Spec) -> str:
     return compute_digest(np.frombuffer(stated.encode(), np.uint8))
 
 
-def _read_kept_row(path: Path, digest: str) -> ReportRow | None:
+def _read_stored_row(path: Path, digest: str) -> ReportRow | None:
     """Read the row in a file; None if the file is missing or invalid, or if the row has other inputs."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8-sig"))

@@ -46,9 +46,9 @@ class VertexModels:
     centroid: np.ndarray
     regressors: tuple[VertexRegressor, ...]
 
-    def predict(self, pushed: Pushed) -> np.ndarray:
+    def predict(self, pushes: Pushed) -> np.ndarray:
         """Predict the displacements (B, k, 3) [m] of the vertices under B pushes."""
-        features = compute_features(self.sites, self.centroid, pushed)
+        features = compute_features(self.sites, self.centroid, pushes)
         angular = [one.predict(X) for one, X in zip(self.regressors, features, strict=True)]
         return convert_from_angles(np.stack(angular, axis=1).astype(np.float64))
 
@@ -58,22 +58,22 @@ def select_vertices(anatomy: Anatomy) -> np.ndarray:
     return anatomy.tumour_nodes[::VERTEX_STRIDE]
 
 
-def compute_features(sites: np.ndarray, centroid: np.ndarray, pushed: Pushed) -> np.ndarray:
+def compute_features(sites: np.ndarray, centroid: np.ndarray, pushes: Pushed) -> np.ndarray:
     """Compute the published features (k, B, 13) of B pushes for vertices `sites` (k, 3) [m].
 
     Features: force (3) [N], direction angles of the force (3) [rad], distances from the loaded point to the vertex and
     to `centroid` (3,) [m], angle between force and line to the vertex [rad], axis (3) and angle [rad] of this rotation.
     """
-    direction = split_forces(pushed)[1]
-    line = sites[:, None] - pushed.point
+    direction = split_forces(pushes)[1]
+    line = sites[:, None] - pushes.point
     distance = np.linalg.norm(line, axis=2, keepdims=True)
     line = line / np.maximum(distance, np.finfo(float).tiny)
     axis = np.cross(direction, line)
     sine = np.linalg.norm(axis, axis=2, keepdims=True)
     angle = np.arctan2(sine, np.einsum("bi,kbi->kb", direction, line)[:, :, None])
     axis = axis / np.maximum(sine, np.finfo(float).tiny)
-    own = np.column_stack([pushed.force, np.arccos(np.clip(direction, -1.0, 1.0))])
-    from_centroid = np.linalg.norm(pushed.point - centroid, axis=1)[:, None]
+    own = np.column_stack([pushes.force, np.arccos(np.clip(direction, -1.0, 1.0))])
+    from_centroid = np.linalg.norm(pushes.point - centroid, axis=1)[:, None]
     own, from_centroid = (np.broadcast_to(part, (len(sites), *part.shape)) for part in (own, from_centroid))
     return np.concatenate([own, distance, from_centroid, angle, axis, angle], axis=2)
 
@@ -90,7 +90,7 @@ def convert_from_angles(angular: np.ndarray) -> np.ndarray:
     return angular[..., :1] * np.cos(angular[..., 1:])
 
 
-def fit_vertex_models(name: str, anatomy: Anatomy, pushed: Pushed, displacement: np.ndarray) -> VertexModels:
+def fit_vertex_models(name: str, anatomy: Anatomy, pushes: Pushed, displacement: np.ndarray) -> VertexModels:
     """Fit the regressor `name` of `PUBLISHED` to displacements (B, k, 3) [m] of `select_vertices` under B pushes."""
     sites, centroid = anatomy.mesh.nodes[select_vertices(anatomy)], anatomy.mesh.nodes.mean(axis=0)
     angular = convert_to_angles(np.asarray(displacement, np.float64)).transpose(1, 0, 2)
@@ -100,4 +100,4 @@ def fit_vertex_models(name: str, anatomy: Anatomy, pushed: Pushed, displacement:
 
     # Threads of BLAS would wait for each other on matrices of 61 rows, and take twelve times as long.
     with limit_to_one_thread(), ThreadPoolExecutor() as pool:
-        return VertexModels(sites, centroid, tuple(pool.map(fit, compute_features(sites, centroid, pushed), angular)))
+        return VertexModels(sites, centroid, tuple(pool.map(fit, compute_features(sites, centroid, pushes), angular)))

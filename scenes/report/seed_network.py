@@ -151,18 +151,18 @@ def take_damped_step(
     return weights, gain, damping
 
 
-def solve_regularised(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def solve_regularised(matrix: np.ndarray, right_side: np.ndarray) -> np.ndarray:
     """Solve symmetric, positive semi-definite systems (r, P, P) for right-hand sides (r, P).
 
     With fewer rows than weights the fit can be exact: the estimated noise is then zero, and the damping vanishes in
     round-off. If any matrix is singular, a multiple of the identity at round-off level is added to each matrix.
     """
     try:
-        return np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
+        return np.linalg.solve(matrix, right_side[:, :, None])[:, :, 0]
     except np.linalg.LinAlgError:
         count = matrix.shape[1]
         rounding = np.finfo(float).eps * count * np.trace(matrix, axis1=1, axis2=2)
-        return np.linalg.solve(matrix + rounding[:, None, None] * np.eye(count), right[:, :, None])[:, :, 0]
+        return np.linalg.solve(matrix + rounding[:, None, None] * np.eye(count), right_side[:, :, None])[:, :, 0]
 
 
 def count_effective_weights(hessian: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
@@ -175,8 +175,8 @@ def count_effective_weights(hessian: np.ndarray, alpha: np.ndarray, beta: np.nda
 
 
 def estimate_precisions(
-    weights: np.ndarray, error: np.ndarray, effective: np.ndarray, rows: int
+    weights: np.ndarray, error: np.ndarray, effective: np.ndarray, row_count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimate MacKay's alpha = gamma / (2 E_W) and beta = (n - gamma) / (2 E_D), (r,) each, gamma = `effective`."""
-    spare = np.maximum(rows - effective, 1.0)
+    spare = np.maximum(row_count - effective, 1.0)
     return effective / np.square(weights).sum(axis=1), spare / np.maximum(error, MIN_SQUARED_ERROR)

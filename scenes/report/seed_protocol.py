@@ -143,7 +143,7 @@ def measure_seed_learner(study: SeedStudy, spec: LearnerSpec) -> ReportRow:
     InputError
         Input that `train` rejects.
     """
-    truth, fit = study.truth, _fit_published if spec.name in PUBLISHED else _fit_learner
+    truth, fit = study.truth, _fit_published_model if spec.name in PUBLISHED else _fit_learner
     predicted, fits, count = np.empty_like(truth), [], 0
     for number in range(len(study.positions)):
         test = np.flatnonzero(study.position == number)
@@ -165,7 +165,7 @@ def measure_seed_learner(study: SeedStudy, spec: LearnerSpec) -> ReportRow:
     )
 
 
-def _fit_published(study: SeedStudy, name: str, number: int, training: np.ndarray) -> Predict:
+def _fit_published_model(study: SeedStudy, name: str, number: int, training: np.ndarray) -> Predict:
     pushed = get_only_pushes(study.converged.select(training))
     model = fit_vertex_models(name, study.anatomy, pushed, study.truth[training])
     return lambda loads: model.predict(get_only_pushes(loads))

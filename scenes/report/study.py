@@ -174,13 +174,13 @@ EDGE_DISTANCES = (0.5, 0.9)  # Range of distances of a centre from the edge, rel
 KINDS = ("stronger", "more oblique", "nearer to the rim")  # Kinds of loads beyond the training range.
 
 
-def draw_extrapolated_loads(patch: Patch, training: Pushed, pattern: Pushed, count: int) -> Loads:
-    """Draw `count` loads, a third of each kind in `KINDS`, otherwise distributed as `pattern`; deterministic."""
+def draw_extrapolated_loads(patch: Patch, training: Pushed, pattern_pushes: Pushed, count: int) -> Loads:
+    """Draw `count` loads, a third of each kind in `KINDS`, otherwise distributed as `pattern_pushes`; deterministic."""
     random = np.random.default_rng(0)
-    rows = random.integers(len(pattern.point), size=count)
+    rows = random.integers(len(pattern_pushes.point), size=count)
     kind = np.arange(count) % len(KINDS)
-    size, direction = split_forces(replace(pattern, force=pattern.force[rows]))
-    point, footprint = pattern.point[rows], pattern.footprint[rows]
+    size, direction = split_forces(replace(pattern_pushes, force=pattern_pushes.force[rows]))
+    point, footprint = pattern_pushes.point[rows], pattern_pushes.footprint[rows]
     size = np.where(kind == 0, split_forces(training)[0].max() * random.uniform(*FORCE_RATIOS, count), size)
     oblique = _turn_from_normal(
         direction, patch.find_normals(point), _compute_max_angle(patch, training), random.uniform(*EXTRA_ANGLES, count)
@@ -190,9 +190,9 @@ def draw_extrapolated_loads(patch: Patch, training: Pushed, pattern: Pushed, cou
     return Loads((Pushed(point, size[:, None] * direction, footprint),))
 
 
-def _compute_max_angle(patch: Patch, pushed: Pushed) -> float:
+def _compute_max_angle(patch: Patch, pushes: Pushed) -> float:
     """Compute the largest angle [rad] between a push's force and the inward normal."""
-    cosine = np.einsum("bi,bi->b", split_forces(pushed)[1], patch.find_normals(pushed.point))
+    cosine = np.einsum("bi,bi->b", split_forces(pushes)[1], patch.find_normals(pushes.point))
     return float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
 
 

@@ -140,7 +140,7 @@ def compute_stresses(tissue: Material | Ogden, measured: MeasuredTissue) -> dict
     }
 
 
-def fit_law(law: str, measured: MeasuredTissue) -> Material | Ogden:
+def fit_law(law: str, measured_tissue: MeasuredTissue) -> Material | Ogden:
     """Fit one parameter set of a law to all tests by least squares of the stresses; `law` of `LAWS`, or Ogden's.
 
     Stresses are proportional to mu, so that mu follows from the other constants. Ogden's law has one term, whose
@@ -151,7 +151,7 @@ def fit_law(law: str, measured: MeasuredTissue) -> Material | Ogden:
     InputError
         See `compute_uniaxial_stress`; for Ogden's law, if no exponent has stresses.
     """
-    target = np.concatenate([stress for _, stress in measured.tests.values()])
+    target = np.concatenate([stress for _, stress in measured_tissue.tests.values()])
 
     def build(mu: float, alpha: float) -> Material | Ogden:
         if law != Ogden.law:
@@ -161,7 +161,7 @@ def fit_law(law: str, measured: MeasuredTissue) -> Material | Ogden:
 
     def fit(alpha: float) -> tuple[float, float]:
         """Return the best mu [Pa] for an exponent, and the sum of squared differences."""
-        unit = np.concatenate(list(compute_stresses(build(1.0, alpha), measured).values()))
+        unit = np.concatenate(list(compute_stresses(build(1.0, alpha), measured_tissue).values()))
         mu = max(float(unit @ target / (unit @ unit)), MIN_MU)
         return mu, float(np.square(mu * unit - target).sum())
 
@@ -180,29 +180,29 @@ def fit_law(law: str, measured: MeasuredTissue) -> Material | Ogden:
     return build(fit(best)[0], best)
 
 
-def compare_tissue(name: str, tissue: Material | Ogden, measured: MeasuredTissue) -> TissueFit:
+def compare_tissue(name: str, tissue: Material | Ogden, measured_tissue: MeasuredTissue) -> TissueFit:
     """Compute R2 and errors of a tissue, for a row with the given name."""
     r2, error = {}, {}
-    for test, stress in compute_stresses(tissue, measured).items():
-        known = measured.tests[test][1]
+    for test, stress in compute_stresses(tissue, measured_tissue).items():
+        known = measured_tissue.tests[test][1]
         r2[test] = float(1.0 - np.square(stress - known).sum() / np.square(known - known.mean()).sum())
         last = np.abs(known).argmax()
         error[test] = float(stress[last] / known[last] - 1.0)
     alpha = tissue.terms[0][1] if isinstance(tissue, Ogden) and len(tissue.terms) == 1 else None
-    return TissueFit(measured.name, name, str(tissue), tissue.lame[0], alpha, r2, error)
+    return TissueFit(measured_tissue.name, name, str(tissue), tissue.lame[0], alpha, r2, error)
 
 
-def list_tissues(measured: MeasuredTissue) -> dict[str, Material | Ogden]:
+def list_tissues(measured_tissue: MeasuredTissue) -> dict[str, Material | Ogden]:
     """Return the fitted laws and the named tissues without relaxation, by the name of their row."""
-    fitted = {f"{law}, fitted": fit_law(law, measured) for law in (*LAWS, Ogden.law)}
+    fitted = {f"{law}, fitted": fit_law(law, measured_tissue) for law in (*LAWS, Ogden.law)}
     named = {name: replace(each.tissue, prony=()) for name, each in MATERIALS.items()}
     return {**fitted, **{name: tissue for name, tissue in named.items() if name == "default" or tissue != BRAIN}}
 
 
-def write_tissue_report(folder: Path, measured: Sequence[MeasuredTissue]) -> tuple[TissueFit, ...]:
+def write_tissue_report(folder: Path, measured_tissues: Sequence[MeasuredTissue]) -> tuple[TissueFit, ...]:
     """Compare all tissues; write `index.html`, `tissue.json` and a plot of each measured tissue. Return the fits."""
     fits, body = [], []
-    for each in measured:
+    for each in measured_tissues:
         tissues = list_tissues(each)
         own = [compare_tissue(name, tissue, each) for name, tissue in tissues.items()]
         drawn = [name for name in tissues if name in (*DRAWN, "default")]

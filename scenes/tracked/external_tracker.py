@@ -139,13 +139,13 @@ class ExternalTracker:
         """External tracker with the poses of tool and reference exchanged."""
         return replace(self, tool_poses=self.reference_poses, reference_poses=self.tool_poses)
 
-    def compare_targets(self, time: float, observed: Mapping[str, Pose], agreement: Agreement) -> Agreement:
+    def compare_targets(self, time: float, observed_poses: Mapping[str, Pose], agreement: Agreement) -> Agreement:
         """Compare the poses with printed targets visible in the image at a time [s]; return the updated `agreement`.
 
-        `observed`: target poses in camera coordinates, by name. Without a `mount`, only the tool's poses can be
+        `observed_poses`: target poses in camera coordinates, by name. Without a `mount`, only the tool's poses can be
         compared, relative to the visible reference.
         """
-        reference, tool = (observed.get(target().name) for target in (build_patient_reference, build_tool_cube))
+        reference, tool = (observed_poses.get(target().name) for target in (build_patient_reference, build_tool_cube))
         if self.mount is None:
             body, other = self.find_tool_pose(time), self.swapped_tracker.find_tool_pose(time)
             if tool is None or reference is None or body is None:

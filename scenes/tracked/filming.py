@@ -227,13 +227,13 @@ def render_frames(player: Player, mounts: Mounts, artefacts: Artefacts, step: in
 
 def _render_image(
     renderer: Renderer,
-    moving: Sequence[np.ndarray],
+    vertices: Sequence[np.ndarray],
     targets: Sequence[tuple[Target, np.ndarray]],
     wrong: set[str],
     camera: Camera,
 ) -> np.ndarray:
     """Render a camera's image (H, W, 3) uint8 with targets at T_scan_target (4, 4); a hand covers those in `wrong`."""
-    sharp = renderer.render(camera, moving).colour
+    sharp = renderer.render(camera, vertices).colour
     shown = render_targets(sharp, camera, [each for each in targets if NAMES[each[0].name] not in wrong])
     for target, T in targets:
         if NAMES[target.name] in wrong:

@@ -282,11 +282,11 @@ class Follower:
         words = UNKNOWN_WARNING if state is TumourState.UNKNOWN else motion.warning
         return TrackingResult(time, state, words, tracked, motion, None, pose, spread, tool_time=time)
 
-    def _find_tool(self, tracked: TrackedTargets, reference: Pose, time: float) -> Pose | None:
+    def _find_tool(self, tracked_targets: TrackedTargets, reference: Pose, time: float) -> Pose | None:
         """Return the pose of the tool's cube relative to the reference; None if the pose is not available."""
         if self.external is not None:
             return self.external.find_tool_pose(time)
-        cube = tracked.poses.get(TOOL)
+        cube = tracked_targets.poses.get(TOOL)
         return None if cube is None else cube.transform_to(reference)
 
     def _describe_age(self, time: float) -> str:

@@ -83,13 +83,13 @@ class Painter:
         )
         return composite(picture, camera, tumour, self.style, cover, Marks(band, gauge, before), words)
 
-    def _describe_hidden(self, camera: Camera, tumour: Layer, covered: np.ndarray | None) -> Sequence[str]:
+    def _describe_hidden(self, camera: Camera, tumour: Layer, occlusion_mask: np.ndarray | None) -> Sequence[str]:
         """Describe the share of the tumour that the foreground hides; empty if the share is negligible."""
         box = find_pixel_box(camera, tumour.vertices)
-        if covered is None or box is None or self.style == "none":
+        if occlusion_mask is None or box is None or self.style == "none":
             return ()
         mask = compute_silhouette(camera.crop_to(*box), tumour.vertices, tumour.triangles)
-        hidden = np.count_nonzero(mask & covered[box])
+        hidden = np.count_nonzero(mask & occlusion_mask[box])
         share = hidden / max(np.count_nonzero(mask), 1)
         return (f"{share:.0%} of the tumour is behind what lies in front",) if share >= MIN_REPORTED_SHARE else ()
 
@@ -114,13 +114,13 @@ class Painter:
         spread = BOUND_DEVIATIONS * float(np.sqrt(along @ tracking.tip_covariance @ along))
         return DistanceGauge(gauge.tip, gauge.nearest_point, error=float(np.hypot(spread, tracking.motion.error)))
 
-    def _draw_grey(self, colour: np.ndarray, tracking: TrackingResult, covered: np.ndarray | None) -> Overlaid:
+    def _draw_grey(self, colour: np.ndarray, tracking: TrackingResult, occlusion_mask: np.ndarray | None) -> Overlaid:
         """Draw the warning and, if a camera pose is available, a grey outline at the last tumour position."""
         over = Overlaid(colour.copy(), np.zeros(colour.shape[:2], np.uint8))
         if tracking.camera is not None and self.style != "none":
             self._draw_dotted(over, tracking.camera, self.stage.build_tumour(tracking.motion.positions))
-            if covered is not None:
-                over.colour[covered] = colour[covered]
+            if occlusion_mask is not None:
+                over.colour[occlusion_mask] = colour[occlusion_mask]
         write_header(over, [])
         write_warning(over, tracking.warning)
         return over

@@ -156,12 +156,12 @@ class OverlayPage:
                 self._show_image(taken, one, wanted, f"image {wanted} of {video.count - 1}, {taken.source.time:.2f} s")
         return list(self.overlays)
 
-    def _find_next_number(self, count: int, due: bool) -> int | None:
+    def _find_next_number(self, count: int, is_due: bool) -> int | None:
         """Return the number of the next image to show; None if the shown image stays."""
         wanted, first = self.number, self.number < 0
         if self.requested:
             wanted = self.requested.pop()
-        elif first or (self.plays and due):
+        elif first or (self.plays and is_due):
             wanted = (self.number + 1) % max(count, 1)
         return None if wanted == self.number else wanted
 

@@ -52,7 +52,7 @@ def read_poses(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         The file is missing or lacks these columns, times do not ascend, quaternions do not have the length 1, or
         positions are farther than 100 m.
     """
-    times, poses, _ = _read(path)
+    times, poses, _ = _read_rows(path)
     back = np.flatnonzero(np.diff(times) <= 0.0)
     if len(back):
         raise InputError(f"{path}: row {back[0] + 3} is not later than the row before it: sort the rows by time_s.")
@@ -71,7 +71,7 @@ def read_pose_stream(path: str | Path) -> PoseStream:
     InputError
         See `read_poses`; also if there is no pose, or an invalid covariance.
     """
-    times, poses, covariances = _read(path)
+    times, poses, covariances = _read_rows(path)
     kept = ~np.isnan(poses[:, 0, 0])
     if not _is_valid_covariance(covariances[kept]):
         raise InputError(f"{path}: has a covariance that is none: mend it, or leave its columns out.")
@@ -81,7 +81,7 @@ def read_pose_stream(path: str | Path) -> PoseStream:
         raise InputError(f"{path}: {error}") from error
 
 
-def _read(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _read_rows(path: str | Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read times (n,) [s], poses (n, 4, 4) [m] and covariances (n, 6, 6) of all rows; missing poses are NaN."""
     with_errors = (TIME, *PLACE, *TURN, *COVARIANCE)
     unseen = Counter[str]()

@@ -53,15 +53,15 @@ def read_registration(path: str | Path) -> Registration:
         if not (np.abs([*T[:3, 3], *centre]) <= MAX_COORDINATE).all():
             raise InputError(f"its shift or its centre is not within {MAX_COORDINATE:g} m: numbers are in millimetres.")
         counts = int(stored["pairs"]), int(stored["surface"])
-        scanned = _read_scanned(stored["scanned"]) if "scanned" in stored else None
+        scanned = _read_registered_scan(stored["scanned"]) if "scanned" in stored else None
         return Registration(T, covariance, centre, 1e-3 * float(stored["rms_mm"]), *counts, scanned)
 
 
-def _read_scanned(stored: dict) -> RegisteredScan:
-    bounds, target = 1e-3 * np.array(stored["bounds_mm"], float), 1e-3 * np.array(stored["tumour_mm"], float)
+def _read_registered_scan(stored_scan: dict) -> RegisteredScan:
+    bounds, target = 1e-3 * np.array(stored_scan["bounds_mm"], float), 1e-3 * np.array(stored_scan["tumour_mm"], float)
     if bounds.shape != (2, 3) or target.shape != (3,) or not (np.abs([*bounds, target]) <= MAX_COORDINATE).all():
         raise InputError("what it was made for has other numbers than bounds 2 x 3 and a tumour's middle of 3.")
-    return RegisteredScan(str(stored["anatomy"]), bounds, target)
+    return RegisteredScan(str(stored_scan["anatomy"]), bounds, target)
 
 
 def describe_scan(anatomy: Anatomy) -> RegisteredScan:

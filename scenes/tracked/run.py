@@ -133,9 +133,9 @@ def pace_images(images: Iterator[TimedImage]) -> Iterator[tuple[TimedImage, floa
 
 
 def draw_overlays(
-    images: Iterator[TimedImage], follower: Follower, painter: Painter, live: bool = False
+    images: Iterator[TimedImage], follower: Follower, painter: Painter, is_live: bool = False
 ) -> Iterator[Overlay]:
-    """Yield the overlay of each image; if `live`, in real time: late images are skipped, and old images are marked.
+    """Yield the overlay of each image; if `is_live`, in real time: late images are skipped, and old images are marked.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def draw_overlays(
         See `Follower.step`; also errors of the video reader.
     """
     known: TrackingResult | None = None
-    for taken, begun in pace_images(images) if live else ((each, None) for each in images):
+    for taken, begun in pace_images(images) if is_live else ((each, None) for each in images):
         shown = overlay_image(taken, begun, known, follower, painter)
         known = shown.result
         yield shown

@@ -101,13 +101,13 @@ class ToolMotion:
         )
 
     def _solve_poses(
-        self, pose: np.ndarray, deeper: np.ndarray, start: Deformation | None
+        self, pose: np.ndarray, deeper_pose: np.ndarray, start: Deformation | None
     ) -> tuple[Deformation, Deformation]:
-        """Compute the solutions for `pose` and `deeper`; FEM starts from the solution `start`."""
+        """Compute the solutions for `pose` and `deeper_pose`; FEM starts from the solution `start`."""
         assert self.deformer is not None
         if isinstance(self.deformer, Learned):
-            loads = Loads((Touching(np.stack([pose, deeper])[:, None]),))
+            loads = Loads((Touching(np.stack([pose, deeper_pose])[:, None]),))
             both = self.deformer.deform(loads, at=self.stage.drawn_vertices)
             return both.select(np.array([0])), both.select(np.array([1]))
         first = self.deformer.deform(Loads((Touching(pose[None, None]),)), start=start)
-        return first, self.deformer.deform(Loads((Touching(deeper[None, None]),)), start=first)
+        return first, self.deformer.deform(Loads((Touching(deeper_pose[None, None]),)), start=first)

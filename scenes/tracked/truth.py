@@ -55,16 +55,16 @@ class VideoGroundTruth:
         return near if abs(self.times[near] - time) < 1e-3 else None
 
 
-def write_truth(path: Path, truth: VideoGroundTruth) -> None:
+def write_truth(path: Path, ground_truth: VideoGroundTruth) -> None:
     """Write the ground truth as an .npz file, atomically."""
     with write_atomically(path, ".npz") as partial, partial.open("wb") as file:
         np.savez_compressed(
             file,
-            header=np.array(json.dumps({"format": FORMAT, "anatomy": truth.anatomy, "spaces": SPACES})),
-            times=truth.times,
-            T_camera_scan=truth.T_camera_scan,
-            T_scan_tool=truth.T_scan_tool,
-            displacement=truth.displacement.astype(np.float32),
+            header=np.array(json.dumps({"format": FORMAT, "anatomy": ground_truth.anatomy, "spaces": SPACES})),
+            times=ground_truth.times,
+            T_camera_scan=ground_truth.T_camera_scan,
+            T_scan_tool=ground_truth.T_scan_tool,
+            displacement=ground_truth.displacement.astype(np.float32),
         )
 
 
@@ -136,14 +136,14 @@ class OverlayError:
 
 
 def compute_overlay_error(
-    tracking: TrackingResult, truth: VideoGroundTruth, calibration: Calibration, stage: Stage
+    tracking: TrackingResult, ground_truth: VideoGroundTruth, calibration: Calibration, stage: Stage
 ) -> OverlayError | None:
     """Compute the error of a tracking result; None if it has no camera pose or no ground truth at its time."""
-    row = truth.find_image(tracking.time)
+    row = ground_truth.find_image(tracking.time)
     if row is None or tracking.camera is None:
         return None
-    camera, triangles = calibration.build_camera(truth.T_camera_scan[row]), stage.tumour_at_rest.triangles
-    true = stage.tumour_at_rest.vertices + truth.displacement[row]
+    camera, triangles = calibration.build_camera(ground_truth.T_camera_scan[row]), stage.tumour_at_rest.triangles
+    true = stage.tumour_at_rest.vertices + ground_truth.displacement[row]
     here = tracking.motion.positions[stage.tumour_vertices]
     masks = compute_silhouette(camera, true, triangles), compute_silhouette(tracking.camera, here, triangles)
     seen, apart = camera.to_camera_frame(true), tracking.camera.to_camera_frame(here) - camera.to_camera_frame(true)

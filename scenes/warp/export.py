@@ -92,15 +92,15 @@ def _compute_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _write_surfaces(folder: Path, deformed: DeformedAnatomy) -> None:
+def _write_surfaces(folder: Path, deformed_anatomy: DeformedAnatomy) -> None:
     triangles = {
-        "brain": deformed.remaining.mesh.surface,
-        "cortex": deformed.remaining.open_surface,
-        "tumour": deformed.remaining.tumour_surface,
+        "brain": deformed_anatomy.remaining.mesh.surface,
+        "cortex": deformed_anatomy.remaining.open_surface,
+        "tumour": deformed_anatomy.remaining.tumour_surface,
     }
-    nodes = deformed.anatomy.mesh.nodes
+    nodes = deformed_anatomy.anatomy.mesh.nodes
     meshes = [
-        build_surface_mesh(name, which, nodes, deformed.displacement, MESH_COLOURS[name])
+        build_surface_mesh(name, which, nodes, deformed_anatomy.displacement, MESH_COLOURS[name])
         for name, which in triangles.items()
         if len(which)
     ]

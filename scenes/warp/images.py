@@ -64,7 +64,7 @@ def list_warnings(values: np.ndarray, affine: np.ndarray, is_label_map: bool, an
     if share < IMAGE_WARNINGS.min_inside_share:
         found.append(f"shows {share:.0%} of the brain; what lies outside is not in it")
     empty = float(np.average(values[tuple(index[inside].T)] == 0, weights=volumes[inside]))
-    turned = _is_turned(values, affine, is_label_map, middles, volumes)
+    turned = _detect_flip(values, affine, is_label_map, middles, volumes)
     if turned:
         found.append(
             f"fits the brain in {turned[0]:.0%} of its volume, but in {turned[1]:.0%} with x and y negated: "
@@ -88,16 +88,16 @@ def list_warnings(values: np.ndarray, affine: np.ndarray, is_label_map: bool, an
     return found
 
 
-def _is_turned(
-    values: np.ndarray, affine: np.ndarray, labels: bool, middles: np.ndarray, volumes: np.ndarray
+def _detect_flip(
+    values: np.ndarray, affine: np.ndarray, is_label_map: bool, centroids: np.ndarray, volumes: np.ndarray
 ) -> tuple[float, float] | None:
     """Return the fractions of the brain on bright voxels, as is and with x and y negated; None if x and y are right."""
     part = np.nan_to_num(values[::SAMPLING_STRIDE, ::SAMPLING_STRIDE, ::SAMPLING_STRIDE].astype(float))
     air, bright = 0.0, part[part > 0.0]
-    if len(bright) and not labels:
+    if len(bright) and not is_label_map:
         air = IMAGE_WARNINGS.dark_ratio * float(np.percentile(bright, IMAGE_WARNINGS.bright_percentile))
     shares = []
-    for points in (middles, middles * LPS):
+    for points in (centroids, centroids * LPS):
         index, inside = _find_voxels(affine, values.shape, points)
         shares.append(float(np.average(inside & (values[tuple(index.T)] > air), weights=volumes)))
     as_is, turned = shares
@@ -254,7 +254,7 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
         slab = out[first : first + BATCH_SLICES]
         index = np.stack(np.unravel_index(np.arange(slab.size), slab.shape), axis=-1) + [first, 0, 0]
         now = index @ affine[:3, :3].T + affine[:3, 3]
-        went, rows = _find_moving(fields, now)
+        went, rows = _find_moving_points(fields, now)
         moved += len(rows)
         if not len(rows):
             continue
@@ -275,7 +275,7 @@ def warp_values(values: np.ndarray, affine: np.ndarray, fields: WarpFields, orde
     return out, Counts(moved, outside, resected, blank)
 
 
-def _find_moving(fields: WarpFields, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_moving_points(fields: WarpFields, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return nonzero backward displacements (m, 3) [m] at points (n, 3) [m], and the numbers (m,) of these points."""
     index = fields.grid.to_indices(points)
     held = np.flatnonzero(((index > 0.0) & (index < np.array(fields.grid.shape) - 1)).all(axis=1))

@@ -65,10 +65,10 @@ class SamplePoints:
         return np.maximum(np.linalg.norm(forward, axis=1), np.linalg.norm(backward, axis=1))
 
 
-def list_points(deformed: DeformedAnatomy) -> SamplePoints:
+def list_points(deformed_anatomy: DeformedAnatomy) -> SamplePoints:
     """Return the vertices, 4 points per tetrahedron and 3 per open triangle of the remaining mesh, and landmarks."""
-    body, mesh = deformed.remaining, deformed.remaining.mesh
-    used, marks = np.unique(mesh.tets), list_landmarks(body, deformed.displacement)
+    body, mesh = deformed_anatomy.remaining, deformed_anatomy.remaining.mesh
+    used, marks = np.unique(mesh.tets), list_landmarks(body, deformed_anatomy.displacement)
     within, on = len(INNER_WEIGHTS) * len(mesh.tets), len(FACE_WEIGHTS) * len(body.open_surface)
     part = np.repeat(np.arange(4), [len(used), within, on, len(marks)])
 
@@ -84,7 +84,7 @@ def list_points(deformed: DeformedAnatomy) -> SamplePoints:
     tumour[part == 1] = np.repeat(body.in_tumour, len(INNER_WEIGHTS))
     cortex[part == 0], cortex[part == 2] = np.isin(used, body.open_surface), True
     rest = evaluate_points(mesh.nodes, [one.rest for one in marks])
-    moved = evaluate_points(deformed.displacement, [one.deformed - one.rest for one in marks])
+    moved = evaluate_points(deformed_anatomy.displacement, [one.deformed - one.rest for one in marks])
     return SamplePoints(rest, moved, tumour, cortex, part == 3, marks)
 
 
@@ -101,17 +101,17 @@ class FoldedRegion:
     field_error: float
 
 
-def find_folds(deformed: DeformedAnatomy, fields: WarpFields) -> tuple[FoldedRegion, ...]:
+def find_folds(deformed_anatomy: DeformedAnatomy, fields: WarpFields) -> tuple[FoldedRegion, ...]:
     """Return all regions where FEM folds, largest first."""
-    mesh = deformed.remaining.mesh
-    bad = mesh.tets[compute_signed_volumes(mesh.nodes + deformed.displacement, mesh.tets) <= 0.0]
+    mesh = deformed_anatomy.remaining.mesh
+    bad = mesh.tets[compute_signed_volumes(mesh.nodes + deformed_anatomy.displacement, mesh.tets) <= 0.0]
     if not len(bad):
         return ()
     count = len(bad)
     sides = np.repeat(np.arange(count), 4), count + bad.ravel()
     graph = coo_matrix((np.ones(4 * count), sides), (count + len(mesh.nodes),) * 2)
     groups = connected_components(graph, directed=False)[1][:count]
-    errors = list_points(deformed).compute_errors(fields)
+    errors = list_points(deformed_anatomy).compute_errors(fields)
     off = np.zeros(len(mesh.nodes))
     used = np.unique(mesh.tets)
     off[used] = errors[: len(used)]

@@ -92,7 +92,7 @@ def write_card(
 
 
 def update_card(
-    folder: Path, numbers: Set[int], changed: bool, progress: Callable[[Iterable], Iterable] = iter
+    folder: Path, numbers: Set[int], has_changes: bool, progress: Callable[[Iterable], Iterable] = iter
 ) -> str | None:
     """Rewrite the card of a run's folder if the card does not match the episodes; return the reason if this failed.
 
@@ -102,10 +102,10 @@ def update_card(
     ----------
     numbers
         Numbers of the existing episodes.
-    changed
+    has_changes
         True if episodes were made or failed since the card was written.
     """
-    if not numbers or not (changed or _is_outdated(folder, {to_episode_name(number) for number in numbers})):
+    if not numbers or not (has_changes or _is_outdated(folder, {to_episode_name(number) for number in numbers})):
         return None
     if len(numbers) > MAX_COMPARED_EPISODES:
         return (

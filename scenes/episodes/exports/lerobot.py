@@ -175,11 +175,11 @@ def to_key(name: str) -> str:
     return "action" if name == "action" else f"observation.{name}"
 
 
-def build_columns(frames: int, episode: int, first: int, task: int, rate: float) -> dict[str, np.ndarray]:
-    """Build the columns that every LeRobot data set requires, for one episode; `first` is its first row."""
-    every = np.arange(frames)
-    same = np.ones(frames, np.int64)
-    numbers = ((every / rate).astype(np.float32), every, episode * same, first + every, task * same)
+def build_columns(frame_count: int, episode: int, first_row: int, task: int, rate: float) -> dict[str, np.ndarray]:
+    """Build the columns that every LeRobot data set requires, for one episode; `first_row` is its first row."""
+    every = np.arange(frame_count)
+    same = np.ones(frame_count, np.int64)
+    numbers = ((every / rate).astype(np.float32), every, episode * same, first_row + every, task * same)
     return dict(zip(REQUIRED_COLUMNS, numbers, strict=True))
 
 
@@ -193,14 +193,14 @@ class TableWriter:
     path: Path = field(default_factory=Path)
 
     def write(
-        self, file: h5py.File, contents: EpisodeContents, columns: Mapping[str, np.ndarray], pictures: Sequence[str]
+        self, file: h5py.File, contents: EpisodeContents, columns: Mapping[str, np.ndarray], image_names: Sequence[str]
     ) -> tuple[int, int]:
         """Write the frames of an episode; return the numbers of the folder and of the file."""
         if self.writer is not None and self.path.stat().st_size > 1e6 * FILE_MEGABYTES:
             self.close()
         for block in split_into_blocks(len(columns["index"])):
             arrays = {name: to_arrow_column(array[block.start : block.stop]) for name, array in columns.items()}
-            for name in pictures:
+            for name in image_names:
                 arrays[f"observation.images.{name}"] = pa.array(encode_images(file, contents, name, block), IMAGE_TYPE)
             table = pa.table(arrays)
             if self.writer is None:
@@ -287,11 +287,11 @@ def describe_features(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
     }
 
 
-def describe_image_features(contents: EpisodeContents, pictures: Sequence[str]) -> dict[str, Any]:
+def describe_image_features(contents: EpisodeContents, image_names: Sequence[str]) -> dict[str, Any]:
     """Describe the images for `info.json`; depth images with the step and the range of depth [m]."""
     width, height = contents.size
     found = {}
-    for name in pictures:
+    for name in image_names:
         channels = 3 if PICTURES[name] == COLOUR else 1
         found[f"observation.images.{name}"] = {
             "dtype": "image",

@@ -60,12 +60,12 @@ def _add_skipped(report: Report, reason: str) -> Report:
 
 
 def _solve_again(
-    attributes: Mapping[str, Any], opened: OpenedBody, solved: np.ndarray, count: int
+    attributes: Mapping[str, Any], opened_body: OpenedBody, solved: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve frames again; return frame numbers (k,), and displacements (k, n, 3) [m] of the tumour's vertices."""
     plan = parse_plan(str(attributes["plan"]), str(attributes.get("plan_name", "plan")), Path())
     seed, number = int(attributes["seed"]), int(attributes["episode"])
-    body, patient = opened.body, opened.patient
+    body, patient = opened_body.body, opened_body.patient
     scene = build_scene(plan, body, patient.site, sample_episode(plan.contents, seed, number), seed, number)
     fem = build_reference_fem(patient, scene)
     rows = np.unique(np.linspace(0, len(solved) - 1, min(count, len(solved))).astype(int))

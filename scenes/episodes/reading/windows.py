@@ -40,7 +40,7 @@ def read_rows(file: h5py.File, contents: EpisodeContents, name: str, frames: ran
         array = get_array(file, name)
         if ARRAYS[name].axes[0] == SOLVED and name != "fem_frames":
             return _read_solved_rows(array, contents, frames)
-        return _read(array, frames) if ARRAYS[name].has_frame_axis else array[:]
+        return _read_frames(array, frames) if ARRAYS[name].has_frame_axis else array[:]
 
 
 def read_numbers(file: h5py.File, contents: EpisodeContents, name: str, frames: range | None = None) -> np.ndarray:
@@ -76,7 +76,7 @@ def read_image_bytes(file: h5py.File, contents: EpisodeContents, name: str, fram
         return np.asarray(get_array(file, f"pictures/{name}")[frame], np.uint8).tobytes()
 
 
-def _read(array: h5py.Dataset, frames: range) -> Rows:
+def _read_frames(array: h5py.Dataset, frames: range) -> Rows:
     found = array[frames.start : frames.stop : frames.step]
     if array.dtype.kind != "O":
         return found
@@ -86,11 +86,11 @@ def _read(array: h5py.Dataset, frames: range) -> Rows:
 def _read_solved_rows(array: h5py.Dataset, contents: EpisodeContents, frames: range) -> Rows:
     """Read the rows of `frames` from an array with a row per solved frame; other rows are NaN or an empty text."""
     if len(contents.fem_frames) == contents.frames:
-        return _read(array, frames)
+        return _read_frames(array, frames)
     wanted = np.arange(frames.start, frames.stop, frames.step)
     known = np.isin(wanted, contents.fem_frames)
     places = np.searchsorted(contents.fem_frames, wanted[known])
-    rows = _read(array, range(places[0], places[-1] + 1)) if len(places) else array[:0]
+    rows = _read_frames(array, range(places[0], places[-1] + 1)) if len(places) else array[:0]
     if isinstance(rows, list):
         texts = dict(zip(wanted[known].tolist(), (rows[place - places[0]] for place in places), strict=True))
         return [texts.get(frame, "") for frame in wanted.tolist()]
@@ -105,7 +105,7 @@ FEM_KNOWN = "fem_known"
 """Key of the mask (T,) bool of frames that FEM solved, which accompanies FEM arrays."""
 
 
-def list_episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
+def list_episode_paths(locations: str | Path | Sequence[str | Path]) -> list[Path]:
     """List the files of episodes: given files, and sorted files in given folders or their subfolders `episodes`.
 
     Raises
@@ -114,7 +114,7 @@ def list_episode_paths(given: str | Path | Sequence[str | Path]) -> list[Path]:
         A path is missing, or a folder has no episodes.
     """
     paths: list[Path] = []
-    for one in [given] if isinstance(given, str | Path) else given:
+    for one in [locations] if isinstance(locations, str | Path) else locations:
         place = to_path(one)
         if not place.is_dir():
             paths.append(place)
