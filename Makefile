@@ -46,7 +46,7 @@ template: $(STAMP)
 	$(VENV)/bin/sulcus train build/template.h5 --learners linear,ann,svr,series,series-gp --most 2000 --out scenes/data/template.model.npz --force
 	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --pose-control --tool-preset spatula --blade 12 26 1.5 --count 1000 --out build/gym.h5
 	$(VENV)/bin/sulcus train build/gym.h5 --learners contact-gp --out scenes/data/template.gym.npz --force
-	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --pose-control --scene spatula --count 640 --batch 5 --out build/spatula.h5
+	$(VENV)/bin/sulcus simulate scenes/data/template.vtu --pose-control --scene spatula --count 640 --out build/spatula.h5
 	$(VENV)/bin/sulcus train build/spatula.h5 --learners gp,svr,ann --out scenes/data/template.spatula.npz --force
 	$(VENV)/bin/sulcus effects --out scenes/data/template.effects.json
 	$(MAKE) locator

@@ -14,8 +14,9 @@ from test_house import FILES, HOUSE, PACKAGED, name_of, nodes_of
 # 120 list claims with their figures and tests; 70 lines are their tests.
 # 180 factorise the tangent stiffness under tools, up to nine times as fast with measured brain; 90 are their tests.
 # 80 lines of tests compare FEM with a silicone phantom.
+# 45 solve poses of a data set in strokes, in a third of the time; 50 are their tests.
 # 290 of the tests are calls that names of full words wrap.
-MOST = {"packages": 85_420, "tests": 54_570}
+MOST = {"packages": 85_462, "tests": 54_620}
 
 
 def lines(paths):

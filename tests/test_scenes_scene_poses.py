@@ -3,12 +3,13 @@ import pytest
 
 from scenes.script.craniotomy_frame import build_craniotomy_frame
 from scenes.script.scene import find_scene
-from scenes.script.scene_poses import DEPTHS, sample_scene_poses
+from scenes.script.scene_poses import sample_scene_poses
 from scenes.script.shipped_files import get_template_path
 from scenes.script.tool_paths import Touch
 from sim.bodies.meshfile import read_anatomy
 from sim.errors import InputError
 from sim.loads import Touching
+from surrogate.data.strokes import STROKE_LENGTH
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +35,12 @@ def test_sampled_poses_cover_the_range_of_manual_control(site):
 
 def test_larger_pose_sample_starts_with_the_smaller_sample(site):
     scene = find_scene("spatula")
-    few, more = (sample_scene_poses(scene, site, count, 3)[1].get(Touching).pose for count in (DEPTHS, 3 * DEPTHS + 1))
-    assert np.array_equal(few, more[:DEPTHS]) and not np.allclose(more[0], more[DEPTHS])
-    assert not np.allclose(few, sample_scene_poses(scene, site, DEPTHS, 4)[1].get(Touching).pose)
+    few, more = (
+        sample_scene_poses(scene, site, count, 3)[1].get(Touching).pose
+        for count in (STROKE_LENGTH, 3 * STROKE_LENGTH + 1)
+    )
+    assert np.array_equal(few, more[:STROKE_LENGTH]) and not np.allclose(more[0], more[STROKE_LENGTH])
+    assert not np.allclose(few, sample_scene_poses(scene, site, STROKE_LENGTH, 4)[1].get(Touching).pose)
 
 
 def test_scene_without_moved_tool_is_rejected(site):

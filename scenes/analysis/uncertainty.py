@@ -9,7 +9,7 @@ from ar.rendering.layer import compute_vertex_normals
 from sim.accuracy import Accuracy
 from sim.anatomy import TUMOUR_LABEL
 from sim.deformation import Deformation
-from sim.effects import SKULLS, Effect, Elasticity, Gravity
+from sim.effects import SKULLS, Effect, Elasticity, Gravity, ToolContact
 from sim.errors import InputError
 from sim.material import LAWS, IsotropicTissue, Ogden
 from sim.skulls import Bonded, SkullContact, Slide
@@ -40,7 +40,7 @@ from ..script.scene import Scene
 from ..script.tool_paths import Path, Touch
 from ..script.uncertainty import LEVEL, Uncertainty, compute_scene_mark
 
-ACCURACY = Accuracy(tolerance=3e-3, limit_strain=False)  # Samples with inverted tetrahedra are counted, not left out.
+ACCURACY = Accuracy(3e-3, outer=60, limit_strain=False)  # Samples with inverted tetrahedra are counted, not left out.
 
 
 @dataclass(frozen=True)
@@ -212,9 +212,11 @@ def solve_nominal(patient: PatientSetup, scene: Scene) -> SurfaceMotions:
 def solve_scene(patient: PatientSetup, scene: Scene) -> Answer:
     """Compute the tumour's motions at each time of `list_solved_times`; None if any time has no equilibrium.
 
-    If the step from the previous time does not converge, intermediate times are solved.
+    If the step from the previous time does not converge, intermediate times are solved, not load steps from rest.
     """
-    fem, stage = patient.build_fem(scene, ACCURACY, batch=1), Stage(scene, patient.site)
+    touches = any(isinstance(effect, ToolContact | SkullContact) for effect in scene.effects)
+    accuracy = ACCURACY if touches else replace(ACCURACY, steps=0)
+    fem, stage = patient.build_fem(scene, accuracy, batch=1), Stage(scene, patient.site)
     last, found, before, inverted = None, [], 0.0, 0
 
     def solve_times(times: Sequence[float], start: Deformation | None) -> Deformation | None:

@@ -6,12 +6,12 @@ from scipy.stats import qmc
 from sim.errors import InputError
 from sim.loads import Loads, Touching
 from sim.tools import BuiltIn
+from surrogate.data.strokes import STROKE_LENGTH
 
 from .craniotomy_frame import CraniotomyFrame
 from .scene import Scene
 from .tool_paths import Touch
 
-DEPTHS = 8  # Number of depths at each place.
 DEPTH_MARGIN = 1.05  # Largest sampled depth over the largest depth of the script.
 
 
@@ -33,10 +33,10 @@ def sample_scene_poses(scene: Scene, site: CraniotomyFrame, count: int, seed: in
             f"the scene {scene.name} moves no ball, capsule or blade by pose into the tissue: name one that does."
         )
     source = np.random.Generator(np.random.Philox(key=seed))
-    places = qmc.Halton(2, scramble=False).random(-(-count // DEPTHS)) + source.random(2)
-    share = np.repeat(places % 1.0, DEPTHS, axis=0)[:count]
+    places = qmc.Halton(2, scramble=False).random(-(-count // STROKE_LENGTH)) + source.random(2)
+    share = np.repeat(places % 1.0, STROKE_LENGTH, axis=0)[:count]
     radius, angle = site.compute_reach(scene.tool.radius) * np.sqrt(share[:, 0]), 2.0 * np.pi * share[:, 1]
-    depth = deepest * (np.arange(count) % DEPTHS + source.random(count)) / DEPTHS
+    depth = deepest * (np.arange(count) % STROKE_LENGTH + source.random(count)) / STROKE_LENGTH
     x, y = radius * np.cos(angle), radius * np.sin(angle)
     touches = (Touch(*one[:2], depth=one[2]) for one in np.column_stack([x, y, depth]).tolist())
     return shape, Loads((Touching(np.stack([scene.compute_pose(site, touch) for touch in touches])[:, None]),))

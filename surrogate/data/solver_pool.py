@@ -10,7 +10,7 @@ import numpy as np
 from sim.accuracy import Accuracy
 from sim.anatomy import Anatomy
 from sim.deformation import Deformation, Deformer
-from sim.effects import Effect
+from sim.effects import Effect, ToolContact
 from sim.fem import Fem
 from sim.loads import Loads, Touching
 from sim.runtime.memory import check_fits
@@ -18,6 +18,7 @@ from sim.runtime.processes import process_pool, run_on_each
 from sim.strategy.memory_needed import MemoryEstimate, estimate_fem_memory
 
 from .load_histories import get_relaxation_series, solve_histories
+from .strokes import STROKE_LENGTH, solve_strokes
 from .tasks import SolverPool
 
 
@@ -57,9 +58,12 @@ class LazyFem:
         )
 
     def deform(self, loads: Loads, start: Deformation | None = None, at: np.ndarray | None = None) -> Deformation:
-        """Solve as `Fem.deform`; poses in relaxing tissue are solved as histories (`solve_histories`)."""
-        if start is None and get_relaxation_series(self.effects) and loads.get(Touching) is not None:
-            result = solve_histories(self.fem, loads)
+        """Solve as `Fem.deform`; poses in relaxing tissue as histories, others as strokes (`solve_strokes`)."""
+        if start is None and loads.get(Touching) is not None:
+            if get_relaxation_series(self.effects):
+                result = solve_histories(self.fem, loads)
+            else:
+                result = solve_strokes(self.fem, loads)
             return result if at is None else result.restrict(at)
         return self.fem.deform(loads, start, at)
 
@@ -121,7 +125,10 @@ def describe_fem_task(asked: LazyFem, task: None) -> tuple[str, str, int]:
         check_fits(
             fem.problem.rows, fem.batch, min(fem.batch, asked.load_count), fem.problem.device, fem.strategy.kept_bytes
         )
-    return asked.fem.space.element, asked.fem.description, asked.fem.batch
+    size = asked.fem.batch
+    if size == 1 and any(isinstance(effect, ToolContact) for effect in asked.effects):
+        size = asked.batch or STROKE_LENGTH
+    return asked.fem.space.element, asked.fem.description, size
 
 
 def choose_even_batch(max_batch: int, load_count: int, device_count: int) -> int:
