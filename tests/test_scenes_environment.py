@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from gym_examples import DOWN, SIZE, made, many, played
+from gymnasium import make_vec
 from gymnasium.utils.env_checker import check_env
 
-from scenes.gym.environment import make_many as made_apart
 from scenes.gym.scripted import compute_scripted_actions
 from sim.errors import InputError
 
@@ -115,6 +115,7 @@ def test_spatula_model_gives_same_bytes_alone_and_in_vector():
         assert seen[1].tobytes() == expected.tobytes()
     assert truth["reliable"].all() and truth["force"][1].tobytes() == true["force"].tobytes()
     assert np.linalg.norm(true["force"]) > 0.02 and 0.0 < true["model_error"] < 1e-3 and 0.0 < true["pressure"] < 4e3
-    apart = made_apart("retract", 1, True, device="cpu", size=SIZE)
+    process = {"vectorization_mode": "async", "vector_kwargs": {"context": "spawn"}}
+    apart = make_vec("sulcus/Retract-v0", 1, **process, device="cpu", size=SIZE)
     assert apart.reset(seed=2)[0][0].tobytes() == alone[0][0].tobytes()
     apart.close()

@@ -36,10 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Step the environments under their scripted policies."""
+    from gymnasium import make_vec
     from tqdm import tqdm
 
     from scenes.analysis.measurement import describe_machine
-    from scenes.gym.environment import make_many
 
     from ..studies.frame import parse_image_size
     from ..studies.gym_rates import measure_rate
@@ -51,9 +51,10 @@ def run(args: argparse.Namespace) -> int:
     where = f"{describe_machine(args.device)}; {args.envs} environments{apart}, pictures of {size[0]} x {size[1]}"
     for task in args.tasks or TASKS:
         for observation in args.observation:
-            environment = make_many(
-                task, args.envs, args.processes, anatomy=args.anatomy, observation=observation, physics=args.physics,
-                device=args.device, size=size, model=args.model,
+            process = {"vectorization_mode": "async", "vector_kwargs": {"context": "spawn"}} if args.processes else {}
+            environment = make_vec(
+                f"scenes.gym:sulcus/{task.capitalize()}-v0", args.envs, **process, anatomy=args.anatomy,
+                observation=observation, physics=args.physics, device=args.device, size=size, model=args.model,
             )  # fmt: skip
             with tqdm(desc=f"{task}, {observation}", total=args.repeats + 1, unit="repeat", file=sys.stderr) as bar:
                 rows.append(measure_rate(environment, task, observation, args.steps, args.repeats, bar.update))

@@ -6,7 +6,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import make_vec
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -17,7 +16,7 @@ from sim.errors import InputError
 from .episode import Episode, EpisodeStep
 from .observation import KINDS, build_action_space, build_observation_space
 from .observation_camera import ObservationCamera
-from .registration import MAX_STEPS, NAMESPACE
+from .registration import MAX_STEPS
 from .setting import TaskSetting, check_arguments, open_setting
 from .tasks import STEP_SECONDS, find_task
 from .tissue_requests import TissueRequest
@@ -247,25 +246,3 @@ class SurgeryVectorEnv(VectorEnv):
         """Return the ground truth as arrays with a row per environment, and Gymnasium's masks, which are all True."""
         infos = {name: np.stack([step.info[name] for step in steps]) for name in steps[0].info}
         return infos | {f"_{name}": np.ones(self.num_envs, bool) for name in infos}
-
-
-def make_many(task: str, count: int, processes: bool = False, **settings: Any) -> VectorEnv:
-    """Make `count` environments of a task by `gymnasium.make_vec`.
-
-    Parameters
-    ----------
-    processes
-        True for one process per environment. Since processes are spawned (a process that uses a GPU cannot be forked),
-        the script needs `if __name__ == "__main__":`.
-    settings
-        Other arguments of `SurgeryEnv`.
-
-    Raises
-    ------
-    InputError
-        See `SurgeryEnv`.
-    """
-    name = f"{NAMESPACE}/{find_task(task).name.capitalize()}-v0"
-    if processes:
-        return make_vec(name, count, vectorization_mode="async", vector_kwargs={"context": "spawn"}, **settings)
-    return make_vec(name, count, **settings)
