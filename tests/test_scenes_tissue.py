@@ -7,6 +7,7 @@ import pytest
 
 from scenes.cli import main
 from scenes.report.tissue import COLUMNS, compare_tissue, fit_law, read_measured_tissues
+from sim.errors import InputError
 from sim.material import Material
 
 HEAD = ",".join(name for pair in COLUMNS.values() for name in pair)
@@ -56,7 +57,7 @@ def test_report_command_writes_page_and_plots(tmp_path, capsys):
     fits = json.loads(capsys.readouterr().out)["fits"]
     assert {"ogden, fitted", "linear, fitted", "default", "minutes"} <= {fit["model"] for fit in fits}
     page = (tmp_path / "out" / "index.html").read_text()
-    assert page.count("<svg") == 1 and "one &amp; &lt;two&gt;" in page and "It says nothing of a patient" in page
+    assert page.count("<svg") == 1 and "one &amp; &lt;two&gt;" in page and "It says nothing about a patient" in page
     assert (tmp_path / "out" / "one & <two>.png").stat().st_size > 5000
     assert main(words) == 0 and "ogden, fitted" in capsys.readouterr().out
 
@@ -66,6 +67,14 @@ def test_file_may_have_one_test_and_empty_cells(tmp_path):
     (tmp_path / "brain.csv").write_text("\r\n".join([HEAD, *rows[:4], "1.04,,,,", *rows[4:]]), encoding="utf-8-sig")
     (measured,) = read_measured_tissues(tmp_path)
     assert list(measured.tests) == ["tension"] and measured.tests["tension"][1].tolist()[-1] == pytest.approx(240.0)
+    assert main(["report", "--tissue", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
+    assert (tmp_path / "out" / "brain.png").stat().st_size > 5000
+
+
+def test_column_without_its_partner_is_rejected(tmp_path):
+    (tmp_path / "brain.csv").write_text(f"{','.join(COLUMNS['shear'])},stretch_tension\n0,0,1\n0.1,1,1.1\n0.2,2,1.2\n")
+    with pytest.raises(InputError, match="a column stretch_tension without stress_tension_kPa"):
+        read_measured_tissues(tmp_path)
 
 
 GOOD = "0.95,-0.1\n0.92,-0.2\n"
@@ -75,8 +84,8 @@ GOOD = "0.95,-0.1\n0.92,-0.2\n"
     ("rows", "problem"),
     [
         ("1,0\n0.9,-1\n", "3 or more rows"),
-        ("1,0\n0.9,x\n0.8,-1\n", "numbers in both columns"),
-        (f"1,0\n{GOOD}1.2,-0.3\n", "outside its range"),
+        ("1,0\n0.9,x\n0.8,-1\n", "need numbers: could not convert string to float: 'x'"),
+        (f"1,0\n{GOOD}1.2,-0.3\n", "stretch_compression is 0.92 to 1.2, outside its range"),
         (f"1,0\n{GOOD}0.9,-300\n", "stress above 100 kPa"),
         (f"1,0\n{GOOD}0.9,1\n", "wrong sign"),
     ],
@@ -86,7 +95,7 @@ def test_unreadable_measurements_are_rejected(tmp_path, capsys, rows, problem):
     words = ["report", "--tissue", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main(words) == 2
     said = capsys.readouterr().err
-    assert "brain.csv" in said and problem in said and "compression is negative" in said
+    assert "brain.csv" in said and problem in said and "negative in compression" in said
     assert not (tmp_path / "out").exists()
     (tmp_path / "brain.csv").write_text(f"{HEAD.replace(',', ';')}\n")
     assert main(words) == 2 and "its columns are stretch_tension;" in capsys.readouterr().err

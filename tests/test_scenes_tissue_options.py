@@ -161,7 +161,7 @@ def test_help_of_solve_names_each_tissue_with_its_source(capsys: pytest.CaptureF
 def test_help_of_other_commands_names_tissues_and_docs_page(command: str, capsys: pytest.CaptureFixture) -> None:
     said = help_on_tissue(capsys, *command.split())
     words = " ".join(said.replace("-\n", "-").split())
-    assert len(said.splitlines()) <= 10 and "docs/concepts/physics.md" in words
+    assert len(said.splitlines()) <= 10 and "docs/notes/tissue.md" in words
     assert all(name in "".join(said.split()) for name in (*MATERIALS, *LAWS))
 
 

@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--credibility",
         type=Path,
         metavar="DIR",
-        help="list claims, figures and tests in the order of ASME V&V 40 instead; DIR: benchmarks of a checkout",
+        help="list claims, figures and tests in the order of ASME V&V 40 instead; DIR: a checkout's folder benchmarks",
     )
     add_force(parser)
     add_json(parser)
@@ -195,17 +195,18 @@ def _compare_tissues(args: argparse.Namespace) -> int:
 
 
 def _assess_credibility(args: argparse.Namespace) -> int:
-    """Write the credibility page, and print the number of claims and of those without support."""
-    from ..report.credibility import MISSING, read_credibility, write_credibility
+    """Write the credibility page, and print the number of claims of each status."""
+    from ..report.credibility import count_statuses, read_credibility, write_credibility
 
     _check_options_without_loads(args, "--credibility", "credibility.json")
     rows = read_credibility(args.credibility)
     write_credibility(args.out, rows)
-    missing, page = sum(row.result == MISSING for row in rows), str(args.out / "index.html")
+    counts, page = count_statuses(rows), str(args.out / "index.html")
     if args.json:
-        print(json.dumps({"page": page, "claims": len(rows), "missing": missing}))
+        print(json.dumps({"page": page, "claims": len(rows), **counts}))
     else:
-        print(f"{len(rows)} claims, {missing} {MISSING}\nwritten: {page}")
+        words = ", ".join(f"{count} {status}" for status, count in counts.items())
+        print(f"{len(rows)} claims: {words}\nwritten: {page}")
     return 0
 
 

@@ -31,8 +31,8 @@ MIN_BODIES = 8  # Minimum number of bodies to solve.
 # Explanation under the table.
 NOTE = """
 Two separate errors. "model": difference from FEM on the same mesh. "tumour": maximum distance between the predicted
-surface and the tumour in the patient. It includes unknowns that are not measured: tissue, skull, position of the tool,
-registration, segmentation. Force, fluid level and resection are assumed to be as prescribed in the scene.
+surface and the tumour in the patient. It includes unknowns that are not measured: stiffness of tissue, skull, position
+of the tool, registration, segmentation. Tissue law, force, fluid level and resection are taken as in the scene.
 """
 
 

@@ -40,7 +40,7 @@ def add_tissue_arguments(
 
     `default_regions` describes the default of --region. If `with_full_help`, the help describes each named tissue.
     """
-    sets = f"{', '.join(MATERIALS)}; see docs/concepts/physics.md"
+    sets = f"{', '.join(MATERIALS)}; see docs/notes/tissue.md"
     if with_full_help:
         each = (f"{name} holds for {preset.time_scale}. Source: {preset.source}" for name, preset in MATERIALS.items())
         sets = ". ".join(each)

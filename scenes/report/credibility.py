@@ -24,24 +24,29 @@ STEPS = (
     "applicability",
 )
 """Steps of ASME V&V 40-2018, "Assessing Credibility of Computational Modeling through Verification and Validation"."""
-MISSING = "missing"  # Result of a claim that nothing supports.
+MISSING = "missing"  # Status of a claim that nothing supports.
+STATUSES = ("supported", "refuted", "not independent", "not judged", MISSING)
+HEADINGS = "claim", "status", "result", "fails if", "tests", "measured by"  # Columns of the page.
 REMEDY = "Give the folder benchmarks of a checkout, with credibility.toml and records."
 ABOUT = (
-    "Each result is read from a record of a measurement, whose command, machine and date stand with it. Tests run on "
-    f'each commit. "{MISSING}": nothing supports the claim yet.',
+    "Numbers that have a command in the last column are read from the record of that measurement; tests run on each "
+    "commit. Files are named relative to a checkout. Not judged: a definition, or a size without a limit. Not "
+    f"independent: the evidence also set a parameter. {MISSING.capitalize()}: nothing supports the claim yet.",
     "This assesses the software for research. It is no clinical validation.",
 )
 
 
 @dataclass(frozen=True)
 class CredibilityRow:
-    """Claim of a step of V&V 40, its result, what would refute it, and where it is measured and tested."""
+    """Claim of a step of V&V 40, its status, result and the condition under which it fails, its tests and records."""
 
     step: str
     claim: str
+    status: str
     result: str
-    refuted: str
-    sources: str
+    fails_if: str
+    tests: str
+    records: str
 
 
 def read_credibility(folder: Path) -> tuple[CredibilityRow, ...]:
@@ -63,9 +68,13 @@ def read_credibility(folder: Path) -> tuple[CredibilityRow, ...]:
 
 def _read_claim(claim: Mapping[str, Any], records: Path) -> CredibilityRow:
     figures = claim.get("figures", [])
-    head, *parts = claim.get("result", MISSING).split("#")
-    if claim["step"] not in STEPS or len(parts) != len(figures):
-        raise InputError(f"{claim['claim']!r} has an unknown step, or another number of # than of figures. {REMEDY}")
+    head, *parts = claim.get("result", "").split("#")
+    usual = MISSING if "result" not in claim else "supported" if "fails_if" in claim else "not judged"
+    status = claim.get("status", usual)
+    if claim["step"] not in STEPS or status not in STATUSES or len(parts) != len(figures):
+        raise InputError(
+            f"{claim['claim']!r} has an unknown step or status, or another number of # than of figures. {REMEDY}"
+        )
     origins: dict[str, None] = {}
     for figure, part in zip(figures, parts, strict=True):
         try:
@@ -74,19 +83,28 @@ def _read_claim(claim: Mapping[str, Any], records: Path) -> CredibilityRow:
             head += f"{record['figures'][row][column]}{part}"
         except (OSError, ValueError, KeyError) as error:
             raise InputError(f"{figure!r} is not a figure of {records}: write RECORD > ROW > COLUMN.") from error
-        origins[f"{record['command']} ({record['machine']}, {record['date']})"] = None
-    tests = [str(test) for test in claim.get("tests", [])]
-    return CredibilityRow(claim["step"], claim["claim"], head, claim.get("refuted", ""), "; ".join([*tests, *origins]))
+        origins[f"{record['command']}, {record['date']}; machine: {record['machine']}"] = None
+    tests = "; ".join(str(test) for test in claim.get("tests", []))
+    return CredibilityRow(
+        claim["step"], claim["claim"], status, head, claim.get("fails_if", ""), tests, "; ".join(origins)
+    )
+
+
+def count_statuses(rows: Sequence[CredibilityRow]) -> dict[str, int]:
+    """Count the claims of each status."""
+    return {status: sum(row.status == status for row in rows) for status in STATUSES}
 
 
 def write_credibility(folder: Path, rows: Sequence[CredibilityRow]) -> None:
     """Write the page `index.html` and the rows as `credibility.json`."""
-    body = ""
+    counts = ", ".join(f"{count} {status}" for status, count in count_statuses(rows).items())
+    body = f"<p>{len(rows)} claims: {counts}.</p>"
     for step in STEPS:
         own = [row for row in rows if row.step == step]
-        kinds = ["text missing" if row.result == MISSING else "text" for row in own]
-        lines = zip(kinds, [(row.claim, row.result, row.refuted, row.sources) for row in own], strict=True)
-        table = format_table(("claim", "result", "refuted by", "tests and records"), lines)
+        cells = [(row.claim, row.status, row.result, row.fails_if, row.tests, row.records) for row in own]
+        used = [column for column in range(len(HEADINGS)) if any(row[column] for row in cells)]
+        lines = [(f"text {row.status}", [each[k] for k in used]) for row, each in zip(own, cells, strict=True)]
+        table = format_table([HEADINGS[k] for k in used], lines)
         body += f"<h2>{escape(step.capitalize())}</h2>{table}"
     with write_atomically(folder / "credibility.json", ".json") as partial:
         partial.write_text(json.dumps([asdict(row) for row in rows]))

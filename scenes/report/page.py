@@ -24,8 +24,15 @@ table { border-collapse: collapse; font-size: 13px; margin: 1em 0; }
 th, td { padding: 3px 8px; border-bottom: 1px solid #ddd; text-align: right; vertical-align: top; white-space: nowrap; }
 th { background: #f4f4f4; } th:first-child, td:first-child { text-align: left; }
 tr.front td:first-child { font-weight: bold; }
-tr.text td { width: 25%; text-align: left; white-space: normal; } table:has(tr.text) th { text-align: left; }
-tr.missing td { background: #fff0d8; }
+tr.text td { text-align: left; white-space: normal; overflow-wrap: anywhere; }
+table:has(tr.text) { table-layout: fixed; width: 100%; } table:has(tr.text) th { text-align: left; }
+table:has(tr.text) th:first-child { width: 30%; } table:has(tr.text) th:nth-child(2) { width: 9%; }
+tr.missing td { background: #fff0d8; } tr.refuted td { background: #fde0dc; }
+@media (max-width: 700px) {
+  table:has(tr.text) th { display: none; } tr.text { border-bottom: 2px solid #888; }
+  tr.text td { display: block; border: 0; } tr.text td:empty { display: none; }
+  tr.text td + td::before { content: attr(title) ": "; color: #666; }
+}
 .wide { overflow-x: auto; }
 figure.chart { width: 880px; max-width: 100%; margin: 0 0 12px; } figure.chart svg { width: 100%; height: auto; }
 """
@@ -120,7 +127,12 @@ def format_table(headings: Sequence[str], lines: Iterable[tuple[str, Sequence[st
     """Format an HTML table from column titles and lines, each a CSS class and its cells."""
     head = "".join(f"<th>{escape(text)}</th>" for text in headings)
     body = "".join(
-        f'<tr class="{kind}">{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>' for kind, cells in lines
+        f'<tr class="{kind}">'
+        + "".join(
+            f'<td title="{escape(title)}">{escape(cell)}</td>' for title, cell in zip(headings, cells, strict=True)
+        )
+        + "</tr>"
+        for kind, cells in lines
     )
     return f'<div class="wide"><table><tr>{head}</tr>{body}</table></div>'
 

@@ -35,21 +35,24 @@ REMEDY = (
     "Give comma-separated columns for one test or more: "
     + "; ".join(f"{strain} ({low:g} to {high:g}), {stress}" for (strain, stress), (low, high) in
                 zip(COLUMNS.values(), RANGES.values(), strict=True))
-    + ". Stress in compression is negative."
+    + ". Stress is nominal (force by undeformed area), negative in compression; shear strain is displacement by height."
 )  # fmt: skip
 MAX_BYTES = 1_000_000  # Largest size of a CSV file.
 FITTED_POISSON = 0.4999  # Poisson's ratio of fitted laws: tests of brain are evaluated as incompressible.
 EXPONENTS = [*range(-40, 0), *range(1, 41)]  # Exponents of Ogden's law from which a fit begins.
 MIN_MU = 0.01  # Smallest fitted shear modulus [Pa].
-DRAWN = ("linear, fitted", "corotational, fitted", "neo-hookean, fitted", "ogden, fitted")  # Fits in the plots.
+FITTED = ("linear, fitted", "neo-hookean, fitted", "ogden, fitted")  # Fits in the plots.
+NAMED = ("default", "brain", "grey", "white")  # Named tissues in the plots.
 MIN_R2 = 0.9  # Smallest R2 of each test for which a law describes a tissue.
 ABOUT = (
-    "R2 = 1 - sum (model - measured)^2 / sum (measured - mean)^2 for each test; below 0: worse than a constant. Errors "
-    "are of the nominal stress, where the largest was measured. Fitted: one parameter set for all tests, by least "
-    "squares of the stresses, nu 0.4999. Bold: R2 is at least 0.9 in each test. Other rows are the named tissues of "
-    "`--material`, without relaxation.",
-    "mu is the shear modulus at small strain: E = 2 (1 + nu) mu; c = 2 mu and m = alpha in the convention of FEBio.",
-    "This compares laws with samples outside the body, under one protocol. It says nothing of a patient.",
+    "R2 = 1 - sum (model - measured)^2 / sum (measured - mean)^2 for each test; below 0: worse than a constant. Error: "
+    "(model - measured) / measured nominal stress, at the largest measured stress. Fitted: one parameter set for all "
+    "tests, by least squares of the stresses, nu 0.4999. Bold: R2 is at least 0.9 in each test. Other rows are the "
+    "named tissues of `--material`, without relaxation. The corotational law is too stiff in shear at this nu, so that "
+    "its fitted mu is far too small.",
+    "mu is the shear modulus at small strain: E = 2 (1 + nu) mu. To use a fitted Ogden law with nu 0.49: --material "
+    'ogden --ogden "2 mu,alpha" --bulk 49.7 mu, as numbers in Pa.',
+    "This compares laws with samples outside the body, under one protocol. It says nothing about a patient.",
 )
 
 
@@ -103,6 +106,9 @@ def _read_tissue(path: Path) -> MeasuredTissue:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file, strict=True, skipinitialspace=True)
             rows, found = list(reader), reader.fieldnames or ()
+        for names in COLUMNS.values():
+            if lone := set(names) & set(found) if not set(names) <= set(found) else None:
+                raise InputError(f"has a column {min(lone)} without {min(set(names) - lone)}. {REMEDY}")
         pairs = {test: [[row.get(name) for name in names] for row in rows] for test, names in COLUMNS.items()}
         tests = {test: _read_test(test, cells) for test, cells in pairs.items() if any(map(all, cells))}
         if not tests:
@@ -115,12 +121,14 @@ def _read_test(test: str, cells: Sequence[Sequence[str | None]]) -> tuple[np.nda
     names, (low, high) = COLUMNS[test], RANGES[test]
     try:
         strain, stress = np.array([[float(cell or "") for cell in pair] for pair in cells if all(pair)]).T
-    except ValueError:
-        raise InputError(f"{' and '.join(names)} need numbers in both columns. {REMEDY}") from None
+    except ValueError as error:
+        raise InputError(f"{' and '.join(names)} need numbers: {str(error)[:80]}. {REMEDY}") from None
     if len(strain) < 3 or not np.ptp(stress) > 0.0:
         raise InputError(f"{names[1]} needs 3 or more rows with different numbers. {REMEDY}")
-    if not ((strain >= low) & (strain <= high)).all() or not (np.abs(stress) <= MAX_STRESS).all():
-        raise InputError(f"{test} has strains outside its range, or a stress above {MAX_STRESS:g} kPa. {REMEDY}")
+    if not ((strain >= low) & (strain <= high)).all():
+        raise InputError(f"{names[0]} is {strain.min():g} to {strain.max():g}, outside its range. {REMEDY}")
+    if not (np.abs(stress) <= MAX_STRESS).all():
+        raise InputError(f"{names[1]} has a stress above {MAX_STRESS:g} kPa. {REMEDY}")
     if not (stress * (-1.0 if test == "compression" else 1.0)).sum() > 0.0:
         raise InputError(f"{names[1]} has the wrong sign. {REMEDY}")
     return strain, 1e3 * stress
@@ -205,13 +213,14 @@ def write_tissue_report(folder: Path, measured_tissues: Sequence[MeasuredTissue]
     for each in measured_tissues:
         tissues = list_tissues(each)
         own = [compare_tissue(name, tissue, each) for name, tissue in tissues.items()]
-        drawn = [name for name in tissues if name in (*DRAWN, "default")]
+        drawn = [name for name in tissues if name in (*FITTED, *NAMED)]
         found = {name: compute_stresses(tissues[name], each) for name in drawn}
         image, svg = draw_stress(
             {
                 test: (strain, {MEASURED: stress, **{name: curves[test] for name, curves in found.items()}})
                 for test, (strain, stress) in each.tests.items()
-            }
+            },
+            FITTED,
         )
         write_png(folder / f"{each.name}.png", image)
         heads = (
