@@ -40,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from scenes.analysis.measurement import describe_machine
+    from scenes.gym.tasks import find_task
 
     from ..studies.frame import parse_image_size
     from ..studies.gym_rates import measure_rate
@@ -53,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         for observation in args.observation:
             process = {"vectorization_mode": "async", "vector_kwargs": {"context": "spawn"}} if args.processes else {}
             environment = make_vec(
-                f"scenes.gym:sulcus/{task.capitalize()}-v0", args.envs, **process, anatomy=args.anatomy,
+                f"scenes.gym:sulcus/{find_task(task).name.capitalize()}-v0", args.envs, **process, anatomy=args.anatomy,
                 observation=observation, physics=args.physics, device=args.device, size=size, model=args.model,
             )  # fmt: skip
             with tqdm(desc=f"{task}, {observation}", total=args.repeats + 1, unit="repeat", file=sys.stderr) as bar:
