@@ -26,7 +26,7 @@ def _build_measured(mu: float, exponent: float) -> Ogden:
 
 
 MATERIALS = {
-    "default": MaterialSet(BRAIN, "seconds", "equal to `seconds`"),
+    "default": MaterialSet(BRAIN, "seconds", "equal to the tissue `seconds`"),
     "brain": MaterialSet(MEASURED_BRAIN, EX_VIVO, f"the mean of cortex and corona radiata, {BUDDAY}"),
     "grey": MaterialSet(_build_measured(1500.0, -18.0), EX_VIVO, f"cortex, {BUDDAY}"),
     "white": MaterialSet(_build_measured(700.0, -24.0), EX_VIVO, f"corona radiata, {BUDDAY}"),

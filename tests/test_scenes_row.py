@@ -65,7 +65,7 @@ def test_report_table_has_values_under_their_headings(tmp_path):
     text = (tmp_path / "index.html").read_text()
     assert "<p>odd: no &lt;memory&gt;</p>" in text
     tables = [
-        [re.findall("<t[hd]>(.*?)</t[hd]>", line) for line in table.split("</tr>")]
+        [re.findall("<t[hd][^>]*>(.*?)</t[hd]>", line) for line in table.split("</tr>")]
         for table in re.findall("<table>(.*?)</table>", text, re.S)
     ]
     ((heads, cells, *_),) = tables
