@@ -5,6 +5,7 @@ import pytest
 
 from scenes.script.priors import sample_from_fit
 from sim.errors import InputError
+from sim.material import BRAIN
 from surrogate.fitting.tissue import FINE_POISSONS, FINE_RATIOS, FittedTissue, load_tissue, save_tissue
 
 
@@ -15,12 +16,12 @@ def test_sampled_tissues_follow_the_fitted_shares():
     names, poisson, ratio = tissue.sample(400, 1)
     assert names.count("bonded") == 100 and (ratio == FINE_RATIOS[30]).sum() == 200
     assert ((poisson == FINE_POISSONS[9]) == (ratio == FINE_RATIOS[30])).all()
-    draws = sample_from_fit(tissue, 3000.0, ("slide", "contact"), 30, 2)
+    draws = sample_from_fit(tissue, BRAIN, ("slide", "contact"), 30, 2)
     assert {draw.stiffness for draw in draws} == {0.5} and all(draw.skull == 0.25 for draw in draws)
-    stiff = sample_from_fit(tissue, 3000.0, ("slide", "contact"), 30, 2, tumour_ratio=2.0)
+    stiff = sample_from_fit(tissue, BRAIN, ("slide", "contact"), 30, 2, tumour_ratio=2.0)
     assert [draw.ratio for draw in stiff] == [draw.ratio / 2.0 for draw in draws]  # of a tumour that is stated as such
     with pytest.raises(InputError, match="cannot have"):
-        sample_from_fit(tissue, 3000.0, ("contact",), 8)
+        sample_from_fit(tissue, BRAIN, ("contact",), 8)
 
 
 def test_tissue_file_round_trips_and_rejects_other_anatomy(tmp_path):

@@ -18,6 +18,7 @@ from ..play.deformers import PatientSetup
 from ..play.stage import Stage
 from ..script.priors import (
     COMBINED,
+    EXPONENT,
     MESH,
     MESH_PRIOR,
     POISSON,
@@ -34,10 +35,11 @@ from ..script.priors import (
     ParameterPrior,
     PatientSample,
     choose_name,
+    has_exponent,
     sample_rigid_errors,
 )  # fmt: skip
 from ..script.scene import Scene
-from ..script.tool_paths import Path, Touch
+from ..script.tool_paths import shift_path
 from ..script.uncertainty import LEVEL, Uncertainty, compute_scene_mark
 
 ACCURACY = Accuracy(3e-3, outer=60, limit_strain=False)  # Samples with inverted tetrahedra are counted, not left out.
@@ -96,19 +98,16 @@ def apply_sample(scene: Scene, sample: PatientSample) -> Scene:
     InputError
         A tissue of the scene is not described by Young's modulus and Poisson's ratio.
     """
-    tissue = get_tissue(scene)
-
-    def scale(one: IsotropicTissue, factor: float = 1.0) -> IsotropicTissue:
-        return one.replace_constants(factor * sample.stiffness * one.young, sample.poisson)
-
-    regions = {label: scale(one) for label, one in scene.elasticity.regions.items() if isinstance(one, IsotropicTissue)}
-    elasticity = Elasticity(scale(tissue), {**regions, TUMOUR_LABEL: scale(get_tumour_tissue(scene), sample.ratio)})
+    tissue, given = get_tissue(scene), scene.elasticity.regions
+    regions = {label: sample.scale_tissue(one) for label, one in given.items() if isinstance(one, IsotropicTissue)}
+    tumour = sample.scale_tissue(get_tumour_tissue(scene), sample.ratio)
+    elasticity = Elasticity(sample.scale_tissue(tissue), {**regions, TUMOUR_LABEL: tumour})
     skull = SKULLS[choose_name(sample.skull, list_skulls(scene))]
 
     def replace_effect(effect: Effect) -> Effect:
         return elasticity if isinstance(effect, Elasticity) else skull if isinstance(effect, SKULL_EFFECTS) else effect
 
-    return replace(scene, effects=tuple(map(replace_effect, scene.effects)), path=_shift_path(scene.path, sample.tip))
+    return replace(scene, effects=tuple(map(replace_effect, scene.effects)), path=shift_path(scene.path, sample.tip))
 
 
 def list_skulls(scene: Scene) -> tuple[str, ...]:
@@ -172,16 +171,6 @@ def get_tumour_tissue(scene: Scene) -> IsotropicTissue:
     """
     brain, tumour = get_tissue(scene), scene.elasticity.regions.get(TUMOUR_LABEL)
     return tumour if isinstance(tumour, IsotropicTissue) else brain
-
-
-def _shift_path(path: Path, tip: Sequence[float]) -> Path:
-    """Return a tool path shifted by `tip` (3,) [m]: to the right, upwards and inwards."""
-
-    def get_touch(time: float) -> Touch:
-        touch = path(time)
-        return replace(touch, x=touch.x + tip[0], y=touch.y + tip[1], depth=touch.depth + tip[2])
-
-    return get_touch
 
 
 def list_solved_times(scene: Scene) -> tuple[float, ...]:
@@ -349,9 +338,13 @@ def split_contributions(
 
 def collect_contributor_values(samples: Sequence[PatientSample], scene: Scene) -> dict[str, np.ndarray]:
     """Return, by contributor, parameters (draws, columns) of the samples minus those of the scene."""
-    poisson = get_tissue(scene).poisson
-    table = np.array([[np.log(one.stiffness), one.poisson - poisson, np.log(one.ratio), *one.tip] for one in samples])
+    tissue = get_tissue(scene)
+    rows = [[np.log(one.stiffness), one.poisson - tissue.poisson, np.log(one.ratio), *one.tip] for one in samples]
+    table = np.array(rows)
     found = {STIFFNESS.name: table[:, :1], POISSON.name: table[:, 1:2], RATIO.name: table[:, 2:3]}
+    if has_exponent(tissue):
+        own = tissue.terms[0][1]
+        found[EXPONENT.name] = np.log([[(one.exponent or own) / own] for one in samples])
     skull = get_skull_model(scene)
     others = [name for name in list_skulls(scene) if name != skull]
     names = [choose_name(draw.skull, list_skulls(scene)) for draw in samples]

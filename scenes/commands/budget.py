@@ -205,7 +205,7 @@ def _sample_bodies(args: argparse.Namespace, patient: PatientSetup, scene: Scene
     from ..analysis.uncertainty import filter_solved_samples, solve_ensemble
     from ..script.priors import sample_priors
 
-    draws = sample_priors(count, seed)
+    draws = sample_priors(count, seed, scene.elasticity.default)
     bar = tqdm(
         solve_ensemble(patient, scene, draws), total=count, unit="body", desc=scene.name, leave=False, file=sys.stderr
     )

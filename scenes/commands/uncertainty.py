@@ -93,10 +93,11 @@ def run(args: argparse.Namespace) -> int:
     fitted = find_fitted_tissue(args.tissue, args.anatomy or get_template_path(), patient.anatomy.digest)
 
     def draw_samples(scene: Scene, count: int, seed: int) -> list[PatientSample]:
+        tissue = get_tissue(scene)
         if fitted is None:
-            return sample_priors(count, seed)
-        young = get_tissue(scene).young
-        return sample_from_fit(fitted, young, list_skulls(scene), count, seed, get_tumour_tissue(scene).young / young)
+            return sample_priors(count, seed, tissue)
+        ratio = get_tumour_tissue(scene).young / tissue.young
+        return sample_from_fit(fitted, tissue, list_skulls(scene), count, seed, ratio)
 
     rows, lines = [], sys.stderr if args.json else sys.stdout
     for scene in scenes:

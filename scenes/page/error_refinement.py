@@ -10,7 +10,7 @@ from ..script.scene import Scene
 from ..script.tool_paths import Touch
 from .text import format_length, format_position_error
 
-DRAWS = 16  # Number of sampled patients: two for each fitted parameter.
+DRAWS = 18  # Number of sampled patients: two for each fitted parameter.
 
 
 def refine_error(patient: PatientSetup, scene: Scene, touch: Touch, time: float, count: int = DRAWS) -> Iterator[str]:
@@ -23,7 +23,8 @@ def refine_error(patient: PatientSetup, scene: Scene, touch: Touch, time: float,
     InputError
         See `solve_nominal` and `estimate_uncertainty`.
     """
-    static_scene, samples = replace(scene, path=lambda time: touch), sample_priors(count, 0)
+    static_scene = replace(scene, path=lambda time: touch)
+    samples = sample_priors(count, 0, scene.elasticity.default)
     yield "<p>solving the load for sampled patients...</p>"
     nominal, solutions = solve_nominal(patient, static_scene), list[Answer]()
     for result in solve_ensemble(patient, static_scene, samples):

@@ -1,7 +1,7 @@
 """Scripted tool motion, which replaces a surgeon's hand, as pure functions of time."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -144,5 +144,15 @@ def stroke_cortex(force: float, radius: float, speed: float) -> Path:
         start, end = (radius * np.array([np.cos(k * turn), np.sin(k * turn)]) for k in (number, number + 1.0))
         x, y = (1.0 - share) * start + share * end
         return Touch(float(x), float(y), force)
+
+    return get_touch
+
+
+def shift_path(path: Path, tip: Sequence[float]) -> Path:
+    """Return a tool path shifted by `tip` (3,) [m]: to the right, upwards and inwards."""
+
+    def get_touch(time: float) -> Touch:
+        touch = path(time)
+        return replace(touch, x=touch.x + tip[0], y=touch.y + tip[1], depth=touch.depth + tip[2])
 
     return get_touch

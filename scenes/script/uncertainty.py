@@ -13,7 +13,7 @@ from sim.runtime.atomic_files import write_atomically
 from sim.runtime.outside_files import parse_json, wrap_errors
 
 from .craniotomy_frame import CraniotomyFrame
-from .priors import PRIORS, REGISTRATION, SEGMENTATION
+from .priors import REGISTRATION, SEGMENTATION, list_priors
 from .registration import REGISTRATIONS, Registration, describe_registration
 from .scene import Scene
 
@@ -192,7 +192,7 @@ def compute_scene_mark(scene: Scene, site: CraniotomyFrame, element: str) -> str
     times = np.linspace(0.0, scene.duration, 25).tolist()
     # Rounded, because sines differ between machines in the last digit.
     acts = [np.round(_list_parameters(scene, time), 6).tolist() for time in times]
-    priors = [(prior.law, prior.range) for prior in PRIORS]
+    priors = [(prior.law, prior.range) for prior in list_priors(scene.elasticity.default)]
     whole = (scene.effects, scene.surgery, scene.tool, scene.duration, element, acts, priors, site.anatomy.digest)
     return sha256(repr(whole).encode()).hexdigest()[:16]
 
