@@ -148,7 +148,7 @@ def test_one_percent_of_loads_is_checked_in_double_precision(box):
 
 
 def test_strained_converged_loads_are_counted_as_converged(box):
-    soft = replace(BRAIN, young=600.0)
+    soft = BRAIN.replace_constants(600.0)
     (row,) = measure_rates(
         SolverTrial(box, (), "p1", "cpu", 12), soft, sample_loads(box, ["brutal"], 12), 1, lambda: None
     )

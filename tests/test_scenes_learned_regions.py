@@ -31,7 +31,7 @@ from surrogate.data.dataset import read_dataset
 from surrogate.data.solution_rows import describe_tissue_source, read_tissue_text
 from surrogate.training.expansion import Expansion
 
-STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=500.0)
+STIFF, SOFT = BRAIN.replace_constants(9000.0), BRAIN.replace_constants(500.0)
 TISSUE = Elasticity(BRAIN, {TUMOUR_LABEL: STIFF, NECROSIS_LABEL: SOFT})
 WORDS = "--region", "necrosis:500", "--region", "tumour:9000"
 
@@ -60,7 +60,9 @@ class TestScenes:
 
     def test_scenes_keep_region_tissue_and_reject_other_model(self, theatre, capsys):
         scene = asked(theatre, short(), "--region", "5:400")
-        assert scene.elasticity == Elasticity(BRAIN, {TUMOUR_LABEL: STIFF, NECROSIS_LABEL: replace(BRAIN, young=400.0)})
+        assert scene.elasticity == Elasticity(
+            BRAIN, {TUMOUR_LABEL: STIFF, NECROSIS_LABEL: BRAIN.replace_constants(400.0)}
+        )
         kept = "press keeps the tissue from the models' training data: region 2 (tumour): neo-hookean, E 9 kPa, nu 0.49"
         assert capsys.readouterr().err == f"{kept}\n"
         asked(theatre, short(), *WORDS)
@@ -100,12 +102,12 @@ class TestScenes:
         assert get_tissue(scene) == BRAIN
         draw = PatientSample(stiffness=2.0, poisson=0.45, ratio=3.0, skull=0.5, tip=(0.0, 0.0, 0.0), mesh=0.0)
         found = apply_sample(scene, draw).elasticity
-        assert found.get_law(TUMOUR_LABEL) == replace(BRAIN, young=6.0 * BRAIN.young, poisson=0.45)
-        assert found.get_law(NECROSIS_LABEL) == replace(BRAIN, young=1000.0, poisson=0.45)
+        assert found.get_law(TUMOUR_LABEL) == BRAIN.replace_constants(6.0 * BRAIN.young, 0.45)
+        assert found.get_law(NECROSIS_LABEL) == BRAIN.replace_constants(1000.0, 0.45)
         stated = apply_sample(
             scene.replace_regions({TUMOUR_LABEL: STIFF}), draw
         ).elasticity  # three times as stiff, as such
-        assert stated.get_law(TUMOUR_LABEL) == replace(BRAIN, young=18.0 * BRAIN.young, poisson=0.45)
+        assert stated.get_law(TUMOUR_LABEL) == BRAIN.replace_constants(18.0 * BRAIN.young, 0.45)
         assert stated.get_law(NECROSIS_LABEL) == found.get_law(NECROSIS_LABEL) and stated.default == found.default
         with pytest.raises(InputError, match=r"the scene .* has another tissue: Yeoh"):
             get_tissue(small().replace_regions({TUMOUR_LABEL: YEOH.Yeoh(500.0, 0.0, 1e4)}))

@@ -21,7 +21,7 @@ from sim.material import BRAIN
 from sim.named_tissues import MATERIALS
 from surrogate.data.solution_rows import describe_tissue_source
 
-STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: replace(BRAIN, young=9000.0)})
+STIFF = Elasticity(BRAIN, {TUMOUR_LABEL: BRAIN.replace_constants(9000.0)})
 
 
 def test_reward_is_potential_difference_minus_penalties():

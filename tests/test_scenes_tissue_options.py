@@ -169,7 +169,7 @@ def test_help_of_other_commands_names_tissues_and_docs_page(command: str, capsys
     ("young", "doubted"), [(99.0, "is below 100,"), (101.0, ""), (9.9e5, ""), (1.1e6, "above 1e+06")]
 )
 def test_implausible_stiffness_gives_a_warning(young, doubted):
-    assert doubted in (said := check_stiffness(replace(BRAIN, young=young))) and bool(said) == bool(doubted)
+    assert doubted in (said := check_stiffness(BRAIN.replace_constants(young))) and bool(said) == bool(doubted)
     if doubted:
         with pytest.warns(UserWarning, match=doubted.replace("+", r"\+")):
             asked("--young", str(young))

@@ -82,7 +82,7 @@ class TestEnsemble:
         found = apply_sample(scene, PatientSample(2.0, 0.47, 0.5, 0.5, (1e-3, 2e-3, 3e-3), 0.1))
         elasticity, _, skull, _ = found.effects
         assert isinstance(elasticity, Elasticity) and skull == SKULLS["slide"]
-        brain = replace(BRAIN, young=2.0 * BRAIN.young, poisson=0.47)
+        brain = BRAIN.replace_constants(2.0 * BRAIN.young, 0.47)
         assert elasticity == Elasticity(brain, {TUMOUR_LABEL: replace(brain, young=BRAIN.young)})
         asked, given = scene.path(1.3), found.path(1.3)
         assert (given.x - asked.x, given.y - asked.y, given.depth - asked.depth) == pytest.approx((1e-3, 2e-3, 3e-3))
@@ -203,7 +203,7 @@ class TestStored:
         knowing = replace(theatre, uncertainties={scene.name: stated(scene, theatre)})
         assert knowing.estimate_uncertainty(scene) is not None
         others = (
-            scene.replace_tissue(replace(BRAIN, young=4000.0), None), scene.replace_tissue(None, "p1"),
+            scene.replace_tissue(BRAIN.replace_constants(4000.0), None), scene.replace_tissue(None, "p1"),
             replace(scene, name="else"),
             replace(scene, path=lambda time: Touch(force=0.1)), replace(scene, effects=scene.effects[:-1]),
         )  # fmt: skip

@@ -20,7 +20,7 @@ from sim.loads import Resected, push
 from sim.material import BRAIN
 from sim.resected_fem import ResectedFem, build_fem
 
-STIFF, SOFT = replace(BRAIN, young=9000.0), replace(BRAIN, young=300.0)
+STIFF, SOFT = BRAIN.replace_constants(9000.0), BRAIN.replace_constants(300.0)
 
 
 def hollowed(anatomy):

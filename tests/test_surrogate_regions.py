@@ -103,7 +103,7 @@ def test_fitted_regions_exclude_the_tumour(locators):
 
 def test_known_regions_are_listed_and_checked(body):
     soft = Material("neo-hookean", 1500.0, 0.45)
-    assert list_known_regions(Elasticity(BRAIN, {OEDEMA: soft, 2: replace(BRAIN, young=9000.0)})) == (
+    assert list_known_regions(Elasticity(BRAIN, {OEDEMA: soft, 2: BRAIN.replace_constants(9000.0)})) == (
         Region(2, 3.0), Region(OEDEMA, 0.5, 0.45),
     )  # fmt: skip
     assert list_known_regions(Elasticity(BRAIN)) == ()
@@ -122,7 +122,7 @@ def test_known_regions_are_listed_and_checked(body):
 def test_scene_regions_are_compared_with_the_locator(body):
     """The tumour is ignored; a region as stiff as the brain does not count."""
     own, tumour = Region(OEDEMA, 0.5, 0.45), Region(2, 3.0)
-    scene = Elasticity(BRAIN, {OEDEMA: Material("neo-hookean", 1500.0, 0.45), 2: replace(BRAIN, young=5000.0)})
+    scene = Elasticity(BRAIN, {OEDEMA: Material("neo-hookean", 1500.0, 0.45), 2: BRAIN.replace_constants(5000.0)})
     assert not find_differing_regions(scene, (own,)) and not find_differing_regions(scene, (own, tumour))
     assert not find_differing_regions(Elasticity(BRAIN, {OEDEMA: BRAIN}), (tumour,))
     for known in ((), (STIFF,), (replace(own, poisson=None),)):
