@@ -1,6 +1,8 @@
 """What tissue does: meshes, laws, loads, and the finite elements that answer them."""
 
 from .accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
+from .adjoint.equilibrium_gradient import EquilibriumGradient, differentiate_equilibrium
+from .adjoint.torch_function import solve_equilibrium
 from .anatomy import Anatomy
 from .bodies.label_volume import build_volume_subject
 from .bodies.meshfile import MeshFile, read_anatomy, read_mesh, write_anatomy, write_mesh
@@ -77,6 +79,7 @@ __all__ = [
     "Deformer",
     "Displaced",
     "Elasticity",
+    "EquilibriumGradient",
     "Fem",
     "Gravity",
     "Held",
@@ -126,12 +129,14 @@ __all__ = [
     "build_volume_subject",
     "check_tissue",
     "compute_pressure",
+    "differentiate_equilibrium",
     "make_anatomy",
     "open_cortex",
     "push",
     "read_anatomy",
     "read_mesh",
     "refine",
+    "solve_equilibrium",
     "solve_with_debonding",
     "stack",
     "write_anatomy",

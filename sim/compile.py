@@ -3,7 +3,7 @@
 The module of a term is imported when an effect needs the term. User-defined effects build their own terms.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -276,28 +276,60 @@ def _build_elasticity(
     absent = set() if pulsation is None else set(pulsation.regions or ()) - set(labels)
     if absent:
         raise InputError(f"Pulsation is given for region {min(absent)}, but the mesh has the regions {labels}.")
+    terms: list[AssembledTerm] = []
+    for part in list_elastic_parts(effect, space, tet_mask):
+        elements = part.elements if nodes is None else part.elements.restrict(nodes)
+        swelling = None if pulsation is None else (pulsation, swell[part.elements.owner])
+        tissues = list(part.tissues.values())
+        terms.append(_build_law_term(tissues, part.tissue_numbers, elements, part.portion, device, swelling))
+    return terms
+
+
+@dataclass(frozen=True, eq=False)
+class ElasticPart:
+    """Elements of one law and one portion of its stiffness; see `get_lame`.
+
+    Parameters
+    ----------
+    tissues
+        Tissue by region label.
+    tissue_numbers
+        Index (T,) of the tissue of each element.
+    """
+
+    elements: Elements
+    portion: str
+    tissues: Mapping[int, Tissue]
+    tissue_numbers: np.ndarray
+
+
+def list_elastic_parts(
+    effect: Elasticity, space: Discretisation, tet_mask: np.ndarray | None = None
+) -> list[ElasticPart]:
+    """Return the elements of each elastic term, in the order of the terms; `tet_mask` (T,) selects tetrahedra.
+
+    Raises
+    ------
+    InputError
+        A law is given for a region that the mesh does not have, or a region has no law.
+    """
+    region = space.mesh.region
+    labels = [int(label) for label in np.unique(region)]
     unknown = sorted(set(effect.regions) - set(effect.restrict(labels).regions))
     if unknown:
         raise InputError(f"a law is given for {describe_region(unknown[0])}, but the mesh has the regions {labels}.")
     materials = collect_laws(effect, labels)
-    terms: list[AssembledTerm] = []
-    for name, relaxes in sorted({(material.law, bool(material.prony)) for material in materials.values()}):
-        obeying = {
-            label: material
-            for label, material in materials.items()
-            if (material.law, bool(material.prony)) == (name, relaxes)
-        }
-        chosen = np.isin(mesh.region, list(obeying))
+    parts: list[ElasticPart] = []
+    for law in sorted({(material.law, bool(material.prony)) for material in materials.values()}):
+        obeying = {label: one for label, one in materials.items() if (one.law, bool(one.prony)) == law}
+        chosen = np.isin(region, list(obeying))
         if tet_mask is not None:
             chosen &= tet_mask
-        if not chosen.any():
-            continue
-        for part in space.build_elements(chosen):
-            which = np.searchsorted(list(obeying), mesh.region[part.elements.owner])
-            elements = part.elements if nodes is None else part.elements.restrict(nodes)
-            swelling = None if pulsation is None else (pulsation, swell[part.elements.owner])
-            terms.append(_build_law_term(list(obeying.values()), which, elements, part.portion, device, swelling))
-    return terms
+        if chosen.any():
+            for part in space.build_elements(chosen):
+                numbers = np.searchsorted(list(obeying), region[part.elements.owner])
+                parts.append(ElasticPart(part.elements, part.portion, obeying, numbers))
+    return parts
 
 
 def collect_laws(effect: Elasticity, labels: Iterable[int]) -> dict[int, Tissue]:

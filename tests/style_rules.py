@@ -43,7 +43,7 @@ GIVEN = set(
     re.findall(
         r"\w+",
         """
-    main readinto data_received isOpened astype argmin min max
+    main backward readinto data_received isOpened astype argmin min max
     energy gradient residual curvature slope rest_curvature second_order longest_step
     coefficients_at term pose state restored
 """,

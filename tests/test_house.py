@@ -29,7 +29,7 @@ ORDER = (
     {"sim.local_solvers"},
     {"sim.strategy"},
     {"sim.fem"},
-    {"sim.resected_fem", "sim.contact_pressure", "sim.debonding"},
+    {"sim.resected_fem", "sim.contact_pressure", "sim.debonding", "sim.adjoint"},
     {"sim.families"},
     {"surrogate.array_functions"},
     {"surrogate.data", "surrogate.regressors"},
@@ -61,7 +61,12 @@ TOGETHER = {"scenes.cli": "scenes.commands", "benchmarks.__main__": "benchmarks.
 OWNERS = {
     "torch": {
         *(f"sim/{of}.py" for of in ["linalg/dense_inverse", "linalg/block_inverse", "runtime/dense_product"]),
-        *["sim/runtime/views.py", "surrogate/regressors/baselines.py", "scenes/episodes/reading/torch_dataset.py"],
+        *[
+            "sim/adjoint/torch_function.py",
+            "sim/runtime/views.py",
+            "surrogate/regressors/baselines.py",
+            "scenes/episodes/reading/torch_dataset.py",
+        ],
     },
     "sklearn": {"surrogate/regressors/baselines.py"},
     "trimesh": {"scenes/script/tool.py", "scenes/play/instruments.py", "scenes/play/drape.py"},

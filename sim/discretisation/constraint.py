@@ -205,6 +205,11 @@ class Constraint:
             combine_columns(self.device, gap, 1.0, rest, gap)
         return gap, np.abs(gap.numpy()).max(axis=0, initial=0.0)
 
+    def sum_by_value(self, force: np.ndarray) -> np.ndarray:
+        """Return the work of forces (B, N, 3) [N] per unit of each prescribed value; zero at free components."""
+        along = np.einsum("bni,ni->bn", force, self.normal)
+        return np.where(self.fixed, force + along[:, :, None] * self._drag.numpy(), 0.0)
+
     def compute_footprint_force(self, gradient: wp.array) -> np.ndarray | None:
         """Return the force (3, b) [N] of the tool on its footprint, by Lagrange multipliers; None without a footprint.
 

@@ -131,6 +131,14 @@ class Discretisation:
         """Return a field (..., V, 3) interpolated to all nodes (..., N, 3), linear along each edge."""
         return np.concatenate([field, field[..., self.edges, :].mean(axis=-2)], axis=-2)
 
+    def sum_by_vertex(self, field: np.ndarray) -> np.ndarray:
+        """Return the transpose of `interpolate_field` applied to values (B, N, 3): values (B, V, 3)."""
+        vertices = len(self.mesh.nodes)
+        out = np.moveaxis(field, 1, 0)[:vertices].copy()
+        for end in self.edges.T:
+            np.add.at(out, end, 0.5 * np.moveaxis(field, 1, 0)[vertices:])
+        return np.moveaxis(out, 0, 1)
+
 
 @lru_cache(2)  # shared by effects, tissues and diagnostics: 10 % of a locator's set-up on a GPU
 def _build_averaged_parts(mesh: TetMesh, element: str, mask_bytes: bytes) -> tuple[ElementPart, ...]:

@@ -203,6 +203,13 @@ class StrainTerm(Term, Protocol):
         """
         ...
 
+    def compute_coefficient_work(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the derivatives (T, k, b) of the work of v against the forces at u, both (3N, b) [m], in float64.
+
+        The derivatives are with respect to the k coefficients of each element.
+        """
+        ...
+
     def find_elements_on(self, nodes: np.ndarray) -> np.ndarray:
         """Return the elements (k,) all of whose nodes are marked in `nodes` (N,) bool."""
         ...

@@ -1,7 +1,7 @@
 """Elastic energy: integral of psi(H) over the undeformed volume, for any law and element type."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
@@ -176,6 +176,21 @@ class ElasticTerm:
         )  # fmt: skip
         found = tangent.numpy().astype(np.float64).reshape(*tangent.shape, 9)
         return assemble_tangent_stiffness(self._rest[0], 0.5 * (found + found.swapaxes(2, 3)))
+
+    def compute_coefficient_work(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the work as `StrainTerm.compute_coefficient_work`."""
+        from .coefficient_kernels import build_kernel
+
+        law, device, size, count = self._of
+        device, elements, own = replace(device, precision="float64"), self._rest[0], self._tissue[1].shape[1]
+        numbers = device.upload(self._tissue[1], wp.types.vector(length=own, dtype=wp.float64))
+        if self._sources:
+            numbers = device.upload(self._numbers.get_array(u.shape[1]).numpy())
+        out = device.allocate(len(elements.table), own, u.shape[1])
+        shape = [self._shape[0], self._shape[1], device.upload(elements.gradient, device.vector)]
+        inputs = [device.upload(u), device.upload(v), *shape, device.upload(elements.weight), numbers]
+        device.launch(build_kernel(law, device, size, count, own), (len(out), u.shape[1]), inputs, [out])
+        return out.numpy()
 
     def compute_second_order(self) -> tuple[Elements, np.ndarray, np.ndarray]:
         """Return the data of `StrainTerm.compute_second_order`, by fourth-order central differences of the stress."""
