@@ -1,7 +1,7 @@
 """What tissue does: meshes, laws, loads, and the finite elements that answer them."""
 
 from .accuracy import DRAFT, LIVE, REFERENCE, TRAIN, Accuracy
-from .adjoint.equilibrium_gradient import EquilibriumGradient, differentiate_equilibrium
+from .adjoint.equilibrium_gradient import EquilibriumGradient, compute_jacobian, differentiate_equilibrium
 from .adjoint.torch_function import solve_equilibrium
 from .anatomy import Anatomy
 from .bodies.label_volume import build_volume_subject
@@ -128,6 +128,7 @@ __all__ = [
     "build_template_subject",
     "build_volume_subject",
     "check_tissue",
+    "compute_jacobian",
     "compute_pressure",
     "differentiate_equilibrium",
     "make_anatomy",

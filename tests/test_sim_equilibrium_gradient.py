@@ -8,7 +8,7 @@ import pytest
 from boxes import base_held, box, hold, top_forces
 
 from sim.accuracy import REFERENCE, TRAIN
-from sim.adjoint.equilibrium_gradient import differentiate_equilibrium
+from sim.adjoint.equilibrium_gradient import compute_jacobian, differentiate_equilibrium
 from sim.adjoint.tissue_gradient import list_parameters
 from sim.anatomy import Anatomy
 from sim.effects import (
@@ -248,3 +248,18 @@ def test_what_has_no_derivative_is_rejected_in_one_message() -> None:
     pressed = Loads((Touching(POSE),))
     with pytest.raises(InputError, match="pose of a tool require float64"):
         differentiate_equilibrium(touching, pressed, touching.deform(pressed), build_seed(1))
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize("name", ["tool force", "prescribed", "contact"])
+def test_forward_mode_agrees_with_adjoint(name: str, element: str) -> None:
+    case, loads = CASES[name], Loads(CASES[name].causes)
+    fem, seed = build(case, MEASURED_BRAIN, STIFF, element), build_seed(len(loads))
+    answer = fem.deform(loads)
+    parameters = [(0, "young"), (0, "poisson"), (0, "m1"), (1, "young")]
+    found = (compute_jacobian(fem, loads, answer, parameters) * seed).sum(axis=(2, 3))
+    expected = differentiate_equilibrium(fem, loads, answer, seed).regions
+    for number, (label, parameter) in enumerate(parameters):
+        np.testing.assert_allclose(found[number], expected[label][parameter], rtol=1e-6)
+    with pytest.raises(InputError, match="region 3 has no parameter 'young'"):
+        compute_jacobian(fem, loads, answer, [(3, "young")])

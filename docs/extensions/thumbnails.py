@@ -124,6 +124,12 @@ def _read_episode(ax, it):
     draw_image(ax, np.vstack([np.hstack([kind[0], kind[-1]]) for kind in (it.last["colour"], depth.astype(np.uint8))]))
 
 
+def _recover_stiffness(ax, it):
+    for name, found, truth in zip(("brain", "tumour"), 1e-3 * np.array(it.course).T, 1e-3 * it.truth, strict=True):
+        draw_curve(ax, np.arange(len(found)), found, name, "iteration", "Young's modulus [kPa]")
+        ax.axhline(truth, color="silver", lw=1, zorder=0)
+
+
 def _slicer_console(ax, it):
     answer, now = MODEL.deform(push(PLACE.point, 0.3 * PLACE.inward, footprint=7e-3)), NODES.copy()
     now[answer.nodes] += answer.displacement[0]

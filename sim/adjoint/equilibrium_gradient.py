@@ -11,13 +11,13 @@ an adjoint model?", Bull. Am. Meteorol. Soc. 78:2577-2591.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..arguments import check_numbers_array
-from ..compile import ElasticPart, list_elastic_parts
+from ..compile import ElasticPart, collect_laws, compile_problem, list_elastic_parts
 from ..deformation import Deformation
 from ..discretisation.term import Cases, StrainTerm
 from ..effects import Elasticity, Inertia
@@ -27,7 +27,15 @@ from ..linalg.pcg import solve_conjugate_gradients
 from ..loads import Loads
 from ..runtime.columns import compute_norms
 from .load_gradient import differentiate_loads
-from .tissue_gradient import Regions, add_barrier_work, spread_over_tetrahedra, sum_by_region
+from .tissue_gradient import (
+    STENCIL,
+    STEP,
+    Regions,
+    add_barrier_work,
+    find_parameter,
+    spread_over_tetrahedra,
+    sum_by_region,
+)
 
 TOLERANCE = {"float32": 1e-5, "float64": 1e-10}  # Relative residual of the adjoint solve, by precision.
 MAX_ITERATIONS = 3000  # Maximum number of conjugate gradient iterations of the adjoint solve.
@@ -114,25 +122,54 @@ def differentiate_equilibrium(
         return _differentiate(fem, loads, deformation, seed, start)
 
 
+def compute_jacobian(
+    fem: Fem,
+    loads: Loads,
+    deformation: Deformation,
+    parameters: Sequence[tuple[int, str]],
+    start: Deformation | None = None,
+) -> np.ndarray:
+    """Return the derivatives (n, B, V, 3) of the displacement with respect to n parameters of tissue (forward mode).
+
+    Each of `parameters`, a region label and a name such as `young`, costs one linear solve. For many parameters and one
+    reading, `differentiate_equilibrium` is faster. The other parameters and the exceptions are as there.
+
+    Raises
+    ------
+    InputError
+        A region or a parameter is unknown; see also `differentiate_equilibrium`.
+    """
+    with fem.lock:
+        cases, u = _linearise(fem, loads, deformation, start)
+        vertices = len(fem.anatomy.mesh.nodes)
+        effect = next(effect for effect in fem.effects if isinstance(effect, Elasticity))
+        laws = collect_laws(effect, np.unique(fem.anatomy.mesh.region).tolist())
+        device, found = replace(fem.problem.device, precision="float64"), []  # differences need all digits
+        state = device.upload(u)
+        for label, name in parameters:
+            value, change = find_parameter(laws, label, name)
+            step, slope = STEP * (abs(value) or 1.0), np.zeros(u.shape)
+            for offset, weight in STENCIL:
+                laws_now = laws | {label: change(laws[label], value + offset * step)}
+                effects = [Elasticity(None, laws_now) if one is effect else one for one in fem.effects]
+                other = compile_problem(effects, fem.anatomy, device, fem.space)
+                other.begin(cases)
+                slope += weight / step * other.gradient(state).numpy()
+            found.append(_solve(fem, -slope)[0].T.reshape(len(loads), -1, 3)[:, :vertices])
+        return np.array(found)
+
+
 def _differentiate(
     fem: Fem, loads: Loads, deformation: Deformation, seed: np.ndarray, start: Deformation | None
 ) -> EquilibriumGradient:
-    problem, space = fem.problem, fem.space
+    problem, space, vertices = fem.problem, fem.space, len(fem.anatomy.mesh.nodes)
     seed = check_numbers_array("seed", seed)
-    if seed.shape != (len(loads), len(fem.anatomy.mesh.nodes), 3):
-        raise InputError(f"seed has shape {seed.shape}: give {(len(loads), len(fem.anatomy.mesh.nodes), 3)}.")
-    if any(isinstance(effect, Inertia) for effect in fem.effects):
-        raise InputError("a time step under Inertia has no equilibrium to differentiate: remove Inertia.")
-    if space.element not in ("p1", "smoothed", "p2"):
-        raise InputError(f"derivatives are not available for {space.element}: choose p1, smoothed or p2.")
-    bad = [row for row, outcome in enumerate(deformation.outcome) if not outcome.good]
-    if bad:
-        raise InputError(f"load {bad[0]} is {deformation.outcome[bad[0]].value}: only equilibria have derivatives.")
-    since = deformation if start is None else start
-    cases = Cases(loads, since.time, since.memory)
-    problem.begin(cases)
-    u = fem.guess(loads, deformation)
-    adjoint, unbalanced = _solve_adjoint(fem, u, seed)
+    if seed.shape != (len(loads), vertices, 3):
+        raise InputError(f"seed has shape {seed.shape}: give {(len(loads), vertices, 3)}.")
+    cases, u = _linearise(fem, loads, deformation, start)
+    whole = np.zeros((len(loads), space.count, 3))
+    whole[:, :vertices] = seed
+    adjoint, unbalanced = _solve(fem, whole.reshape(len(loads), -1).T)
     effect = next(effect for effect in fem.effects if isinstance(effect, Elasticity))
     parts = tuple(list_elastic_parts(effect, space))
     terms = [term for term in problem.terms if isinstance(term, StrainTerm)][: len(parts)]
@@ -148,19 +185,32 @@ def _differentiate(
     return EquilibriumGradient(causes, regions, by_node, fem, parts, work)
 
 
-def _solve_adjoint(fem: Fem, u: np.ndarray, seed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the adjoint solution v (3N, b), and seed - K v (3N, b), which is zero at free nodes.
+def _linearise(fem: Fem, loads: Loads, deformation: Deformation, start: Deformation | None) -> tuple[Cases, np.ndarray]:
+    """Set the solver's problem to the equilibrium and linearise it there; return the cases, and u (3N, b) [m]."""
+    if any(isinstance(effect, Inertia) for effect in fem.effects):
+        raise InputError("a time step under Inertia has no equilibrium to differentiate: remove Inertia.")
+    if fem.space.element not in ("p1", "smoothed", "p2"):
+        raise InputError(f"derivatives are not available for {fem.space.element}: choose p1, smoothed or p2.")
+    bad = [row for row, outcome in enumerate(deformation.outcome) if not outcome.good]
+    if bad:
+        raise InputError(f"load {bad[0]} is {deformation.outcome[bad[0]].value}: only equilibria have derivatives.")
+    since = deformation if start is None else start
+    cases = Cases(loads, since.time, since.memory)
+    fem.problem.begin(cases)
+    u = fem.guess(loads, deformation)
+    fem.problem.linearise(fem.problem.device.upload(u), np.zeros(len(loads), bool))
+    return cases, u
+
+
+def _solve(fem: Fem, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the solution v (3N, b) of K v = force at free nodes, and force - K v, which is zero there.
 
     Raises
     ------
     InputError
         The stiffness is not positive definite, or the iteration limit is reached.
     """
-    problem, device, columns = fem.problem, fem.problem.device, len(seed)
-    whole = np.zeros((columns, fem.space.count, 3))
-    whole[:, : seed.shape[1]] = seed
-    force = whole.reshape(columns, -1).T
-    problem.linearise(device.upload(u), np.zeros(columns, bool))
+    problem, device, columns = fem.problem, fem.problem.device, force.shape[1]
     right = device.upload(force)
     problem.constraint.project(right)
     preconditioner = fem.strategy.preconditioner
@@ -171,9 +221,7 @@ def _solve_adjoint(fem: Fem, u: np.ndarray, seed: np.ndarray) -> tuple[np.ndarra
         raise InputError(f"the equilibrium of load {np.argmax(found.truncated)} is unstable: it has no derivative.")
     left = compute_norms(device, right) > 10.0 * wanted
     if left.any():
-        raise InputError(
-            f"the adjoint solve of load {np.argmax(left)} did not converge in {MAX_ITERATIONS} iterations."
-        )
-    answer, product = found.x.numpy().astype(np.float64), device.allocate(*u.shape)
+        raise InputError(f"the linear solve of load {np.argmax(left)} did not converge in {MAX_ITERATIONS} iterations.")
+    product = device.allocate(*force.shape)
     problem.add_curvature(found.x, product)
-    return answer, force - product.numpy()
+    return found.x.numpy().astype(np.float64), force - product.numpy()

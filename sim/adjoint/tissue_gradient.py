@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..compile import ElasticPart
+from ..errors import InputError
 from ..geometry.tetmesh import EDGES, TetMesh, compute_row_keys
 from ..material import IsotropicTissue, Ogden, Tissue, get_lame
 
@@ -37,6 +38,20 @@ def list_parameters(tissue: Tissue) -> dict[str, tuple[float, Change]]:
             if isinstance(value, float) and field.name not in (*found, "limit"):
                 found[field.name] = value, partial(_replace_field, name=field.name)
     return found
+
+
+def find_parameter(tissues: Mapping[int, Tissue], label: int, name: str) -> tuple[float, Change]:
+    """Return the value of a parameter of a region, and the function that replaces it.
+
+    Raises
+    ------
+    InputError
+        The region or the parameter is unknown.
+    """
+    if label not in tissues or name not in list_parameters(tissues[label]):
+        known = ", ".join(f"{one}: {'/'.join(list_parameters(tissue))}" for one, tissue in tissues.items())
+        raise InputError(f"region {label} has no parameter {name!r}: choose from {known}.")
+    return list_parameters(tissues[label])[name]
 
 
 def differentiate_coefficients(part: ElasticPart, label: int, name: str) -> np.ndarray:

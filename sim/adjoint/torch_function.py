@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..fem import Fem
 from ..loads import Cause, Loads
 from .equilibrium_gradient import differentiate_equilibrium
-from .tissue_gradient import list_parameters
+from .tissue_gradient import find_parameter
 
 Tissues = Mapping[int, Mapping[str, torch.Tensor]]
 """Tensors () by region label and parameter, such as {1: {"young": tensor}}."""
@@ -124,10 +124,7 @@ def _replace_parameters(fem: Fem, values: Mapping[tuple[int, str], float]) -> Fe
     effect = next(effect for effect in fem.effects if isinstance(effect, Elasticity))
     laws = collect_laws(effect, np.unique(fem.anatomy.mesh.region).tolist())
     for (label, name), value in values.items():
-        if label not in laws or name not in list_parameters(laws[label]):
-            known = ", ".join(f"{one}: {'/'.join(list_parameters(law))}" for one, law in laws.items())
-            raise InputError(f"region {label} has no parameter {name!r}: choose from {known}.")
-        laws[label] = list_parameters(laws[label])[name][1](laws[label], value)
+        laws[label] = find_parameter(laws, label, name)[1](laws[label], value)
     effects = [Elasticity(None, laws) if one is effect else one for one in fem.effects]
     device = fem.problem.device.name
     return Fem(fem.anatomy, effects, fem.accuracy, device, fem.batch, fem.space.element)
