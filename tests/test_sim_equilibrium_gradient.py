@@ -257,9 +257,18 @@ def test_forward_mode_agrees_with_adjoint(name: str, element: str) -> None:
     fem, seed = build(case, MEASURED_BRAIN, STIFF, element), build_seed(len(loads))
     answer = fem.deform(loads)
     parameters = [(0, "young"), (0, "poisson"), (0, "m1"), (1, "young")]
-    found = (compute_jacobian(fem, loads, answer, parameters) * seed).sum(axis=(2, 3))
-    expected = differentiate_equilibrium(fem, loads, answer, seed).regions
+    arrays = {"tool force": [(0, "force"), (0, "footprint")], "prescribed": [], "contact": [(0, "pose"), (1, "share")]}[
+        name
+    ]
+    found = (compute_jacobian(fem, loads, answer, parameters, arrays) * seed).sum(axis=(2, 3))
+    adjoint = differentiate_equilibrium(fem, loads, answer, seed)
+    expected, rows = adjoint.regions, [adjoint.causes[number][array] for number, array in arrays]
+    if rows:
+        row = np.concatenate([row.reshape(len(loads), -1) for row in rows], axis=1).T
+        np.testing.assert_allclose(found[len(parameters) :], row, rtol=1e-6, atol=1e-6 * np.abs(row).max())
     for number, (label, parameter) in enumerate(parameters):
         np.testing.assert_allclose(found[number], expected[label][parameter], rtol=1e-6)
     with pytest.raises(InputError, match="region 3 has no parameter 'young'"):
         compute_jacobian(fem, loads, answer, [(3, "young")])
+    with pytest.raises(InputError, match="cause 5 has no array 'force'"):
+        compute_jacobian(fem, loads, answer, arrays=[(5, "force")])

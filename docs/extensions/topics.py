@@ -13,8 +13,8 @@ TOPICS = {
             NodalForce Gravity Inertia Pulsation Resection Retraction build_push_effects""",
         "Solver": """Fem build_fem build_family FAMILIES Deformer Deformation Outcome Cost Accuracy DRAFT LIVE TRAIN
             REFERENCE InputError""",
-        "Derived results": "compute_pressure solve_with_debonding DebondedSolution differentiate_equilibrium compute_jacobian "
-        "EquilibriumGradient solve_equilibrium",
+        "Derived results": "compute_pressure solve_with_debonding DebondedSolution differentiate_equilibrium "
+        "compute_jacobian EquilibriumGradient solve_equilibrium",
         "Extension": "OwnEffect OwnCause OwnTool Term Cases",
     },
     "surrogate": {

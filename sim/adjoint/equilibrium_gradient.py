@@ -26,7 +26,7 @@ from ..fem import Fem
 from ..linalg.pcg import solve_conjugate_gradients
 from ..loads import Loads
 from ..runtime.columns import compute_norms
-from .load_gradient import differentiate_loads
+from .load_gradient import differentiate_loads, iterate_load_slopes
 from .tissue_gradient import (
     STENCIL,
     STEP,
@@ -126,25 +126,34 @@ def compute_jacobian(
     fem: Fem,
     loads: Loads,
     deformation: Deformation,
-    parameters: Sequence[tuple[int, str]],
+    parameters: Sequence[tuple[int, str]] = (),
+    arrays: Sequence[tuple[int, str]] = (),
     start: Deformation | None = None,
 ) -> np.ndarray:
-    """Return the derivatives (n, B, V, 3) of the displacement with respect to n parameters of tissue (forward mode).
+    """Return the derivatives (n, B, V, 3) of the displacement with respect to n numbers (forward mode).
 
-    Each of `parameters`, a region label and a name such as `young`, costs one linear solve. For many parameters and one
-    reading, `differentiate_equilibrium` is faster. The other parameters and the exceptions are as there.
+    Each number costs one linear solve. For many numbers and one reading, `differentiate_equilibrium` is faster. The
+    other parameters are as there.
+
+    Parameters
+    ----------
+    parameters
+        Region label and parameter of tissue, such as (1, "young").
+    arrays
+        Number of a cause in `loads.causes` and one of its arrays, such as (0, "force"); each component is a number. Not
+        available for `Nodal`, `Prescribed`, `Displaced` and `Resected`.
 
     Raises
     ------
     InputError
-        A region or a parameter is unknown; see also `differentiate_equilibrium`.
+        A region, parameter, cause or array is unknown; see also `differentiate_equilibrium`.
     """
     with fem.lock:
         cases, u = _linearise(fem, loads, deformation, start)
         vertices = len(fem.anatomy.mesh.nodes)
         effect = next(effect for effect in fem.effects if isinstance(effect, Elasticity))
         laws = collect_laws(effect, np.unique(fem.anatomy.mesh.region).tolist())
-        device, found = replace(fem.problem.device, precision="float64"), []  # differences need all digits
+        device, slopes = replace(fem.problem.device, precision="float64"), []  # differences need all digits
         state = device.upload(u)
         for label, name in parameters:
             value, change = find_parameter(laws, label, name)
@@ -155,8 +164,12 @@ def compute_jacobian(
                 other = compile_problem(effects, fem.anatomy, device, fem.space)
                 other.begin(cases)
                 slope += weight / step * other.gradient(state).numpy()
-            found.append(_solve(fem, -slope)[0].T.reshape(len(loads), -1, 3)[:, :vertices])
-        return np.array(found)
+            slopes.append(slope)
+        at = fem.problem.device.upload(u)
+        for number, name in arrays:
+            slopes += iterate_load_slopes(fem.problem, cases, number, name, at)
+        fem.problem.linearise(at, np.zeros(len(loads), bool))
+        return np.array([_solve(fem, -slope)[0].T.reshape(len(loads), -1, 3)[:, :vertices] for slope in slopes])
 
 
 def _differentiate(

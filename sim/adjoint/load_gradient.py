@@ -5,16 +5,18 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 from ..discretisation.problem import Problem
 from ..discretisation.space import Discretisation
 from ..discretisation.term import Cases, StrainTerm
 from ..errors import InputError
-from ..loads import Displaced, Loads, Nodal, Prescribed, Resected, Retracted, Touching
+from ..loads import BuiltIn, Displaced, Loads, Nodal, Prescribed, Resected, Retracted, Touching
 from .tissue_gradient import STENCIL
 
 ROTATION_STEP = 1e-6  # Step of rotations of a tool [rad].
+OWN_STEP = 1e-4  # Relative step of the arrays of user-defined causes.
 # Relative to the radius. The force of a footprint is a sum over small triangles: its derivative by a step of 10 % is
 # within 1 % of the derivative of the integral, by a step of 0.1 % only within 12 %.
 FOOTPRINT_STEP = 0.1
@@ -70,37 +72,43 @@ def _differentiate_cause(
         return
     if isinstance(cause, Resected):
         raise InputError("a resection step has no derivative: differentiate before or after it.")
+    for field in fields(cause):
+        slopes = iterate_load_slopes(problem, cases, number, field.name, problem.device.upload(u))
+        work = np.stack([-np.einsum("nb,nb->b", adjoint, slope) for slope in slopes], axis=-1)
+        yield field.name, _arrange(work, getattr(cause, field.name), field.name)
+
+
+def iterate_load_slopes(problem: Problem, cases: Cases, number: int, name: str, u: wp.array) -> Iterator[np.ndarray]:
+    """Yield the derivative (3N, b) of the energy's gradient at u by each component of an array of cause `number`.
+
+    Raises
+    ------
+    InputError
+        The cause has no such array, acts as a constraint or on all nodes, or is a pose in single precision.
+    """
+    cause: Any = cases.loads.causes[number] if 0 <= number < len(cases.loads.causes) else None
+    if cause is None or isinstance(cause, Nodal | Prescribed | Displaced | Resected) or not hasattr(cause, name):
+        raise InputError(f"cause {number} has no array {name!r} for this derivative: see `compute_jacobian`.")
     if isinstance(cause, Touching | Retracted) and problem.device.precision != "float64":
         raise InputError("derivatives by the pose of a tool require float64: use an Accuracy of that precision.")
-    state = problem.device.upload(u)
+    array, terms = getattr(cause, name), [term for term in problem.terms if not isinstance(term, StrainTerm)]
 
-    def compute_work(array_name: str, change: np.ndarray) -> np.ndarray:
-        """Return the work (b,) of the adjoint solution against all but elastic forces, for a changed array."""
-        changed = replace(cause, **{array_name: change})
+    def compute_gradient(change: np.ndarray) -> np.ndarray:
+        """Return the gradient of all but elastic terms for a changed array."""
+        changed = replace(cause, **{name: change})
         causes = tuple(changed if k == number else one for k, one in enumerate(cases.loads.causes))
-        moved = replace(cases, loads=Loads(causes, cases.loads.times))
-        out = problem.device.allocate(*u.shape)
-        for term in problem.terms:
-            if not isinstance(term, StrainTerm):
-                term.begin(moved)
-                term.add_gradient(state, out)
-        return np.einsum("nb,nb->b", adjoint, out.numpy().astype(np.float64))
+        moved, out = replace(cases, loads=Loads(causes, cases.loads.times)), problem.device.allocate(*u.shape)
+        for term in terms:
+            term.begin(moved)
+            term.add_gradient(u, out)
+        return out.numpy().astype(np.float64)
 
-    for field in fields(cause):
-        array = getattr(cause, field.name)
-        slopes = []
-        for direction in _list_directions(array, field.name):
-            turns = field.name == "pose" and direction[-1] >= 3
-            step = ROTATION_STEP if turns else _choose_step(cause, field.name)
-            parts = [
-                weight * compute_work(field.name, _move(array, field.name, direction, offset * step))
-                for offset, weight in STENCIL
-            ]
-            slopes.append(-np.sum(parts, axis=0) / step)
-        yield field.name, _arrange(np.stack(slopes, axis=-1), array, field.name)
-    for term in problem.terms:
-        if not isinstance(term, StrainTerm):
-            term.begin(cases)
+    for direction in _list_directions(array, name):
+        step = ROTATION_STEP if name == "pose" and direction[-1] >= 3 else _choose_step(cause, name)
+        parts = [weight * compute_gradient(_move(array, name, direction, offset * step)) for offset, weight in STENCIL]
+        yield np.sum(parts, axis=0) / step
+    for term in terms:
+        term.begin(cases)
 
 
 def _choose_step(cause: Any, name: str) -> np.ndarray | float:
@@ -109,7 +117,8 @@ def _choose_step(cause: Any, name: str) -> np.ndarray | float:
         return FOOTPRINT_STEP * cause.footprint
     if name == "direction":
         return STEPS[name] * np.linalg.norm(cause.direction, axis=1)
-    return STEPS.get(name) or float(np.abs(getattr(cause, name)).max(initial=0.0)) or 1.0
+    size = float(np.abs(getattr(cause, name)).max(initial=0.0)) or 1.0
+    return STEPS.get(name) or (size if isinstance(cause, BuiltIn) else OWN_STEP * size)
 
 
 def _list_directions(array: np.ndarray, name: str) -> Iterator[tuple[int, ...]]:
