@@ -103,6 +103,13 @@ def _own_mesh(ax, it):
     ax.set(aspect="equal", xlabel="length [mm]")
 
 
+def _force_from_surface(ax, it):
+    ax.bar(np.arange(3) - 0.2, it.truth, 0.4, color="silver", label="true")
+    ax.bar(np.arange(3) + 0.2, it.force, 0.4, yerr=2 * it.deviation, label="found, 95 %")
+    ax.set(xticks=range(3), xticklabels="xyz", ylabel="force [N]")
+    ax.legend()
+
+
 def _palpate_policies(ax, it):
     ax.bar(list(it.found), [total.mean() for total, _ in it.found.values()], color=["silver", "tab:blue", "tab:green"])
     ax.set(ylabel="mean return")
@@ -140,6 +147,17 @@ def _slicer_console(ax, it):
         solid.plot_trisurf(*nodes.T, triangles=faces, color=(*it.LOOKS[name][0], it.LOOKS[name][1]))
     solid.set_aspect("equal")
     solid.axis("off")
+
+
+def _stiffness_sensitivity(ax, it):
+    """Draw the section through the push."""
+    right = np.cross(PLACE.inward, [0.0, 1.0, 0.0])
+    frame = np.stack([right / np.linalg.norm(right), -PLACE.inward])
+    flat = np.stack(np.meshgrid(np.linspace(-0.04, 0.04, 161), np.linspace(-0.055, 0.0, 111)), axis=-1)
+    values = LinearNDInterpolator(it.centres, np.log10(it.image))(PLACE.point + flat @ frame)
+    shown = ax.pcolormesh(*1e3 * np.moveaxis(flat, -1, 0), values, cmap="magma", vmin=-1.0, shading="gouraud")
+    ax.figure.colorbar(shown, label="log10 of sensitivity [1/m2]")
+    ax.set(aspect="equal", xticks=[], yticks=[])
 
 
 def _veins(ax, it):
