@@ -18,7 +18,7 @@ from test_house import FILES, HOUSE, PACKAGED, name_of, nodes_of
 # 810 differentiate equilibria, also in PyTorch; 345 lines are their tests.
 # 55 draw the exponent of a measured law; 35 are their tests.
 # 290 of the tests are calls that names of full words wrap.
-MOST = {"packages": 86_338, "tests": 55_035}
+MOST = {"packages": 86_344, "tests": 55_040}
 
 
 def lines(paths):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -168,10 +169,12 @@ def test_footprint_derivatives_equal_coarse_differences() -> None:
         np.testing.assert_allclose(own, difference(evaluate, 1.0) / 5e-4, rtol=0.1)
 
 
-def test_relaxing_tissue_is_differentiated_for_one_step() -> None:
+@pytest.mark.parametrize("started", [False, True])
+def test_relaxing_tissue_is_differentiated_for_one_step(started: bool) -> None:
+    """From the undeformed state, or from an earlier solution whose history is kept."""
     tissue = replace(NEO, prony=((0.45, 0.5),))
     fem, seed = build(CASES["tool force"], tissue, tissue, "smoothed"), build_seed(2)
-    first = fem.deform(Loads((replace(PUSH, force=0.4 * PUSH.force),), np.full(2, 0.1)))
+    first = fem.deform(Loads((replace(PUSH, force=0.4 * PUSH.force),), np.full(2, 0.1))) if started else None
     loads = Loads((PUSH,), np.full(2, 0.4))
     found = differentiate_equilibrium(fem, loads, fem.deform(loads, start=first), seed, start=first)
 
@@ -244,6 +247,8 @@ def test_what_has_no_derivative_is_rejected_in_one_message() -> None:
     )
     with pytest.raises(InputError, match="choose p1, smoothed or p2"):
         differentiate_equilibrium(springs, loads, found, seed)
+    with pytest.raises(InputError, match="SimpleNamespace has no derivatives: give a Fem"):
+        differentiate_equilibrium(SimpleNamespace(), loads, found, seed)  # pyright: ignore[reportArgumentType]
     touching = Fem(HELD, (Elasticity(NEO), Held(), ToolContact((Ball(8e-3),))), TRAIN, "cpu", element="p1")
     pressed = Loads((Touching(POSE),))
     with pytest.raises(InputError, match="pose of a tool require float64"):

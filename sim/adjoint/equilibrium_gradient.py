@@ -96,13 +96,13 @@ def differentiate_equilibrium(
     seed
         Derivative (B, V, 3) of the reading with respect to the displacement of every mesh vertex.
     start
-        Start of the equilibrium under tissue that relaxes, whose history variables are kept constant.
+        Start of the equilibrium if tissue relaxes: its history variables are kept constant. None: the undeformed state.
 
     Raises
     ------
     InputError
-        A load case has no equilibrium, or an unstable one. The effects include inertia, the element is not p1, smoothed
-        or p2, `seed` has another shape, or the adjoint solve does not converge.
+        A load case has no equilibrium, or an unstable one. The effects include inertia or a resection, the element is
+        not p1, smoothed or p2, `seed` has another shape, or the adjoint solve does not converge.
 
     Examples
     --------
@@ -118,6 +118,7 @@ def differentiate_equilibrium(
     >>> print(f"{1e3 * found.causes[0]['force'][0] @ place.inward:.1f} mm/N")
     2.9 mm/N
     """
+    _check_solver(fem)
     with fem.lock:
         return _differentiate(fem, loads, deformation, seed, start)
 
@@ -148,6 +149,7 @@ def compute_jacobian(
     InputError
         A region, parameter, cause or array is unknown; see also `differentiate_equilibrium`.
     """
+    _check_solver(fem)
     with fem.lock:
         cases, u = _linearise(fem, loads, deformation, start)
         vertices = len(fem.anatomy.mesh.nodes)
@@ -170,6 +172,11 @@ def compute_jacobian(
             slopes += iterate_load_slopes(fem.problem, cases, number, name, at)
         fem.problem.linearise(at, np.zeros(len(loads), bool))
         return np.array([_solve(fem, -slope)[0].T.reshape(len(loads), -1, 3)[:, :vertices] for slope in slopes])
+
+
+def _check_solver(fem: Fem) -> None:
+    if not isinstance(fem, Fem):
+        raise InputError(f"{type(fem).__name__} has no derivatives: give a Fem, whose effects contain no Resection.")
 
 
 def _differentiate(
@@ -207,8 +214,7 @@ def _linearise(fem: Fem, loads: Loads, deformation: Deformation, start: Deformat
     bad = [row for row, outcome in enumerate(deformation.outcome) if not outcome.good]
     if bad:
         raise InputError(f"load {bad[0]} is {deformation.outcome[bad[0]].value}: only equilibria have derivatives.")
-    since = deformation if start is None else start
-    cases = Cases(loads, since.time, since.memory)
+    cases = Cases(loads, np.zeros(len(loads))) if start is None else Cases(loads, start.time, start.memory)
     fem.problem.begin(cases)
     u = fem.guess(loads, deformation)
     fem.problem.linearise(fem.problem.device.upload(u), np.zeros(len(loads), bool))
